@@ -1,0 +1,97 @@
+"""Simulated tasks: Gymnasium environments and their TorchRL form. Everything is imported when first used."""
+
+from __future__ import annotations
+
+import difflib
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+from playslot_rl.config import EnvConfig, RenderConfig
+from playslot_rl.errors import ConfigError
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+    import numpy as np
+    import numpy.typing as npt
+    from torchrl.envs import EnvBase
+
+ENVIRONMENTS: dict[str, tuple[str, str]] = {
+    "button_press": ("PlaySlot/ButtonPress-v0", "playslot_rl.envs.button_press:ButtonPressEnv"),
+}
+"""Name in the configuration -> Gymnasium id and entry point."""
+
+
+class TaskEnv(Protocol):
+    """What the collectors and the evaluation need of an environment, beyond Gymnasium's own interface."""
+
+    config: EnvConfig
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start the episode of `seed`; `info["success"]` is True where it starts solved."""
+
+    def step(self, action: npt.NDArray[np.float32]) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """One agent step; `info["success"]` says whether it solved the task."""
+
+    def expert_action(self) -> npt.NDArray[np.float32]:
+        """The scripted expert's action for the present state, (A,) in [-1, 1]."""
+
+    def close(self) -> None:
+        """Free the renderer."""
+
+
+def register() -> None:
+    """Register the Gymnasium ids; calling it again does nothing. Called by `make_env` and by Gymnasium's plug-ins."""
+    from gymnasium.envs.registration import register as gym_register
+    from gymnasium.envs.registration import registry
+
+    for gym_id, entry_point in ENVIRONMENTS.values():
+        if gym_id not in registry:
+            gym_register(id=gym_id, entry_point=entry_point, order_enforce=False, disable_env_checker=True)
+
+
+def gym_id(name: str) -> str:
+    """Gymnasium id of a configured environment name.
+
+    Raises:
+        ConfigError: there is no such environment.
+    """
+    if name not in ENVIRONMENTS:
+        near = difflib.get_close_matches(name, ENVIRONMENTS, n=1)
+        hint = f"; did you mean env={near[0]}?" if near else "; choose one of these"
+        raise ConfigError(f"unknown environment: got {name!r}, expected one of {', '.join(sorted(ENVIRONMENTS))}{hint}")
+    return ENVIRONMENTS[name][0]
+
+
+def make_env(env: EnvConfig | None = None, render: RenderConfig | None = None) -> gym.Env[Any, Any]:
+    """Make a task as a Gymnasium environment without wrappers, so that `expert_action()` can be called on it.
+
+    Observations: `{"pixels": uint8 (H, W, 3), "state": float32 (S,)}`; actions float32 (A,) in [-1, 1];
+    `info["success"]: bool` from `reset` and `step`.
+
+    Raises:
+        ConfigError: unknown environment name.
+        RenderError: there is no working GL backend.
+    """
+    env = env or EnvConfig()
+    name = gym_id(env.name)
+    from playslot_rl.envs.rendering import import_mujoco
+
+    import_mujoco()
+    import gymnasium
+
+    register()
+    return gymnasium.make(name, env=env, render=render or RenderConfig(), render_mode="rgb_array")
+
+
+def task_env(env: gym.Env[Any, Any]) -> TaskEnv:
+    """The task under any Gymnasium wrappers."""
+    return cast(TaskEnv, env.unwrapped)
+
+
+def make_torchrl_env(env: EnvConfig | None = None, render: RenderConfig | None = None) -> EnvBase:
+    """Make a task in its TorchRL form; see `playslot_rl.envs.torchrl`."""
+    from playslot_rl.envs.torchrl import make_torchrl_env as make
+
+    return make(env or EnvConfig(), render or RenderConfig())
+
+
+__all__ = ["ENVIRONMENTS", "TaskEnv", "gym_id", "make_env", "make_torchrl_env", "register", "task_env"]

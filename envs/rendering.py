@@ -1,0 +1,123 @@
+"""Off-screen rendering: one path for training data and for evaluation.
+
+What makes MuJoCo's default slow under software GL is the 4096-pixel shadow map and 4x multisampling. The `fast` path
+switches both off, draws at `supersample` times the size and averages boxes: about 4 ms a 64x64 frame instead of 80.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import weakref
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.config import RenderConfig
+from playslot_rl.errors import RenderError
+
+if TYPE_CHECKING:
+    import mujoco
+
+CURE = "set MUJOCO_GL to egl, osmesa or glfw and install that library (Debian/Ubuntu: apt-get install libegl1 libgl1)"
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A free camera.
+
+    Attributes:
+        distance: metres from the point looked at.
+        azimuth: degrees about the vertical.
+        elevation: degrees over the horizon; negative looks down.
+        lookat: the point looked at, metres.
+    """
+
+    distance: float
+    azimuth: float
+    elevation: float
+    lookat: tuple[float, float, float]
+
+
+def import_mujoco() -> Any:
+    """Import mujoco with a GL backend that works without a display.
+
+    MuJoCo reads `MUJOCO_GL` once, when it is first imported. On Linux it is set to `egl` where it is not set, with or
+    without a display, so that every machine and every worker process draws by the same path.
+
+    Raises:
+        RenderError: mujoco cannot be imported with the backend asked for.
+    """
+    if sys.platform.startswith("linux"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        import mujoco
+    except Exception as error:  # PyOpenGL raises AttributeError, ImportError or RuntimeError, by platform
+        raise RenderError(_message(error)) from error
+    return mujoco
+
+
+def _message(error: BaseException) -> str:
+    backend = os.environ.get("MUJOCO_GL", "")
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return f"no GL backend: got MUJOCO_GL={backend!r} ({reason}), expected one that can draw off-screen; {CURE}"
+
+
+def _close(renderer: Any) -> None:
+    renderer.close()
+
+
+class FrameRenderer:
+    """Draws the scene of one MuJoCo model.
+
+    Args:
+        model: the model; its off-screen buffer size and, for `fast`, its sample count are changed.
+        camera: the viewpoint.
+        size: side of the frames, pixels.
+        config: quality and supersampling.
+
+    Raises:
+        RenderError: there is no working GL backend.
+    """
+
+    def __init__(self, model: mujoco.MjModel, camera: Camera, size: int, config: RenderConfig) -> None:
+        mj = import_mujoco()
+        fast = config.quality == "fast"
+        self.size = size
+        self._factor = config.supersample if fast else 1
+        side = size * self._factor
+        model.vis.global_.offwidth = model.vis.global_.offheight = side
+        if fast:
+            model.vis.quality.offsamples = 0
+        try:
+            self._renderer = mj.Renderer(model, height=side, width=side)
+        except Exception as error:  # each GL backend raises its own types
+            raise RenderError(_message(error)) from error
+        # Closed at interpreter exit too, while mujoco still exists: otherwise EGL prints tracebacks.
+        self._finalizer = weakref.finalize(self, _close, self._renderer)
+        if fast:
+            for flag in (mj.mjtRndFlag.mjRND_SHADOW, mj.mjtRndFlag.mjRND_REFLECTION):
+                self._renderer.scene.flags[flag] = 0
+        self._camera = mj.MjvCamera()
+        self._camera.type = mj.mjtCamera.mjCAMERA_FREE
+        self._camera.distance = camera.distance
+        self._camera.azimuth = camera.azimuth
+        self._camera.elevation = camera.elevation
+        self._camera.lookat[:] = camera.lookat
+
+    def __call__(self, data: mujoco.MjData) -> npt.NDArray[np.uint8]:
+        """Draw one frame: uint8 [0, 255] of shape (H, W, 3)."""
+        self._renderer.update_scene(data, self._camera)
+        frame: npt.NDArray[np.uint8] = self._renderer.render()
+        if self._factor == 1:
+            return frame.copy()
+        boxes = frame.reshape(self.size, self._factor, self.size, self._factor, 3)
+        area = self._factor**2
+        # Integer arithmetic, rounded to nearest: exact on every machine.
+        return ((boxes.sum(axis=(1, 3), dtype=np.uint32) + area // 2) // area).astype(np.uint8)
+
+    def close(self) -> None:
+        """Free the GL context; safe to call twice."""
+        self._finalizer()
