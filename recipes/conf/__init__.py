@@ -1,0 +1,1 @@
+"""The shipped YAML: `config.yaml` and the groups `env` and `preset`."""

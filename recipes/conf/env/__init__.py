@@ -1,0 +1,1 @@
+"""The `env` group: one YAML a task."""

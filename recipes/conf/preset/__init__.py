@@ -1,0 +1,1 @@
+"""The `preset` group: `smoke` (tests), `compact` (two CPU cores), `paper` (one GPU)."""
