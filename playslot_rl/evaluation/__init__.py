@@ -1,0 +1,1 @@
+"""Evaluation: success in simulation and in imagination, video metrics, latent-action probes."""

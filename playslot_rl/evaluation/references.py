@@ -1,0 +1,113 @@
+"""Success of the references: random actions, the scripted expert, and the slot oracle, on the same seeds."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.evaluation.controllers import ClosedLoop
+from playslot_rl.evaluation.episodes import Actions, Controller, Episode, Frames, Task, TaskPool, run_episodes
+from playslot_rl.evaluation.intervals import wilson
+from playslot_rl.training.atomic import write_json
+from playslot_rl.world_model import Agent
+
+
+class RandomController:
+    """Uniform actions in [-1, 1]; an episode's actions depend on its seed alone."""
+
+    def __init__(self, action_dim: int) -> None:
+        self._action_dim = action_dim
+        self._streams: list[np.random.Generator] = []
+
+    def begin(self, frames: Frames, seeds: Sequence[int]) -> None:
+        """Seed one stream an episode; 7 keeps it apart from the environment's own streams of the same seed."""
+        self._streams = [np.random.default_rng([seed, 7]) for seed in seeds]
+
+    def act(self, step: int, running: Sequence[int], frames: Frames, tasks: Sequence[Task]) -> Actions:
+        """Draw (n, A)."""
+        return np.stack([self._streams[i].uniform(-1, 1, self._action_dim).astype(np.float32) for i in running])
+
+
+class ExpertController:
+    """The scripted expert, which sees the simulator's state."""
+
+    def begin(self, frames: Frames, seeds: Sequence[int]) -> None:
+        """Nothing to remember."""
+
+    def act(self, step: int, running: Sequence[int], frames: Frames, tasks: Sequence[Task]) -> Actions:
+        """Ask each environment: (n, A)."""
+        return np.stack([task.expert_action() for task in tasks])
+
+
+def summary(episodes: Sequence[Episode]) -> dict[str, Any]:
+    """`success_rate` (0 to 1), `ci95` (Wilson) and `mean_steps_to_success` (agent steps; None without a success)."""
+    steps = [e.steps for e in episodes if e.steps is not None]
+    return {
+        "success_rate": len(steps) / len(episodes),
+        "ci95": list(wilson(len(steps), len(episodes))),
+        "mean_steps_to_success": float(np.mean(steps)) if steps else None,
+    }
+
+
+def run_references(
+    agent: Agent,
+    config: ExperimentConfig,
+    seeds: Sequence[int],
+    pool: TaskPool,
+    oracle_fingerprint: str = "",
+    cache: Path | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Results of `random`, `expert` and `slot_oracle`, always closed-loop.
+
+    Args:
+        agent: its oracle is run; an agent without one gets null values.
+        config: environment and renderer.
+        seeds: evaluation seeds.
+        pool: environments.
+        oracle_fingerprint: names the weights of oracle and SAVi; empty means that the oracle's result is not cached.
+        cache: JSON file that both protocols of a run share; None means no cache.
+    """
+    controllers: dict[str, Controller] = {"random": RandomController(config.env.action_dim), "expert": ExpertController()}
+    if agent.oracle is not None:
+        controllers["slot_oracle"] = ClosedLoop(agent, oracle=True)
+    stored = _read_cache(cache)
+    results: dict[str, dict[str, Any]] = {}
+    for name, controller in controllers.items():
+        weights = oracle_fingerprint if name == "slot_oracle" else name
+        key = _key(name, weights, config, seeds)
+        if not weights or key not in stored:
+            stored[key] = summary(run_episodes(pool, controller, seeds))
+        results[name] = stored[key]
+    if agent.oracle is None:
+        results["slot_oracle"] = {"success_rate": None, "ci95": None, "mean_steps_to_success": None}
+    if cache is not None:
+        kept = {k: v for k, v in stored.items() if oracle_fingerprint or not k.startswith("slot_oracle")}
+        write_json(cache, kept)
+    return results
+
+
+def _key(name: str, weights: str, config: ExperimentConfig, seeds: Sequence[int]) -> str:
+    what = [weights, to_dict(config.env), to_dict(config.render), list(seeds)]
+    return f"{name}-{hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]}"
+
+
+def _read_cache(path: Path | None) -> dict[str, dict[str, Any]]:
+    if path is None or not path.is_file():
+        return {}
+    try:
+        stored: dict[str, dict[str, Any]] = json.loads(path.read_text())
+    except json.JSONDecodeError:
+        return {}  # only a cache: run the references again
+    return stored
+
+
+def episode_records(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
+    """Plain dicts of the episodes, for JSON."""
+    return [asdict(e) for e in episodes]

@@ -1,0 +1,73 @@
+"""Evaluation seeds: a fixed list, never one that was collected for training."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.errors import ConfigError, DataError
+
+BLOCK = 1_000_000
+"""Seeds set aside for each value of `seed`."""
+
+
+def first_seed(config: ExperimentConfig, seed: int) -> int:
+    """First evaluation seed of `seed`; the others follow it one by one."""
+    return config.evaluation.seed_offset + seed * BLOCK
+
+
+def recorded_seeds(root: Path) -> set[int]:
+    """Episode seeds that one of our data sets says it was collected with; empty for foreign data sets.
+
+    Raises:
+        DataError: `meta/playslot.json` is there but cannot be read.
+    """
+    path = root / "meta" / "playslot.json"
+    if not path.is_file():
+        return set()
+    try:
+        meta = json.loads(path.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise DataError(f"{path}: got {error}, expected JSON; collect the data set again") from error
+    return set(_seeds_in(meta))
+
+
+def _seeds_in(node: Any) -> Iterable[int]:
+    """All integers under a key `seed` or `seeds`, at any depth below the per-episode records."""
+    if isinstance(node, dict):
+        for key, value in node.items():
+            if key == "seeds" and isinstance(value, list):
+                yield from (int(v) for v in value if isinstance(v, int))
+            elif key == "episodes" and isinstance(value, list):
+                yield from (int(v["seed"]) for v in value if isinstance(v, dict) and isinstance(v.get("seed"), int))
+            else:
+                yield from _seeds_in(value)
+
+
+def training_seeds(config: ExperimentConfig, run: Path | None = None) -> set[int]:
+    """Episode seeds of every data set the config (or the run's `data` folder) names."""
+    roots = [r.strip() for r in f"{config.data.root},{config.data.demos}".split(",") if r.strip()]
+    found: set[int] = set()
+    for root in roots:
+        found |= recorded_seeds(Path(root))
+    if run is not None and (run / "data").is_dir():
+        for folder in sorted((run / "data").iterdir()):
+            found |= recorded_seeds(folder)
+    return found
+
+
+def check_disjoint(seeds: Iterable[int], training: set[int]) -> None:
+    """Refuse evaluation seeds that a training data set holds.
+
+    Raises:
+        ConfigError: they overlap.
+    """
+    common = sorted(set(seeds) & training)
+    if common:
+        raise ConfigError(
+            f"evaluation.seed_offset: got evaluation seed {common[0]} that is in a training data set "
+            f"({len(common)} in all), expected seeds apart; choose another evaluation.seed_offset"
+        )

@@ -1,0 +1,207 @@
+"""Success in simulation (closed loop) and in imagination (open loop), on a fixed list of seeds, one episode each.
+
+TorchRL's `Evaluator` counts the first N *finished* episodes, which favours short ones and overstates success; the plain
+loop here runs each seed once. That it acts as the TorchRL environments do is tested.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.evaluation.controllers import ClosedLoop, OpenLoop
+from playslot_rl.evaluation.episodes import Controller, TaskPool, run_episodes
+from playslot_rl.evaluation.references import episode_records, run_references, summary
+from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
+from playslot_rl.training.atomic import write_json
+from playslot_rl.world_model import Agent
+
+PROTOCOLS = ("simulation", "imagination")
+DEFAULT_EPISODES = 50
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """What the result file says about the run it measures.
+
+    Attributes:
+        demos: demonstrations whose videos the policy was trained on; None if the run does not say.
+        labelled_demos: those of them whose real actions were used; None if the run does not say.
+        fingerprints: weights of each stage.
+        commit: commit the policy was trained from.
+    """
+
+    demos: int | None = None
+    labelled_demos: int | None = None
+    fingerprints: dict[str, str] = field(default_factory=dict)
+    commit: str = ""
+
+
+def run_facts(run: Path) -> RunFacts:
+    """Read `RUN/policy/checkpoint/meta.json`.
+
+    Raises:
+        CheckpointError: the run has no trained policy, or its meta file cannot be read.
+    """
+    path = run / "policy" / "checkpoint" / "meta.json"
+    if not path.is_file():
+        raise CheckpointError(f"{run}: got no policy/checkpoint, expected a trained policy; run `playslot train-policy run={run}`")
+    try:
+        meta: dict[str, Any] = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise CheckpointError(f"{path}: got {error}, expected JSON; train the policy again") from error
+    metrics = meta.get("metrics", {})
+    prints = {str(k): str(v) for k, v in meta.get("parents", {}).items()}
+    prints["policy"] = str(meta.get("fingerprint", "")) or weights_fingerprint(path.parent)
+    return RunFacts(
+        demos=_count(meta.get("demos", metrics.get("demos"))),
+        labelled_demos=_count(meta.get("labelled_demos", metrics.get("labelled_demos"))),
+        fingerprints=prints,
+        commit=str(meta.get("commit", "")),
+    )
+
+
+def _count(value: Any) -> int | None:
+    return None if value is None else int(value)
+
+
+def weights_fingerprint(folder: Path) -> str:
+    """First 16 hexadecimal digits of the SHA-256 of `weights.safetensors`."""
+    import hashlib
+
+    with open(folder / "weights.safetensors", "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
+def check_protocol(protocol: str) -> None:
+    """Refuse an unknown protocol.
+
+    Raises:
+        ConfigError: it is neither `simulation` nor `imagination`.
+    """
+    if protocol not in PROTOCOLS:
+        raise ConfigError(f"protocol: got {protocol!r}, expected one of {', '.join(PROTOCOLS)}")
+
+
+def evaluate(
+    agent: Agent,
+    config: ExperimentConfig,
+    protocol: str,
+    episodes: int,
+    seed: int,
+    *,
+    facts: RunFacts | None = None,
+    run: Path | None = None,
+    pool: TaskPool | None = None,
+) -> dict[str, Any]:
+    """Measure an agent.
+
+    Args:
+        agent: world model, policy, action decoder and, for the reference, slot oracle.
+        config: environment, renderer, `evaluation`, and the data sets whose seeds must not come up.
+        protocol: `simulation` (closed loop) or `imagination` (open loop: one frame is parsed, policy and cOCVP unfold
+            `max_steps` steps in latent space, and the decoded actions are then executed).
+        episodes: number of seeds.
+        seed: selects the block of evaluation seeds.
+        facts: what to say about the run.
+        run: run folder; the reference results shared by both protocols are cached under `RUN/evaluation`.
+        pool: environments to use and leave open; None makes and closes its own.
+
+    Returns:
+        `protocol`, `episodes`, `seeds`, `success_rate` (0 to 1), `ci95` (Wilson), `mean_steps_to_success` (agent steps),
+        `labelled_demos`, `demos`, `references` (`random`, `expert`, `slot_oracle`: all closed-loop), and extras.
+
+    Raises:
+        ConfigError: unknown protocol, or a seed that a training data set holds.
+    """
+    check_protocol(protocol)
+    facts = facts or RunFacts()
+    start = first_seed(config, seed)
+    seeds = list(range(start, start + episodes))
+    training = training_seeds(config, run)
+    check_disjoint(seeds, training)
+    agent.eval()
+    own = TaskPool(config.env, config.render) if pool is None else None
+    used = pool or own
+    assert used is not None
+    begin = time.perf_counter()
+    try:
+        controller: Controller = ClosedLoop(agent) if protocol == "simulation" else OpenLoop(agent, config.env.max_steps)
+        outcome = run_episodes(used, controller, seeds)
+        wall = time.perf_counter() - begin
+        references = _references(agent, config, seeds, used, facts, run)
+    finally:
+        if own is not None:
+            own.close()
+    played = [e.seed for e in outcome]
+    check_disjoint(played, training)  # a redrawn episode has another seed
+    return {
+        "protocol": protocol,
+        "episodes": episodes,
+        "seeds": played,
+        **summary(outcome),
+        "labelled_demos": facts.labelled_demos,
+        "demos": facts.demos,
+        "references": references,
+        "references_protocol": "simulation (closed loop), on the same seeds",
+        "max_steps": config.env.max_steps,
+        "redrawn": sum(e.redrawn for e in outcome),
+        "per_episode": episode_records(outcome),
+        "seed": seed,
+        "wall_seconds": round(wall, 2),
+        "wall_seconds_with_references": round(time.perf_counter() - begin, 2),
+        "fingerprints": facts.fingerprints,
+        "commit": facts.commit,
+        "hardware": hardware(),
+    }
+
+
+def _references(
+    agent: Agent, config: ExperimentConfig, seeds: list[int], pool: TaskPool, facts: RunFacts, run: Path | None
+) -> dict[str, dict[str, Any]]:
+    if not config.evaluation.references:
+        return {n: {"success_rate": None, "ci95": None} for n in ("random", "expert", "slot_oracle")}
+    cache = None if run is None else run / "evaluation" / "references.json"
+    weights = "-".join(facts.fingerprints[k] for k in ("slots", "policy") if facts.fingerprints.get(k))
+    return run_references(agent, config, seeds, pool, weights if "policy" in facts.fingerprints else "", cache)
+
+
+def evaluate_run(
+    run: Path, agent: Agent, config: ExperimentConfig, protocol: str, pool: TaskPool | None = None
+) -> dict[str, Any]:
+    """Evaluate a run's agent with the config's `episodes` and `seed`, and write `RUN/evaluation/PROTOCOL/eval_info.json`.
+
+    Raises:
+        CheckpointError: the run has no trained policy.
+        OutputError: the file cannot be written.
+    """
+    episodes = config.episodes or DEFAULT_EPISODES
+    result = evaluate(agent, config, protocol, episodes, config.seed, facts=run_facts(run), run=run, pool=pool)
+    folder = run / "evaluation" / protocol
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "eval_info.json", result)
+    return result
+
+
+def hardware() -> dict[str, Any]:
+    """Processor, cores, threads and GPU."""
+    import os
+
+    gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
+    return {
+        "machine": platform.machine(),
+        "system": platform.system(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "gpu": gpu,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }

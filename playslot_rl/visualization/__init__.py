@@ -1,0 +1,1 @@
+"""Pictures of slots, rollouts and prototypes, and the report of a run."""

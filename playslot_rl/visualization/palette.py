@@ -1,0 +1,34 @@
+"""Colours: the Okabe-Ito palette, which colour-blind readers can tell apart, and the two themes of the charts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+OKABE_ITO: Final = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#7F7F7F")
+LABEL: Final = "#767676"
+"""Grey of labels on transparent pictures: legible on white and on the report's dark ground."""
+
+
+@dataclass(frozen=True)
+class Theme:
+    """Colours of a chart on a light or a dark page."""
+
+    name: str
+    text: str
+    grid: str
+    series: tuple[str, ...]
+
+
+LIGHT: Final = Theme("light", "#22262b", "#d8dbe0", OKABE_ITO)
+DARK: Final = Theme(
+    "dark",
+    "#e4e6ea",
+    "#3b4048",
+    ("#56B4E9", "#E69F00", "#2FC79A", "#E39AC4", "#9AD1F3", "#F08A4B", "#F0E442", "#B5B5B5"),
+)
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Red, green and blue in [0, 255] of `#rrggbb`."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
