@@ -1,0 +1,486 @@
+"""The configuration: frozen dataclasses are the truth, YAML and command-line overrides only change their values.
+
+`from_dict` builds a config from nested plain dicts (what Hydra composes) and refuses unknown keys;
+`to_dict` is its inverse; `fingerprint` names a config by its content.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import hashlib
+import json
+import types
+import typing
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+
+LatentMode = Literal["hybrid", "discrete", "continuous", "ground_truth"]
+Precision = Literal["fp32", "bf16"]
+
+
+def _check(ok: bool, what: str, got: object, expected: str) -> None:
+    if not ok:
+        raise ValueError(f"{what}: got {got!r}, expected {expected}")
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """How frames are rendered, for data and for evaluation alike.
+
+    Attributes:
+        quality: `fast` (no shadows, no multisampling, box-averaged supersampling) or `full` (MuJoCo's default look).
+        supersample: side factor of the `fast` path; 2 renders at twice the size and averages 2x2 boxes.
+    """
+
+    quality: Literal["fast", "full"] = "fast"
+    supersample: int = 2
+
+    def __post_init__(self) -> None:
+        _check(1 <= self.supersample <= 8, "render.supersample", self.supersample, "an integer from 1 to 8")
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """The task.
+
+    Attributes:
+        name: registered environment name (`button_press`).
+        image_size: side of the square frames, pixels.
+        action_dim: width A of the real action.
+        frame_skip: environment steps per agent step, all with the same action.
+        max_steps: agent steps in an episode.
+        warmup_steps: random agent steps after each reset, before the first observation.
+    """
+
+    name: str = "button_press"
+    image_size: int = 64
+    action_dim: int = 4
+    frame_skip: int = 5
+    max_steps: int = 20
+    warmup_steps: int = 12
+
+    def __post_init__(self) -> None:
+        _check(self.image_size in (32, 64, 128), "env.image_size", self.image_size, "32, 64 or 128")
+        _check(self.frame_skip >= 1, "env.frame_skip", self.frame_skip, "at least 1")
+        _check(self.max_steps >= 2, "env.max_steps", self.max_steps, "at least 2")
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Where data come from.
+
+    Attributes:
+        root: LeRobot v3.0 data set(s) of unlabelled videos; several are separated by commas.
+        demos: data set of demonstrations; empty means `root`.
+        camera: image feature to read; empty means the only one.
+        cache: folder of the frame and slot caches; empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
+        validation: fraction of episodes held out from training.
+    """
+
+    root: str = ""
+    demos: str = ""
+    camera: str = ""
+    cache: str = ""
+    validation: float = 0.05
+
+    def __post_init__(self) -> None:
+        _check(0.0 <= self.validation < 1.0, "data.validation", self.validation, "a fraction in [0, 1)")
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """What the collectors record (agent steps; an episode has one more frame than actions).
+
+    Attributes:
+        random_episodes: episodes of the random policy that `pipeline` collects.
+        random_steps: agent steps of each.
+        expert_episodes: demonstrations that `pipeline` collects for the policy.
+        expert_steps: agent steps of each; clips go on past success.
+        noise: standard deviation of Gaussian noise added to the expert's actions.
+        storage: `image` (PNG in parquet, lossless) or `video` (h264 yuv444p, crf 0).
+    """
+
+    random_episodes: int = 400
+    random_steps: int = 20
+    expert_episodes: int = 150
+    expert_steps: int = 20
+    noise: float = 0.0
+    storage: Literal["image", "video"] = "image"
+
+
+@dataclass(frozen=True)
+class SAViConfig:
+    """Sizes of SAVi (system.md section 1; paper, appendix A.1).
+
+    Attributes:
+        n_slots: N.
+        slot_dim: D.
+        initial: `gaussian` (learned mean and scale shared by all slots; paper) or `learned` (one vector per slot).
+        encoder: `full` (four 5x5 stride-1 convs; paper) or `strided` (5x5 convs with `encoder_strides`).
+        encoder_channels: channels of each encoder conv.
+        encoder_strides: strides of the encoder convs (all 1 for `full`).
+        token_dim: width of the encoder tokens' MLP and of q, k, v.
+        decoder: `broadcast` (full-resolution spatial broadcast; paper) or `pixel_shuffle` (from 8x8 upwards).
+        decoder_channels: channels of the decoder.
+        collapse: use the collapsed first layer of the broadcast decoder (exact; `false` computes it plainly).
+        first_iterations: Slot Attention iterations on an episode's first frame.
+        iterations: iterations on every later frame.
+        corrector_mlp: hidden width of the corrector's residual MLP.
+        transition_heads: heads of the transition block, of width D / heads.
+        transition_mlp: hidden width of the transition block's MLP.
+    """
+
+    n_slots: int = 4
+    slot_dim: int = 128
+    initial: Literal["gaussian", "learned"] = "gaussian"
+    encoder: Literal["full", "strided"] = "full"
+    encoder_channels: tuple[int, ...] = (32, 32, 32, 32)
+    encoder_strides: tuple[int, ...] = (1, 1, 1, 1)
+    token_dim: int = 128
+    decoder: Literal["broadcast", "pixel_shuffle"] = "broadcast"
+    decoder_channels: tuple[int, ...] = (64, 64, 64, 64)
+    collapse: bool = True
+    first_iterations: int = 3
+    iterations: int = 1
+    corrector_mlp: int = 256
+    transition_heads: int = 4
+    transition_mlp: int = 512
+
+    def __post_init__(self) -> None:
+        _check(self.n_slots >= 1, "model.savi.n_slots", self.n_slots, "at least 1")
+        _check(
+            len(self.encoder_channels) == len(self.encoder_strides),
+            "model.savi.encoder_strides",
+            self.encoder_strides,
+            f"one stride for each of the {len(self.encoder_channels)} encoder channels",
+        )
+        _check(
+            self.slot_dim % self.transition_heads == 0,
+            "model.savi.transition_heads",
+            self.transition_heads,
+            f"a divisor of slot_dim {self.slot_dim}",
+        )
+
+
+@dataclass(frozen=True)
+class InverseDynamicsConfig:
+    """Sizes of InvDyn and its quantiser (system.md section 2; paper, appendix A.2).
+
+    Attributes:
+        variant: `single` (InvDyn_S, one z per step) or `multi` (InvDyn_M, one z per slot and step).
+        mode: latent-action mode.
+        latent_dim: Z.
+        n_prototypes: K.
+        dim, layers, heads, head_dim, mlp_dim: transformer of InvDyn_S; `dim` is the hidden width of InvDyn_M.
+        decay: EMA decay of the codebook.
+        dead_threshold: EMA cluster size under which a code is revived by a random latent of the batch.
+        commitment: weight beta of the commitment term.
+        sample: sample z at evaluation too (training always samples).
+    """
+
+    variant: Literal["single", "multi"] = "single"
+    mode: LatentMode = "hybrid"
+    latent_dim: int = 16
+    n_prototypes: int = 8
+    dim: int = 256
+    layers: int = 4
+    heads: int = 4
+    head_dim: int = 64
+    mlp_dim: int = 1024
+    decay: float = 0.99
+    dead_threshold: float = 1.0
+    commitment: float = 0.25
+    sample: bool = False
+
+    def __post_init__(self) -> None:
+        _check(0.0 < self.decay < 1.0, "model.inverse_dynamics.decay", self.decay, "a number in (0, 1)")
+        _check(self.n_prototypes >= 2, "model.inverse_dynamics.n_prototypes", self.n_prototypes, "at least 2")
+
+
+@dataclass(frozen=True)
+class PredictorConfig:
+    """Sizes of cOCVP (system.md section 3; paper, appendix A.3).
+
+    Attributes:
+        dim, layers, heads, head_dim, mlp_dim: the transformer.
+        residual: predict the change of the slots instead of the slots.
+        context: frames it attends to; past them the window slides and is recomputed.
+    """
+
+    dim: int = 256
+    layers: int = 4
+    heads: int = 8
+    head_dim: int = 64
+    mlp_dim: int = 1024
+    residual: bool = False
+    context: int = 24
+
+    def __post_init__(self) -> None:
+        _check(self.context >= 2, "model.predictor.context", self.context, "at least 2 frames")
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """Sizes of the latent policy: InvDyn_S's architecture with one head (paper, appendix A.4)."""
+
+    dim: int = 256
+    layers: int = 4
+    heads: int = 4
+    head_dim: int = 64
+    mlp_dim: int = 1024
+
+
+@dataclass(frozen=True)
+class ActionDecoderConfig:
+    """Sizes of the action decoder: a three-layer MLP (paper, appendix A.4)."""
+
+    hidden_dim: int = 128
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """All sizes."""
+
+    savi: SAViConfig = field(default_factory=SAViConfig)
+    inverse_dynamics: InverseDynamicsConfig = field(default_factory=InverseDynamicsConfig)
+    predictor: PredictorConfig = field(default_factory=PredictorConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    action_decoder: ActionDecoderConfig = field(default_factory=ActionDecoderConfig)
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """Adam and its schedule.
+
+    Attributes:
+        lr: base learning rate.
+        warmup_steps: linear warm-up.
+        schedule: `cosine` to zero over the stage's steps after warm-up, or `constant`.
+        grad_clip: maximum gradient norm; 0 switches clipping off.
+    """
+
+    lr: float = 1e-4
+    warmup_steps: int = 0
+    schedule: Literal["cosine", "constant"] = "cosine"
+    grad_clip: float = 0.05
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """What every training stage has.
+
+    Attributes:
+        steps: optimiser steps.
+        batch_size: windows per step.
+        optim: optimiser.
+        precision: `bf16` autocasts the convolutions.
+        checkpoint_every: steps between checkpoints.
+        validate_every: steps between validations.
+        log_every: steps between log lines.
+    """
+
+    steps: int = 200_000
+    batch_size: int = 64
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    precision: Precision = "fp32"
+    checkpoint_every: int = 1000
+    validate_every: int = 1000
+    log_every: int = 50
+
+    def __post_init__(self) -> None:
+        _check(self.steps >= 1, "steps", self.steps, "at least 1")
+        _check(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
+        _check(self.checkpoint_every >= 1, "checkpoint_every", self.checkpoint_every, "at least 1")
+
+
+@dataclass(frozen=True)
+class SlotsStageConfig(StageConfig):
+    """Stage 1, SAVi.
+
+    Attributes:
+        clip_frames: frames per clip.
+    """
+
+    clip_frames: int = 8
+
+
+@dataclass(frozen=True)
+class DynamicsStageConfig(StageConfig):
+    """Stage 2, InvDyn and cOCVP.
+
+    Attributes:
+        seed_frames: parsed frames a rollout starts from.
+        predicted_frames: frames predicted after the seed.
+        teacher_steps: first steps in which every input is a parsed slot (one parallel pass; 0 in the paper).
+        decoded_frames: predicted frames decoded for the image loss, drawn at random; 0 decodes all of them.
+        image_weight, slot_weight, vq_weight: loss weights (lambda of Eq. "full loss").
+    """
+
+    seed_frames: int = 6
+    predicted_frames: int = 8
+    teacher_steps: int = 0
+    decoded_frames: int = 0
+    image_weight: float = 1.0
+    slot_weight: float = 1.0
+    vq_weight: float = 0.25
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check(self.seed_frames >= 1, "dynamics.seed_frames", self.seed_frames, "at least 1")
+        _check(self.predicted_frames >= 1, "dynamics.predicted_frames", self.predicted_frames, "at least 1")
+
+
+@dataclass(frozen=True)
+class BehaviourStageConfig(StageConfig):
+    """Stage 3, latent policy, action decoder and the slot oracle.
+
+    Attributes:
+        labelled_demos: demonstrations whose real actions the action decoder may see.
+        imagined: also clone from slots that cOCVP predicts along each demonstration.
+        decoder_inputs: `policy` (the policy's outputs) or `inverse_dynamics` (InvDyn's latents; paper).
+        decoder_steps: optimiser steps of the action decoder.
+        oracle: also train the slot oracle (same network on the real actions of all demos).
+    """
+
+    labelled_demos: int = 50
+    imagined: bool = True
+    decoder_inputs: Literal["policy", "inverse_dynamics"] = "inverse_dynamics"
+    decoder_steps: int = 2000
+    oracle: bool = True
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Evaluation.
+
+    Attributes:
+        references: also run the random, expert and slot-oracle references.
+        seed_offset: added to `seed`, far above every collection seed, so that no episode was seen in training.
+    """
+
+    references: bool = True
+    seed_offset: int = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class LoggingConfig:
+    """Logging: `tensorboard` (default), `wandb`, `trackio` or `none`, and a progress bar."""
+
+    backend: Literal["tensorboard", "wandb", "trackio", "none"] = "tensorboard"
+    progress: bool = True
+    project: str = "playslot_rl"
+
+
+@dataclass(frozen=True)
+class ExperimentConfig:
+    """Everything a command needs.
+
+    Attributes:
+        preset: name of the preset the values came from.
+        policy: collector policy of `collect`: `random` or `expert`.
+        episodes: episodes to collect or to evaluate; None means the command's default.
+        seed: seed of data collection, training or evaluation.
+        workers: collector processes; 0 means one per core.
+        out: folder to write.
+        run: run folder to read (and to write where `out` is empty); `pretrained` names the shipped model.
+        protocol: evaluation protocol.
+        device: torch device; empty means a GPU if there is one.
+        threads: torch threads; 0 leaves torch's choice.
+    """
+
+    preset: str = "paper"
+    policy: str = "expert"
+    episodes: int | None = None
+    seed: int = 0
+    workers: int = 0
+    out: str = ""
+    run: str = ""
+    protocol: Literal["simulation", "imagination"] = "simulation"
+    device: str = ""
+    threads: int = 0
+    env: EnvConfig = field(default_factory=EnvConfig)
+    render: RenderConfig = field(default_factory=RenderConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    collect: CollectConfig = field(default_factory=CollectConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    slots: SlotsStageConfig = field(default_factory=SlotsStageConfig)
+    dynamics: DynamicsStageConfig = field(default_factory=DynamicsStageConfig)
+    behaviour: BehaviourStageConfig = field(default_factory=BehaviourStageConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    logging: LoggingConfig = field(default_factory=LoggingConfig)
+
+    def __post_init__(self) -> None:
+        _check(self.episodes is None or self.episodes >= 1, "episodes", self.episodes, "at least 1")
+        _check(self.seed >= 0, "seed", self.seed, "a non-negative integer")
+        _check(self.workers >= 0, "workers", self.workers, "0 (one per core) or more")
+
+
+# --- conversion ----------------------------------------------------------------------------------------------------
+
+T = TypeVar("T")
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Nested plain dict of a config (tuples become lists, as in JSON)."""
+    plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
+    return plain
+
+
+def fingerprint(config: Any) -> str:
+    """Short content hash of a config: equal configs, equal names."""
+    text = json.dumps(to_dict(config), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def from_dict(cls: type[T], values: dict[str, Any], where: str = "") -> T:
+    """Build a config from nested dicts.
+
+    Args:
+        cls: the dataclass.
+        values: nested plain values; missing keys keep their defaults.
+        where: dotted prefix for error messages.
+
+    Raises:
+        ValueError: unknown key, wrong type, or a value outside its range.
+    """
+    hints = typing.get_type_hints(cls)
+    names = {f.name for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    for key in values:
+        if key not in names:
+            near = difflib.get_close_matches(str(key), names, n=1)
+            hint = f"; did you mean {where}{near[0]!s}?" if near else ""
+            raise ValueError(f"unknown key {where}{key}: expected one of {', '.join(sorted(names))}{hint}")
+    kwargs = {key: _convert(hints[key], value, f"{where}{key}") for key, value in values.items()}
+    return cls(**kwargs)
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    origin = get_origin(hint)
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, dict):
+            raise ValueError(f"{where}: got {value!r}, expected a group of keys")
+        return from_dict(typing.cast(type, hint), value, f"{where}.")
+    if origin is Literal:
+        if value not in get_args(hint):
+            raise ValueError(f"{where}: got {value!r}, expected one of {', '.join(map(str, get_args(hint)))}")
+        return value
+    if origin in (Union, types.UnionType):
+        if value is None:
+            return None
+        return _convert(next(a for a in get_args(hint) if a is not type(None)), value, where)
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise ValueError(f"{where}: got {value!r}, expected a list")
+        return tuple(_convert(get_args(hint)[0], v, where) for v in value)
+    return _convert_scalar(hint, value, where)
+
+
+def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if hint is str and value is None:
+        return ""
+    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
+        raise ValueError(f"{where}: got {value!r} ({type(value).__name__}), expected {hint.__name__}")
+    return value

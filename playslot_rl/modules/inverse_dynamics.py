@@ -1,0 +1,143 @@
+"""InvDyn: latent actions from consecutive slots (system.md section 2; paper, section "InvDyn Module").
+
+    mu_t, var_t = f(S_t);   z_t ~ N(mu_{t+1} - mu_t, var_{t+1} + var_t);   p_t = VQ(z_t),  v_t = z_t - sg[p_t]
+
+Shapes: slots (B, T, N, D) -> z, p, v (B, T-1, Z) for InvDyn_S (one agent), (B, T-1, N, Z) for InvDyn_M (many).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from playslot_rl.config import InverseDynamicsConfig
+from playslot_rl.modules.quantizer import ActionQuantizer
+from playslot_rl.modules.token_encoder import SlotTokenEncoder
+
+
+class LatentActions(NamedTuple):
+    """Latent actions between consecutive frames.
+
+    z (sampled in training), its mean, prototype p and variability v: (B, T-1, [N,] Z); code: int64 (B, T-1, [N]);
+    vq_loss: scalar.
+    """
+
+    z: Tensor
+    mean: Tensor
+    prototype: Tensor
+    variability: Tensor
+    code: Tensor
+    vq_loss: Tensor
+
+
+class SlotMLP(nn.Module):
+    """InvDyn_M's two-layer MLP with ReLU and layer norm, shared by all slots: (..., N, D) -> (..., N, dim)."""
+
+    def __init__(self, slot_dim: int, dim: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.LayerNorm(slot_dim), nn.Linear(slot_dim, dim), nn.ReLU(), nn.Linear(dim, dim), nn.LayerNorm(dim)
+        )
+
+    def forward(self, slots: Tensor) -> Tensor:
+        """Slots (..., N, D) to (..., N, dim)."""
+        out: Tensor = self.layers(slots)
+        return out
+
+
+class InverseDynamics(nn.Module):
+    """InvDyn_S or InvDyn_M, by `config.variant`.
+
+    Args:
+        config: sizes and mode.
+        slot_dim: D.
+        action_dim: A, the width of z in mode `ground_truth`.
+
+    Example:
+        >>> import torch
+        >>> from playslot_rl.config import InverseDynamicsConfig
+        >>> model = InverseDynamics(InverseDynamicsConfig(), slot_dim=128, action_dim=4).eval()
+        >>> model(torch.randn(2, 5, 4, 128)).z.shape
+        torch.Size([2, 4, 16])
+    """
+
+    def __init__(self, config: InverseDynamicsConfig, slot_dim: int, action_dim: int) -> None:
+        super().__init__()
+        self.config = config
+        self.per_slot = config.variant == "multi"
+        self.latent_dim = action_dim if config.mode == "ground_truth" else config.latent_dim
+        if config.mode == "ground_truth" and self.per_slot:
+            raise ValueError("mode ground_truth with variant multi: real actions are not per slot; use variant=single")
+        c = config
+        if config.mode != "ground_truth":
+            self.encoder: nn.Module = (
+                SlotMLP(slot_dim, c.dim)
+                if self.per_slot
+                else SlotTokenEncoder(slot_dim, c.dim, c.layers, c.heads, c.head_dim, c.mlp_dim)
+            )
+            self.to_mean = nn.Linear(c.dim, c.latent_dim)
+            self.to_variance = nn.Linear(c.dim, c.latent_dim)
+        if config.mode in ("hybrid", "discrete"):
+            self.quantizer = ActionQuantizer(
+                c.latent_dim, c.n_prototypes, c.decay, c.dead_threshold, c.commitment
+            )
+
+    @property
+    def n_prototypes(self) -> int:
+        """K, or 0 in the modes without prototypes."""
+        return self.config.n_prototypes if hasattr(self, "quantizer") else 0
+
+    @property
+    def prototypes(self) -> Tensor:
+        """The codebook (K, Z); raises ValueError in the modes without one."""
+        if not hasattr(self, "quantizer"):
+            raise ValueError(f"mode {self.config.mode} has no prototypes; use mode hybrid or discrete")
+        return self.quantizer.prototypes
+
+    def scene_dynamics(self, slots: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the scene dynamics of each frame: slots (..., N, D) -> two of (..., [N,] Z)."""
+        h = self.encoder(slots)
+        return self.to_mean(h), F.softplus(self.to_variance(h)) + 1e-6
+
+    def forward(
+        self, slots: Tensor, actions: Tensor | None = None, generator: torch.Generator | None = None
+    ) -> LatentActions:
+        """Infer the latent actions of a clip.
+
+        Args:
+            slots: (B, T, N, D).
+            actions: real actions (B, T-1, A), needed in mode `ground_truth` only.
+            generator: draws z in training, and at evaluation with `config.sample`.
+
+        Raises:
+            ValueError: mode `ground_truth` without actions.
+        """
+        if self.config.mode == "ground_truth":
+            if actions is None:
+                raise ValueError("mode ground_truth: got no actions, expected (B, T-1, A); use a data set with actions")
+            return self._compose(actions, actions)
+        mu, var = self.scene_dynamics(slots)
+        mean, variance = mu[:, 1:] - mu[:, :-1], var[:, 1:] + var[:, :-1]
+        z = mean
+        if self.training or self.config.sample:
+            noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
+            z = mean + variance.sqrt() * noise
+        return self._compose(z, mean)
+
+    def split(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Prototype and variability of given latents z (..., Z), as cOCVP takes them."""
+        out = self._compose(z, z)
+        return out.prototype, out.variability
+
+    def _compose(self, z: Tensor, mean: Tensor) -> LatentActions:
+        mode = self.config.mode
+        if mode in ("continuous", "ground_truth"):
+            # Without a codebook z enters through the variability's projection alone.
+            code = torch.zeros(z.shape[:-1], dtype=torch.long, device=z.device)
+            return LatentActions(z, mean, torch.zeros_like(z), z, code, z.new_zeros(()))
+        p, code, loss = self.quantizer(z)
+        v = z - p.detach() if mode == "hybrid" else torch.zeros_like(z)
+        return LatentActions(z, mean, p, v, code, loss)

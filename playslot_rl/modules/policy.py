@@ -1,0 +1,32 @@
+"""The latent policy: z_t = f_pi(S_t), InvDyn_S's architecture with one head (system.md section 4; paper, A.4).
+
+Shapes: slots (..., N, D) -> (..., Z). On real actions in place of latents it is the slot oracle.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from playslot_rl.config import PolicyConfig
+from playslot_rl.modules.token_encoder import SlotTokenEncoder
+
+
+class LatentPolicy(nn.Module):
+    """Latent action from the slots of one frame.
+
+    Args:
+        config: sizes.
+        slot_dim: D.
+        out_dim: Z, or A for the oracle.
+    """
+
+    def __init__(self, config: PolicyConfig, slot_dim: int, out_dim: int) -> None:
+        super().__init__()
+        c = config
+        self.encoder = SlotTokenEncoder(slot_dim, c.dim, c.layers, c.heads, c.head_dim, c.mlp_dim)
+        self.head = nn.Linear(c.dim, out_dim)
+
+    def forward(self, slots: Tensor) -> Tensor:
+        """Slots (..., N, D) to latent actions (..., Z)."""
+        out: Tensor = self.head(self.encoder(slots))
+        return out

@@ -1,0 +1,107 @@
+"""SAVi's slot decoders (system.md section 1; Watters et al., 2019): slot -> RGB and mask logit.
+
+Shapes: slots (M, D) -> (M, 4, H, W): three channels of RGB without activation, one mask logit.
+
+Broadcast (paper): each slot is broadcast to H x W, a position map P is added, then four 5x5 convs and one 3x3 conv.
+The first conv is linear, so conv(broadcast(s) + P) = conv0(broadcast(s)) + conv(P), and conv0 of a constant map takes
+only 5 x 5 values a channel (two border rows, the inside, two border rows, and so for columns): the kernel summed over
+its part inside the image, applied to the slot. That is exact and removes most of the first layer's arithmetic.
+
+Pixel shuffle (compact): broadcast to 8x8, then a 3x3 conv and pixel shuffle for each doubling.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from playslot_rl.modules.savi.encoder import SoftPositionEmbedding
+
+BASE = 8
+"""Side of the map that the pixel-shuffle decoder starts from."""
+
+
+class BroadcastDecoder(nn.Module):
+    """Full-resolution spatial broadcast decoder.
+
+    Args:
+        image_size: side of the frames.
+        slot_dim: D.
+        channels: channels of the 5x5 convs.
+        collapse: compute the first layer in its collapsed form.
+    """
+
+    inside: Tensor
+
+    def __init__(self, image_size: int, slot_dim: int, channels: tuple[int, ...], collapse: bool = True) -> None:
+        super().__init__()
+        self.image_size, self.collapse = image_size, collapse
+        self.position = SoftPositionEmbedding(image_size, slot_dim)
+        widths = (slot_dim, *channels)
+        self.convs = nn.ModuleList(
+            nn.Conv2d(a, b, 5, padding=2) for a, b in zip(widths[:-1], widths[1:], strict=True)
+        )
+        self.head = nn.Conv2d(widths[-1], 4, 3, padding=1)
+        # Row r: which of the 5 kernel rows lie inside the image for output rows 0, 1, inside, H-2, H-1.
+        cases = torch.tensor([[0, 0, 1, 1, 1], [0, 1, 1, 1, 1], [1, 1, 1, 1, 1], [1, 1, 1, 1, 0], [1, 1, 1, 0, 0]])
+        self.register_buffer("inside", cases.float(), persistent=False)
+
+    def first_layer(self, slots: Tensor) -> Tensor:
+        """First conv of the broadcast slots (M, D) plus position map: (M, C, H, W)."""
+        conv = self.convs[0]
+        if not self.collapse:
+            maps = slots[:, :, None, None] + self.position()
+            return conv(maps.contiguous(memory_format=torch.channels_last))  # type: ignore[no-any-return]
+        weight = torch.einsum("oikl,rk,cl->rcoi", conv.weight, self.inside, self.inside)  # type: ignore[operator]
+        small = torch.einsum("mi,rcoi->morc", slots, weight.to(slots.dtype))
+        middle = self.image_size - 4
+        # cat and expand, not an index gather: the gather's backward is slow.
+        rows = torch.cat((small[:, :, :2], small[:, :, 2:3].expand(-1, -1, middle, -1), small[:, :, 3:]), dim=2)
+        maps = torch.cat((rows[..., :2], rows[..., 2:3].expand(-1, -1, -1, middle), rows[..., 3:]), dim=3)
+        return maps.contiguous(memory_format=torch.channels_last) + conv(self.position())
+
+    def forward(self, slots: Tensor) -> Tensor:
+        """Slots (M, D) to RGB and mask logit (M, 4, H, W)."""
+        x = F.relu(self.first_layer(slots))
+        for conv in self.convs[1:]:  # type: ignore[index]
+            x = F.relu(conv(x))
+        out: Tensor = self.head(x)
+        return out
+
+
+class PixelShuffleDecoder(nn.Module):
+    """Decoder from an 8x8 broadcast by 3x3 convs and pixel shuffles.
+
+    Args:
+        image_size: side of the frames, 8 times a power of two.
+        slot_dim: D.
+        channels: channels at 8x8, 16x16, ... : one for each doubling.
+    """
+
+    def __init__(self, image_size: int, slot_dim: int, channels: tuple[int, ...]) -> None:
+        super().__init__()
+        doublings = int(math.log2(image_size // BASE))
+        if len(channels) != doublings:
+            raise ValueError(
+                f"model.savi.decoder_channels: got {len(channels)} widths, expected {doublings} for {image_size}x"
+                f"{image_size} frames; give one for each doubling from {BASE}x{BASE}"
+            )
+        self.project = nn.Linear(slot_dim, channels[0])
+        self.position = SoftPositionEmbedding(BASE, channels[0])
+        outs = (*channels[1:], 4)
+        self.convs = nn.ModuleList(
+            nn.Conv2d(a, 4 * b, 3, padding=1) for a, b in zip(channels, outs, strict=True)
+        )
+
+    def forward(self, slots: Tensor) -> Tensor:
+        """Slots (M, D) to RGB and mask logit (M, 4, H, W)."""
+        x = F.relu(self.project(slots)[:, :, None, None] + self.position())
+        x = x.contiguous(memory_format=torch.channels_last)
+        for i, conv in enumerate(self.convs):
+            x = F.pixel_shuffle(conv(x), 2)
+            if i < len(self.convs) - 1:
+                x = F.relu(x)
+        return x

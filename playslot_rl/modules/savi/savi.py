@@ -1,0 +1,108 @@
+"""SAVi: frames to slots and back (system.md section 1; paper, section "Object-Centric Representation Learning").
+
+    S_t = correct(h_t, S_t^init),   S_{t+1}^init = transition(S_t),   o^_t = sum_n softmax_N(m_n) * rgb_n
+
+Shapes: frames (B, T, 3, H, W) float in [0, 1]; slots (B, T, N, D). The slots handed on are the corrected ones.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from playslot_rl.config import SAViConfig
+from playslot_rl.modules.savi.corrector import SlotAttention
+from playslot_rl.modules.savi.decoder import BroadcastDecoder, PixelShuffleDecoder
+from playslot_rl.modules.savi.encoder import SAViEncoder
+from playslot_rl.modules.savi.initializer import SlotInitializer
+from playslot_rl.modules.savi.transition import SlotTransition
+
+
+class Decoded(NamedTuple):
+    """Rendered slots: frames (..., 3, H, W), rgb (..., N, 3, H, W), masks (..., N, 1, H, W) that sum to one over N."""
+
+    frames: Tensor
+    rgb: Tensor
+    masks: Tensor
+
+
+class SAVi(nn.Module):
+    """Encoder, initialiser, corrector, transition and decoder.
+
+    Args:
+        config: sizes.
+        image_size: side of the square frames.
+
+    Example:
+        >>> import torch
+        >>> from playslot_rl.config import SAViConfig
+        >>> savi = SAVi(SAViConfig(n_slots=3), image_size=32)
+        >>> slots, state = savi(torch.rand(2, 4, 3, 32, 32))
+        >>> slots.shape, savi.decode(slots).frames.shape
+        (torch.Size([2, 4, 3, 128]), torch.Size([2, 4, 3, 32, 32]))
+    """
+
+    def __init__(self, config: SAViConfig, image_size: int) -> None:
+        super().__init__()
+        self.config, self.image_size = config, image_size
+        c = config
+        self.encoder = SAViEncoder(image_size, c.encoder_channels, c.encoder_strides, c.token_dim)
+        self.initializer = SlotInitializer(c.n_slots, c.slot_dim, c.initial)
+        self.corrector = SlotAttention(c.slot_dim, c.token_dim, c.corrector_mlp)
+        self.transition = SlotTransition(c.slot_dim, c.transition_heads, c.transition_mlp)
+        self.decoder: nn.Module = (
+            BroadcastDecoder(image_size, c.slot_dim, c.decoder_channels, c.collapse)
+            if c.decoder == "broadcast"
+            else PixelShuffleDecoder(image_size, c.slot_dim, c.decoder_channels)
+        )
+        self.apply(_initialise)
+
+    def forward(
+        self, frames: Tensor, state: Tensor | None = None, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Parse a clip.
+
+        Args:
+            frames: (B, T, 3, H, W) float in [0, 1].
+            state: (B, N, D) returned by the previous call of the same episode; None at its first frame.
+            generator: draws the initial slots of the `gaussian` initialiser.
+
+        Returns:
+            Slots (B, T, N, D), and the state to go on from.
+        """
+        b, t = frames.shape[:2]
+        tokens = self.encoder(frames.flatten(0, 1))
+        keys, values = self.corrector.keys_values(tokens)
+        keys, values = keys.view(b, t, *keys.shape[1:]), values.view(b, t, *values.shape[1:])
+        first = state is None
+        current = self.initializer(b, generator) if state is None else state
+        slots = []
+        for i in range(t):
+            iterations = self.config.first_iterations if first and i == 0 else self.config.iterations
+            corrected = self.corrector(keys[:, i], values[:, i], current, iterations)
+            slots.append(corrected)
+            current = self.transition(corrected)
+        return torch.stack(slots, dim=1), current
+
+    def decode(self, slots: Tensor) -> Decoded:
+        """Render slots (..., N, D)."""
+        lead = slots.shape[:-1]
+        out = self.decoder(slots.reshape(-1, slots.shape[-1])).float()
+        out = out.reshape(*lead, *out.shape[1:])
+        rgb, logits = out[..., :3, :, :], out[..., 3:, :, :]
+        masks = torch.softmax(logits, dim=-4)
+        return Decoded((rgb * masks).sum(dim=-4), rgb, masks)
+
+
+def _initialise(module: nn.Module) -> None:
+    if isinstance(module, (nn.Linear, nn.Conv2d)):
+        nn.init.xavier_uniform_(module.weight)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
+    elif isinstance(module, nn.GRUCell):
+        nn.init.xavier_uniform_(module.weight_ih)
+        nn.init.orthogonal_(module.weight_hh)
+        nn.init.zeros_(module.bias_ih)
+        nn.init.zeros_(module.bias_hh)

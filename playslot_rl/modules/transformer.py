@@ -1,0 +1,77 @@
+"""Pre-norm transformer block with cached keys and values.
+
+    x <- x + O(softmax(Q K^T / sqrt(head_dim)) V),   x <- x + MLP(LN(x))     with Q, K, V = W_{q,k,v} LN(x)
+
+Shapes: x (B, S, dim), S tokens; Q, K, V (B, heads, S, head_dim), inner = heads * head_dim.
+q, k, v have no bias; the output projection and the MLP have one (system.md).
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+KeysValues = tuple[Tensor, Tensor]
+"""Cached keys and values of the past tokens, each (B, heads, S_past, head_dim)."""
+
+
+class TransformerBlock(nn.Module):
+    """One pre-norm block.
+
+    Args:
+        dim: token width.
+        heads: attention heads.
+        head_dim: width of each head.
+        mlp_dim: hidden width of the MLP (GELU).
+        project_out: output projection; SAVi's transition has none, since there heads * head_dim = dim.
+    """
+
+    def __init__(self, dim: int, heads: int, head_dim: int, mlp_dim: int, project_out: bool = True) -> None:
+        super().__init__()
+        inner = heads * head_dim
+        if not project_out and inner != dim:
+            raise ValueError(f"project_out=False: got heads * head_dim = {inner}, expected dim = {dim}")
+        self.heads, self.head_dim = heads, head_dim
+        self.norm_attention = nn.LayerNorm(dim)
+        self.to_q = nn.Linear(dim, inner, bias=False)
+        self.to_k = nn.Linear(dim, inner, bias=False)
+        self.to_v = nn.Linear(dim, inner, bias=False)
+        self.to_out: nn.Module = nn.Linear(inner, dim) if project_out else nn.Identity()
+        self.norm_mlp = nn.LayerNorm(dim)
+        self.mlp = nn.Sequential(nn.Linear(dim, mlp_dim), nn.GELU(), nn.Linear(mlp_dim, dim))
+
+    def forward(
+        self, x: Tensor, mask: Tensor | None = None, past: KeysValues | None = None
+    ) -> tuple[Tensor, KeysValues]:
+        """Transform S new tokens that attend to the past and to each other.
+
+        Args:
+            x: new tokens (B, S, dim).
+            mask: bool, True where attention is allowed, broadcastable to (B, heads, S, S_past + S).
+            past: keys and values of earlier tokens.
+
+        Returns:
+            Tokens (B, S, dim), and the keys and values of past and new tokens together.
+        """
+        b, s, _ = x.shape
+        normed = self.norm_attention(x)
+        q, k, v = (
+            layer(normed).view(b, s, self.heads, self.head_dim).transpose(1, 2)
+            for layer in (self.to_q, self.to_k, self.to_v)
+        )
+        if past is not None:
+            k, v = torch.cat((past[0], k), dim=2), torch.cat((past[1], v), dim=2)
+        y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+        x = x + self.to_out(y.transpose(1, 2).reshape(b, s, -1))
+        return x + self.mlp(self.norm_mlp(x)), (k, v)
+
+
+def sinusoidal_code(length: int, dim: int) -> Tensor:
+    """Sinusoidal position code (length, dim) of Vaswani et al., 2017: even columns sine, odd columns cosine."""
+    position = torch.arange(length, dtype=torch.float32)[:, None]
+    frequency = torch.exp(torch.arange(0, dim, 2, dtype=torch.float32) * (-torch.log(torch.tensor(10000.0)) / dim))
+    code = torch.zeros(length, dim)
+    code[:, 0::2] = torch.sin(position * frequency)
+    code[:, 1::2] = torch.cos(position * frequency)
+    return code
