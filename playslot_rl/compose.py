@@ -1,0 +1,208 @@
+"""From `key=value` overrides to an `ExperimentConfig`: Hydra composes the YAML, the dataclasses judge the result.
+
+`env` and `preset` choose a file of the Hydra group of that name in `playslot_rl/recipes/conf`; every other key sets one
+value. A command that continues a run (`CONTINUES`) and is given `run=DIR` starts from `DIR/config.json` instead.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+import typing
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, Final
+
+from playslot_rl.config import ExperimentConfig, from_dict, to_dict
+from playslot_rl.errors import ConfigError
+
+CONF_MODULE: Final = "playslot_rl.recipes.conf"
+GROUPS: Final = ("env", "preset")
+CONTINUES: Final = frozenset({"evaluate", "train-dynamics", "train-policy"})
+"""Commands that take the config of the run they continue."""
+SHIPPED: Final = "pretrained"
+"""`run=pretrained` names the shipped world model, which is not a run folder."""
+
+# These say what one invocation does, on which machine; a stored run does not hand them on.
+_OF_THE_CALL: Final = ("out", "run", "episodes", "policy", "protocol", "workers", "device")
+
+
+def choices(group: str) -> list[str]:
+    """Names of the YAML files of a group (`env` or `preset`), sorted."""
+    folder = resources.files(f"{CONF_MODULE}.{group}")
+    return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+
+
+def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfig:
+    """Build the config of one command.
+
+    Args:
+        overrides: `key=value` strings, such as `preset=smoke` or `slots.optim.lr=1e-3`; the last of equal keys wins.
+        command: name of the command, which decides whether `run=DIR` brings its stored config.
+
+    Returns:
+        The validated config.
+
+    Raises:
+        ConfigError: an argument that is not `key=value`, an unknown environment, preset or key, a value outside its
+            range, or a run folder without a usable `config.json`.
+    """
+    pairs = _parse(overrides)
+    try:
+        run = pairs.get("run", "")
+        if command in CONTINUES and run and run != SHIPPED:
+            return _from_run(Path(_unquote(run)), pairs)
+        groups = {key: value for key, value in pairs.items() if key in GROUPS}
+        for group, name in groups.items():
+            _check_choice(group, name)
+        values = {key: value for key, value in pairs.items() if key not in GROUPS}
+        plain = _hydra("config", [f"{g}={n}" for g, n in groups.items()] + _assignments(values))
+        config = from_dict(ExperimentConfig, plain)
+        _check_choice("env", config.env.name)
+        return config
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _parse(overrides: Sequence[str]) -> dict[str, str]:
+    """Split `key=value` arguments; the last of equal keys wins."""
+    pairs: dict[str, str] = {}
+    for argument in overrides:
+        key, equals, value = argument.partition("=")
+        key = key.strip().lstrip("+")
+        if not equals or not key or key.startswith("~"):
+            raise ConfigError(f"got the argument {argument!r}, expected key=value, such as preset=compact")
+        if _hint(key) is None:
+            raise ConfigError(_unknown_key(key))
+        pairs.pop(key, None)  # the order of the arguments is kept: a later one wins
+        pairs[key] = _unquote(value) if key in GROUPS else value
+    return pairs
+
+
+def _hint(key: str) -> Any:
+    """Type of a dotted key of the config, or None where there is no such key."""
+    hint: Any = ExperimentConfig
+    for part in key.split("."):
+        if not dataclasses.is_dataclass(hint):
+            return None
+        hint = typing.get_type_hints(hint).get(part)
+    return hint
+
+
+def _unknown_key(key: str) -> str:
+    """The message for an unknown key: the keys of its deepest known group, and the nearest key of all."""
+    group = key.rpartition(".")[0]
+    while group and not dataclasses.is_dataclass(_hint(group)):
+        group = group.rpartition(".")[0]
+    level = _hint(group) if group else ExperimentConfig
+    names = [f"{group}.{f.name}" if group else f.name for f in dataclasses.fields(level)]
+    near = difflib.get_close_matches(key, [*names, *_leaves()], n=1)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    return f"unknown key {key}: expected one of {', '.join(sorted(names))}{hint}"
+
+
+def _leaves() -> list[str]:
+    """All dotted keys of the config."""
+    leaves: list[str] = []
+
+    def walk(values: Mapping[str, Any], prefix: str) -> None:
+        for name, value in values.items():
+            if isinstance(value, dict):
+                walk(value, f"{prefix}{name}.")
+            else:
+                leaves.append(f"{prefix}{name}")
+
+    walk(to_dict(ExperimentConfig()), "")
+    return leaves
+
+
+def _check_choice(group: str, name: str) -> None:
+    known = choices(group)
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"; did you mean {group}={near[0]}?" if near else ""
+        raise ConfigError(f"unknown {group} {name!r}: expected one of {', '.join(known)}{hint}")
+
+
+def _unquote(value: str) -> str:
+    if len(value) >= 2 and value[0] == value[-1] and value[0] in "'\"":
+        return value[1:-1]
+    return value
+
+
+def _assignments(pairs: Mapping[str, str]) -> list[str]:
+    """Hydra overrides that set (`++`) values.
+
+    Text is quoted here, since Hydra's grammar gives commas, equals signs, brackets, `${` and digits in a path a meaning.
+    """
+    assignments = []
+    for key, value in pairs.items():
+        if _hint(key) is str and value != "null":
+            text = _unquote(value).replace("\\", "\\\\").replace("'", "\\'")
+            value = "'" + text.replace("${", "\\${") + "'"
+        assignments.append(f"++{key}={value}")
+    return assignments
+
+
+def _hydra(config_name: str | None, overrides: list[str]) -> dict[str, Any]:
+    """Compose with Hydra; a plain nested dict."""
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_module
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        with initialize_config_module(CONF_MODULE, version_base="1.3"):
+            composed = hydra_compose(config_name, overrides)
+        plain = OmegaConf.to_container(composed, resolve=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        first_line = str(error).strip().splitlines()[0]
+        raise ConfigError(f"cannot read the arguments: {first_line}; expected key=value pairs") from error
+    return typing.cast("dict[str, Any]", plain)
+
+
+def _from_run(run: Path, pairs: Mapping[str, str]) -> ExperimentConfig:
+    """The stored config of a run, changed by what the user typed; `out` is the run where it is not given."""
+    stored = _read_stored(run)
+    for group in GROUPS:
+        if group in pairs:
+            _check_choice(group, pairs[group])
+            have = stored.preset if group == "preset" else stored.env.name
+            if pairs[group] != have:
+                raise ConfigError(
+                    f"got {group}={pairs[group]} with run={run}, which was made with {group}={have}: "
+                    f"leave {group} out, or start a new run with out="
+                )
+    values = to_dict(stored)
+    defaults = to_dict(ExperimentConfig())
+    values.update({key: defaults[key] for key in _OF_THE_CALL})
+    typed = _hydra(None, _assignments({key: value for key, value in pairs.items() if key not in GROUPS}))
+    config = from_dict(ExperimentConfig, _merge(values, typed))
+    return config if config.out else dataclasses.replace(config, out=str(run))
+
+
+def _read_stored(run: Path) -> ExperimentConfig:
+    path = run / "config.json"
+    if not path.is_file():
+        raise ConfigError(
+            f"run={run}: got no {path}, expected the folder of a run; make one with `playslot pipeline out={run}`"
+        )
+    try:
+        return from_dict(ExperimentConfig, json.loads(path.read_text(encoding="utf-8")))
+    except ValueError as error:
+        raise ConfigError(f"{path} cannot be used: {error}; restore it or start a new run") from error
+
+
+def _merge(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in changes.items():
+        if isinstance(value, Mapping) and isinstance(merged.get(key), dict):
+            merged[key] = _merge(merged[key], value)
+        else:
+            merged[key] = value
+    return merged
