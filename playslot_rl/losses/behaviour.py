@@ -1,0 +1,145 @@
+"""Stage 3: cloning latent actions, and decoding them to real ones (system.md section 4; paper, "Learning behaviours").
+
+    L_pi = mean (f_pi(S_t) - z_t)^2,   L_a = mean (D_a(z_t) - a_t)^2
+
+Shapes: N slots, D slot width, Z latent-action width, A action width; "..." is any batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
+
+from playslot_rl import keys
+
+
+class _CloningLoss(LossModule):
+    """Mean squared error of a network's output to an action; the two losses below name the keys."""
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that `set_keys` can rename.
+
+        Attributes:
+            observation: what the network reads.
+            action: the target.
+            mask: optional bool (...); False leaves an element out. Not read where it is missing.
+        """
+
+        observation: NestedKey = keys.SLOTS
+        action: NestedKey = keys.LATENT_ACTION
+        mask: NestedKey = "mask"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_name = "loss_cloning"
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys that are read."""
+        return [self.tensor_keys.observation, self.tensor_keys.action]
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Keys that are written."""
+        return [self.out_name]
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        """There is no value estimator."""
+
+    def forward(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDictBase:  # noqa: ARG002
+        """Compare.
+
+        Args:
+            tensordict: observation and target of equal leading shape, maybe a mask.
+            generator: not used, nothing is drawn; the three stages' losses are called alike.
+
+        Raises:
+            ValueError: output and target differ in shape, which broadcasting would hide.
+        """
+        predicted: Tensor = self.network(tensordict.get(self.tensor_keys.observation))
+        target = tensordict.get(self.tensor_keys.action)
+        if predicted.shape != target.shape:
+            got, expected = tuple(target.shape), tuple(predicted.shape)
+            raise ValueError(f"{self.tensor_keys.action}: got shape {got}, expected {expected} (the network's output)")
+        error = (predicted - target).square().mean(-1)
+        mask: Tensor | None = tensordict.get(self.tensor_keys.mask, None)
+        if mask is not None:
+            mask = mask.reshape(error.shape)
+            # Selecting, not multiplying: what is masked out may be anything, NaN too.
+            error = torch.where(mask, error, 0.0) * (mask.numel() / mask.sum().clamp(min=1))
+        return TensorDict({self.out_name: error.mean()}, [])
+
+
+class BehaviourLoss(_CloningLoss):
+    """Behaviour cloning of latent actions; of real ones for the slot oracle.
+
+    Reads SLOTS (..., N, D) and LATENT_ACTION (..., Z), targets inferred by InvDyn from unlabelled videos; SLOTS may be
+    parsed or predicted ones. Writes `loss_policy`. For the oracle, `set_keys(action=keys.ACTION)`.
+
+    Note: equal to TorchRL's `BCLoss(loss_function="l2")` (a test holds it to that), which we do not use because its
+    functional conversion hides the network from `.train()`, `.eval()` and the checkpoints.
+
+    Args:
+        policy: the network that is trained, (..., N, D) to (..., Z).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from playslot_rl.testing import tiny_agent
+        >>> loss = BehaviourLoss(tiny_agent().policy)
+        >>> demos = TensorDict({"slots": torch.randn(2, 5, 4, 32), "latent_action": torch.randn(2, 5, 8)}, [2, 5])
+        >>> loss(demos)["loss_policy"].backward()
+    """
+
+    out_name = "loss_policy"
+
+    def __init__(self, policy: nn.Module) -> None:
+        super().__init__(policy)
+
+
+class ActionDecoderLoss(_CloningLoss):
+    """Regression of real actions on latent ones, on the labelled demonstrations.
+
+    Reads LATENT_ACTION (..., Z) and ACTION (..., A) in [-1, 1]; writes `loss_action`.
+
+    Args:
+        action_decoder: the network that is trained, (..., Z) to (..., A).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from playslot_rl.testing import tiny_agent
+        >>> loss = ActionDecoderLoss(tiny_agent().action_decoder)
+        >>> labelled = TensorDict({"latent_action": torch.randn(6, 8), "action": torch.rand(6, 4)}, [6])
+        >>> loss(labelled)["loss_action"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that `set_keys` can rename.
+
+        Attributes:
+            observation: the latent action.
+            action: the real action.
+            mask: optional bool (...); False leaves an element out. Not read where it is missing.
+        """
+
+        observation: NestedKey = keys.LATENT_ACTION
+        action: NestedKey = keys.ACTION
+        mask: NestedKey = "mask"
+
+    default_keys = _AcceptedKeys
+    out_name = "loss_action"
+
+    def __init__(self, action_decoder: nn.Module) -> None:
+        super().__init__(action_decoder)

@@ -1,0 +1,29 @@
+"""What the losses share: TorchRL's convention is that a step minimises the sum of the entries named `loss_*`."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+
+def total_loss(losses: TensorDictBase) -> Tensor:
+    """Sum of the entries named `loss_*` (scalars, weights included).
+
+    Raises:
+        ValueError: there is none.
+    """
+    parts = [value for key, value in losses.items() if key.startswith("loss_")]
+    if not parts:
+        raise ValueError(f"losses: got keys {sorted(losses.keys())}, expected some named loss_*")
+    return torch.stack(parts).sum()
+
+
+def psnr(mse: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio in dB of a mean squared error on frames in [0, 1]."""
+    return -10 * mse.detach().clamp(min=1e-12).log10()
+
+
+def freeze(module: nn.Module) -> nn.Module:
+    """Put a module into evaluation mode and stop its parameters' gradients; its inputs still get theirs."""
+    return module.eval().requires_grad_(False)

@@ -1,0 +1,295 @@
+"""The world model and the agent as bundles, and their TensorDictModules.
+
+The modules under `playslot_rl.modules` take and return plain tensors; here each gets the TensorDict keys it reads and
+writes (`playslot_rl.keys`), so that the same piece runs in the simulator, in imagination and in a loss.
+
+Shapes: B batch, T frames, N slots, D slot width, Z latent-action width, A action width, C context frames,
+H W image height and width. "[N,]" is there with one latent action per slot (InvDyn_M) and absent otherwise.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+
+from playslot_rl import keys
+from playslot_rl.config import EnvConfig, ModelConfig
+from playslot_rl.errors import ConfigError
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.modules.inverse_dynamics import InverseDynamics
+from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.modules.predictor import COCVP
+from playslot_rl.modules.savi import SAVi
+
+
+class WorldModel(nn.Module):
+    """SAVi, InvDyn and cOCVP: parse, infer latent actions, predict (paper, Figure "PlaySlot").
+
+    Args:
+        config: sizes.
+        env: the task, for the frame size and the width of the real action.
+
+    Attributes:
+        savi, inverse_dynamics, predictor: the three modules.
+        config, env: as given.
+
+    Examples:
+        >>> import torch
+        >>> from playslot_rl.testing import tiny_config
+        >>> config = tiny_config()
+        >>> model = WorldModel(config.model, config.env).eval()
+        >>> slots, state = model.savi(torch.rand(2, 5, 3, 64, 64))
+        >>> slots.shape, model.inverse_dynamics(slots).z.shape
+        (torch.Size([2, 5, 4, 32]), torch.Size([2, 4, 8]))
+    """
+
+    def __init__(self, config: ModelConfig, env: EnvConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.env = env
+        self.savi = SAVi(config.savi, env.image_size)
+        self.inverse_dynamics = InverseDynamics(config.inverse_dynamics, config.savi.slot_dim, env.action_dim)
+        self.predictor = COCVP(config.predictor, config.savi.slot_dim, self.inverse_dynamics.latent_dim)
+
+    @property
+    def slot_shape(self) -> tuple[int, int]:
+        """(N, D)."""
+        return (self.config.savi.n_slots, self.config.savi.slot_dim)
+
+    @property
+    def latent_shape(self) -> tuple[int, ...]:
+        """([N,] Z): shape of one step's latent action."""
+        width = self.inverse_dynamics.latent_dim
+        return (self.config.savi.n_slots, width) if self.inverse_dynamics.per_slot else (width,)
+
+
+class Agent(nn.Module):
+    """A world model, the latent policy and the action decoder, and maybe the slot oracle.
+
+    Args:
+        world_model: the world model whose slots and latent actions the others were trained on.
+        policy: slots (..., N, D) to a latent action.
+        action_decoder: latent action to real action.
+        oracle: the policy's architecture on real actions (..., A); clamp its output to [-1, 1] in use.
+    """
+
+    def __init__(
+        self,
+        world_model: WorldModel,
+        policy: LatentPolicy,
+        action_decoder: ActionDecoder,
+        oracle: LatentPolicy | None = None,
+    ) -> None:
+        super().__init__()
+        self.world_model = world_model
+        self.policy = policy
+        self.action_decoder = action_decoder
+        self.oracle = oracle
+
+    @classmethod
+    def untrained(cls, world_model: WorldModel, oracle: bool = True) -> Agent:
+        """Fresh networks of the sizes in `world_model.config`.
+
+        Raises:
+            ConfigError: the world model has one latent action per slot, the policy gives one per step.
+        """
+        if world_model.inverse_dynamics.per_slot:
+            raise ConfigError("model.inverse_dynamics.variant: got multi, expected single: the policy gives one latent")
+        config, env = world_model.config, world_model.env
+        slot_dim, width = config.savi.slot_dim, world_model.inverse_dynamics.latent_dim
+        return cls(
+            world_model,
+            LatentPolicy(config.policy, slot_dim, width),
+            ActionDecoder(config.action_decoder, width, env.action_dim),
+            LatentPolicy(config.policy, slot_dim, env.action_dim) if oracle else None,
+        )
+
+
+def module_device(module: nn.Module) -> torch.device:
+    """Device of a module's parameters."""
+    return next(module.parameters()).device
+
+
+def normalise(pixels: Tensor) -> Tensor:
+    """uint8 [0, 255] to float [0, 1]; floats pass through."""
+    return pixels if pixels.is_floating_point() else pixels.float().div(255)
+
+
+# --- parse --------------------------------------------------------------------------------------------------------
+
+
+class _ParseClip(nn.Module):
+    def __init__(self, savi: SAVi, generator: torch.Generator | None) -> None:
+        super().__init__()
+        self.savi = savi
+        self.generator = generator
+
+    def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        slots, state = self.savi(normalise(pixels), generator=self.generator)
+        return slots, state
+
+
+class _ParseFrame(nn.Module):
+    def __init__(self, savi: SAVi, generator: torch.Generator | None) -> None:
+        super().__init__()
+        self.savi = savi
+        self.generator = generator
+
+    def forward(self, pixels: Tensor, state: Tensor, age: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        batch = age.shape[:-1]
+        frames, flat = normalise(pixels).reshape(-1, 1, *pixels.shape[-3:]), state.reshape(-1, *state.shape[-2:])
+        fresh = age.reshape(-1) == 0
+        slots, after = torch.empty_like(flat), torch.empty_like(flat)
+        # An episode's first frame takes other initial slots and more iterations than a later one, so a batch that
+        # mixes both (a partial reset) is parsed in two parts.
+        for rows, start in ((fresh, None), (~fresh, flat)):
+            if rows.any():
+                parsed, next_state = self.savi(
+                    frames[rows], None if start is None else start[rows], generator=self.generator
+                )
+                slots[rows], after[rows] = parsed[:, 0], next_state
+        return slots.reshape(*batch, *slots.shape[1:]), after.reshape(*batch, *after.shape[1:]), age + 1
+
+
+def parser_module(savi: SAVi, generator: torch.Generator | None = None) -> TensorDictModule:
+    """PIXELS (B, T, 3, H, W) to SLOTS (B, T, N, D) and SLOT_STATE (B, N, D); each clip starts an episode.
+
+    Args:
+        savi: the parser.
+        generator: of sampled initial slots.
+    """
+    return TensorDictModule(_ParseClip(savi, generator), in_keys=[keys.PIXELS], out_keys=[keys.SLOTS, keys.SLOT_STATE])
+
+
+def frame_parser_module(savi: SAVi, generator: torch.Generator | None = None) -> TensorDictModule:
+    """One frame with the recurrent state: PIXELS (..., 3, H, W), SLOT_STATE, SLOT_AGE to SLOTS, SLOT_STATE, SLOT_AGE.
+
+    Where SLOT_AGE (..., 1) is 0 the state is not read: that frame is an episode's first.
+    """
+    return TensorDictModule(
+        _ParseFrame(savi, generator),
+        in_keys=[keys.PIXELS, keys.SLOT_STATE, keys.SLOT_AGE],
+        out_keys=[keys.SLOTS, keys.SLOT_STATE, keys.SLOT_AGE],
+    )
+
+
+class _Render(nn.Module):
+    def __init__(self, savi: SAVi) -> None:
+        super().__init__()
+        self.savi = savi
+
+    def forward(self, slots: Tensor) -> tuple[Tensor, Tensor]:
+        decoded = self.savi.decode(slots)
+        return decoded.frames, decoded.masks
+
+
+def render_module(savi: SAVi) -> TensorDictModule:
+    """SLOTS (..., N, D) to PREDICTED_PIXELS (..., 3, H, W) and MASKS (..., N, 1, H, W)."""
+    return TensorDictModule(_Render(savi), in_keys=[keys.SLOTS], out_keys=[keys.PREDICTED_PIXELS, keys.MASKS])
+
+
+# --- latent actions -----------------------------------------------------------------------------------------------
+
+
+class _Infer(nn.Module):
+    def __init__(self, inverse_dynamics: InverseDynamics) -> None:
+        super().__init__()
+        self.inverse_dynamics = inverse_dynamics
+
+    def forward(self, slots: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        latent = self.inverse_dynamics(slots)
+        return latent.z, latent.prototype, latent.variability, latent.code
+
+
+def inverse_dynamics_module(inverse_dynamics: InverseDynamics) -> TensorDictModule:
+    """SLOTS (B, T, N, D) to LATENT_ACTION, PROTOTYPE, VARIABILITY (B, T-1, [N,] Z) and CODE (B, T-1, [N])."""
+    return TensorDictModule(
+        _Infer(inverse_dynamics),
+        in_keys=[keys.SLOTS],
+        out_keys=[keys.LATENT_ACTION, keys.PROTOTYPE, keys.VARIABILITY, keys.CODE],
+    )
+
+
+# --- predict ------------------------------------------------------------------------------------------------------
+
+
+class _Step(nn.Module):
+    """One step of cOCVP on right-aligned histories: the arithmetic of the imagination environment."""
+
+    def __init__(self, inverse_dynamics: InverseDynamics, predictor: COCVP) -> None:
+        super().__init__()
+        self.inverse_dynamics = inverse_dynamics
+        self.predictor = predictor
+
+    def forward(
+        self, z: Tensor, slot_history: Tensor, action_history: Tensor, length: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        batch, context = length.shape[:-1], slot_history.shape[len(length.shape) - 1]
+        slots = slot_history.reshape(-1, *slot_history.shape[len(batch) :])
+        actions = action_history.reshape(-1, *action_history.shape[len(batch) :])
+        actions = torch.cat([actions[:, :-1], z.reshape(-1, 1, *z.shape[len(batch) :])], 1)
+        lengths = length.reshape(-1)
+        predicted = self._predict(slots, actions, lengths)
+        slots = torch.cat([slots[:, 1:], predicted[:, None]], 1)
+        actions = torch.cat([actions[:, 1:], torch.zeros_like(actions[:, :1])], 1)
+        return (
+            predicted.reshape(*batch, *predicted.shape[1:]),
+            slots.reshape(*batch, *slots.shape[1:]),
+            actions.reshape(*batch, *actions.shape[1:]),
+            (length + 1).clamp(max=context),
+        )
+
+    def _predict(self, slots: Tensor, actions: Tensor, lengths: Tensor) -> Tensor:
+        # Frames before the longest episode's first carry nothing: leaving them out makes short imaginations cheap.
+        window = int(lengths.max())
+        slots, actions = slots[:, -window:], actions[:, -window:]
+        valid = torch.arange(window, device=slots.device) >= window - lengths[:, None]
+        p, v = self.inverse_dynamics.split(actions)
+        predicted: Tensor = self.predictor(slots, p, v, valid=None if bool(valid.all()) else valid)
+        return predicted[:, -1]
+
+
+def dynamics_module(inverse_dynamics: InverseDynamics, predictor: COCVP) -> TensorDictSequential:
+    """One step of the world model, on root keys, as `ModelBasedEnvBase` wants it.
+
+    Reads LATENT_ACTION (..., [N,] Z), SLOT_HISTORY (..., C, N, D), ACTION_HISTORY (..., C, [N,] Z) and
+    HISTORY_LENGTH (..., 1); writes SLOTS (..., N, D) of the next frame and the histories moved on by one. The newest
+    frame is the last of SLOT_HISTORY; its action, LATENT_ACTION, is not in ACTION_HISTORY yet. Past C frames the oldest
+    is dropped and the window is computed anew, frame numbers starting at zero: the semantics of `COCVP.rollout`.
+    """
+    return TensorDictSequential(
+        TensorDictModule(
+            _Step(inverse_dynamics, predictor),
+            in_keys=[keys.LATENT_ACTION, keys.SLOT_HISTORY, keys.ACTION_HISTORY, keys.HISTORY_LENGTH],
+            out_keys=[keys.SLOTS, keys.SLOT_HISTORY, keys.ACTION_HISTORY, keys.HISTORY_LENGTH],
+        )
+    )
+
+
+# --- behave -------------------------------------------------------------------------------------------------------
+
+
+def latent_policy_module(policy: nn.Module) -> TensorDictModule:
+    """SLOTS (..., N, D) to LATENT_ACTION (..., [N,] Z). The same module acts in the simulator and in imagination."""
+    return TensorDictModule(policy, in_keys=[keys.SLOTS], out_keys=[keys.LATENT_ACTION])
+
+
+def action_decoder_module(action_decoder: nn.Module) -> TensorDictModule:
+    """LATENT_ACTION (..., Z) to ACTION (..., A) in [-1, 1]."""
+    return TensorDictModule(action_decoder, in_keys=[keys.LATENT_ACTION], out_keys=[keys.ACTION])
+
+
+class _Clamped(nn.Module):
+    def __init__(self, policy: nn.Module) -> None:
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, slots: Tensor) -> Tensor:
+        actions: Tensor = self.policy(slots)
+        return actions.clamp(-1, 1)
+
+
+def oracle_module(oracle: nn.Module) -> TensorDictModule:
+    """SLOTS (..., N, D) to ACTION (..., A), clamped to [-1, 1]."""
+    return TensorDictModule(_Clamped(oracle), in_keys=[keys.SLOTS], out_keys=[keys.ACTION])
