@@ -6,26 +6,21 @@ A action dim, H W image height and width.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.evaluation.episodes import Actions, Frames, Task
-from playslot_rl.world_model import Agent
+from playslot_rl.evaluation.episodes import Actions, Frames, Moment
+from playslot_rl.world_model import Agent, dynamics_module, latent_policy_module, module_device
 
 
 def frames_to_tensor(frames: Frames, device: torch.device) -> Tensor:
     """(n, H, W, 3) uint8 [0, 255] -> (n, 3, H, W) float32 [0, 1]."""
     return torch.from_numpy(frames).to(device).movedim(-1, -3).float().div(255)
-
-
-def device_of(module: torch.nn.Module) -> torch.device:
-    """Device of a module's parameters."""
-    return next(module.parameters()).device
 
 
 class ClosedLoop:
@@ -41,24 +36,26 @@ class ClosedLoop:
 
     def __init__(self, agent: Agent, oracle: bool = False) -> None:
         if oracle and agent.oracle is None:
-            raise ValueError("ClosedLoop: got an agent without a slot oracle, expected one trained with behaviour.oracle")
+            raise ValueError(
+                "ClosedLoop: got an agent without a slot oracle, expected one trained with behaviour.oracle"
+            )
         self._agent = agent
         self._oracle = agent.oracle if oracle else None
-        self._device = device_of(agent)
+        self._device = module_device(agent)
         self._state: Tensor | None = None
         self._generator = torch.Generator(self._device)
 
-    def begin(self, frames: Frames, seeds: Sequence[int]) -> None:
+    def begin(self, moment: Moment) -> None:
         """Forget the last episodes; sampled initial slots are a function of the seeds."""
         self._state = None
-        self._generator.manual_seed(seeds[0])
+        self._generator.manual_seed(moment.seeds[0])
 
     @torch.no_grad()
-    def act(self, step: int, running: Sequence[int], frames: Frames, tasks: Sequence[Task]) -> Actions:
-        """Actions (n, A) in [-1, 1] for frames (n, H, W, 3)."""
-        rows = torch.as_tensor(running, device=self._device)
+    def act(self, moment: Moment) -> Actions:
+        """Actions (n, A) in [-1, 1] of the running episodes."""
+        rows = torch.as_tensor(moment.running, device=self._device)
         state = None if self._state is None else self._state[rows]
-        pixels = frames_to_tensor(frames, self._device)[:, None]
+        pixels = frames_to_tensor(moment.frames, self._device)[:, None]
         slots, after = self._agent.world_model.savi(pixels, state, generator=self._generator)
         if self._state is None:
             self._state = after
@@ -100,18 +97,40 @@ def imagine(agent: Agent, frames: Frames, steps: int, seed: int = 0) -> Imaginat
         steps: T.
         seed: of sampled initial slots (SAVi with `initial: gaussian`).
     """
-    from playslot_rl.imagination import ImaginationEnv
-    from playslot_rl.world_model import latent_policy_module
-
-    device = device_of(agent)
+    device = module_device(agent)
     generator = torch.Generator(device).manual_seed(seed)
     slots, _ = agent.world_model.savi(frames_to_tensor(frames, device)[:, None], generator=generator)
-    env = ImaginationEnv(agent.world_model, batch_size=(len(frames),))
-    start = env.reset_from_slots(slots[:, 0])
-    rollout = env.rollout(steps, latent_policy_module(agent.policy), tensordict=start, auto_reset=False)
-    latents = rollout[keys.LATENT_ACTION]
-    unfolded = torch.cat([rollout[keys.SLOTS][:, :1], rollout["next", keys.SLOTS]], 1)
-    return Imagination(unfolded, latents, agent.action_decoder(latents))
+    return unfold(agent, slots[:, 0], steps)
+
+
+@torch.no_grad()
+def unfold(agent: Agent, slots: Tensor, steps: int) -> Imagination:
+    """Imagine from given slots (E, N, D), by the step of the imagination environment (`dynamics_module`).
+
+    Equal to `ImaginationEnv.rollout(policy)` (tested), without the copies an environment keeps of every step.
+    """
+    model, context = agent.world_model, agent.world_model.config.predictor.context
+    e = len(slots)
+    history = slots.new_zeros(e, context, *slots.shape[1:])
+    history[:, -1] = slots
+    state = TensorDict(
+        {
+            keys.SLOTS: slots,
+            keys.SLOT_HISTORY: history,
+            keys.ACTION_HISTORY: slots.new_zeros(e, context, *model.latent_shape),
+            keys.HISTORY_LENGTH: torch.ones(e, 1, dtype=torch.long, device=slots.device),
+        },
+        batch_size=[e],
+    )
+    policy = latent_policy_module(agent.policy)
+    step = dynamics_module(model.inverse_dynamics, model.predictor)
+    unfolded, latents = [slots], []
+    for _ in range(steps):
+        state = step(policy(state))
+        latents.append(state[keys.LATENT_ACTION])
+        unfolded.append(state[keys.SLOTS])
+    z = torch.stack(latents, 1)
+    return Imagination(torch.stack(unfolded, 1), z, agent.action_decoder(z))
 
 
 class OpenLoop:
@@ -127,12 +146,12 @@ class OpenLoop:
         self.imagined: list[Imagination] = []
         self._actions: Actions = np.zeros((0, steps, 0), np.float32)
 
-    def begin(self, frames: Frames, seeds: Sequence[int]) -> None:
+    def begin(self, moment: Moment) -> None:
         """Imagine all episodes of the chunk in one batch; kept in `imagined` for pictures."""
-        rollout = imagine(self._agent, frames, self._steps, seeds[0])
+        rollout = imagine(self._agent, moment.frames, self._steps, moment.seeds[0])
         self.imagined.append(rollout)
         self._actions = rollout.actions.cpu().numpy()
 
-    def act(self, step: int, running: Sequence[int], frames: Frames, tasks: Sequence[Task]) -> Actions:
+    def act(self, moment: Moment) -> Actions:
         """The step's actions (n, A) of the running episodes."""
-        return self._actions[list(running), step]
+        return self._actions[list(moment.running), moment.step]

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from playslot_rl.config import EnvConfig, RenderConfig
 
 Frames = npt.NDArray[np.uint8]
 Actions = npt.NDArray[np.float32]
+FrameCallback = Callable[[int, int, Frames], None]
 
 LOCKSTEP = 5
 """Episodes run side by side. Making an environment takes most of a second, and a small CPU gains little from more."""
@@ -39,14 +40,32 @@ class Task(Protocol):
         """Free the renderer."""
 
 
+class Moment(NamedTuple):
+    """What a controller may look at.
+
+    Attributes:
+        step: agent steps taken so far.
+        running: indices of the episodes that still run, of the E of this lock-step.
+        seeds: their seeds.
+        frames: their present frames (n, H, W, 3) uint8 [0, 255].
+        tasks: their environments; only the scripted expert looks at them.
+    """
+
+    step: int
+    running: Sequence[int]
+    seeds: Sequence[int]
+    frames: Frames
+    tasks: Sequence[Task]
+
+
 class Controller(Protocol):
     """Chooses the actions of episodes that run in lock-step."""
 
-    def begin(self, frames: Frames, seeds: Sequence[int]) -> None:
-        """New episodes: their first frames (E, H, W, 3) uint8 and seeds."""
+    def begin(self, moment: Moment) -> None:
+        """New episodes, all running at step 0."""
 
-    def act(self, step: int, running: Sequence[int], frames: Frames, tasks: Sequence[Task]) -> Actions:
-        """Actions (n, A) in [-1, 1] of the running episodes (their indices, present frames and environments)."""
+    def act(self, moment: Moment) -> Actions:
+        """Actions (n, A) in [-1, 1] of the running episodes."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +109,9 @@ class TaskPool:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
 
@@ -120,7 +141,7 @@ def run_episodes(
     pool: TaskPool,
     controller: Controller,
     seeds: Sequence[int],
-    on_frame: Callable[[int, int, Frames], None] | None = None,
+    on_frame: FrameCallback | None = None,
     stop: bool = True,
 ) -> list[Episode]:
     """Run one episode for each seed, in the order of the list.
@@ -145,31 +166,35 @@ def _run_chunk(
     seeds: Sequence[int],
     stride: int,
     first: int,
-    on_frame: Callable[[int, int, Frames], None] | None,
+    on_frame: FrameCallback | None,
     stop: bool,
 ) -> list[Episode]:
     tasks = pool.take(len(seeds))
     started = [start_episode(task, seed, stride) for task, seed in zip(tasks, seeds, strict=True)]
     frames = [frame for frame, _, _ in started]
     solved: list[int | None] = [None] * len(seeds)
-    controller.begin(np.stack(frames), [seed for _, seed, _ in started])
     for i, frame in enumerate(frames):
-        if on_frame is not None:
-            on_frame(first + i, 0, frame)
+        _show(on_frame, first + i, 0, frame)
     for step in range(pool.env.max_steps):
         running = [i for i, s in enumerate(solved) if s is None or not stop]
         if not running:
             break
-        now = np.stack([frames[i] for i in running])
-        actions = controller.act(step, running, now, [tasks[i] for i in running])
-        for i, action in zip(running, actions, strict=True):
+        used = [started[i][1] for i in running]
+        now = Moment(step, running, used, np.stack([frames[i] for i in running]), [tasks[i] for i in running])
+        if step == 0:
+            controller.begin(now)
+        for i, action in zip(running, controller.act(now), strict=True):
             observation, _, _, _, info = tasks[i].step(action)
             frames[i] = observation["pixels"]
             if info["success"] and solved[i] is None:
                 solved[i] = step + 1
-            if on_frame is not None:
-                on_frame(first + i, step + 1, frames[i])
+            _show(on_frame, first + i, step + 1, frames[i])
     return [
         Episode(seed, steps is not None, steps, redrawn)
         for (_, seed, redrawn), steps in zip(started, solved, strict=True)
     ]
+
+
+def _show(on_frame: FrameCallback | None, episode: int, step: int, frame: Frames) -> None:
+    if on_frame is not None:
+        on_frame(episode, step, frame)

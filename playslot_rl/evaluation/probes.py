@@ -51,9 +51,8 @@ def infer_latents(
             real = torch.from_numpy(np.array(actions[start : start + length - 1])).to(device)[None]
         latents = model(clip, real)
         z.append(latents.z[0].reshape(length - 1, -1).cpu().numpy())
-        code = getattr(latents, "code", None)
-        empty = np.full((length - 1, 1), -1, np.int64)
-        codes.append(empty if code is None else code[0].reshape(length - 1, -1).cpu().numpy())
+        code = latents.code[0].reshape(length - 1, -1).cpu().numpy()
+        codes.append(code if model.n_prototypes else np.full_like(code, -1))
         episodes.append(np.full(length - 1, episode, np.int64))
     if not z:
         raise ValueError("infer_latents: got no episode of two frames or more, expected at least one")
@@ -107,7 +106,9 @@ def _score(kind: str, x: Floats, y: Floats, x_test: Floats, y_test: Floats, seed
         model = make_pipeline(StandardScaler(), RidgeCV(alphas=np.logspace(-3, 3, 13)))
     else:
         # Adam with a fixed number of passes: early stopping would need a split by episodes that sklearn does not make.
-        net = MLPRegressor((64, 64), alpha=1e-3, learning_rate_init=2e-3, batch_size=128, max_iter=60, random_state=seed)
+        net = MLPRegressor(
+            (64, 64), alpha=1e-3, learning_rate_init=2e-3, batch_size=128, max_iter=60, random_state=seed
+        )
         net.set_params(tol=0.0, n_iter_no_change=60)
         model = make_pipeline(StandardScaler(), net)
     import warnings

@@ -13,7 +13,7 @@ import numpy as np
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.evaluation.controllers import ClosedLoop
-from playslot_rl.evaluation.episodes import Actions, Controller, Episode, Frames, Task, TaskPool, run_episodes
+from playslot_rl.evaluation.episodes import Actions, Controller, Episode, Moment, TaskPool, run_episodes
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.training.atomic import write_json
 from playslot_rl.world_model import Agent
@@ -26,24 +26,25 @@ class RandomController:
         self._action_dim = action_dim
         self._streams: list[np.random.Generator] = []
 
-    def begin(self, frames: Frames, seeds: Sequence[int]) -> None:
+    def begin(self, moment: Moment) -> None:
         """Seed one stream an episode; 7 keeps it apart from the environment's own streams of the same seed."""
-        self._streams = [np.random.default_rng([seed, 7]) for seed in seeds]
+        self._streams = [np.random.default_rng([seed, 7]) for seed in moment.seeds]
 
-    def act(self, step: int, running: Sequence[int], frames: Frames, tasks: Sequence[Task]) -> Actions:
+    def act(self, moment: Moment) -> Actions:
         """Draw (n, A)."""
-        return np.stack([self._streams[i].uniform(-1, 1, self._action_dim).astype(np.float32) for i in running])
+        return np.stack([self._streams[i].uniform(-1, 1, self._action_dim).astype(np.float32) for i in moment.running])
 
 
 class ExpertController:
     """The scripted expert, which sees the simulator's state."""
 
-    def begin(self, frames: Frames, seeds: Sequence[int]) -> None:
+    def begin(self, moment: Moment) -> None:
         """Nothing to remember."""
+        del moment
 
-    def act(self, step: int, running: Sequence[int], frames: Frames, tasks: Sequence[Task]) -> Actions:
+    def act(self, moment: Moment) -> Actions:
         """Ask each environment: (n, A)."""
-        return np.stack([task.expert_action() for task in tasks])
+        return np.stack([task.expert_action() for task in moment.tasks])
 
 
 def summary(episodes: Sequence[Episode]) -> dict[str, Any]:
@@ -74,7 +75,10 @@ def run_references(
         oracle_fingerprint: names the weights of oracle and SAVi; empty means that the oracle's result is not cached.
         cache: JSON file that both protocols of a run share; None means no cache.
     """
-    controllers: dict[str, Controller] = {"random": RandomController(config.env.action_dim), "expert": ExpertController()}
+    controllers: dict[str, Controller] = {
+        "random": RandomController(config.env.action_dim),
+        "expert": ExpertController(),
+    }
     if agent.oracle is not None:
         controllers["slot_oracle"] = ClosedLoop(agent, oracle=True)
     stored = _read_cache(cache)

@@ -53,17 +53,18 @@ def run_facts(run: Path) -> RunFacts:
     """
     path = run / "policy" / "checkpoint" / "meta.json"
     if not path.is_file():
-        raise CheckpointError(f"{run}: got no policy/checkpoint, expected a trained policy; run `playslot train-policy run={run}`")
+        raise CheckpointError(
+            f"{run}: got no policy/checkpoint, expected a trained policy; run `playslot train-policy run={run}`"
+        )
     try:
         meta: dict[str, Any] = json.loads(path.read_text())
     except json.JSONDecodeError as error:
         raise CheckpointError(f"{path}: got {error}, expected JSON; train the policy again") from error
-    metrics = meta.get("metrics", {})
     prints = {str(k): str(v) for k, v in meta.get("parents", {}).items()}
-    prints["policy"] = str(meta.get("fingerprint", "")) or weights_fingerprint(path.parent)
+    prints["policy"] = str(meta.get("fingerprint", ""))
     return RunFacts(
-        demos=_count(meta.get("demos", metrics.get("demos"))),
-        labelled_demos=_count(meta.get("labelled_demos", metrics.get("labelled_demos"))),
+        demos=_count(meta.get("demos")),
+        labelled_demos=_count(meta.get("labelled_demos")),
         fingerprints=prints,
         commit=str(meta.get("commit", "")),
     )
@@ -71,14 +72,6 @@ def run_facts(run: Path) -> RunFacts:
 
 def _count(value: Any) -> int | None:
     return None if value is None else int(value)
-
-
-def weights_fingerprint(folder: Path) -> str:
-    """First 16 hexadecimal digits of the SHA-256 of `weights.safetensors`."""
-    import hashlib
-
-    with open(folder / "weights.safetensors", "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
 def check_protocol(protocol: str) -> None:
@@ -116,8 +109,8 @@ def evaluate(
         pool: environments to use and leave open; None makes and closes its own.
 
     Returns:
-        `protocol`, `episodes`, `seeds`, `success_rate` (0 to 1), `ci95` (Wilson), `mean_steps_to_success` (agent steps),
-        `labelled_demos`, `demos`, `references` (`random`, `expert`, `slot_oracle`: all closed-loop), and extras.
+        `protocol`, `episodes`, `seeds`, `success_rate` (0 to 1), `ci95` (Wilson), `mean_steps_to_success` (agent
+        steps), `labelled_demos`, `demos`, `references` (`random`, `expert`, `slot_oracle`: all closed-loop), and extras.
 
     Raises:
         ConfigError: unknown protocol, or a seed that a training data set holds.
@@ -134,7 +127,9 @@ def evaluate(
     assert used is not None
     begin = time.perf_counter()
     try:
-        controller: Controller = ClosedLoop(agent) if protocol == "simulation" else OpenLoop(agent, config.env.max_steps)
+        controller: Controller = (
+            ClosedLoop(agent) if protocol == "simulation" else OpenLoop(agent, config.env.max_steps)
+        )
         outcome = run_episodes(used, controller, seeds)
         wall = time.perf_counter() - begin
         references = _references(agent, config, seeds, used, facts, run)
@@ -177,7 +172,7 @@ def _references(
 def evaluate_run(
     run: Path, agent: Agent, config: ExperimentConfig, protocol: str, pool: TaskPool | None = None
 ) -> dict[str, Any]:
-    """Evaluate a run's agent with the config's `episodes` and `seed`, and write `RUN/evaluation/PROTOCOL/eval_info.json`.
+    """Evaluate a run's agent with the config's `episodes` and `seed`; write `RUN/evaluation/PROTOCOL/eval_info.json`.
 
     Raises:
         CheckpointError: the run has no trained policy.

@@ -39,7 +39,7 @@ def video_metrics(predicted: Tensor, target: Tensor) -> VideoMetrics:
         ValueError: the shapes differ or are not those of clips.
 
     Note:
-        A frame's PSNR is taken before the mean, as in the paper's evaluation; the PSNR of the mean error would be lower.
+        The PSNR of each frame is taken before the mean, as in the paper; that of the mean error would be lower.
         Equal frames are counted as 100 dB instead of infinity.
     """
     if predicted.shape != target.shape or predicted.ndim != 5:

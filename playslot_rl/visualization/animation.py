@@ -28,7 +28,9 @@ def animation(pictures: list[Image.Image], fps: float = 6.0, pause: float = 1.2)
         ValueError: no pictures, or a rate that is not positive.
     """
     if not pictures or fps <= 0:
-        raise ValueError(f"animation: got {len(pictures)} frames at {fps} fps, expected at least one and a positive rate")
+        raise ValueError(
+            f"animation: got {len(pictures)} frames at {fps} fps, expected at least one and a positive rate"
+        )
     times = [1000.0 / fps] * (len(pictures) - 1) + [1000.0 * pause]
     buffer = io.BytesIO()
     pictures[0].save(
@@ -44,7 +46,9 @@ def animation(pictures: list[Image.Image], fps: float = 6.0, pause: float = 1.2)
     return buffer.getvalue()
 
 
-def side_by_side(left: Frames, right: Frames, labels: tuple[str, str], titles: list[str], scale: int = 2) -> list[Image.Image]:
+def side_by_side(
+    left: Frames, right: Frames, labels: tuple[str, str], titles: list[str], scale: int = 2
+) -> list[Image.Image]:
     """Frames of an animation: one row an episode, two columns.
 
     Args:

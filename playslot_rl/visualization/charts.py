@@ -62,7 +62,9 @@ def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], bool]], 
         axes.plot([100 * rate], [y], "o" if own else "D", color=colour, markersize=9 if own else 7)
         right = rate <= 0.5
         x = 100 * high + 2 if right else 100 * low - 2
-        axes.text(x, y, f"{100 * rate:.0f} %", color=theme.text, ha="left" if right else "right", va="center", fontsize=10)
+        axes.text(
+            x, y, f"{100 * rate:.0f} %", color=theme.text, ha="left" if right else "right", va="center", fontsize=10
+        )
     axes.set_yticks(range(len(rows)), [label for label, *_ in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlim(-3, 103)
@@ -135,7 +137,13 @@ def usage_chart(counts: Mapping[str, Sequence[int]], theme: Theme) -> bytes:
     width = 0.8 / len(counts)
     for i, (name, values) in enumerate(counts.items()):
         share = 100 * np.array(values) / max(1, sum(values))
-        axes.bar(np.arange(len(values)) + (i - (len(counts) - 1) / 2) * width, share, width * 0.92, color=theme.series[i], label=name)
+        axes.bar(
+            np.arange(len(values)) + (i - (len(counts) - 1) / 2) * width,
+            share,
+            width * 0.92,
+            color=theme.series[i],
+            label=name,
+        )
     axes.set_xticks(range(k))
     axes.set_xlabel("code")
     axes.set_ylabel("transitions, %")

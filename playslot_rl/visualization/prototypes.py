@@ -59,7 +59,7 @@ def draw_prototypes(model: WorldModel, frame: Frames, steps: int = 15, columns: 
 
 
 def change_map(before: Frames, after: Frames) -> Frames:
-    """Where pictures (K, H, W, 3) differ: blue what left, orange what came, on white (both by brightness of the change).
+    """Where pictures (K, H, W, 3) differ: blue what left, orange what came, on white (by change in brightness).
 
     The first *imagined* frame is the reference, so that the decoder's blur is not shown as motion.
     """
