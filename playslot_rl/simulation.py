@@ -130,6 +130,7 @@ def latent_env(
             ActionDecoderTransform(action_decoder, world_model.latent_shape),
             StepCounter(max_steps=max_steps, step_count_key=keys.STEP_COUNT),
         ),
+        auto_unwrap=True,
     )
 
 

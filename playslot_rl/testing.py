@@ -35,7 +35,6 @@ def tiny_config(
         >>> tiny_config().model.savi.slot_dim
         32
     """
-    layers = {"dim": 32, "layers": 2, "heads": 2, "head_dim": 16, "mlp_dim": 64}
     savi = SAViConfig(
         slot_dim=32,
         initial="learned",
@@ -49,7 +48,15 @@ def tiny_config(
         transition_mlp=64,
     )
     inverse = InverseDynamicsConfig(
-        variant="multi" if multi else "single", mode=mode, latent_dim=8, n_prototypes=5, **layers
+        variant="multi" if multi else "single",
+        mode=mode,
+        latent_dim=8,
+        n_prototypes=5,
+        dim=32,
+        layers=2,
+        heads=2,
+        head_dim=16,
+        mlp_dim=64,
     )
     return ExperimentConfig(
         preset="tiny",
@@ -58,8 +65,8 @@ def tiny_config(
         model=ModelConfig(
             savi=savi,
             inverse_dynamics=inverse,
-            predictor=PredictorConfig(context=context, **layers),
-            policy=PolicyConfig(**layers),
+            predictor=PredictorConfig(context=context, dim=32, layers=2, heads=2, head_dim=16, mlp_dim=64),
+            policy=PolicyConfig(dim=32, layers=2, heads=2, head_dim=16, mlp_dim=64),
             action_decoder=ActionDecoderConfig(hidden_dim=32),
         ),
     )

@@ -8,6 +8,7 @@ Shapes: N slots, D slot width, Z latent-action width, A action width; "..." is a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -36,7 +37,7 @@ class _CloningLoss(LossModule):
         mask: NestedKey = "mask"
 
     tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
+    default_keys: ClassVar[type[Any]] = _AcceptedKeys
     out_name = "loss_cloning"
 
     def __init__(self, network: nn.Module) -> None:

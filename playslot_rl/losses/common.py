@@ -24,6 +24,6 @@ def psnr(mse: Tensor) -> Tensor:
     return -10 * mse.detach().clamp(min=1e-12).log10()
 
 
-def freeze(module: nn.Module) -> nn.Module:
+def freeze[Module: nn.Module](module: Module) -> Module:
     """Put a module into evaluation mode and stop its parameters' gradients; its inputs still get theirs."""
     return module.eval().requires_grad_(False)

@@ -1,0 +1,285 @@
+"""The front door: load a run or the shipped model, then parse, infer, imagine, decode and act.
+
+    model = playslot_rl.load("runs/demo")
+    slots = model.parse(video)                       # frames to object slots
+    actions = model.infer_actions(slots)             # what happened between the frames
+    future = model.imagine(video[0], actions.z)      # what would happen
+    frames = model.decode(future).frames             # what it would look like
+    action = model.act(frame)                        # what to do
+
+Frames are accepted as they come: numpy or torch, uint8 [0, 255] or float [0, 1], height-width-channels or
+channels-height-width. Everything runs without gradients, in evaluation mode, on the model's device.
+
+Shapes: B batch, T frames, P imagined steps, N slots, D slot width, Z latent-action width, A action width,
+H W image height and width. "[B,]" may be there or not; "[N,]" is there with one latent action per slot.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.errors import CheckpointError
+from playslot_rl.modules.inverse_dynamics import LatentActions
+from playslot_rl.modules.savi import Decoded
+from playslot_rl.world_model import Agent, WorldModel, module_device
+
+Array = npt.NDArray[Any] | Tensor
+
+
+def load(run: str | Path = "pretrained", device: str = "", seed: int = 0) -> PlaySlot:
+    """Load a run folder, or the world model that ships with the package.
+
+    Args:
+        run: folder of a run, or `pretrained`, which has no policy and so cannot `act`.
+        device: torch device; empty means a GPU if there is one.
+        seed: of sampled initial slots (only models with `initial: gaussian` draw any).
+
+    Raises:
+        CheckpointError: there is no such run, or its checkpoints are damaged or do not belong together.
+
+    Examples:
+        >>> import playslot_rl
+        >>> model = playslot_rl.load("pretrained", device="cpu")
+        >>> model.world_model.slot_shape[0]
+        4
+    """
+    from playslot_rl.training.checkpoints import checkpoint_folder, load_agent, load_world_model
+
+    target = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    if str(run) != "pretrained" and (checkpoint_folder(Path(run), "policy") / "meta.json").is_file():
+        agent = load_agent(run).to(target)
+        return PlaySlot(agent.world_model, agent, seed)
+    return PlaySlot(load_world_model(run).to(target), None, seed)
+
+
+class PlaySlot:
+    """A world model, maybe with an agent, behind five methods.
+
+    Args:
+        world_model: put into evaluation mode.
+        agent: the agent of that world model; without one `act` is refused.
+        seed: of sampled initial slots; equal calls give equal results.
+    """
+
+    def __init__(self, world_model: WorldModel, agent: Agent | None = None, seed: int = 0) -> None:
+        self.world_model = world_model.eval()
+        self.agent = None if agent is None else agent.eval()
+        self._seed = seed
+        self._state: Tensor | None = None
+
+    @classmethod
+    def untrained(cls, config: ExperimentConfig | None = None, seed: int = 0) -> PlaySlot:
+        """Random weights, for trying out the interface; by default of the sizes of `playslot_rl.testing.tiny_config`.
+
+        Examples:
+            >>> PlaySlot.untrained().world_model.latent_shape
+            (8,)
+        """
+        from playslot_rl.testing import tiny_agent
+
+        agent = tiny_agent(config, seed)
+        return cls(agent.world_model, agent, seed)
+
+    @torch.no_grad()
+    def parse(self, frames: Array) -> Tensor:
+        """Slots of a frame, a clip or a batch of clips; each clip starts an episode.
+
+        Args:
+            frames: ([B,] [T,] H, W, 3) or ([B,] [T,] 3, H, W).
+
+        Returns:
+            ([B,] [T,] N, D).
+
+        Raises:
+            ValueError: other shapes, another frame size than the model's, or floats outside [0, 1].
+
+        Examples:
+            >>> import numpy as np
+            >>> video = np.random.default_rng(0).integers(256, size=(5, 64, 64, 3), dtype=np.uint8)
+            >>> PlaySlot.untrained().parse(video).shape
+            torch.Size([5, 4, 32])
+        """
+        pixels = self._frames(frames)
+        lead = pixels.shape[:-3]
+        if len(lead) > 2:
+            raise ValueError(f"frames: got {pixels.ndim} dimensions, expected 3 (a frame), 4 (a clip) or 5 (clips)")
+        clips = pixels.reshape((1,) * (2 - len(lead)) + tuple(pixels.shape))
+        slots, _ = self.world_model.savi(clips, generator=self._generator())
+        out: Tensor = slots.reshape(*lead, *slots.shape[2:])
+        return out
+
+    @torch.no_grad()
+    def infer_actions(self, slots: Tensor) -> LatentActions:
+        """Latent actions between consecutive frames, from the slots of a clip or of a batch of clips.
+
+        Args:
+            slots: ([B,] T, N, D) as `parse` gives them, T at least 2.
+
+        Returns:
+            z, its mean, prototype, variability ([B,] T-1, [N,] Z), code ([B,] T-1, [N]) and the quantiser's loss.
+
+        Raises:
+            ValueError: other shapes, or a model of mode `ground_truth`, which infers none.
+
+        Examples:
+            >>> import torch
+            >>> model = PlaySlot.untrained()
+            >>> actions = model.infer_actions(model.parse(torch.rand(5, 3, 64, 64)))
+            >>> actions.z.shape, actions.code.shape
+            (torch.Size([4, 8]), torch.Size([4]))
+        """
+        given = self._slots(slots)
+        if given.ndim not in (3, 4) or given.shape[-3] < 2:
+            raise ValueError(f"slots: got shape {tuple(given.shape)}, expected ([B,] T, N, D) with at least 2 frames")
+        clips = given if given.ndim == 4 else given[None]
+        actions: LatentActions = self.world_model.inverse_dynamics(clips)
+        if given.ndim == 4:
+            return actions
+        return actions._replace(**{name: getattr(actions, name)[0] for name in actions._fields if name != "vq_loss"})
+
+    @torch.no_grad()
+    def imagine(self, first_frame: Array, actions: Array) -> Tensor:
+        """Slots of the future that follows a frame under given latent actions.
+
+        Args:
+            first_frame: ([B,] H, W, 3) or ([B,] 3, H, W).
+            actions: latent actions, float ([B,] P, [N,] Z), or prototypes by number, integer ([B,] P, [N]).
+
+        Returns:
+            ([B,] P, N, D): the imagined frames, the first one not included.
+
+        Raises:
+            ValueError: other shapes, unequal batches, or a prototype that does not exist.
+
+        Examples:
+            >>> import torch
+            >>> model = PlaySlot.untrained()
+            >>> frame = torch.rand(3, 64, 64)
+            >>> model.imagine(frame, torch.randn(6, 8)).shape
+            torch.Size([6, 4, 32])
+            >>> model.imagine(frame, torch.tensor([0, 0, 3, 3])).shape
+            torch.Size([4, 4, 32])
+        """
+        z = self._latents(actions)
+        batched = z.ndim == len(self.world_model.latent_shape) + 2
+        slots = self.parse(first_frame)
+        if slots.ndim not in (2, 3) or (slots.ndim == 3 and not batched):
+            raise ValueError(f"first_frame: got parsed shape {tuple(slots.shape)}, expected one frame for each z")
+        z = z if batched else z[None]
+        slots = slots.expand(len(z), -1, -1) if slots.ndim == 2 else slots
+        if len(slots) != len(z):
+            raise ValueError(f"imagine: got {len(slots)} frames and {len(z)} action sequences, expected equal numbers")
+        p, v = self.world_model.inverse_dynamics.split(z)
+        future = self.world_model.predictor.rollout(slots[:, None], p, v)
+        return future if batched else future[0]
+
+    @torch.no_grad()
+    def decode(self, slots: Tensor) -> Decoded:
+        """Frames and masks of slots.
+
+        Args:
+            slots: (..., N, D).
+
+        Returns:
+            frames (..., 3, H, W), about [0, 1]; rgb (..., N, 3, H, W); masks (..., N, 1, H, W) that sum to one over N.
+
+        Examples:
+            >>> import torch
+            >>> PlaySlot.untrained().decode(torch.randn(5, 4, 32)).masks.shape
+            torch.Size([5, 4, 1, 64, 64])
+        """
+        decoded: Decoded = self.world_model.savi.decode(self._slots(slots))
+        return decoded
+
+    @torch.no_grad()
+    def act(self, frame: Array) -> npt.NDArray[np.float32]:
+        """The real action for an observed frame; the frames of an episode are given one after the other.
+
+        SAVi's recurrent state is carried from call to call: `reset` before each episode.
+
+        Args:
+            frame: (H, W, 3) or (3, H, W).
+
+        Returns:
+            (A,) in [-1, 1].
+
+        Raises:
+            CheckpointError: the model has no policy.
+            ValueError: not one frame of the model's size.
+
+        Examples:
+            >>> import torch
+            >>> model = PlaySlot.untrained()
+            >>> model.reset()
+            >>> [model.act(torch.rand(3, 64, 64)).shape for _ in range(2)]
+            [(4,), (4,)]
+        """
+        if self.agent is None:
+            raise CheckpointError(
+                "act: got a world model without a policy; run `playslot train-policy` and load that run"
+            )
+        pixels = self._frames(frame)
+        if pixels.ndim != 3:
+            raise ValueError(f"frame: got shape {tuple(pixels.shape)}, expected one frame, (H, W, 3) or (3, H, W)")
+        slots, self._state = self.world_model.savi(pixels[None, None], self._state, generator=self._generator())
+        action = self.agent.action_decoder(self.agent.policy(slots[:, 0]))[0]
+        out: npt.NDArray[np.float32] = action.float().cpu().numpy()
+        return out
+
+    def reset(self) -> None:
+        """Forget the episode: the next frame `act` gets is a first one."""
+        self._state = None
+
+    def _generator(self) -> torch.Generator:
+        return torch.Generator(module_device(self.world_model)).manual_seed(self._seed)
+
+    def _frames(self, frames: Array) -> Tensor:
+        """Any accepted layout to float (..., 3, H, W) in [0, 1] on the model's device."""
+        pixels = torch.as_tensor(frames)
+        side, shape = self.world_model.env.image_size, tuple(pixels.shape)
+        if shape[-3:] == (side, side, 3):
+            pixels = pixels.movedim(-1, -3)
+        elif shape[-3:] != (3, side, side):
+            raise ValueError(
+                f"frames: got shape {shape}, expected (..., {side}, {side}, 3) or (..., 3, {side}, {side})"
+            )
+        pixels = pixels.to(module_device(self.world_model))
+        if pixels.dtype == torch.uint8:
+            return pixels.float().div(255)
+        if not pixels.is_floating_point() or not bool(((pixels >= 0) & (pixels <= 1)).all()):
+            low, high = pixels.min().item(), pixels.max().item()
+            raise ValueError(
+                f"frames: got {pixels.dtype} in [{low:g}, {high:g}], expected uint8 in [0, 255] or floats in [0, 1]"
+            )
+        return pixels.float()
+
+    def _slots(self, slots: Tensor) -> Tensor:
+        if tuple(slots.shape[-2:]) != self.world_model.slot_shape:
+            expected = self.world_model.slot_shape
+            raise ValueError(f"slots: got shape {tuple(slots.shape)}, expected (..., {expected[0]}, {expected[1]})")
+        return slots.to(module_device(self.world_model))
+
+    def _latents(self, actions: Array) -> Tensor:
+        """Latent actions, or prototypes by number, to float ([B,] P, [N,] Z)."""
+        given = torch.as_tensor(actions).to(module_device(self.world_model))
+        shape, inverse = self.world_model.latent_shape, self.world_model.inverse_dynamics
+        if not given.is_floating_point():
+            numbers, prototypes = given.long(), inverse.prototypes
+            if numbers.numel() and not 0 <= int(numbers.min()) <= int(numbers.max()) < len(prototypes):
+                raise ValueError(
+                    f"actions: got prototypes {given.unique().tolist()}, expected 0 to {len(prototypes) - 1}"
+                )
+            given = prototypes[numbers]
+        steps = given.ndim - len(shape)
+        if steps not in (1, 2) or tuple(given.shape[steps:]) != shape or given.shape[steps - 1] == 0:
+            raise ValueError(
+                f"actions: got shape {tuple(given.shape)}, expected ([B,] P, {', '.join(map(str, shape))})"
+            )
+        return given.float()
