@@ -1,0 +1,107 @@
+"""Cache folders: made once, whole or absent, safe with several processes, outside every data set."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.errors import DataError
+from playslot_rl.training.atomic import explain_write_errors, replace_dir
+
+
+def cache_folder(cache: str | Path = "") -> Path:
+    """The cache: as given, else `$PLAYSLOT_CACHE`, else `~/.cache/playslot_rl`."""
+    chosen = str(cache) or os.environ.get("PLAYSLOT_CACHE", "")
+    return Path(chosen).expanduser() if chosen else Path.home() / ".cache" / "playslot_rl"
+
+
+def require_outside(cache: Path, root: Path) -> None:
+    """Refuse a cache below a data set's root: a push would upload it.
+
+    Raises:
+        DataError: `cache` lies in `root`.
+    """
+    if cache.resolve().is_relative_to(root.resolve()):
+        raise DataError(f"data.cache={cache}: got a folder inside the data set {root}, expected one outside: move it")
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def build_once(folder: Path, build: Callable[[Path], None]) -> Path:
+    """Return `folder`, made by `build(temporary)` if it does not exist.
+
+    A lock lets one process build while others wait; the system drops the lock of a killed process, so what lies in the
+    temporary folder under the lock is always a leftover.
+
+    Raises:
+        OutputError: full disk; nothing is left behind.
+    """
+    if folder.is_dir():
+        return folder
+    with explain_write_errors(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with _locked(folder.with_name(f".{folder.name}.lock")):
+            if folder.is_dir():
+                return folder
+            temporary = folder.with_name(f".{folder.name}.tmp")
+            shutil.rmtree(temporary, ignore_errors=True)
+            temporary.mkdir()
+            try:
+                build(temporary)
+                replace_dir(temporary, folder)
+            finally:
+                shutil.rmtree(temporary, ignore_errors=True)
+    return folder
+
+
+def load_cached(folder: Path, name: str) -> npt.NDArray[Any]:
+    """Memory-map an array of a cache folder, read-only.
+
+    Raises:
+        DataError: the file was damaged after it was made.
+    """
+    try:
+        array: npt.NDArray[Any] = np.load(folder / name, mmap_mode="r")
+    except (OSError, ValueError) as error:
+        raise DataError(f"{folder / name} is damaged ({error}), expected a cached array: delete {folder}") from error
+    return array
+
+
+class ArrayWriter:
+    """Writes an `.npy` file piece by piece along its first axis.
+
+    Plain writes, because a full disk under a memory map is a bus error, not an exception.
+    """
+
+    def __init__(self, path: Path, shape: Sequence[int], dtype: npt.DTypeLike) -> None:
+        self.path, self.shape, self.dtype = path, tuple(shape), np.dtype(dtype)
+        self.rows = 0
+        self._file: IO[bytes] = path.open("wb")
+        header = {"descr": np.lib.format.dtype_to_descr(self.dtype), "fortran_order": False, "shape": self.shape}
+        np.lib.format.write_array_header_1_0(self._file, header)
+
+    def write(self, rows: npt.NDArray[np.generic]) -> None:
+        """Append rows (n, *shape[1:])."""
+        if rows.shape[1:] != self.shape[1:]:
+            raise ValueError(f"{self.path}: got rows of shape {rows.shape[1:]}, expected {self.shape[1:]}")
+        self._file.write(np.ascontiguousarray(rows, self.dtype).data)
+        self.rows += len(rows)
+
+    def close(self) -> None:
+        """Finish; all rows must have been written."""
+        self._file.close()
+        if self.rows != self.shape[0]:
+            raise ValueError(f"{self.path}: got {self.rows} rows, expected {self.shape[0]}")

@@ -1,0 +1,97 @@
+"""The slot cache: frozen SAVi's slots of a whole data set, computed once, keyed by weights and data.
+
+Shapes: F frames, E episodes, N slots, D slot width.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from playslot_rl.data.cache import ArrayWriter, build_once, cache_folder, load_cached
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.training.seeding import step_generator
+
+if TYPE_CHECKING:
+    from playslot_rl.modules.savi import SAVi
+
+_FORMAT = "1"
+EPISODES_A_BATCH = 32
+FRAMES_A_PASS = 4
+"""Frames of each episode parsed at a time: bounds the memory of the encoder's activations."""
+
+
+def slot_cache(
+    source: EpisodeFrames,
+    savi: SAVi,
+    savi_fingerprint: str,
+    cache: str | Path = "",
+    device: torch.device | str = "cpu",
+    progress: bool = False,
+) -> npt.NDArray[np.float32]:
+    """Slots of every frame of a data set, each episode parsed from its first frame on.
+
+    Args:
+        source: the frames.
+        savi: SAVi with frozen weights; moved to `device` and put in eval mode.
+        savi_fingerprint: of its weights (`StageCheckpoint.fingerprint`).
+        cache: the cache; empty means the default one.
+        device: where to compute.
+        progress: print a line to standard error before a long computation.
+
+    Returns:
+        float32 (F, N, D), memory-mapped.
+
+    Raises:
+        OutputError: full disk.
+
+    Note: sampled initial slots (`gaussian`) are drawn by a generator seeded with the episode's number.
+    """
+    key = hashlib.sha256(json.dumps([_FORMAT, source.fingerprint, source.camera, source.image_size, savi_fingerprint])
+                         .encode()).hexdigest()[:24]  # fmt: skip
+    folder = cache_folder(cache) / "slots" / key
+
+    def build(temporary: Path) -> None:
+        if progress:
+            print(f"slots: parsing {len(source.frames)} frames once", file=sys.stderr, flush=True)
+        writer = ArrayWriter(
+            temporary / "slots.npy", (len(source.frames), savi.config.n_slots, savi.config.slot_dim), np.float32
+        )
+        for slots in parse_episodes(source, savi, device):
+            writer.write(slots)
+        writer.close()
+
+    build_once(folder, build)
+    slots: npt.NDArray[np.float32] = load_cached(folder, "slots.npy")
+    return slots
+
+
+@torch.no_grad()
+def parse_episodes(
+    source: EpisodeFrames, savi: SAVi, device: torch.device | str = "cpu"
+) -> Iterator[npt.NDArray[np.float32]]:
+    """Parse all episodes in order: yields float32 (frames of the episode, N, D)."""
+    savi = savi.to(device).eval()
+    for first in range(0, source.episodes, EPISODES_A_BATCH):
+        episodes = np.arange(first, min(first + EPISODES_A_BATCH, source.episodes))
+        lengths = source.lengths[episodes]
+        # Shorter episodes repeat their last frame; SAVi is causal, so what is kept does not see it.
+        steps = np.minimum(np.arange(int(lengths.max())), lengths[:, None] - 1)
+        rows = source.starts[episodes][:, None] + steps
+        generator = step_generator(0, first, "slot_cache", device)
+        pieces, state = [], None
+        for begin in range(0, rows.shape[1], FRAMES_A_PASS):
+            frames = source.pixels(rows[:, begin : begin + FRAMES_A_PASS]).to(device).float() / 255
+            slots, state = savi(frames, state, generator)
+            pieces.append(slots.float().cpu().numpy())
+        parsed = np.concatenate(pieces, axis=1)
+        for i, length in enumerate(lengths):
+            yield parsed[i, :length]

@@ -1,0 +1,228 @@
+"""Opening data sets for training: decoded frames by row number, whatever LeRobot v3.0 data set they come from.
+
+Shapes: F frames, E episodes, H W image height and width, A action width.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.data.cache import load_cached
+from playslot_rl.data.frame_cache import frame_cache
+from playslot_rl.data.lerobot_files import LeRobotFiles, open_files
+from playslot_rl.errors import DataError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Frames = npt.NDArray[np.uint8]
+
+
+class ConcatFrames:
+    """Several memory-mapped arrays as one along the first axis, gathered by row numbers; nothing is copied before."""
+
+    def __init__(self, parts: Sequence[Frames]) -> None:
+        self.parts = list(parts)
+        self._ends = np.cumsum([len(part) for part in self.parts])
+        self.shape = (int(self._ends[-1]), *self.parts[0].shape[1:])
+        self.dtype = self.parts[0].dtype
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, rows: Any) -> Frames:
+        """Rows by an integer, a slice or an integer array of any shape."""
+        if isinstance(rows, slice):
+            rows = np.arange(*rows.indices(len(self)))
+        index = np.asarray(rows, np.int64)
+        flat = np.where(index < 0, index + len(self), index).reshape(-1)
+        if flat.size and (flat.min() < 0 or flat.max() >= len(self)):
+            raise IndexError(f"row {int(flat.max())}: expected 0 to {len(self) - 1}")
+        part = np.searchsorted(self._ends, flat, side="right")
+        out = np.empty((len(flat), *self.shape[1:]), self.dtype)
+        for number in np.unique(part):
+            here = part == number
+            offset = self._ends[number] - len(self.parts[number])
+            out[here] = self.parts[number][flat[here] - offset]
+        return out.reshape(*index.shape, *self.shape[1:])
+
+
+@dataclass(frozen=True)
+class EpisodeFrames:
+    """A data set's frames and labels by row. Episode e is rows `starts[e]` to `starts[e] + lengths[e]`.
+
+    An episode of n rows has n - 1 transitions: row t and row t + 1 with the action of row t. The action of an episode's
+    last row is padding.
+
+    Attributes:
+        frames: uint8 (F, H, W, 3), [0, 255], memory-mapped; index it by integers, slices or integer arrays.
+        starts, lengths: int64 (E,).
+        actions: float32 (F, A), or None if the data set (or one of several) has none.
+        success: bool (F,), or None.
+        seeds: int64 (E,), or None.
+        fingerprint: content hash, 16 hex digits.
+        fps: frames a second.
+        task: the task in words.
+        camera: feature the frames come from.
+    """
+
+    frames: Frames | ConcatFrames
+    starts: npt.NDArray[np.int64]
+    lengths: npt.NDArray[np.int64]
+    actions: npt.NDArray[np.float32] | None
+    success: npt.NDArray[np.bool_] | None
+    seeds: npt.NDArray[np.int64] | None
+    fingerprint: str
+    fps: float
+    task: str
+    camera: str
+
+    @property
+    def episodes(self) -> int:
+        """E."""
+        return len(self.starts)
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(H, W)."""
+        return int(self.frames.shape[1]), int(self.frames.shape[2])
+
+    def pixels(self, rows: npt.ArrayLike) -> Tensor:
+        """Frames of rows of any shape (...) as a uint8 tensor (..., 3, H, W)."""
+        import torch
+
+        return torch.from_numpy(np.ascontiguousarray(self.frames[np.asarray(rows)])).movedim(-1, -3)
+
+    def episode_rows(self, episode: int) -> npt.NDArray[np.int64]:
+        """Row numbers of an episode."""
+        return np.arange(self.starts[episode], self.starts[episode] + self.lengths[episode])
+
+    def require_actions(self) -> npt.NDArray[np.float32]:
+        """The actions.
+
+        Raises:
+            DataError: the data set has none.
+        """
+        if self.actions is None:
+            raise DataError(
+                "got a data set without actions, expected the feature `action`: use labelled demonstrations"
+            )
+        return self.actions
+
+
+def open_source(
+    root: str | Path, camera: str = "", cache: str | Path = "", *, image_size: int | None = None, resize: bool = False
+) -> EpisodeFrames:
+    """Open a LeRobot v3.0 data set through the frame cache; the first time decodes all its frames.
+
+    Args:
+        root: its folder.
+        camera: image or video feature; empty means the only one.
+        cache: the cache; empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
+        image_size: side the model expects; None takes what there is.
+        resize: resize frames of another size instead of refusing them.
+
+    Raises:
+        DataError: the data set is missing, foreign, truncated or unfinalised; no such camera; wrong frame size.
+        OutputError: full disk.
+    """
+    files = open_files(root)
+    camera = files.camera(camera)
+    _check_size(files, camera, image_size, resize)
+    folder, fingerprint = frame_cache(files, camera, cache, image_size if resize else None)
+    frames: Frames = load_cached(folder, "frames.npy")
+    if image_size is not None and frames.shape[1:3] != (image_size, image_size):
+        raise _wrong_size(files, camera, (frames.shape[1], frames.shape[2]), image_size)
+    meta = json.loads((folder / "meta.json").read_text())
+    with np.load(folder / "columns.npz") as columns:
+        loaded = {name: columns[name] for name in columns.files}
+    return EpisodeFrames(
+        frames=frames,
+        starts=loaded["starts"],
+        lengths=loaded["lengths"],
+        actions=loaded.get("actions"),
+        success=loaded.get("success"),
+        seeds=loaded.get("seeds"),
+        fingerprint=fingerprint,
+        fps=meta["fps"],
+        task=meta["task"],
+        camera=camera,
+    )
+
+
+def open_sources(
+    roots: str | Sequence[str | Path],
+    camera: str = "",
+    cache: str | Path = "",
+    *,
+    image_size: int | None = None,
+    resize: bool = False,
+) -> EpisodeFrames:
+    """Open one or several data sets as one; `roots` is a list, or a string with commas.
+
+    Labels that not every data set has are dropped. The frames must have one size.
+
+    Raises:
+        DataError: as `open_source`, or the frame sizes differ.
+    """
+    names = [name.strip() for name in roots.split(",")] if isinstance(roots, str) else list(roots)
+    names = [name for name in names if str(name)] or [""]
+    sources = [open_source(root, camera, cache, image_size=image_size, resize=resize) for root in names]
+    if len(sources) == 1:
+        return sources[0]
+    for name, source in zip(names, sources, strict=True):
+        if source.image_size != sources[0].image_size:
+            got, want = source.image_size, sources[0].image_size
+            raise DataError(f"{name}: got frames of {got[0]}x{got[1]}, expected {want[0]}x{want[1]} as in {names[0]}")
+    return concatenate(sources)
+
+
+def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
+    """Several data sets with frames of one size as one; labels that not all have, or of another width, are dropped."""
+    offsets = np.cumsum([0, *(len(source.frames) for source in sources)])[:-1]
+    parts = [p for s in sources for p in (s.frames.parts if isinstance(s.frames, ConcatFrames) else [s.frames])]
+
+    def joined(name: str) -> Any:
+        labels = [getattr(source, name) for source in sources]
+        if any(label is None or label.shape[1:] != labels[0].shape[1:] for label in labels):
+            return None
+        return np.concatenate(labels)
+
+    return EpisodeFrames(
+        frames=ConcatFrames(parts),
+        starts=np.concatenate([s.starts + offset for s, offset in zip(sources, offsets, strict=True)]),
+        lengths=np.concatenate([s.lengths for s in sources]),
+        actions=joined("actions"),
+        success=joined("success"),
+        seeds=joined("seeds"),
+        fingerprint=hashlib.sha256("+".join(s.fingerprint for s in sources).encode()).hexdigest()[:16],
+        fps=sources[0].fps,
+        task=sources[0].task,
+        camera=sources[0].camera,
+    )
+
+
+def _check_size(files: LeRobotFiles, camera: str, image_size: int | None, resize: bool) -> None:
+    """Refuse a wrong size before decoding everything, where the metadata say it."""
+    shape, names = files.info["features"][camera].get("shape"), files.info["features"][camera].get("names")
+    if image_size is None or resize or not isinstance(shape, list) or len(shape) != 3:
+        return
+    channels_first = (names or [""])[0] in ("channel", "channels")
+    height, width = shape[1:] if channels_first else shape[:2]
+    if (height, width) != (image_size, image_size):
+        raise _wrong_size(files, camera, (height, width), image_size)
+
+
+def _wrong_size(files: LeRobotFiles, camera: str, got: tuple[int, int], expected: int) -> DataError:
+    return DataError(
+        f"{files.root}: got frames of {got[0]}x{got[1]} from {camera}, expected {expected}x{expected}: "
+        f"set env.image_size, or record at that size"
+    )

@@ -1,0 +1,107 @@
+"""Windows of consecutive frames, drawn uniformly over all places where one fits.
+
+Shapes: F frames of a data set, E episodes, B batch, T window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.errors import DataError
+
+IntArray = npt.NDArray[np.int64]
+
+
+def sample_windows(
+    starts: npt.ArrayLike,
+    lengths: npt.ArrayLike,
+    window: int,
+    batch: int,
+    generator: np.random.Generator,
+    episodes: Sequence[int] | IntArray | None = None,
+) -> IntArray:
+    """Draw windows: every valid first frame is equally likely, so long episodes count for more.
+
+    Args:
+        starts: first row of each episode (E,).
+        lengths: frames of each episode (E,).
+        window: T.
+        batch: B.
+        generator: source of randomness.
+        episodes: episodes to draw from; None means all.
+
+    Returns:
+        Row indices (B, T), int64.
+
+    Raises:
+        DataError: no episode has `window` frames.
+
+    Example:
+        >>> sample_windows([0, 3], [3, 2], 3, 2, np.random.default_rng(0))
+        array([[0, 1, 2],
+               [0, 1, 2]])
+    """
+    first, valid = _valid_starts(starts, lengths, window, episodes)
+    cumulative = np.cumsum(valid)
+    drawn = generator.integers(0, cumulative[-1], size=batch)
+    episode = np.searchsorted(cumulative, drawn, side="right")
+    offset = drawn - (cumulative[episode] - valid[episode])
+    rows: IntArray = (first[episode] + offset)[:, None] + np.arange(window)
+    return rows
+
+
+def all_windows(
+    starts: npt.ArrayLike,
+    lengths: npt.ArrayLike,
+    window: int,
+    stride: int = 1,
+    episodes: Sequence[int] | IntArray | None = None,
+) -> IntArray:
+    """Every window in order, first frames `stride` apart within an episode: row indices (B, T).
+
+    Raises:
+        DataError: no episode has `window` frames.
+    """
+    first, valid = _valid_starts(starts, lengths, window, episodes)
+    begins = np.concatenate([s + np.arange(0, n, stride) for s, n in zip(first, valid, strict=True)])
+    rows: IntArray = begins[:, None].astype(np.int64) + np.arange(window)
+    return rows
+
+
+def _valid_starts(
+    starts: npt.ArrayLike, lengths: npt.ArrayLike, window: int, episodes: Sequence[int] | IntArray | None
+) -> tuple[IntArray, IntArray]:
+    first, length = np.asarray(starts, np.int64), np.asarray(lengths, np.int64)
+    if episodes is not None:
+        chosen = np.asarray(episodes, np.int64)
+        first, length = first[chosen], length[chosen]
+    valid = np.maximum(length - window + 1, 0)
+    if valid.sum() == 0:
+        longest = int(length.max()) if len(length) else 0
+        raise DataError(
+            f"got episodes of at most {longest} frames ({len(length)} of them), expected at least one of {window}: "
+            "shorten the training window or collect longer episodes"
+        )
+    return first, valid
+
+
+def split_episodes(episodes: int, validation: float, seed: int) -> tuple[IntArray, IntArray]:
+    """Split episode indices into training and validation, at random but always the same for a seed.
+
+    Args:
+        episodes: E.
+        validation: fraction held out; at least one episode is, if the fraction is not 0 and there are two.
+        seed: of the split.
+
+    Returns:
+        Sorted training and validation indices; with nothing held out, validation is the training set.
+    """
+    held_out = round(episodes * validation)
+    if validation > 0 and episodes >= 2:
+        held_out = min(max(1, held_out), episodes - 1)
+    order = np.random.default_rng(seed).permutation(episodes).astype(np.int64)
+    training = np.sort(order[held_out:])
+    return training, np.sort(order[:held_out]) if held_out else training

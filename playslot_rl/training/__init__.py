@@ -1,0 +1,1 @@
+"""The training machinery: one fit loop, optimiser and schedule, checkpoints, logging, seeding, atomic writes."""
