@@ -6,7 +6,7 @@ Shapes: A = 4, S = 4, H = W = `EnvConfig.image_size`.
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -46,7 +46,13 @@ class ButtonPressEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         RenderError: there is no working GL backend.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 16}
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it so)
+        "render_modes": ["rgb_array"],
+        "render_fps": 16,
+        "control_hz": 80,
+        "task": "Press the red button.",
+    }
+    """`control_hz` counts environment steps: an agent step of `frame_skip` of them takes `frame_skip / 80` seconds."""
 
     def __init__(
         self,
@@ -71,12 +77,13 @@ class ButtonPressEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         size = self.config.image_size
         self._renderer = FrameRenderer(self._env.model, CAMERA, size, render or RenderConfig())
         self.render_mode = render_mode
-        self.observation_space = gym.spaces.Dict(
+        space = gym.spaces.Dict(
             {
                 "pixels": gym.spaces.Box(0, 255, (size, size, 3), np.uint8),
                 "state": gym.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32),
             }
         )
+        self.observation_space = cast(gym.Space[Observation], space)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
         self._full: npt.NDArray[np.float64] = np.zeros(0)
         self._frame: npt.NDArray[np.uint8] | None = None
@@ -94,6 +101,7 @@ class ButtonPressEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         Returns:
             The first observation and `{"success": bool}`: True for an episode that starts solved.
         """
+        del options
         super().reset(seed=seed)
         episode = int(self.np_random.integers(2**31)) if seed is None else seed
         task, warmup = (np.random.default_rng(s) for s in np.random.SeedSequence(episode).spawn(2))
@@ -150,7 +158,7 @@ class ButtonPressEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._frame = self._renderer(self._env.data)
         return {"pixels": self._frame, "state": self._full[HAND_STATE].astype(np.float32)}
 
-    def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> npt.NDArray[np.uint8] | None:
         """The present frame, uint8 (H, W, 3); None without a render mode or before the first reset."""
         if self.render_mode is None or self._frame is None:
             return None

@@ -6,8 +6,10 @@ switches both off, draws at `supersample` times the size and averages boxes: abo
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
+import warnings
 import weakref
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -44,19 +46,43 @@ class Camera:
 def import_mujoco() -> Any:
     """Import mujoco with a GL backend that works without a display.
 
-    MuJoCo reads `MUJOCO_GL` once, when it is first imported. On Linux it is set to `egl` where it is not set, with or
-    without a display, so that every machine and every worker process draws by the same path.
+    MuJoCo reads `MUJOCO_GL` once, when it is first imported, and torchrl.envs imports it too. On Linux the variable is
+    set to `egl` where it is not set, with or without a display, so that every machine and every worker process draws by
+    the same path; where mujoco was imported before that, its choice of context is replaced.
 
     Raises:
         RenderError: mujoco cannot be imported with the backend asked for.
     """
-    if sys.platform.startswith("linux"):
+    linux = sys.platform.startswith("linux")
+    imported_before = "mujoco" in sys.modules
+    if linux:
         os.environ.setdefault("MUJOCO_GL", "egl")
     try:
         import mujoco
+
+        if linux and imported_before and os.environ["MUJOCO_GL"] == "egl":
+            from mujoco import gl_context
+            from mujoco.egl import GLContext
+
+            gl_context.GLContext = GLContext
     except Exception as error:  # PyOpenGL raises AttributeError, ImportError or RuntimeError, by platform
         raise RenderError(_message(error)) from error
     return mujoco
+
+
+def _make_renderer(mj: Any, model: mujoco.MjModel, side: int) -> Any:
+    class QuietRenderer(mj.Renderer):
+        """A renderer whose destructor also works where its constructor failed (no traceback after our error)."""
+
+        _gl_context = None
+        _mjr_context = None
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # GLFW warns, then fails
+            return QuietRenderer(model, height=side, width=side)
+    except Exception as error:  # each GL backend raises its own types
+        raise RenderError(_message(error)) from error
 
 
 def _message(error: BaseException) -> str:
@@ -91,12 +117,12 @@ class FrameRenderer:
         model.vis.global_.offwidth = model.vis.global_.offheight = side
         if fast:
             model.vis.quality.offsamples = 0
-        try:
-            self._renderer = mj.Renderer(model, height=side, width=side)
-        except Exception as error:  # each GL backend raises its own types
-            raise RenderError(_message(error)) from error
-        # Closed at interpreter exit too, while mujoco still exists: otherwise EGL prints tracebacks.
+        self._renderer = _make_renderer(mj, model, side)
         self._finalizer = weakref.finalize(self, _close, self._renderer)
+        # Handlers at exit run last in, first out: ours must precede EGL's own, registered with its first context, or
+        # closing prints tracebacks. `finalize` may have registered its handler before both.
+        self._finalizer.atexit = False
+        atexit.register(self._finalizer)
         if fast:
             for flag in (mj.mjtRndFlag.mjRND_SHADOW, mj.mjtRndFlag.mjRND_REFLECTION):
                 self._renderer.scene.flags[flag] = 0
@@ -121,3 +147,4 @@ class FrameRenderer:
     def close(self) -> None:
         """Free the GL context; safe to call twice."""
         self._finalizer()
+        atexit.unregister(self._finalizer)

@@ -1,0 +1,168 @@
+"""Collect a data set: record what the journal lacks, then export it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from playslot_rl.collectors.export import META_NAME, export
+from playslot_rl.collectors.journal import Journal, journal_path, read_spec
+from playslot_rl.collectors.spec import CollectionSpec, difference
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.errors import DataError, OutputError
+from playslot_rl.training.progress import format_seconds
+
+PLAIN_EVERY_S = 10.0
+"""Seconds between progress lines where standard error is no terminal."""
+
+
+def is_complete(out: Path, spec: CollectionSpec) -> bool:
+    """Whether the data set `out` is there.
+
+    Returns:
+        True for this collection's finished data set; False where there is nothing yet.
+
+    Raises:
+        OutputError: it holds something else, or a collection with other settings.
+        DataError: its own record and LeRobot's disagree.
+    """
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return False
+    record = out / META_NAME
+    if not record.is_file():
+        raise OutputError(f"{out}: got a folder or file of something else, expected none; choose another out=")
+    stored = read_spec(record).get("spec")
+    differs = difference(stored if isinstance(stored, dict) else {}, spec.to_dict())
+    if differs:
+        raise OutputError(f"{out} was collected with other settings ({differs}); repeat them or choose another out=")
+    try:
+        info = json.loads((out / "meta" / "info.json").read_text())
+        counts = info["total_episodes"], info["total_frames"]
+    except (OSError, ValueError, KeyError) as error:
+        raise DataError(
+            f"{out}: got no readable meta/info.json ({error}); delete the folder and collect again"
+        ) from error
+    expected = spec.episodes, spec.episodes * (spec.steps + 1)
+    if counts != expected:
+        raise DataError(f"{out}: got {counts} episodes and frames, expected {expected}; delete it and collect again")
+    return True
+
+
+@contextlib.contextmanager
+def progress(name: str, done: int, total: int, enabled: bool) -> Iterator[Callable[[], None]]:
+    """Show episodes, rate and remaining time; gives a function to call after each episode."""
+    began, start = time.monotonic(), done
+    if not enabled:
+        yield lambda: None
+        return
+    if sys.stderr.isatty():
+        from rich import progress as rich
+        from rich.console import Console
+
+        columns = (
+            rich.TextColumn("{task.description}"),
+            rich.BarColumn(),
+            rich.MofNCompleteColumn(),
+            rich.TextColumn("{task.fields[rate]}"),
+            rich.TimeRemainingColumn(),
+        )
+        with rich.Progress(*columns, console=Console(stderr=True)) as bar:
+            task = bar.add_task(name, total=total, completed=done, rate="starting")
+
+            def advance() -> None:
+                nonlocal done
+                done += 1
+                rate = (done - start) / max(1e-9, time.monotonic() - began)
+                bar.update(task, completed=done, rate=f"{rate:.1f} episodes/s")
+
+            yield advance
+        return
+    last = began
+
+    def line() -> None:
+        nonlocal done, last
+        done += 1
+        now = time.monotonic()
+        if done == total or now - last >= PLAIN_EVERY_S:
+            last, rate = now, (done - start) / max(1e-9, now - began)
+            left = format_seconds((total - done) / rate)
+            print(f"{name}: {done}/{total}, {rate:.1f} episodes/s, {left} left", file=sys.stderr, flush=True)
+
+    yield line
+
+
+def collect(
+    config: ExperimentConfig, policy: str, episodes: int, steps: int, out: Path, seed: int, workers: int
+) -> Path:
+    """Record episodes as a LeRobot v3.0 data set.
+
+    Episodes go to a journal, `OUT.journal`, and from there in one transaction to `out`. Killed at any moment, it loses
+    at most the episodes in hand (one per worker), and the same call carries on. A finished data set is left alone.
+
+    Args:
+        config: its `env`, `render`, `collect` and `logging` are used.
+        policy: `random` or `expert`.
+        episodes: how many.
+        steps: agent steps of each; an episode has one more frame.
+        out: root of the data set.
+        seed: base seed; the data depend on it, not on the number of workers.
+        workers: processes; 0 means one per core, 1 records in this process.
+
+    Returns:
+        `out`.
+
+    Raises:
+        ConfigError: unknown environment or policy, or a number outside its range.
+        OutputError: `out` holds something else or a collection with other settings, another process is collecting
+            into it, or the disk is full.
+        DataError: the finished data set at `out` is damaged.
+        RenderError: there is no working GL backend.
+
+    Examples:
+        >>> import tempfile
+        >>> from playslot_rl.config import ExperimentConfig
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     root = collect(ExperimentConfig(), "expert", 1, 2, Path(folder) / "demos", seed=0, workers=1)
+        ...     (root / "meta" / "info.json").is_file()
+        True
+    """
+    spec = CollectionSpec.make(config, policy, episodes, steps, seed)
+    out = Path(out).absolute()
+    shown = config.logging.progress
+    folder = journal_path(out)
+    if is_complete(out, spec):
+        if (folder / "collection.json").is_file():
+            Journal(folder, spec).remove()  # killed between the rename and this
+        if shown:
+            print(f"collect: {out} is complete ({episodes} episodes), nothing to do", file=sys.stderr)
+        return out
+    journal = Journal(folder, spec)
+    with journal.lock():
+        _record_missing(journal, workers or os.cpu_count() or 1, shown)
+        if shown:
+            print(f"collect: exporting {episodes} episodes to {out}", file=sys.stderr, flush=True)
+        export(journal, out)
+    journal.remove()
+    return out
+
+
+def _record_missing(journal: Journal, workers: int, shown: bool) -> None:
+    missing, total = journal.missing(), journal.spec.episodes
+    if not missing:
+        return
+    from playslot_rl.envs.rendering import import_mujoco
+
+    import_mujoco()  # before torchrl, which imports it too
+    from playslot_rl.collectors.episodes import record
+
+    if shown and len(missing) < total:
+        print(f"collect: {total - len(missing)} of {total} episodes are there already", file=sys.stderr, flush=True)
+    with progress(f"collect {journal.spec.policy}", total - len(missing), total, shown) as advance:
+        for episode in record(journal.spec, missing, workers):
+            journal.add(episode)
+            advance()

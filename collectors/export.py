@@ -1,0 +1,205 @@
+"""From the journal to a LeRobot v3.0 data set, in one transaction: written under a temporary name, read back, renamed.
+
+A LeRobot data set is unreadable until it is finalised, so none is ever open while episodes are being recorded.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl import keys
+from playslot_rl.collectors.episodes import Episode
+from playslot_rl.collectors.journal import Journal
+from playslot_rl.collectors.spec import CollectionSpec
+from playslot_rl.errors import OutputError
+from playslot_rl.training.atomic import explain_write_errors, replace_dir, write_json
+
+META_NAME = "meta/playslot.json"
+PACKAGES = ("metaworld", "mujoco", "gymnasium", "torchrl", "lerobot", "playslot_rl")
+FREE_BYTES = 16 * 2**20
+"""Less free space than this after a failed export is reported as a full disk."""
+
+
+def repo_id(spec: CollectionSpec) -> str:
+    """Name LeRobot knows the data set by; nothing is looked up on the Hub."""
+    return f"playslot_rl/{spec.env.name}_{spec.policy}"
+
+
+def features(spec: CollectionSpec, state_dim: int) -> dict[str, dict[str, Any]]:
+    """LeRobot features of a collection."""
+    size = spec.env.image_size
+    axes = [f"action_{i}" for i in range(spec.env.action_dim)]
+
+    def one(dtype: str) -> dict[str, Any]:
+        return {"dtype": dtype, "shape": (1,), "names": None}
+
+    return {
+        keys.FEATURE_IMAGE: {
+            "dtype": spec.storage,
+            "shape": (size, size, 3),
+            "names": ["height", "width", "channels"],
+        },
+        keys.FEATURE_STATE: {"dtype": "float32", "shape": (state_dim,), "names": None},
+        keys.FEATURE_ACTION: {"dtype": "float32", "shape": (spec.env.action_dim,), "names": axes},
+        keys.FEATURE_REWARD: one("float32"),
+        keys.FEATURE_SUCCESS: one("bool"),
+        keys.FEATURE_DONE: one("bool"),
+        keys.FEATURE_SEED: one("int64"),
+        keys.FEATURE_LAST: one("bool"),
+    }
+
+
+def rows(episode: Episode, task: str) -> Iterator[dict[str, Any]]:
+    """LeRobot frames of an episode: T transitions and then the last observation, whose action is padding.
+
+    Reward, success and done of row t belong to the agent step from frame t to t + 1; done is true on the last
+    transition and stays true on the last observation.
+    """
+    steps = len(episode.actions)
+    for t in range(steps + 1):
+        last = t == steps
+        yield {
+            keys.FEATURE_IMAGE: episode.frames[t],
+            keys.FEATURE_STATE: episode.states[t],
+            keys.FEATURE_ACTION: np.zeros_like(episode.actions[0]) if last else episode.actions[t],
+            keys.FEATURE_REWARD: np.array([0.0 if last else episode.rewards[t]], np.float32),
+            keys.FEATURE_SUCCESS: np.array([episode.success[min(t, steps - 1)]], np.bool_),
+            keys.FEATURE_DONE: np.array([t >= steps - 1], np.bool_),
+            keys.FEATURE_SEED: np.array([episode.seed], np.int64),
+            keys.FEATURE_LAST: np.array([last], np.bool_),
+            "task": task,
+        }
+
+
+def env_metadata(spec: CollectionSpec) -> dict[str, Any]:
+    """Gymnasium's metadata of the task."""
+    import gymnasium
+    from gymnasium.envs.registration import load_env_creator
+
+    from playslot_rl.envs import gym_id, register
+
+    register()
+    entry_point = gymnasium.spec(gym_id(spec.env.name)).entry_point
+    creator: Any = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    metadata: dict[str, Any] = creator.metadata
+    return metadata
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the progress bar that `datasets` draws for every episode."""
+    import datasets
+
+    shown = datasets.utils.logging.is_progress_bar_enabled()
+    datasets.disable_progress_bars()
+    try:
+        yield
+    finally:
+        if shown:
+            datasets.enable_progress_bars()
+
+
+def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str, Any]]:
+    """Write and finalise the data set at `root`; returns a record of each episode."""
+    from lerobot.configs.video import RGBEncoderConfig
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    metadata = env_metadata(spec)
+    video = spec.storage == "video"
+    dataset = LeRobotDataset.create(
+        repo_id(spec),
+        fps=max(1, round(metadata["control_hz"] / spec.env.frame_skip)),
+        features=features(spec, journal.read(0).states.shape[1]),
+        root=root,
+        robot_type=spec.env.name,
+        use_videos=video,
+        video_backend="pyav",
+        rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=0) if video else None,
+    )
+    records = []
+    for index in range(spec.episodes):
+        episode = journal.read(index)
+        for row in rows(episode, metadata["task"]):
+            dataset.add_frame(row)
+        dataset.save_episode()
+        solved = bool(episode.success.any())
+        records.append(
+            {
+                "seed": episode.seed,
+                "success": solved,
+                "steps_to_success": int(episode.success.argmax()) + 1 if solved else None,
+                "redrawn": episode.redrawn,
+            }
+        )
+    dataset.finalize()
+    return records
+
+
+def _check(root: Path, spec: CollectionSpec, journal: Journal) -> None:
+    """Read the data set back.
+
+    Raises:
+        OutputError: it does not hold what was recorded.
+    """
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset(repo_id(spec), root=root, video_backend="pyav")
+    got, expected = (dataset.num_episodes, len(dataset)), (spec.episodes, spec.episodes * (spec.steps + 1))
+    if got != expected:
+        raise OutputError(f"{root}: got {got} episodes and frames, expected {expected}; run the same command again")
+    for index in {0, spec.episodes - 1}:
+        stored = dataset[index * (spec.steps + 1) + spec.steps][keys.FEATURE_IMAGE].numpy()
+        frame: npt.NDArray[Any] = np.rint(stored.transpose(1, 2, 0) * 255)
+        error = float(np.abs(frame - journal.read(index).frames[-1]).mean())
+        if error > (0.0 if spec.storage == "image" else 2.0):
+            raise OutputError(f"{root}: got frames that differ from the recorded ones by {error:.1f}; run it again")
+
+
+def _collection_record(spec: CollectionSpec, records: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "spec": spec.to_dict(),
+        "success_rate": sum(r["success"] for r in records) / len(records),
+        "redrawn": sum(r["redrawn"] for r in records),
+        "versions": {name: version(name) for name in PACKAGES},
+        "episodes": records,
+    }
+
+
+def export(journal: Journal, out: Path) -> None:
+    """Make the LeRobot data set `out` from a complete journal. A kill leaves `out` whole or not there.
+
+    Raises:
+        OutputError: full disk, a damaged journal, or a data set that reads back otherwise.
+    """
+    spec = journal.spec
+    temporary = out.with_name(f".{out.name}.export")
+    with explain_write_errors(out), _quiet():
+        try:
+            shutil.rmtree(temporary, ignore_errors=True)  # of an export that was killed
+            records = _write(temporary, spec, journal)
+            _check(temporary, spec, journal)
+            write_json(temporary / META_NAME, _collection_record(spec, records))
+            if out.is_dir():
+                out.rmdir()  # empty, or it would have been refused
+            replace_dir(temporary, out)
+        except Exception as error:
+            _explain_full_disk(out, error)
+            raise
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _explain_full_disk(out: Path, error: Exception) -> None:
+    """LeRobot swallows errors of writing images and fails later with others."""
+    if not isinstance(error, OutputError) and shutil.disk_usage(out.parent).free < FREE_BYTES:
+        raise OutputError(
+            f"cannot write {out}: the disk is full, expected free space; free some, the same command carries on"
+        ) from error

@@ -1,0 +1,97 @@
+"""What a collection is: everything its content depends on, and nothing else (not the number of workers)."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
+
+from playslot_rl.config import EnvConfig, ExperimentConfig, RenderConfig
+from playslot_rl.envs import gym_id
+from playslot_rl.errors import ConfigError
+
+FORMAT = 1
+BLOCK = 1_000_000
+"""Seeds set aside for one value of `seed`: its first half for random episodes, its second half for the expert's."""
+OFFSETS = {"random": 0, "expert": 500_000}
+REDRAW_STRIDE = 10**12
+"""Distance between an episode's seed and the one drawn next where it starts solved: far above all other seeds."""
+
+
+@dataclass(frozen=True)
+class CollectionSpec:
+    """A collection.
+
+    Attributes:
+        policy: `random` or `expert`.
+        episodes: how many.
+        steps: agent steps of each; an episode has one more frame.
+        seed: base seed.
+        noise: standard deviation of Gaussian noise on the expert's actions.
+        storage: `image` or `video`.
+        env: the task; its `max_steps` equals `steps`.
+        render: how frames are drawn.
+        format: version of this record.
+    """
+
+    policy: str
+    episodes: int
+    steps: int
+    seed: int
+    noise: float = 0.0
+    storage: Literal["image", "video"] = "image"
+    env: EnvConfig = field(default_factory=EnvConfig)
+    render: RenderConfig = field(default_factory=RenderConfig)
+    format: int = FORMAT
+
+    @classmethod
+    def make(cls, config: ExperimentConfig, policy: str, episodes: int, steps: int, seed: int) -> CollectionSpec:
+        """Check the request and name it.
+
+        Raises:
+            ConfigError: unknown policy or environment, too few or too many episodes or steps, or a seed whose episodes
+                would be evaluation episodes.
+        """
+        if policy not in OFFSETS:
+            near = difflib.get_close_matches(policy, OFFSETS, n=1)
+            hint = f"; did you mean policy={near[0]}?" if near else "; choose one of these"
+            raise ConfigError(f"unknown policy: got {policy!r}, expected one of {', '.join(sorted(OFFSETS))}{hint}")
+        gym_id(config.env.name)
+        if not 1 <= episodes <= BLOCK // 2:
+            raise ConfigError(f"episodes: got {episodes}, expected 1 to {BLOCK // 2}; split larger sets over seeds")
+        if steps < 2:
+            raise ConfigError(f"steps: got {steps}, expected at least 2; set collect.{policy}_steps")
+        limit = config.evaluation.seed_offset // BLOCK
+        if not 0 <= seed < limit:
+            raise ConfigError(
+                f"seed: got {seed}, expected 0 to {limit - 1}; larger ones are evaluation's, choose a smaller one"
+            )
+        noise = config.collect.noise if policy == "expert" else 0.0
+        env = replace(config.env, max_steps=steps)
+        return cls(policy, episodes, steps, seed, noise, config.collect.storage, env, config.render)
+
+    def episode_seed(self, index: int) -> int:
+        """Seed of episode `index`."""
+        return self.seed * BLOCK + OFFSETS[self.policy] + index
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain nested dict."""
+        return asdict(self)
+
+
+def redraw(seed: int, attempt: int) -> int:
+    """Seed of the `attempt`-th draw (from 0) of the episode with this seed."""
+    return seed + attempt * REDRAW_STRIDE
+
+
+def difference(got: dict[str, Any], expected: dict[str, Any]) -> str:
+    """First setting in which two records differ, as `name: got X, expected Y`; empty if none does."""
+    for name in sorted(set(got) | set(expected)):
+        a, b = got.get(name), expected.get(name)
+        if isinstance(a, dict) and isinstance(b, dict):
+            inner = difference(a, b)
+            if inner:
+                return f"{name}.{inner}"
+        elif a != b:
+            return f"{name}: got {a!r}, expected {b!r}"
+    return ""
