@@ -29,7 +29,7 @@ class _CloningLoss(LossModule):
         Attributes:
             observation: what the network reads.
             action: the target.
-            mask: optional bool (...); False leaves an element out. Not read where it is missing.
+            mask: optional bool (...); False leaves an element's target out. Not read where missing.
         """
 
         observation: NestedKey = keys.SLOTS
@@ -72,13 +72,13 @@ class _CloningLoss(LossModule):
         if predicted.shape != target.shape:
             got, expected = tuple(target.shape), tuple(predicted.shape)
             raise ValueError(f"{self.tensor_keys.action}: got shape {got}, expected {expected} (the network's output)")
-        error = (predicted - target).square().mean(-1)
         mask: Tensor | None = tensordict.get(self.tensor_keys.mask, None)
-        if mask is not None:
-            mask = mask.reshape(error.shape)
-            # Selecting, not multiplying: what is masked out may be anything, NaN too.
-            error = torch.where(mask, error, 0.0) * (mask.numel() / mask.sum().clamp(min=1))
-        return TensorDict({self.out_name: error.mean()}, [])
+        if mask is None:
+            return TensorDict({self.out_name: (predicted - target).square().mean()}, [])
+        mask = mask.reshape(target.shape[:-1])
+        # The target is replaced, not the error multiplied: masked targets may be NaN, and 0 * NaN is NaN in the gradient.
+        error = (predicted - torch.where(mask[..., None], target, predicted.detach())).square().mean(-1)
+        return TensorDict({self.out_name: error.sum() / mask.sum().clamp(min=1)}, [])
 
 
 class BehaviourLoss(_CloningLoss):
@@ -132,7 +132,7 @@ class ActionDecoderLoss(_CloningLoss):
         Attributes:
             observation: the latent action.
             action: the real action.
-            mask: optional bool (...); False leaves an element out. Not read where it is missing.
+            mask: optional bool (...); False leaves an element's target out. Not read where missing.
         """
 
         observation: NestedKey = keys.LATENT_ACTION

@@ -1,0 +1,157 @@
+"""The front door."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from playslot_rl import api
+from playslot_rl.api import PlaySlot
+from playslot_rl.errors import CheckpointError
+from playslot_rl.testing import tiny_config
+
+
+@pytest.fixture(scope="module")
+def model() -> PlaySlot:
+    return PlaySlot.untrained()
+
+
+@pytest.fixture(scope="module")
+def video() -> np.ndarray:
+    return np.random.default_rng(0).integers(256, size=(5, 64, 64, 3), dtype=np.uint8)
+
+
+def test_frames_are_accepted_as_they_come(model: PlaySlot, video: np.ndarray) -> None:
+    tensor = torch.from_numpy(video)
+    layouts = [video, tensor, tensor.movedim(-1, 1), tensor.float() / 255, video.transpose(0, 3, 1, 2) / 255.0]
+    expected, *others = (model.parse(frames) for frames in layouts)
+    assert expected.shape == (5, 4, 32)
+    for slots in others:
+        torch.testing.assert_close(slots, expected, atol=1e-5, rtol=1e-5)
+
+
+def test_a_frame_and_a_batch_of_clips_are_parsed_like_a_clip(model: PlaySlot, video: np.ndarray) -> None:
+    slots = model.parse(video)
+    torch.testing.assert_close(model.parse(video[0]), slots[0], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(model.parse(np.stack([video, video])), torch.stack([slots, slots]), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "frames, message",
+    [
+        (np.zeros((5, 32, 32, 3), np.uint8), r"got shape \(5, 32, 32, 3\), expected \(\.\.\., 64, 64, 3\)"),
+        (np.full((64, 64, 3), 200.0), r"in \[200, 200\], expected uint8 in \[0, 255\] or floats in \[0, 1\]"),
+        (np.full((64, 64, 3), np.nan), r"expected uint8 in \[0, 255\] or floats in \[0, 1\]"),
+        (np.zeros((64, 64, 3), np.int64), r"got torch.int64"),
+        (np.zeros((1, 1, 1, 64, 64, 3), np.uint8), r"got 6 dimensions"),
+    ],
+)
+def test_other_frames_are_refused(model: PlaySlot, frames: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        model.parse(frames)
+
+
+def test_latent_actions_of_a_clip_are_those_of_the_batch(model: PlaySlot, video: np.ndarray) -> None:
+    slots = model.parse(video)
+    single, batch = model.infer_actions(slots), model.infer_actions(slots[None])
+    assert single.z.shape == (4, 8)
+    assert torch.equal(single.z, batch.z[0])
+    assert torch.equal(single.code, batch.code[0])
+    with pytest.raises(ValueError, match="at least 2 frames"):
+        model.infer_actions(slots[:1])
+    with pytest.raises(ValueError, match=r"expected \(\.\.\., 4, 32\)"):
+        model.infer_actions(slots[..., :16])
+
+
+def test_imagining_is_the_predictors_rollout(model: PlaySlot, video: np.ndarray) -> None:
+    slots = model.parse(video)
+    z = model.infer_actions(slots).z
+    future = model.imagine(video[0], z)
+    p, v = model.world_model.inverse_dynamics.split(z[None])
+    expected = model.world_model.predictor.rollout(slots[None, :1], p, v)[0]
+    torch.testing.assert_close(future, expected, atol=1e-5, rtol=1e-5)
+    both = model.imagine(np.stack([video[0], video[1]]), torch.stack([z, z]))
+    torch.testing.assert_close(both[0], future, atol=1e-5, rtol=1e-5)
+    many = model.imagine(video[0], torch.stack([z, -z]))
+    torch.testing.assert_close(many[0], future, atol=1e-5, rtol=1e-5)
+    assert not torch.allclose(many[0], many[1])
+    assert model.decode(future).frames.shape == (4, 3, 64, 64)
+
+
+def test_prototypes_can_be_played_by_number(model: PlaySlot, video: np.ndarray) -> None:
+    numbers = np.array([0, 3, 3])
+    by_value = model.imagine(video[0], model.world_model.inverse_dynamics.prototypes[torch.from_numpy(numbers)])
+    torch.testing.assert_close(model.imagine(video[0], numbers), by_value)
+    with pytest.raises(ValueError, match=r"got prototypes \[0, 5\], expected 0 to 4"):
+        model.imagine(video[0], np.array([0, 5]))
+    continuous = PlaySlot.untrained(tiny_config("continuous"))
+    with pytest.raises(ValueError, match="has no prototypes"):
+        continuous.imagine(video[0], numbers)
+
+
+@pytest.mark.parametrize("shape", [(8,), (3, 7), (2, 2, 2, 8), (0, 8)])
+def test_actions_of_another_shape_are_refused(model: PlaySlot, video: np.ndarray, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"expected \(\[B,\] P, 8\)"):
+        model.imagine(video[0], torch.zeros(shape))
+    with pytest.raises(ValueError, match=r"expected equal numbers|one frame for each"):
+        model.imagine(video[:2], torch.zeros(3, 4, 8))
+
+
+def test_acting_carries_savis_state_until_reset(model: PlaySlot, video: np.ndarray) -> None:
+    assert model.agent is not None
+    model.reset()
+    acted = torch.from_numpy(np.stack([model.act(frame) for frame in video]))
+    with torch.no_grad():
+        expected = model.agent.action_decoder(model.agent.policy(model.parse(video)))
+    torch.testing.assert_close(acted, expected, atol=1e-5, rtol=1e-5)
+    model.reset()
+    np.testing.assert_allclose(model.act(video[0]), acted[0], atol=1e-5)
+    with pytest.raises(ValueError, match="expected one frame"):
+        model.act(video)
+
+
+def test_a_world_model_alone_refuses_to_act(model: PlaySlot, video: np.ndarray) -> None:
+    with pytest.raises(CheckpointError, match="without a policy"):
+        PlaySlot(model.world_model).act(video[0])
+
+
+def test_nothing_is_trained_and_nothing_random_is_left_to_chance(video: np.ndarray) -> None:
+    config = tiny_config()
+    savi = replace(config.model.savi, initial="gaussian")
+    gaussian = PlaySlot.untrained(replace(config, model=replace(config.model, savi=savi)))
+    before = {name: tensor.clone() for name, tensor in gaussian.world_model.state_dict().items()}
+    first, second = gaussian.parse(video), gaussian.parse(video)
+    assert torch.equal(first, second)
+    assert not first.requires_grad
+    gaussian.imagine(video[0], gaussian.infer_actions(first).z)
+    assert all(torch.equal(before[name], t) for name, t in gaussian.world_model.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "api",
+        "imagination",
+        "simulation",
+        "testing",
+        "world_model",
+        "losses.slots",
+        "losses.dynamics",
+        "losses.behaviour",
+    ],
+)
+def test_docstring_examples_run(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from importlib.resources import files
+
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    loaded = importlib.import_module(f"playslot_rl.{module}")
+    if module == "api" and not (files("playslot_rl.pretrained") / "button_press").is_dir():
+        monkeypatch.setattr(api.load, "__doc__", "")  # its example loads the shipped model
+    result = doctest.testmod(loaded, optionflags=doctest.NORMALIZE_WHITESPACE)
+    assert result.attempted > 0
+    assert result.failed == 0
