@@ -107,7 +107,12 @@ def _score(kind: str, x: Floats, y: Floats, x_test: Floats, y_test: Floats, seed
     else:
         # Adam with a fixed number of passes: early stopping would need a split by episodes that sklearn does not make.
         net = MLPRegressor(
-            (64, 64), alpha=1e-3, learning_rate_init=2e-3, batch_size=128, max_iter=60, random_state=seed
+            hidden_layer_sizes=(64, 64),
+            alpha=1e-3,
+            learning_rate_init=2e-3,
+            batch_size=128,
+            max_iter=60,
+            random_state=seed,
         )
         net.set_params(tol=0.0, n_iter_no_change=60)
         model = make_pipeline(StandardScaler(), net)

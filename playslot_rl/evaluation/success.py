@@ -110,7 +110,7 @@ def evaluate(
 
     Returns:
         `protocol`, `episodes`, `seeds`, `success_rate` (0 to 1), `ci95` (Wilson), `mean_steps_to_success` (agent
-        steps), `labelled_demos`, `demos`, `references` (`random`, `expert`, `slot_oracle`: all closed-loop), and extras.
+        steps), `labelled_demos`, `demos`, `references` (`random`, `expert`, `slot_oracle`: closed-loop), and extras.
 
     Raises:
         ConfigError: unknown protocol, or a seed that a training data set holds.

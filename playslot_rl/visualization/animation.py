@@ -1,11 +1,12 @@
 """Animated PNGs: lossless, shown by every browser and by code hosts.
 
-Shapes: T frames, E episodes, H W frame height and width. Frames are uint8 [0, 255].
+Shapes: E episodes, C columns, T frames, H W frame height and width. Frames are uint8 [0, 255].
 """
 
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -46,22 +47,18 @@ def animation(pictures: list[Image.Image], fps: float = 6.0, pause: float = 1.2)
     return buffer.getvalue()
 
 
-def side_by_side(
-    left: Frames, right: Frames, labels: tuple[str, str], titles: list[str], scale: int = 2
-) -> list[Image.Image]:
-    """Frames of an animation: one row an episode, two columns.
+def side_by_side(clips: Frames, columns: Sequence[str], rows: Sequence[str], scale: int = 2) -> list[Image.Image]:
+    """Pictures of an animation: one row an episode, one column a way of running it.
 
     Args:
-        left: (E, T, H, W, 3).
-        right: same shape.
-        labels: column labels.
-        titles: E row labels.
+        clips: (E, C, T, H, W, 3).
+        columns: C labels.
+        rows: E labels.
         scale: enlargement.
 
     Raises:
-        ValueError: the shapes differ.
+        ValueError: wrong shape or number of labels.
     """
-    if left.shape != right.shape or left.ndim != 5:
-        raise ValueError(f"side_by_side: got {left.shape} and {right.shape}, expected two equal (E, T, H, W, 3)")
-    cells = np.stack([left, right], 2)
-    return [image_grid(cells[:, t], titles, list(labels), scale) for t in range(cells.shape[1])]
+    if clips.ndim != 6:
+        raise ValueError(f"side_by_side: got clips {clips.shape}, expected (E, C, T, H, W, 3)")
+    return [image_grid(clips[:, :, t], rows, columns, scale) for t in range(clips.shape[2])]

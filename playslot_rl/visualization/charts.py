@@ -94,6 +94,7 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
     columns = min(columns, len(panels))
     height = -(-len(panels) // columns)
     figure = _figure(3.1 * columns, 2.3 * height)
+    handles: dict[str, Any] = {}
     for index, (stage, name) in enumerate(panels):
         axes = figure.add_subplot(height, columns, index + 1)
         for split, colour, marker in (("train", theme.series[0], ""), ("validation", theme.series[1], "o")):
@@ -108,8 +109,10 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
         axes.set_xlabel("optimiser step", fontsize=9)
         _style(axes, theme)
         axes.tick_params(axis="y", which="minor", labelsize=7, colors=theme.text)
-        if index == 0:
-            axes.legend(frameon=False, labelcolor=theme.text, fontsize=9)
+        handles |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside upper right", ncols=2, frameon=False, labelcolor=theme.text
+    )
     return _png(figure)
 
 
@@ -117,8 +120,8 @@ def loss_names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Names of loss terms in a history: `loss` first, then `loss_...` in the order of appearance."""
     names = dict.fromkeys(k for r in rows for k in r if k == "loss" or k.startswith("loss_"))
     terms = [n for n in names if n != "loss"]
-    # With a single term the sum is the same curve.
-    return terms if len(terms) == 1 else [n for n in names if n == "loss"] + terms
+    # With a single term the sum is the same curve, and it is the one that is validated.
+    return ["loss"] if "loss" in names and len(terms) == 1 else [n for n in names if n == "loss"] + terms
 
 
 def usage_chart(counts: Mapping[str, Sequence[int]], theme: Theme) -> bytes:

@@ -1,0 +1,141 @@
+"""The report's section on latent actions: codebook usage, what a code stands for, what a probe can read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from playslot_rl.errors import DataError
+from playslot_rl.evaluation.probes import code_table, codebook_usage, infer_latents, probe_actions
+from playslot_rl.visualization.charts import usage_chart
+from playslot_rl.visualization.document import Block, Missing, Section, Table, Text
+from playslot_rl.visualization.sections import ReportInput, chart
+from playslot_rl.world_model import WorldModel, module_device
+
+
+@dataclass(frozen=True)
+class LatentData:
+    """Latent actions of a data set.
+
+    Attributes:
+        name: of the data set.
+        codes: (M, 1) or (M, N) int64.
+        actions: (M, A) in [-1, 1]; None for a data set without actions.
+        probe: result of `probe_actions`; None without actions.
+    """
+
+    name: str
+    codes: Any
+    actions: Any
+    probe: dict[str, Any] | None
+
+
+def data_roots(given: ReportInput) -> list[Path]:
+    """Data sets of the run: those its config names, then those in its `data` folder."""
+    config = given.config.data
+    named = [Path(r.strip()) for r in f"{config.root},{config.demos}".split(",") if r.strip()]
+    inside = sorted((given.run / "data").iterdir()) if (given.run / "data").is_dir() else []
+    found = [p for p in [*named, *inside] if (p / "meta" / "info.json").is_file()]
+    return list({p.resolve(): p for p in found}.values())
+
+
+def read_latents(model: WorldModel, root: Path, given: ReportInput, most_episodes: int = 200) -> LatentData:
+    """Latent actions of up to `most_episodes` episodes of a data set, with the probe where it has actions."""
+    from playslot_rl.data.slot_cache import slot_cache
+    from playslot_rl.data.source import open_source
+
+    data = given.config.data
+    source = open_source(root, camera=data.camera, cache=data.cache)
+    prints = str(given.metas.get("slots", {}).get("fingerprint", ""))
+    slots = slot_cache(source, model.savi, prints, data.cache, module_device(model))
+    starts, lengths = source.starts[:most_episodes], source.lengths[:most_episodes]
+    z, codes, episodes = infer_latents(model.inverse_dynamics, slots, starts, lengths, source.actions)
+    if source.actions is None:
+        return LatentData(root.name, codes, None, None)
+    rows = [np.asarray(source.actions[s : s + n - 1]) for s, n in zip(starts, lengths, strict=True) if n > 1]
+    actions = np.concatenate(rows)
+    several = len(np.unique(episodes)) > 1
+    return LatentData(root.name, codes, actions, probe_actions(z, actions, episodes, codes=codes) if several else None)
+
+
+def latent_section(given: ReportInput) -> Section:
+    """Codebook usage, probes, and a table of codes."""
+    title = "Latent actions"
+    if given.world_model is None:
+        return Section(title, [Missing("There is no trained dynamics model.", given.command("train-dynamics"))])
+    roots = data_roots(given)
+    if not roots:
+        return Section(
+            title, [Missing("The run names no data set on this machine.", "playslot collect out=DIR policy=random")]
+        )
+    model = given.world_model
+    sets, blocks = [], list[Block]()
+    for root in roots:
+        try:
+            sets.append(read_latents(model, root, given))
+        except DataError as error:  # the rest of the report does not depend on it
+            blocks.append(Missing(f"A data set cannot be read: {error}.", "playslot collect out=DIR policy=random"))
+    if not sets:
+        return Section(title, blocks)
+    k = model.inverse_dynamics.n_prototypes
+    blocks += _usage(sets, k) if k else []
+    blocks += _probes(sets)
+    if k:
+        blocks += _codes(sets, k)
+    return Section(title, blocks)
+
+
+def _usage(sets: list[LatentData], k: int) -> list[Block]:
+    usage = {d.name: codebook_usage(d.codes, k) for d in sets}
+    rows = [[n, f"{u['used']} of {k}", f"{u['perplexity']:.2f}", str(sum(u["counts"]))] for n, u in usage.items()]
+    counts = {n: u["counts"] for n, u in usage.items()}
+    alt = "Share of transitions by code. " + "; ".join(f"{n}: {', '.join(map(str, c))}" for n, c in counts.items())
+    return [
+        Table(["data set", "codes in use", f"perplexity (1 to {k})", "transitions"], rows),
+        chart("codebook", lambda theme: usage_chart(counts, theme), alt, "Codebook usage."),
+    ]
+
+
+def _r2(value: float | None) -> str:
+    return "–" if value is None else f"{round(value, 2) + 0.0:.2f}"
+
+
+def _probes(sets: list[LatentData]) -> list[Block]:
+    probed = [d for d in sets if d.probe is not None]
+    if not probed:
+        return [Text("No probe of the real action: the data sets carry no actions, or a single episode.")]
+    names = {
+        "linear": "linear (ridge), from z",
+        "mlp": "two-layer network, from z",
+        "code": "linear, from the code alone",
+    }
+    width = probed[0].actions.shape[1]
+    rows = []
+    for d in probed:
+        assert d.probe is not None
+        for key, label in names.items():
+            if key in d.probe:
+                score = d.probe[key]
+                rows.append([f"{d.name}: {label}", _r2(score["mean_r2"]), *(_r2(v) for v in score["r2"])])
+    headers = ["probe", "mean R²", *(f"action {i + 1}" for i in range(width))]
+    held = ", ".join(f"{d.name}: {d.probe['test_episodes']} episodes" for d in probed if d.probe is not None)
+    caption = f"Variance of the real action recovered on held-out episodes ({held}); 1 is all of it, 0 or less is none."
+    return [Table(headers, rows, caption)]
+
+
+def _codes(sets: list[LatentData], k: int) -> list[Block]:
+    labelled = [d for d in sets if d.actions is not None and d.codes.shape[1] == 1]
+    blocks: list[Block] = []
+    for d in labelled:
+        rows = []
+        for row in code_table(d.codes[:, 0], d.actions, k):
+            cells = ["–"] * d.actions.shape[1]
+            if row["mean"] is not None:
+                cells = [f"{m:+.2f} ± {s:.2f}" for m, s in zip(row["mean"], row["std"], strict=True)]
+            rows.append([str(row["code"]), str(row["count"]), *cells])
+        headers = ["code", "transitions", *(f"action {i + 1}" for i in range(d.actions.shape[1]))]
+        blocks.append(Table(headers, rows, f"Real actions by code, mean ± standard deviation ({d.name})."))
+    return blocks

@@ -1,0 +1,93 @@
+"""Imagined futures beside what happens when their actions are executed.
+
+Shapes: E episodes, T agent steps, H W image height and width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from PIL import Image
+
+from playslot_rl.evaluation.controllers import ClosedLoop, OpenLoop
+from playslot_rl.evaluation.episodes import Controller, Episode, TaskPool, run_episodes
+from playslot_rl.evaluation.references import ExpertController
+from playslot_rl.evaluation.video import VideoMetrics, video_metrics
+from playslot_rl.visualization.animation import side_by_side
+from playslot_rl.visualization.frames import to_float, to_uint8
+from playslot_rl.visualization.grid import image_grid
+from playslot_rl.world_model import Agent
+
+Frames = npt.NDArray[np.uint8]
+COLUMNS = ("imagined", "executed", "closed loop")
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """The same episodes imagined, executed open-loop, and run closed-loop.
+
+    Attributes:
+        imagined: (E, T + 1, H, W, 3) frames decoded from the unfolded slots.
+        executed: same shape; the imagined rollout's actions in the simulator.
+        closed: same shape; the agent observing every frame.
+        executed_outcome, closed_outcome: their episodes.
+    """
+
+    imagined: Frames
+    executed: Frames
+    closed: Frames
+    executed_outcome: list[Episode]
+    closed_outcome: list[Episode]
+
+    def metrics(self) -> VideoMetrics:
+        """PSNR and SSIM of the imagined against the executed frames, without the parsed first one."""
+        return video_metrics(to_float(self.imagined[:, 1:]), to_float(self.executed[:, 1:]))
+
+
+def record(pool: TaskPool, controller: Controller, seeds: Sequence[int]) -> tuple[Frames, list[Episode]]:
+    """Frames (E, T + 1, H, W, 3) of whole episodes, past success too, and their outcomes."""
+    size = pool.env.image_size
+    frames = np.zeros((len(seeds), pool.env.max_steps + 1, size, size, 3), np.uint8)
+
+    def keep(episode: int, step: int, frame: Frames) -> None:
+        frames[episode, step] = frame
+
+    return frames, run_episodes(pool, controller, seeds, on_frame=keep, stop=False)
+
+
+def expert_frames(pool: TaskPool, seed: int) -> Frames:
+    """Frames (T + 1, H, W, 3) of one episode of the scripted expert."""
+    return record(pool, ExpertController(), [seed])[0][0]
+
+
+@torch.no_grad()
+def run_rollouts(agent: Agent, pool: TaskPool, seeds: Sequence[int]) -> Rollouts:
+    """Run the episodes of `seeds` both ways."""
+    open_loop = OpenLoop(agent, pool.env.max_steps)
+    executed, executed_outcome = record(pool, open_loop, seeds)
+    slots = torch.cat([rollout.slots for rollout in open_loop.imagined])
+    imagined = np.stack([to_uint8(agent.world_model.savi.decode(s).frames) for s in slots])
+    closed, closed_outcome = record(pool, ClosedLoop(agent), seeds)
+    return Rollouts(imagined, executed, closed, executed_outcome, closed_outcome)
+
+
+def draw_animation(rollouts: Rollouts, scale: int = 2) -> list[Image.Image]:
+    """One picture a step: a row an episode, the three ways of running it side by side."""
+    clips = np.stack([rollouts.imagined, rollouts.executed, rollouts.closed], 1)
+    return side_by_side(clips, COLUMNS, [f"episode {i + 1}" for i in range(len(clips))], scale)
+
+
+def draw_strip(rollouts: Rollouts, columns: int = 8, scale: int = 2) -> Image.Image:
+    """Frames spread evenly over time: three rows an episode."""
+    steps = rollouts.imagined.shape[1]
+    shown = np.unique(np.linspace(0, steps - 1, min(columns, steps)).round().astype(int))
+    rows, labels = [], []
+    for i in range(len(rollouts.imagined)):
+        for name, clip in zip(COLUMNS, (rollouts.imagined, rollouts.executed, rollouts.closed), strict=True):
+            rows.append(clip[i, shown])
+            labels.append(f"{i + 1} {name}")
+    return image_grid(np.stack(rows), labels, [f"t = {t}" for t in shown], scale)

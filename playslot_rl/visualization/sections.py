@@ -1,0 +1,269 @@
+"""The sections of a run's report, each from what the run folder holds; what is missing is named with its command."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.evaluation.episodes import TaskPool
+from playslot_rl.evaluation.seeds import first_seed
+from playslot_rl.evaluation.success import PROTOCOLS
+from playslot_rl.visualization.charts import loss_chart, loss_names, success_chart
+from playslot_rl.visualization.document import Block, Missing, Picture, Section, Table, Text
+from playslot_rl.visualization.palette import DARK, LIGHT, Theme
+from playslot_rl.world_model import Agent, WorldModel
+
+STAGES = ("slots", "dynamics", "policy")
+EPISODES_SHOWN = 3
+
+
+@dataclass(frozen=True)
+class ReportInput:
+    """What the sections are made from.
+
+    Attributes:
+        run: the run folder.
+        config: of the run.
+        world_model, agent: trained models; None where the run has none yet.
+        pool: environments for the pictures.
+        shown: how the run folder is written in commands: relative where that is possible.
+        metas: stage -> `meta.json` of its finished checkpoint.
+    """
+
+    run: Path
+    config: ExperimentConfig
+    world_model: WorldModel | None
+    agent: Agent | None
+    pool: TaskPool
+    shown: str
+    metas: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    @property
+    def first_seed(self) -> int:
+        """First seed of the last evaluation, so that the pictures show episodes that were measured."""
+        results = read_evaluations(self.run)
+        seeds = [result["seeds"][0] for result in results.values()]
+        return int(seeds[0]) if seeds else first_seed(self.config, self.config.seed)
+
+    def command(self, name: str, rest: str = "") -> str:
+        """A `playslot` command on this run."""
+        return f"playslot {name} run={self.shown}{' ' + rest if rest else ''}"
+
+
+def png(picture: Image.Image) -> bytes:
+    """Bytes of a picture."""
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG", optimize=True)
+    return buffer.getvalue()
+
+
+def chart(name: str, draw: Callable[[Theme], bytes], alt: str, caption: str) -> Picture:
+    """A chart drawn for both themes."""
+    return Picture(name, draw(LIGHT), alt, caption, dark=draw(DARK))
+
+
+def percent(rate: float | None) -> str:
+    """`87 %`, or a dash."""
+    return "–" if rate is None else f"{100 * rate:.0f} %"
+
+
+def interval(ci: list[float] | None) -> str:
+    """`79 to 92 %`, or a dash."""
+    return "–" if ci is None else f"{100 * ci[0]:.0f} to {100 * ci[1]:.0f} %"
+
+
+def seconds(value: float | None) -> str:
+    """`42 s`, `7.5 min`, `3.2 h`, or a dash."""
+    if value is None:
+        return "–"
+    if value < 120:
+        return f"{value:.0f} s"
+    return f"{value / 60:.1f} min" if value < 7200 else f"{value / 3600:.1f} h"
+
+
+def read_evaluations(run: Path) -> dict[str, dict[str, Any]]:
+    """Protocol -> `eval_info.json`, for those that are there."""
+    found = {}
+    for protocol in PROTOCOLS:
+        path = run / "evaluation" / protocol / "eval_info.json"
+        if path.is_file():
+            found[protocol] = json.loads(path.read_text())
+    return found
+
+
+# --- success ------------------------------------------------------------------------------------------------------
+
+WAYS = {"simulation": "PlaySlot, in simulation", "imagination": "PlaySlot, in imagination"}
+REFERENCES = {"slot_oracle": "slot oracle", "expert": "scripted expert", "random": "random actions"}
+
+
+def success_section(given: ReportInput) -> Section:
+    """Success table and chart."""
+    results = read_evaluations(given.run)
+    blocks: list[Block] = []
+    if results:
+        rows = _success_rows(results)
+        cells = [[n, percent(r["success_rate"]), interval(r["ci95"]), _steps(r), e] for n, r, _, e in rows]
+        headers = ["", "success rate", "95 % interval", "mean steps to success", "episodes"]
+        blocks.append(Table(headers, cells, "Wilson intervals. References run closed-loop on the same seeds."))
+        drawn = [
+            (n, r["success_rate"], tuple(r["ci95"]), own) for n, r, own, _ in rows if r["success_rate"] is not None
+        ]
+        alt = "; ".join(f"{n}: {percent(rate)}, {interval(list(ci))}" for n, rate, ci, _ in drawn)
+        blocks.append(
+            chart("success", lambda theme: success_chart(drawn, theme), f"Success rates. {alt}.", _ways(given))
+        )
+    for protocol in PROTOCOLS:
+        if protocol not in results:
+            command = given.command("evaluate", f"protocol={protocol}")
+            blocks.append(Missing(f"Success in {protocol} has not been measured.", command))
+    return Section("Success", blocks)
+
+
+def _steps(result: dict[str, Any]) -> str:
+    value = result.get("mean_steps_to_success")
+    return "–" if value is None else f"{value:.1f}"
+
+
+def _ways(given: ReportInput) -> str:
+    return (
+        "Simulation: the agent sees every frame. Imagination: it sees the first frame only, unfolds "
+        f"{given.config.env.max_steps} steps in latent space, and the decoded actions are then executed."
+    )
+
+
+def _success_rows(results: dict[str, dict[str, Any]]) -> list[tuple[str, dict[str, Any], bool, str]]:
+    rows = [(WAYS[p], results[p], True, str(results[p]["episodes"])) for p in PROTOCOLS if p in results]
+    last = next(iter(results.values()))
+    for name, label in REFERENCES.items():
+        if name in last.get("references", {}):
+            rows.append((label, last["references"][name], False, str(last["episodes"])))
+    return rows
+
+
+# --- pictures -----------------------------------------------------------------------------------------------------
+
+
+def rollout_section(given: ReportInput) -> Section:
+    """Imagined beside simulated rollouts: animation, film strip and their agreement."""
+    title = "Imagined and simulated rollouts"
+    if given.agent is None:
+        return Section(title, [Missing("There is no trained policy.", given.command("train-policy"))])
+    from playslot_rl.visualization.animation import animation
+    from playslot_rl.visualization.rollouts import draw_animation, draw_strip, run_rollouts
+
+    start = given.first_seed
+    rollouts = run_rollouts(given.agent, given.pool, range(start, start + EPISODES_SHOWN))
+    pictures, metrics = draw_animation(rollouts), rollouts.metrics()
+    outcome = "; ".join(
+        f"episode {i + 1}: {_outcome(a.steps)} from imagination, {_outcome(b.steps)} closed-loop"
+        for i, (a, b) in enumerate(zip(rollouts.executed_outcome, rollouts.closed_outcome, strict=True))
+    )
+    moving = Picture(
+        "rollouts",
+        animation(pictures),
+        f"Animation of {EPISODES_SHOWN} episodes: imagined frames, the same actions in the simulator, and the agent "
+        "running closed-loop.",
+        f"The first {EPISODES_SHOWN} evaluation seeds, not chosen. {outcome[:1].upper()}{outcome[1:]}.",
+        still=png(pictures[-1]),
+    )
+    steps = len(metrics.psnr_steps)
+    text = (
+        f"Imagined against executed frames over {steps} steps and {EPISODES_SHOWN} episodes: "
+        f"PSNR {metrics.psnr:.1f} dB ({metrics.psnr_steps[0]:.1f} dB at step 1, {metrics.psnr_steps[-1]:.1f} dB at "
+        f"step {steps}), SSIM {metrics.ssim:.3f}."
+    )
+    alt = "Frames of the same episodes at even distances in time, three rows an episode."
+    return Section(
+        title,
+        [moving, Text(text), Picture("rollouts_strip", png(draw_strip(rollouts)), alt, "The same, as a film strip.")],
+    )
+
+
+def _outcome(steps: int | None) -> str:
+    return "not solved" if steps is None else f"solved at step {steps}"
+
+
+def slots_section(given: ReportInput, clip: Callable[[], Any]) -> Section:
+    """Slot masks and reconstructions."""
+    title = "Slots"
+    if given.world_model is None:
+        return Section(title, [Missing("There is no trained SAVi.", given.command("train-slots"))])
+    from playslot_rl.visualization.slots import draw_slots
+
+    alt = "Rows: frames, their reconstructions, the segmentation by slot, and the part of the frame each slot holds."
+    caption = (
+        "A held-out episode of the scripted expert. Segmentation: each pixel in the colour of the slot with the "
+        "largest mask. Slot rows: the slot's colours weighted by its mask, on white."
+    )
+    return Section(title, [Picture("slots", png(draw_slots(given.world_model, clip())), alt, caption)])
+
+
+def prototype_section(given: ReportInput, clip: Callable[[], Any]) -> Section:
+    """Each prototype held for 15 frames."""
+    title = "Action prototypes"
+    if given.world_model is None:
+        return Section(title, [Missing("There is no trained dynamics model.", given.command("train-dynamics"))])
+    model = given.world_model
+    if model.inverse_dynamics.n_prototypes == 0:
+        mode = model.config.inverse_dynamics.mode
+        return Section(title, [Text(f"The latent-action mode is `{mode}`, which has no prototypes.")])
+    from playslot_rl.visualization.prototypes import draw_prototypes
+
+    alt = "One row a prototype: the first frame and imagined frames up to t = 15, then a map of what changed."
+    caption = (
+        "Each prototype held for 15 frames with zero variability, from one parsed frame (t = 0 is real). Change: "
+        "between t = 1 and t = 15, orange where it became brighter, blue where it became darker."
+    )
+    return Section(title, [Picture("prototypes", png(draw_prototypes(model, clip()[0])), alt, caption)])
+
+
+# --- training -----------------------------------------------------------------------------------------------------
+
+
+def read_history(path: Path) -> list[dict[str, Any]]:
+    """Rows of a `metrics.jsonl`; a line that a kill cut off is left out."""
+    rows = []
+    for line in path.read_text().splitlines() if path.is_file() else []:
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            break
+    return rows
+
+
+def training_section(given: ReportInput) -> Section:
+    """Stage table and loss curves."""
+    blocks: list[Block] = []
+    rows = []
+    for stage in STAGES:
+        meta = given.metas.get(stage)
+        if meta is None:
+            blocks.append(Missing(f"Stage {stage} is not finished.", given.command(f"train-{stage}")))
+            continue
+        metrics = ", ".join(f"{k} {v:.3g}" for k, v in meta.get("metrics", {}).items() if isinstance(v, (int, float)))
+        took = seconds(meta.get("seconds"))
+        machine = ", ".join(part for part in (meta.get("gpu"), meta.get("machine")) if part) or "–"
+        rows.append(
+            [stage, str(meta.get("steps", "–")), took, machine, str(meta.get("commit", ""))[:12] or "–", metrics or "–"]
+        )
+    if rows:
+        blocks.insert(0, Table(["stage", "steps", "time", "machine", "commit", "held-out metrics at the end"], rows))
+    paths = {stage: given.run / stage / "metrics.jsonl" for stage in STAGES}
+    histories = {stage: history for stage, path in paths.items() if loss_names(history := read_history(path))}
+    if histories:
+        names = ", ".join(histories)
+        caption = f"Logarithmic where all values are positive. Stages trained in this run: {names}."
+        drawn = chart("losses", lambda theme: loss_chart(histories, theme), f"Loss curves of {names}.", caption)
+        blocks.append(drawn)
+    elsewhere = [stage for stage in given.metas if stage not in histories]
+    if elsewhere:
+        blocks.append(Text(f"No loss curves here for {', '.join(elsewhere)}: trained outside this run folder."))
+    return Section("Training", blocks)

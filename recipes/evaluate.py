@@ -1,0 +1,103 @@
+"""`playslot evaluate run=DIR protocol=simulation|imagination episodes=N seed=S`: success of a trained policy.
+
+Writes `DIR/evaluation/PROTOCOL/eval_info.json` and renews `DIR/report.md` and `DIR/report.html`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.errors import CheckpointError, ConfigError
+
+
+def main(config: ExperimentConfig, report: bool = True) -> None:
+    """Evaluate the policy of `config.run` under `config.protocol` and print the result.
+
+    Args:
+        config: `run`, `protocol`, `episodes` (50 if None), `seed`, `device`, `env`, `render`, `evaluation`.
+        report: renew the run's report afterwards.
+
+    Raises:
+        ConfigError: no run was named, or `out` names another folder.
+        CheckpointError: the run does not exist, has no trained policy, or was made for another frame size.
+        OutputError: the result cannot be written.
+    """
+    run = check_run(config)
+    from playslot_rl.evaluation.episodes import TaskPool
+    from playslot_rl.evaluation.success import check_protocol, evaluate_run, run_facts
+    from playslot_rl.threads import set_threads
+    from playslot_rl.training.checkpoints import load_agent
+
+    check_protocol(config.protocol)
+    run_facts(run)  # a run without a policy is refused before anything is loaded
+    set_threads(config.threads)
+    agent = load_agent(run, device(config))
+    check_environment(config, agent.world_model.env.image_size, agent.world_model.env.action_dim)
+    with TaskPool(config.env, config.render) as pool:
+        result = evaluate_run(run, agent, config, config.protocol, pool)
+        print(describe(result, run))
+        if report:
+            from playslot_rl.visualization.report import write_report
+
+            print(f"report: {write_report(run, agent=agent, pool=pool)}")
+
+
+def check_run(config: ExperimentConfig) -> Path:
+    """The run folder.
+
+    Raises:
+        ConfigError: none was named, or `out` names another folder.
+        CheckpointError: there is no such folder, or it is the shipped world model, which has no policy.
+    """
+    if not config.run:
+        raise ConfigError("run: got nothing, expected the folder of a run with a trained policy, such as run=runs/demo")
+    if config.run == "pretrained":
+        raise CheckpointError("run=pretrained is a world model without a policy; train one by `playslot train-policy`")
+    run = Path(config.run)
+    if not run.is_dir():
+        raise CheckpointError(f"run={config.run}: no such folder, expected a run; make one by `playslot demo`")
+    if config.out and Path(config.out).resolve() != run.resolve():
+        raise ConfigError(
+            f"out: got {config.out}, expected nothing: evaluate writes into run={config.run}; leave it out"
+        )
+    return run
+
+
+def check_environment(config: ExperimentConfig, image_size: int, action_dim: int) -> None:
+    """Refuse an environment whose frames or actions are not those the run was trained on.
+
+    Raises:
+        ConfigError: they differ.
+    """
+    for name, got, expected in (
+        ("image_size", config.env.image_size, image_size),
+        ("action_dim", config.env.action_dim, action_dim),
+    ):
+        if got != expected:
+            raise ConfigError(f"env.{name}: got {got}, expected {expected}, with which run={config.run} was trained")
+
+
+def device(config: ExperimentConfig) -> str:
+    """The configured device; a GPU if there is one and none was configured."""
+    import torch
+
+    return config.device or ("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def describe(result: dict[str, Any], run: Path) -> str:
+    """The result in a few lines."""
+    rows = [(f"PlaySlot, {result['protocol']}", result)]
+    rows += [(name.replace("_", " "), reference) for name, reference in result["references"].items()]
+    lines = []
+    for name, row in rows:
+        if row["success_rate"] is None:
+            continue
+        low, high = row["ci95"]
+        steps = row.get("mean_steps_to_success")
+        mean = "" if steps is None else f", {steps:.1f} agent steps on average"
+        lines.append(f"{name:>22}: {100 * row['success_rate']:3.0f} % ({100 * low:.0f} to {100 * high:.0f} %){mean}")
+    path = run / "evaluation" / result["protocol"] / "eval_info.json"
+    took = result["wall_seconds_with_references"]
+    return "\n".join([*lines, f"{result['episodes']} episodes each, {took:.0f} s; written to {path}"])

@@ -1,0 +1,55 @@
+"""Evaluation seeds stay away from training seeds."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from playslot_rl.config import DataConfig, EvaluationConfig, ExperimentConfig
+from playslot_rl.errors import ConfigError, DataError
+from playslot_rl.evaluation.seeds import check_disjoint, first_seed, recorded_seeds, training_seeds
+
+
+def _data_set(root: Path, content: object) -> Path:
+    (root / "meta").mkdir(parents=True)
+    (root / "meta" / "playslot.json").write_text(json.dumps(content))
+    return root
+
+
+def test_seed_blocks_do_not_meet() -> None:
+    config = ExperimentConfig()
+    assert first_seed(config, 0) == config.evaluation.seed_offset
+    assert first_seed(config, 1) - first_seed(config, 0) == 1_000_000
+
+
+def test_seeds_are_read_from_lists_and_from_episode_records(tmp_path: Path) -> None:
+    assert recorded_seeds(_data_set(tmp_path / "a", {"spec": {"seed": 99}, "seeds": [1, 2]})) == {1, 2}
+    assert recorded_seeds(_data_set(tmp_path / "b", {"episodes": [{"seed": 5}, {"seed": 6}]})) == {5, 6}
+    assert recorded_seeds(tmp_path / "none") == set()
+
+
+def test_seeds_of_all_named_data_sets_and_of_the_run_are_known(tmp_path: Path) -> None:
+    _data_set(tmp_path / "run" / "data" / "expert", {"seeds": [3]})
+    roots = f"{_data_set(tmp_path / 'a', {'seeds': [1]})}, {_data_set(tmp_path / 'b', {'seeds': [2]})}"
+    config = replace(ExperimentConfig(), data=DataConfig(root=roots))
+    assert training_seeds(config, tmp_path / "run") == {1, 2, 3}
+
+
+def test_an_overlap_is_refused() -> None:
+    check_disjoint([1, 2], {3})
+    with pytest.raises(ConfigError, match="seed 2 that is in a training data set"):
+        check_disjoint([1, 2], {2, 3})
+
+
+def test_a_damaged_record_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "playslot.json").write_text("{")
+    with pytest.raises(DataError, match="expected JSON"):
+        recorded_seeds(tmp_path)
+
+
+def test_offset_moves_the_seeds() -> None:
+    assert first_seed(replace(ExperimentConfig(), evaluation=EvaluationConfig(seed_offset=7)), 0) == 7
