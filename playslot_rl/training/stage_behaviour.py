@@ -1,0 +1,141 @@
+"""Stage 3: the latent policy (with the slot oracle beside it), then the action decoder (system.md section 4).
+
+Two `Stage`s for `fit`. The world model is frozen and has labelled the demonstrations before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from playslot_rl import keys
+from playslot_rl.config import BehaviourStageConfig
+from playslot_rl.data.demonstrations import Demonstrations
+from playslot_rl.errors import DataError
+from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.training.seeding import StepGenerators
+
+
+def _draw(count: int, batch: int, generators: StepGenerators, stream: str, device: torch.device) -> Tensor:
+    drawn = torch.randint(count, (batch,), generator=generators.torch(stream, "cpu"))
+    return drawn.to(device)
+
+
+class CloneStage:
+    """Clone latents from parsed slots, and from imagined ones with `config.imagined`; the oracle clones real actions.
+
+    Note: the paper clones from parsed slots only. Imagination then feeds the policy slots it never saw; with the
+    predicted slots of the same demonstrations among its inputs (still without any action label) it has.
+
+    Args:
+        policy: trained in place.
+        oracle: trained in place on the real actions of all demonstrations, from parsed slots; None for none.
+        demos: labelled by the world model.
+        config: batch and options.
+
+    Raises:
+        DataError: an oracle, but no actions.
+    """
+
+    def __init__(
+        self, policy: LatentPolicy, oracle: LatentPolicy | None, demos: Demonstrations, config: BehaviourStageConfig
+    ) -> None:
+        if oracle is not None and demos.actions is None:
+            raise DataError(
+                "behaviour.oracle: got demonstrations without actions, expected some for the slot oracle: "
+                "set behaviour.oracle=false"
+            )
+        self.policy, self.oracle, self.demos, self.config = policy, oracle, demos, config
+        self.criterion = BehaviourLoss(policy)
+        self.oracle_criterion: BehaviourLoss | None = None
+        if oracle is not None:
+            self.oracle_criterion = BehaviourLoss(oracle)
+            self.oracle_criterion.set_keys(action=keys.ACTION)
+        self.inputs = torch.cat((demos.slots, demos.imagined)) if config.imagined else demos.slots
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """Policy, and oracle if there is one."""
+        return {"policy": self.policy} | ({"oracle": self.oracle} if self.oracle is not None else {})
+
+    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        """Cloning error of one batch; the networks share no weights, so the sum trains each as alone."""
+        demos, device = self.demos, self.inputs.device
+        rows = _draw(len(self.inputs), self.config.batch_size, generators, "policy", device)
+        batch = {keys.SLOTS: self.inputs[rows], keys.LATENT_ACTION: demos.latents[rows % len(demos.latents)]}
+        losses = {"policy": self.criterion(TensorDict(batch, [len(rows)]))["loss_policy"]}
+        if self.oracle_criterion is not None and demos.actions is not None:
+            rows = _draw(len(demos.slots), self.config.batch_size, generators, "oracle", device)
+            batch = {keys.SLOTS: demos.slots[rows], keys.ACTION: demos.actions[rows]}
+            losses["oracle"] = self.oracle_criterion(TensorDict(batch, [len(rows)]))["loss_policy"]
+        return {"loss": torch.stack(list(losses.values())).sum(), **losses}
+
+    def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
+        """Unexplained fraction of the latents' variance on the demonstrations, from parsed and from imagined slots."""
+        return {
+            "unexplained_parsed": unexplained(_apply(self.policy, self.demos.slots), self.demos.latents),
+            "unexplained_imagined": unexplained(_apply(self.policy, self.demos.imagined), self.demos.latents),
+        }
+
+
+class DecoderStage:
+    """Regress real actions of the labelled demonstrations.
+
+    Note: with `config.decoder_inputs=policy` the inputs are the trained policy's outputs, on parsed slots and (with
+    `config.imagined`) on imagined ones, which is what the decoder gets at test time; the paper feeds InvDyn's latents.
+
+    Args:
+        decoder: trained in place.
+        policy: trained, frozen.
+        demos: with actions.
+        config: options.
+
+    Raises:
+        DataError: no actions, or fewer demonstrations than `config.labelled_demos`.
+    """
+
+    def __init__(
+        self, decoder: ActionDecoder, policy: LatentPolicy, demos: Demonstrations, config: BehaviourStageConfig
+    ) -> None:
+        if demos.actions is None:
+            raise DataError("action decoder: got demonstrations without actions, expected the feature `action`")
+        self.decoder, self.config = decoder, config
+        self.criterion = ActionDecoderLoss(decoder)
+        rows = demos.labelled(config.labelled_demos)
+        inputs = [demos.latents[rows]]
+        if config.decoder_inputs == "policy":
+            seen = [demos.slots[rows], *([demos.imagined[rows]] if config.imagined else [])]
+            inputs = [_apply(policy, slots) for slots in seen]
+        self.inputs = torch.cat(inputs)
+        self.targets = demos.actions[rows].repeat(len(inputs), 1)
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """The action decoder."""
+        return {"action_decoder": self.decoder}
+
+    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        """Regression error of one batch."""
+        rows = _draw(len(self.inputs), self.config.batch_size, generators, "decoder", self.inputs.device)
+        batch = TensorDict({keys.LATENT_ACTION: self.inputs[rows], keys.ACTION: self.targets[rows]}, [len(rows)])
+        return {"loss": self.criterion(batch)["loss_action"]}
+
+    def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
+        """Unexplained fraction of the actions' variance on the labelled demonstrations."""
+        return {"unexplained": unexplained(self.decoder(self.inputs), self.targets)}
+
+
+def unexplained(predicted: Tensor, target: Tensor) -> float:
+    """Fraction of the targets' variance that predictions leave unexplained (1 - R^2, pooled over dimensions)."""
+    spread = (target - target.mean(dim=0)).square().sum().clamp(min=1e-12)
+    return float((predicted - target).square().sum() / spread)
+
+
+@torch.no_grad()
+def _apply(network: nn.Module, inputs: Tensor) -> Tensor:
+    return torch.cat([network(part) for part in inputs.split(1024)])

@@ -1,0 +1,101 @@
+"""Stage 2: InvDyn and cOCVP on the cached slots of a frozen SAVi (system.md section 3). A `Stage` for `fit`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from playslot_rl import keys
+from playslot_rl.config import DynamicsStageConfig
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.windows import all_windows, sample_windows, split_episodes
+from playslot_rl.losses.common import total_loss
+from playslot_rl.losses.dynamics import DynamicsLoss
+from playslot_rl.training.seeding import StepGenerators, step_generator
+from playslot_rl.world_model import WorldModel
+
+VALIDATION_WINDOWS = 32
+Rows = npt.NDArray[np.int64]
+
+
+class DynamicsStage:
+    """Roll out from parsed seed frames under inferred latent actions.
+
+    Args:
+        model: world model; its SAVi is frozen, the rest is trained in place.
+        source: unlabelled videos.
+        slots: their cached slots (F, N, D).
+        config: rollout lengths, weights.
+        validation: fraction of episodes held out.
+        seed: of the split.
+        device: where `model` is.
+    """
+
+    def __init__(
+        self,
+        model: WorldModel,
+        source: EpisodeFrames,
+        slots: npt.NDArray[np.float32],
+        config: DynamicsStageConfig,
+        *,
+        validation: float,
+        seed: int,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.model, self.source, self.slots, self.config, self.device = model, source, slots, config, device
+        self.criterion = DynamicsLoss(model.inverse_dynamics, model.predictor, model.savi, config)
+        if self.criterion.needs_actions:
+            source.require_actions()
+        self.frames = config.seed_frames + config.predicted_frames
+        self.train_episodes, held_out = split_episodes(source.episodes, validation, seed)
+        windows = all_windows(source.starts, source.lengths, self.frames, self.frames, held_out)
+        self.validation_rows = windows[:: max(1, len(windows) // VALIDATION_WINDOWS)][:VALIDATION_WINDOWS]
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """InvDyn and cOCVP."""
+        return {"inverse_dynamics": self.model.inverse_dynamics, "predictor": self.model.predictor}
+
+    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+        """Image, slot and quantiser loss of one batch of clips."""
+        self.model.savi.precision = self.config.precision
+        teacher = step < self.config.teacher_steps
+        out = self.criterion(self._batch(self._sample(generators)), generators.torch("latent"), teacher)
+        logged = {key: value for key, value in out.items() if not key.startswith("loss_")}
+        return {"loss": total_loss(out), "loss_vq": out["loss_vq"], **logged}
+
+    def validate(self, step: int) -> Mapping[str, float]:
+        """Errors of autoregressive rollouts on held-out clips, with the latents' means, in fp32."""
+        self.model.savi.precision = "fp32"
+        outs = [
+            self.criterion(self._batch(rows), step_generator(0, step, "validation", self.device))
+            for rows in np.array_split(self.validation_rows, max(1, len(self.validation_rows) // 8))
+        ]
+        names = ("mse_image", "mse_slot", "psnr", "usage", "perplexity")
+        return {name: float(np.mean([float(out[name]) for out in outs])) for name in names}
+
+    def _sample(self, generators: StepGenerators) -> Rows:
+        config, numpy = self.config, generators.numpy("windows")
+        rows = sample_windows(
+            self.source.starts, self.source.lengths, self.frames, config.batch_size, numpy, self.train_episodes
+        )
+        if config.from_start > 0:
+            fits = self.train_episodes[self.source.lengths[self.train_episodes] >= self.frames]
+            first = self.source.starts[numpy.choice(fits, config.batch_size)]
+            chosen = numpy.random(config.batch_size) < config.from_start
+            rows[chosen] = first[chosen, None] + np.arange(self.frames)
+        return rows
+
+    def _batch(self, rows: Rows) -> TensorDict:
+        batch = {
+            keys.SLOTS: torch.from_numpy(self.slots[rows]).to(self.device),
+            keys.PIXELS: self.source.pixels(rows).to(self.device),
+        }
+        if self.criterion.needs_actions:
+            batch[keys.ACTION] = torch.from_numpy(self.source.require_actions()[rows]).to(self.device)
+        return TensorDict(batch, [len(rows)])

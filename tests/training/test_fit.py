@@ -1,0 +1,260 @@
+"""The fit loop: resuming, faults, logs."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from toy_stage import ToyStage, toy_config, train
+
+import playslot_rl.training.resume as resume_module
+from playslot_rl.config import LoggingConfig
+from playslot_rl.errors import CheckpointError, ConfigError, OutputError, TrainingError
+from playslot_rl.training.fit import fit
+from playslot_rl.training.logging import History
+from playslot_rl.training.tensors import load_tensors, module_tensors, save_tensors
+
+
+def tensors(folder: Path, step: int) -> dict[str, torch.Tensor]:
+    last = folder / "checkpoints" / f"step_{step:08d}"
+    return load_tensors(last / "modules.safetensors") | load_tensors(last / "optimizer.safetensors")
+
+
+def assert_equal(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
+    assert one.keys() == other.keys()
+    different = [key for key in one if not torch.equal(one[key], other[key])]
+    assert different == []
+
+
+def stop_at(monkeypatch: pytest.MonkeyPatch, step: int, error: BaseException) -> None:
+    """Make the toy stage fail when it reaches a step."""
+    original = ToyStage.loss
+
+    def loss(self: ToyStage, number: int, generators: object) -> dict[str, torch.Tensor]:
+        if number == step:
+            raise error
+        return original(self, number, generators)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(ToyStage, "loss", loss)
+
+
+@pytest.mark.parametrize("step", [1, 3, 8, 11])
+def test_a_resumed_run_ends_with_the_same_weights_buffers_and_optimiser(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    train(tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        stop_at(patch, step, KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            train(tmp_path / "parts")
+    stage, result = train(tmp_path / "parts")
+    assert result.resumed_from == step - step % 3
+    assert stage.steps_seen == 12 - result.resumed_from
+    assert_equal(tensors(tmp_path / "parts", 12), tensors(tmp_path / "whole", 12))
+    rows = [History(tmp_path / name / "metrics.jsonl").read() for name in ("whole", "parts")]
+    for row in rows[0] + rows[1]:
+        del row["seconds"]
+    assert rows[0] == rows[1]
+
+
+def test_training_changes_weights_and_codebook_but_not_the_frozen_part(tmp_path: Path) -> None:
+    before = module_tensors(ToyStage().modules)
+    train(tmp_path)
+    after = tensors(tmp_path, 12)
+    changed = {key for key in before if not torch.equal(before[key], after[key])}
+    assert "encoder.2.weight" not in changed
+    assert {"encoder.0.weight", "encoder.1.running_mean", "decoder.weight"} <= changed
+    assert any("quantizer" in key for key in changed)
+
+
+def test_a_run_killed_by_the_system_ends_with_the_same_weights(tmp_path: Path) -> None:
+    script = Path(__file__).with_name("toy_stage.py")
+    command = [sys.executable, str(script), str(tmp_path / "killed"), "12", "0.1"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(command, env=environment)
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "killed" / "checkpoints" / "step_00000003").exists():
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "killed" / "checkpoints" / "step_00000012").exists()
+    assert train(tmp_path / "killed")[1].resumed_from >= 3
+    train(tmp_path / "whole")
+    assert_equal(tensors(tmp_path / "killed", 12), tensors(tmp_path / "whole", 12))
+
+
+def test_what_a_kill_left_half_written_is_removed(tmp_path: Path) -> None:
+    leftover = tmp_path / "checkpoints" / ".step_00000099.tmp-0123"
+    leftover.mkdir(parents=True)
+    (leftover / "modules.safetensors").write_bytes(b"half")
+    (tmp_path / "metrics.jsonl").write_text('{"step": 50, "split": "train"}\n{"step": 5')
+    _, result = train(tmp_path)
+    assert result.resumed_from == 0
+    assert not leftover.exists()
+    assert all(row["step"] <= 12 for row in History(tmp_path / "metrics.jsonl").read())
+
+
+def test_a_finished_stage_is_not_trained_again(tmp_path: Path) -> None:
+    _, first = train(tmp_path)
+    stage, second = train(tmp_path)
+    assert stage.steps_seen == 0
+    assert second.resumed_from == second.step == 12
+    assert second.metrics == first.metrics
+    assert second.metrics["step"] == 12
+
+
+def test_two_checkpoints_are_kept_and_none_is_a_pickle(tmp_path: Path) -> None:
+    train(tmp_path)
+    kept = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+    assert kept == ["step_00000009", "step_00000012"]
+    suffixes = {path.suffix for path in (tmp_path / "checkpoints").rglob("*") if path.is_file()}
+    assert suffixes == {".safetensors", ".json"}
+
+
+def test_a_nan_loss_stops_and_keeps_the_last_good_checkpoint(tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match=r"loss is nan at step 8.*step_00000006") as caught:
+        fit(ToyStage(nan_at=7), toy_config(), tmp_path, name="toy", seed=3, identity={"data": "abc"})
+    assert "\n" not in str(caught.value)
+    train(tmp_path / "whole")
+    _, result = train(tmp_path)
+    assert result.resumed_from == 6
+    assert_equal(tensors(tmp_path, 12), tensors(tmp_path / "whole", 12))
+
+
+def test_a_nan_before_the_first_checkpoint_says_so(tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match="no checkpoint yet"):
+        fit(ToyStage(nan_at=0), toy_config(), tmp_path, name="toy", seed=3)
+
+
+def test_an_infinite_gradient_of_a_finite_loss_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = ToyStage.loss
+
+    def loss(self: ToyStage, step: int, generators: object) -> dict[str, torch.Tensor]:
+        values = original(self, step, generators)  # type: ignore[arg-type]
+        values["loss"] = values["loss"] + (values["error"] * 0).sqrt()
+        return values
+
+    monkeypatch.setattr(ToyStage, "loss", loss)
+    with pytest.raises(TrainingError, match=r"gradient norm is (inf|nan) at step 1"):
+        train(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"), [({"lr": 0.02}, "toy.optim.lr"), ({"steps": 20}, "toy.steps")], ids=["lr", "steps"]
+)
+def test_a_changed_config_is_refused(tmp_path: Path, changes: dict[str, float], key: str) -> None:
+    train(tmp_path)
+    before = tensors(tmp_path, 12)
+    with pytest.raises(CheckpointError, match=f"^{key}: got .*, expected .*out=") as caught:
+        fit(ToyStage(), toy_config(**changes), tmp_path, name="toy", seed=3, identity={"data": "abc"})  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+    assert_equal(tensors(tmp_path, 12), before)
+
+
+@pytest.mark.parametrize(("seed", "data", "key"), [(4, "abc", "seed"), (3, "xyz", "data")])
+def test_another_seed_or_data_set_is_refused(tmp_path: Path, seed: int, data: str, key: str) -> None:
+    train(tmp_path)
+    with pytest.raises(CheckpointError, match=f"^{key}: got"):
+        fit(ToyStage(), toy_config(), tmp_path, name="toy", seed=seed, identity={"data": data})
+
+
+def test_intervals_may_change_when_resuming(tmp_path: Path) -> None:
+    train(tmp_path)
+    config = toy_config(checkpoint_every=5, log_every=1)
+    assert fit(ToyStage(), config, tmp_path, name="toy", seed=3, identity={"data": "abc"}).step == 12
+
+
+@pytest.mark.parametrize("name", ["modules.safetensors", "optimizer.safetensors", "state.json"])
+def test_a_truncated_checkpoint_is_refused(tmp_path: Path, name: str) -> None:
+    train(tmp_path)
+    path = tmp_path / "checkpoints" / "step_00000012" / name
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(CheckpointError, match="damaged") as caught:
+        train(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_checkpoint_with_a_missing_tensor_is_refused(tmp_path: Path) -> None:
+    train(tmp_path)
+    path = tmp_path / "checkpoints" / "step_00000012" / "modules.safetensors"
+    kept = load_tensors(path)
+    del kept["decoder.bias"]
+    save_tensors(path, kept)
+    with pytest.raises(CheckpointError, match=r"misses tensor decoder\.bias"):
+        train(tmp_path)
+
+
+def test_a_full_disk_keeps_the_last_good_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = resume_module.save_tensors
+
+    def full(path: Path, values: dict[str, torch.Tensor]) -> None:
+        if "step_00000006" in str(path):
+            (path.parent / "half").write_bytes(b"half")
+            raise OSError(errno.ENOSPC, "No space left on device")
+        original(path, values)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(resume_module, "save_tensors", full)
+        with pytest.raises(OutputError, match="the disk is full"):
+            train(tmp_path)
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["step_00000003"]
+    assert train(tmp_path)[1].resumed_from == 3
+
+
+def test_an_interrupt_says_where_it_carries_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stop_at(monkeypatch, 4, KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path)
+    assert "carries on from step 3 " in capsys.readouterr().err
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints").write_text("mine")
+    with pytest.raises(OutputError, match="is a file"):
+        train(tmp_path)
+    assert (tmp_path / "checkpoints").read_text() == "mine"
+
+
+def test_plain_progress_lines_where_there_is_no_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    logging = LoggingConfig(backend="none", progress=True)
+    fit(ToyStage(), toy_config(log_every=1), tmp_path, name="toy", seed=3, logging=logging)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(",")[0] for line in lines] == ["toy: step 10/12", "toy: step 12/12"]
+    assert "steps/s" in lines[0]
+
+
+def test_tensorboard_logs_are_written(tmp_path: Path) -> None:
+    logging = LoggingConfig(backend="tensorboard", progress=False)
+    fit(ToyStage(), toy_config(), tmp_path, name="toy", seed=3, logging=logging)
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(tmp_path / "logs"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("toy/train/loss")] == [1, 2, 4, 6, 8, 10, 12]
+    rows = [row for row in History(tmp_path / "metrics.jsonl").read() if row["split"] == "validation"]
+    assert [row["step"] for row in rows] == [4, 8, 12]
+
+
+def test_a_missing_logging_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(ConfigError, match=r"playslot_rl\[wandb\]"):
+        fit(ToyStage(), toy_config(), tmp_path, name="toy", seed=3, logging=LoggingConfig(backend="wandb"))
+
+
+def test_the_stored_state_is_readable_json(tmp_path: Path) -> None:
+    train(tmp_path)
+    state = json.loads((tmp_path / "checkpoints" / "step_00000012" / "state.json").read_text())
+    assert state["step"] == 12
+    assert state["identity"]["toy"]["optim"]["lr"] == 0.01
