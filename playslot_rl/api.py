@@ -37,7 +37,7 @@ def load(run: str | Path = "pretrained", device: str = "", seed: int = 0) -> Pla
     """Load a run folder, or the world model that ships with the package.
 
     Args:
-        run: folder of a run, or `pretrained`, which has no policy and so cannot `act`.
+        run: folder of a run, or `pretrained`. Without a finished `train-policy` the model cannot `act`.
         device: torch device; empty means a GPU if there is one.
         seed: of sampled initial slots (only models with `initial: gaussian` draw any).
 
@@ -50,13 +50,13 @@ def load(run: str | Path = "pretrained", device: str = "", seed: int = 0) -> Pla
         >>> model.world_model.slot_shape[0]
         4
     """
-    from playslot_rl.training.checkpoints import checkpoint_folder, load_agent, load_world_model
+    from playslot_rl.training.checkpoints import checkpoint_folder, load_agent, load_world_model, run_folder
 
-    target = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    if str(run) != "pretrained" and (checkpoint_folder(Path(run), "policy") / "meta.json").is_file():
-        agent = load_agent(run).to(target)
+    target = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    if (checkpoint_folder(run_folder(run), "policy") / "meta.json").is_file():
+        agent = load_agent(run, target)
         return PlaySlot(agent.world_model, agent, seed)
-    return PlaySlot(load_world_model(run).to(target), None, seed)
+    return PlaySlot(load_world_model(run, target), None, seed)
 
 
 class PlaySlot:

@@ -5,15 +5,20 @@ from __future__ import annotations
 import doctest
 import importlib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+import playslot_rl
 from playslot_rl import api
 from playslot_rl.api import PlaySlot
+from playslot_rl.config import to_dict
 from playslot_rl.errors import CheckpointError
 from playslot_rl.testing import tiny_config
+from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
+from playslot_rl.world_model import Agent
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +135,45 @@ def test_nothing_is_trained_and_nothing_random_is_left_to_chance(video: np.ndarr
     assert not first.requires_grad
     gaussian.imagine(video[0], gaussian.infer_actions(first).z)
     assert all(torch.equal(before[name], t) for name, t in gaussian.world_model.state_dict().items())
+
+
+def write_stages(run: Path, agent: Agent, stages: tuple[str, ...]) -> None:
+    config = tiny_config()
+    plain = {"env": to_dict(config.env), "model": to_dict(config.model)}
+    world = agent.world_model
+    modules = {
+        "slots": {"savi": world.savi},
+        "dynamics": {"inverse_dynamics": world.inverse_dynamics, "predictor": world.predictor},
+        "policy": {"policy": agent.policy, "action_decoder": agent.action_decoder},
+    }
+    parents: dict[str, str] = {}
+    for stage in stages:
+        saved = save_stage(
+            checkpoint_folder(run, stage),
+            stage=stage,
+            modules=modules[stage],
+            config=plain,
+            data={},
+            parents=parents,
+            metrics={},
+            steps=1,
+            seconds=0.0,
+        )
+        parents = {**parents, stage: saved.fingerprint}
+
+
+def test_a_run_folder_is_loaded_with_what_it_has(model: PlaySlot, video: np.ndarray, tmp_path: Path) -> None:
+    assert model.agent is not None
+    write_stages(tmp_path / "world", model.agent, ("slots", "dynamics"))
+    write_stages(tmp_path / "whole", model.agent, ("slots", "dynamics", "policy"))
+    world, whole = playslot_rl.load(tmp_path / "world", "cpu"), playslot_rl.load(str(tmp_path / "whole"), "cpu")
+    torch.testing.assert_close(world.parse(video), model.parse(video))
+    with pytest.raises(CheckpointError, match="without a policy"):
+        world.act(video[0])
+    model.reset()
+    np.testing.assert_allclose(whole.act(video[0]), model.act(video[0]), atol=1e-6)
+    with pytest.raises(CheckpointError, match="no such folder"):
+        playslot_rl.load(tmp_path / "missing")
 
 
 @pytest.mark.parametrize(

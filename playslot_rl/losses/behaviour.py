@@ -76,7 +76,7 @@ class _CloningLoss(LossModule):
         if mask is None:
             return TensorDict({self.out_name: (predicted - target).square().mean()}, [])
         mask = mask.reshape(target.shape[:-1])
-        # The target is replaced, not the error multiplied: masked targets may be NaN, and 0 * NaN is NaN in the gradient.
+        # The target is replaced, not the error multiplied: it may be NaN, and 0 * NaN is NaN in the gradient.
         error = (predicted - torch.where(mask[..., None], target, predicted.detach())).square().mean(-1)
         return TensorDict({self.out_name: error.sum() / mask.sum().clamp(min=1)}, [])
 
