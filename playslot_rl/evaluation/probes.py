@@ -23,8 +23,8 @@ Ints = npt.NDArray[np.int64]
 def infer_latents(
     model: InverseDynamics,
     slots: npt.NDArray[np.float32],
-    starts: Sequence[int],
-    lengths: Sequence[int],
+    starts: Sequence[int] | Ints,
+    lengths: Sequence[int] | Ints,
     actions: npt.NDArray[np.float32] | None = None,
 ) -> tuple[Floats, Ints, Ints]:
     """Latent actions of whole episodes.

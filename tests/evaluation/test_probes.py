@@ -43,7 +43,8 @@ def test_whole_episodes_are_held_out_and_the_probe_repeats() -> None:
     actions = names[episodes][:, None].astype(np.float32)
     result = probe_actions(keyed, actions, episodes)
     assert result["linear"]["mean_r2"] < 0.2
-    assert result["train"] + result["test"] == len(z) and result["test_episodes"] == 6
+    assert result["train"] + result["test"] == len(z)
+    assert result["test_episodes"] == 6
     assert result == probe_actions(keyed, actions, episodes)
 
 
@@ -51,7 +52,8 @@ def test_an_action_that_never_varies_has_no_score() -> None:
     z, _, episodes = _data()
     actions = np.stack([z[:, 0], np.zeros(len(z))], 1).astype(np.float32)
     score = probe_actions(z, actions, episodes)["linear"]
-    assert score["r2"][1] is None and score["mean_r2"] == score["r2"][0]
+    assert score["r2"][1] is None
+    assert score["mean_r2"] == score["r2"][0]
 
 
 def test_code_probe_sees_the_code_only() -> None:
@@ -81,7 +83,9 @@ def test_perplexity_counts_the_codes_in_equal_use() -> None:
 def test_code_table_gives_the_mean_action_of_each_code() -> None:
     rows = code_table(np.array([0, 0, 2]), np.array([[0.0], [1.0], [-1.0]], np.float32), 3)
     assert [row["count"] for row in rows] == [2, 0, 1]
-    assert rows[0]["mean"] == [0.5] and rows[1]["mean"] is None and rows[2]["std"] == [0.0]
+    assert rows[0]["mean"] == [0.5]
+    assert rows[1]["mean"] is None
+    assert rows[2]["std"] == [0.0]
 
 
 @pytest.mark.parametrize("multi", [False, True])
@@ -92,7 +96,8 @@ def test_latents_of_whole_episodes_do_not_cross_their_borders(multi: bool) -> No
     model.eval()
     slots = torch.randn(9, 4, 32).numpy()
     z, codes, episodes = infer_latents(model, slots, [0, 5], [5, 4])
-    assert z.shape == (7, 32 if multi else 8) and codes.shape == (7, 4 if multi else 1)
+    assert z.shape == (7, 32 if multi else 8)
+    assert codes.shape == (7, 4 if multi else 1)
     assert episodes.tolist() == [0] * 4 + [1] * 3
     alone, _, _ = infer_latents(model, slots[5:], [0], [4])
     np.testing.assert_allclose(z[4:], alone, atol=1e-6)

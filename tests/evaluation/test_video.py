@@ -18,7 +18,8 @@ def test_psnr_of_a_known_error() -> None:
 def test_equal_frames_have_the_highest_scores() -> None:
     frames = torch.rand(1, 2, 3, 32, 32, generator=torch.Generator().manual_seed(0))
     metrics = video_metrics(frames, frames)
-    assert metrics.psnr == pytest.approx(100.0) and metrics.ssim == pytest.approx(1.0)
+    assert metrics.psnr == pytest.approx(100.0)
+    assert metrics.ssim == pytest.approx(1.0)
 
 
 def test_psnr_is_averaged_over_frames_not_over_errors() -> None:
@@ -34,7 +35,8 @@ def test_steps_are_kept_apart() -> None:
     predicted = target.clone()
     predicted[:, 1] = 1 - predicted[:, 1]
     first, second = video_metrics(predicted, target).ssim_steps
-    assert first == pytest.approx(1.0) and second < 0.5
+    assert first == pytest.approx(1.0)
+    assert second < 0.5
 
 
 def test_other_shapes_are_refused() -> None:

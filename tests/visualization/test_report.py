@@ -1,0 +1,156 @@
+"""The report of a run: whole, partial and broken."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.errors import ConfigError, DataError
+from playslot_rl.testing import tiny_config
+from playslot_rl.visualization import latents
+from playslot_rl.visualization.charts import loss_names
+from playslot_rl.visualization.document import Document, Missing, Section, Table, Text
+from playslot_rl.visualization.html import to_html
+from playslot_rl.visualization.markdown import to_markdown
+from playslot_rl.visualization.report import write_report
+from playslot_rl.world_model import Agent, WorldModel
+
+REFERENCES = {
+    "random": {"success_rate": 0.0, "ci95": [0.0, 0.071]},
+    "expert": {"success_rate": 1.0, "ci95": [0.93, 1.0], "mean_steps_to_success": 14.5},
+    "slot_oracle": {"success_rate": None, "ci95": None},
+}
+
+
+class _Page(HTMLParser):
+    """Open tags, addresses and pictures without alternative text."""
+
+    VOID = ("meta", "img", "source", "br")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stack: list[str] = []
+        self.addresses: list[str] = []
+        self.silent = 0
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.addresses += [str(values[k]) for k in ("src", "srcset", "href") if k in values]
+        self.silent += tag == "img" and not values.get("alt")
+        if tag not in self.VOID:
+            self.stack.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.stack.pop() == tag
+
+
+def _check_page(text: str) -> None:
+    page = _Page()
+    page.feed(text)
+    assert page.stack == []
+    assert page.silent == 0
+    assert page.addresses
+    assert all(a.startswith(("data:image/png;base64,", "#")) for a in page.addresses)
+    style = text[text.index("<style>") : text.index("</style>")]
+    assert "url(" not in style
+    assert "@import" not in style
+
+
+def _run(folder: Path, config: ExperimentConfig) -> Path:
+    run = folder / "run"
+    for protocol, rate in (("simulation", 0.98), ("imagination", 0.5)):
+        result = {"protocol": protocol, "episodes": 50, "seeds": list(range(10**9, 10**9 + 50)), "success_rate": rate}
+        result |= {"ci95": [0.4, 0.99], "mean_steps_to_success": None, "references": REFERENCES, "seed": 0}
+        path = run / "evaluation" / protocol / "eval_info.json"
+        path.parent.mkdir(parents=True)
+        path.write_text(json.dumps(result))
+    for stage in ("slots", "policy"):
+        (run / stage / "checkpoint").mkdir(parents=True)
+        meta = {"steps": 5, "seconds": 3.0, "metrics": {"psnr": 20.0}, "demos": 9, "labelled_demos": 4}
+        (run / stage / "checkpoint" / "meta.json").write_text(json.dumps(meta))
+        rows = [{"step": s, "split": "train", "loss": 1 / (s + 1)} for s in range(5)]
+        (run / stage / "metrics.jsonl").write_text("\n".join(map(json.dumps, rows)) + '\n{"step": 5, "lo')
+    (run / "config.json").write_text(json.dumps(to_dict(config)))
+    return run
+
+
+def _agent(config: ExperimentConfig) -> Agent:
+    torch.manual_seed(0)
+    agent = Agent.untrained(WorldModel(config.model, config.env)).train()
+    agent.world_model.inverse_dynamics(torch.randn(4, 9, 4, 32))  # fills the codebook
+    return agent.eval()
+
+
+def test_report_of_a_whole_run_is_self_contained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = tiny_config(max_steps=2)
+    rng = np.random.default_rng(0)
+    z, actions = rng.normal(size=(40, 8)).astype(np.float32), rng.normal(size=(40, 4)).astype(np.float32)
+    codes, episodes = rng.integers(0, 5, (40, 1)), np.repeat(np.arange(4), 10)
+    probe = latents.probe_actions(z, actions, episodes, codes=codes)
+    monkeypatch.setattr(latents, "data_roots", lambda _: [Path("expert"), Path("broken")])
+
+    def read(model: WorldModel, root: Path, given: object) -> latents.LatentData:
+        if root.name == "broken":
+            raise DataError("broken: no such thing")
+        return latents.LatentData(root.name, codes, actions, probe)
+
+    monkeypatch.setattr(latents, "read_latents", read)
+    run = _run(tmp_path, config)
+    path = write_report(run, agent=_agent(config))
+    html, text = path.read_text(), (run / "report.md").read_text()
+    _check_page(html)
+    for title in ("Success", "rollouts", "Slots", "Action prototypes", "Latent actions", "Training", "Settings"):
+        assert re.search(f"<h2>.*{title}", html), title
+    assert "98 %" in html
+    assert "9 demonstration videos, the real actions of 4 of them" in text
+    assert "broken: no such thing" in text
+    assert "Stage dynamics is not finished" in text
+    named = re.findall(r"\]\((figures/[a-z_]+\.png)\)", text)
+    assert len(named) == 7
+    assert all((run / name).stat().st_size > 500 for name in named)
+    assert str(tmp_path) not in html + text  # no path of this machine
+
+
+def test_report_of_an_empty_run_says_what_is_missing_and_how_to_make_it(tmp_path: Path) -> None:
+    config = tiny_config()
+    path = write_report(tmp_path, config)
+    _check_page(path.read_text())
+    text = (tmp_path / "report.md").read_text()
+    for command in ("evaluate", "train-policy", "train-slots", "train-dynamics"):
+        assert f"`playslot {command} run={tmp_path.name}" in text
+
+
+def test_a_run_without_config_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="expected the config of a run"):
+        write_report(tmp_path)
+
+
+def test_text_is_escaped_in_both_formats() -> None:
+    blocks = [Text("a < b & `c<d>`"), Table(["x|y"], [["<b>"]], "note"), Missing("No <i>.", "playslot a=<b>")]
+    document = Document("<t>", "lead", [Section("<s>", blocks)])
+    html = to_html(document)
+    assert "<code>c&lt;d&gt;</code>" in html
+    assert "a &lt; b &amp;" in html
+    assert not re.search("<(b|i|t|s)>", html)
+    assert "x\\|y" in to_markdown(document)
+
+
+def test_a_single_loss_term_is_drawn_once() -> None:
+    assert loss_names([{"step": 1, "loss": 1.0, "loss_reconstruction": 1.0}]) == ["loss"]
+    assert loss_names([{"loss_a": 1.0, "loss": 1.0}, {"loss_b": 1.0, "lr": 1.0}]) == ["loss", "loss_a", "loss_b"]
+    assert loss_names([]) == []
+
+
+def test_a_mode_without_prototypes_is_said_so(tmp_path: Path) -> None:
+    config = replace(tiny_config(mode="continuous", max_steps=2))
+    model = WorldModel(config.model, config.env)
+    write_report(tmp_path, config, world_model=model)
+    assert "mode is `continuous`, which has no prototypes" in (tmp_path / "report.md").read_text()
