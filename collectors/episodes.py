@@ -27,6 +27,7 @@ from playslot_rl.collectors.policies import EPISODE_SEED, EPISODE_STEP, EXPERT_A
 from playslot_rl.collectors.spec import CollectionSpec, redraw
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.envs import make_env, task_env
+from playslot_rl.envs.rendering import check_rendering
 from playslot_rl.envs.torchrl import TensorView, View, wrap
 from playslot_rl.errors import ConfigError, PlaySlotError
 
@@ -198,7 +199,7 @@ def record(spec: CollectionSpec, indices: Sequence[int], workers: int) -> Iterat
     if not wanted:
         return
     if workers > 1:
-        make_env(spec.env, spec.render).close()  # a missing GL backend is one line here, many in the workers
+        check_rendering()  # a missing GL backend is one line here, many in the workers
     collector = _make_collector(spec, [(i, spec.episode_seed(i)) for i in sorted(wanted)], workers)
     try:
         batches = iter(collector)

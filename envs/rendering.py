@@ -148,3 +148,20 @@ class FrameRenderer:
         """Free the GL context; safe to call twice."""
         self._finalizer()
         atexit.unregister(self._finalizer)
+
+
+def check_rendering() -> npt.NDArray[np.uint8]:
+    """Draw one frame of an empty scene: uint8 (64, 64, 3).
+
+    Raises:
+        RenderError: there is no working GL backend.
+    """
+    mj = import_mujoco()
+    model = mj.MjModel.from_xml_string("<mujoco/>")
+    data = mj.MjData(model)
+    mj.mj_forward(model, data)
+    renderer = FrameRenderer(model, Camera(1.0, 0.0, 0.0, (0.0, 0.0, 0.0)), 64, RenderConfig())
+    try:
+        return renderer(data)
+    finally:
+        renderer.close()

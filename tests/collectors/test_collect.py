@@ -1,0 +1,391 @@
+"""Collections: what they hold, that they survive kills, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from playslot_rl import keys
+from playslot_rl.collectors import collect
+from playslot_rl.collectors.journal import Journal, journal_path
+from playslot_rl.collectors.spec import CollectionSpec, redraw
+from playslot_rl.config import ExperimentConfig, from_dict
+from playslot_rl.errors import ConfigError, DataError, OutputError
+
+STEPS = 3
+SMALL = {
+    "env": {"image_size": 32, "warmup_steps": 1},
+    "render": {"supersample": 1},
+    "logging": {"progress": False},
+}
+
+
+def config(**changes: Any) -> ExperimentConfig:
+    return from_dict(ExperimentConfig, {**SMALL, **changes})
+
+
+def small(out: Path, episodes: int = 2, policy: Any = "random", workers: int = 1, **changes: Any) -> Path:
+    return collect(config(**changes), policy, episodes, STEPS, out, seed=0, workers=workers)
+
+
+def load(root: Path) -> Any:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    return LeRobotDataset("anything/at_all", root=root)
+
+
+def frames_of(root: Path) -> np.ndarray:
+    dataset = load(root)
+    return np.stack([dataset[i][keys.FEATURE_IMAGE].numpy() for i in range(len(dataset))])
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two random episodes, with a copy of the journal they came from beside them."""
+    folder = tmp_path_factory.mktemp("made")
+    out = folder / "data"
+    from playslot_rl.collectors.episodes import record
+
+    spec = CollectionSpec.make(config(), "random", 2, STEPS, 0)
+    journal = Journal(journal_path(out), spec)
+    for episode in record(spec, [0, 1], 1):
+        journal.add(episode)
+    shutil.copytree(journal.folder, folder / "journal_copy")
+    return small(out)
+
+
+def restore(made: Path, out: Path) -> None:
+    """A complete journal that has not been exported."""
+    shutil.copytree(made.parent / "journal_copy", journal_path(out))
+
+
+def test_data_set_opens_in_lerobot_with_the_recorded_frames(made: Path) -> None:
+    dataset = load(made)
+    journal = Journal(made.parent / "journal_copy", CollectionSpec.make(config(), "random", 2, STEPS, 0))
+    assert (dataset.num_episodes, len(dataset), dataset.fps) == (2, 2 * (STEPS + 1), 16)
+    for e in range(2):
+        episode = journal.read(e)
+        items = [dataset[e * (STEPS + 1) + t] for t in range(STEPS + 1)]
+        images = np.stack([np.rint(i[keys.FEATURE_IMAGE].numpy() * 255).transpose(1, 2, 0) for i in items])
+        np.testing.assert_array_equal(images, episode.frames)
+        np.testing.assert_array_equal(np.stack([i[keys.FEATURE_ACTION] for i in items[:-1]]), episode.actions)
+        assert not items[-1][keys.FEATURE_ACTION].any()
+        assert [bool(i[keys.FEATURE_LAST]) for i in items] == [False] * STEPS + [True]
+        assert [bool(i[keys.FEATURE_DONE]) for i in items] == [False] * (STEPS - 1) + [True, True]
+        assert {int(i[keys.FEATURE_SEED]) for i in items} == {e}
+
+
+def test_record_names_seeds_success_and_versions(made: Path) -> None:
+    record = json.loads((made / "meta" / "playslot.json").read_text())
+    assert [e["seed"] for e in record["episodes"]] == [0, 1]
+    assert record["success_rate"] == 0.0
+    assert record["versions"]["mujoco"] == "3.3.0"
+    assert record["spec"]["env"]["max_steps"] == STEPS
+
+
+def test_recorded_episode_is_the_environments_own(made: Path) -> None:
+    from playslot_rl.envs import make_env
+
+    journal = Journal(made.parent / "journal_copy", CollectionSpec.make(config(), "random", 2, STEPS, 0))
+    episode = journal.read(1)
+    env = make_env(journal.spec.env, journal.spec.render)
+    frames = [env.reset(seed=1)[0]["pixels"]] + [env.step(a)[0]["pixels"] for a in episode.actions]
+    np.testing.assert_array_equal(np.stack(frames), episode.frames)
+    env.close()
+
+
+def test_finished_collection_is_skipped_and_its_journal_removed(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (made / "meta" / "info.json").stat().st_mtime_ns
+    restore(made, made)
+    small(made, logging={"progress": True})
+    assert "nothing to do" in capsys.readouterr().err
+    assert (made / "meta" / "info.json").stat().st_mtime_ns == before
+    assert not journal_path(made).exists()
+
+
+def test_only_missing_episodes_are_recorded(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from playslot_rl.collectors import episodes
+
+    out = tmp_path / "data"
+    restore(made, out)
+    next(journal_path(out).glob("episode_000001*")).unlink()
+    asked: list[list[int]] = []
+    original = episodes.record
+
+    def spy(spec: CollectionSpec, indices: list[int], workers: int) -> Any:
+        asked.append(list(indices))
+        return original(spec, indices, workers)
+
+    monkeypatch.setattr(episodes, "record", spy)
+    small(out)
+    assert asked == [[1]]
+    np.testing.assert_array_equal(frames_of(out), frames_of(made))
+
+
+def test_expert_succeeds_and_noise_changes_its_actions(tmp_path: Path) -> None:
+    clean = collect(config(), "expert", 1, 20, tmp_path / "clean", seed=0, workers=1)
+    noisy = collect(config(collect={"noise": 0.3}), "expert", 1, 20, tmp_path / "noisy", seed=0, workers=1)
+    record = json.loads((clean / "meta" / "playslot.json").read_text())
+    assert record["success_rate"] == 1.0
+    assert 5 < record["episodes"][0]["steps_to_success"] <= 20
+    assert record["episodes"][0]["seed"] == 500_000
+    assert not np.allclose(load(clean)[0][keys.FEATURE_ACTION], load(noisy)[0][keys.FEATURE_ACTION])
+
+
+def test_episodes_that_start_solved_are_redrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    from playslot_rl.collectors.episodes import SeededView
+    from playslot_rl.envs import make_env
+
+    spec = CollectionSpec.make(config(), "random", 1, STEPS, 0)
+    env = make_env(spec.env, spec.render)
+    original = type(env.unwrapped).reset
+
+    def reset(self: Any, *, seed: int | None = None, options: Any = None) -> Any:
+        observation, _ = original(self, seed=seed, options=options)
+        return observation, {"success": seed == 0}
+
+    monkeypatch.setattr(type(env.unwrapped), "reset", reset)
+    observation, _ = SeededView(env, [(0, 0)]).reset()
+    assert (int(observation["episode_seed"][0]), int(observation["redrawn"][0])) == (redraw(0, 1), 1)
+    env.close()
+
+
+def test_video_storage_keeps_colours(made: Path, tmp_path: Path) -> None:
+    out = small(tmp_path / "video", collect={"storage": "video"})
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("anything/at_all", root=out, video_backend="pyav")
+    stored = np.stack([dataset[i][keys.FEATURE_IMAGE].numpy() for i in range(len(dataset))])
+    assert np.abs(stored - frames_of(made)).mean() * 255 < 2.0
+
+
+# --- refusals -------------------------------------------------------------------------------------------------------
+
+
+def test_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match="something else"):
+        small(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_other_settings_are_refused_by_name(made: Path, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="episodes: got 2, expected 3"):
+        small(made, episodes=3)
+    out = tmp_path / "data"
+    restore(made, out)
+    with pytest.raises(OutputError, match=r"env\.warmup_steps: got 1, expected 2"):
+        small(out, env={"image_size": 32, "warmup_steps": 2})
+
+
+def test_foreign_journal_folder_is_refused(tmp_path: Path) -> None:
+    journal_path(tmp_path / "data").mkdir()
+    (journal_path(tmp_path / "data") / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match="something else"):
+        small(tmp_path / "data")
+
+
+def test_damaged_data_set_is_refused(made: Path, tmp_path: Path) -> None:
+    out = tmp_path / "data"
+    shutil.copytree(made, out)
+    (out / "meta" / "info.json").write_text('{"total_episodes": 1, "total_frames": 4}')
+    with pytest.raises(DataError, match="delete it and collect again"):
+        small(out)
+
+
+def test_second_process_on_the_same_folder_is_refused(made: Path, tmp_path: Path) -> None:
+    out = tmp_path / "data"
+    restore(made, out)
+    spec = CollectionSpec.make(config(), "random", 2, STEPS, 0)
+    with Journal(journal_path(out), spec).lock(), pytest.raises(OutputError, match="another process"):
+        small(out)
+
+
+def test_full_disk_is_one_line_and_loses_nothing(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from playslot_rl.collectors import export
+
+    out = tmp_path / "data"
+    restore(made, out)
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(export, "_check", full)
+        with pytest.raises(OutputError, match="disk is full"):
+            small(out)
+    assert not out.exists()
+    assert not list(tmp_path.glob(".*export"))
+    small(out)
+    assert len(load(out)) == 2 * (STEPS + 1)
+
+
+def test_image_that_lerobot_failed_to_write_is_noticed(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot.datasets import dataset_writer
+
+    original = dataset_writer.write_image
+
+    def lossy(image: Any, path: Path, **options: Any) -> None:
+        original(image // 2 if path.stem.endswith("2") else image, path, **options)
+
+    out = tmp_path / "data"
+    restore(made, out)
+    monkeypatch.setattr(dataset_writer, "write_image", lossy)
+    with pytest.raises(OutputError, match="frames of episode 0 that differ"):
+        small(out)
+    assert not out.exists()
+
+
+def test_damaged_journal_file_is_named(made: Path, tmp_path: Path) -> None:
+    out = tmp_path / "data"
+    restore(made, out)
+    (journal_path(out) / "episode_000000.npz").write_bytes(b"PK torn")
+    with pytest.raises(OutputError, match=r"episode_000000\.npz: got a damaged file"):
+        small(out)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("expret", 1, 3, 0), "did you mean policy=expert"),
+        (("expert", 0, 3, 0), "episodes: got 0"),
+        (("expert", 1, 1, 0), "steps: got 1"),
+        (("expert", 1, 3, 1000), "larger ones are evaluation's"),
+    ],
+)
+def test_bad_requests_are_refused(arguments: tuple[str, int, int, int], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        CollectionSpec.make(config(), *arguments)
+
+
+# --- kills ----------------------------------------------------------------------------------------------------------
+
+PROGRAM = """
+import json, sys
+from pathlib import Path
+from playslot_rl.collectors import collect
+from playslot_rl.config import ExperimentConfig, from_dict
+if __name__ == "__main__":
+    settings, episodes, workers, out = json.loads(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
+    collect(from_dict(ExperimentConfig, settings), "random", episodes, 3, out, seed=0, workers=workers)
+"""
+
+
+def start(tmp_path: Path, out: Path, episodes: int, workers: int) -> subprocess.Popen[bytes]:
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM)
+    command = [sys.executable, str(program), json.dumps(SMALL), str(episodes), str(workers), str(out)]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True)
+
+
+def wait_for(process: subprocess.Popen[bytes], happened: Any, timeout: float = 120.0) -> None:
+    deadline = time.monotonic() + timeout
+    while not happened():
+        assert process.poll() is None, process.communicate()[1].decode()
+        assert time.monotonic() < deadline, "timed out"
+        time.sleep(0.005)
+
+
+def children(pid: int) -> list[int]:
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rsplit(")", 1)[1].split()
+        except OSError:
+            continue
+        if int(fields[1]) == pid and fields[0] != "Z":
+            found.append(int(path.parent.name))
+    return found
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_kill_during_collection_loses_only_the_episode_in_hand(made: Path, tmp_path: Path) -> None:
+    out = tmp_path / "data"
+    process = start(tmp_path, out, episodes=200, workers=1)
+    folder = journal_path(out)
+    wait_for(process, lambda: len(list(folder.glob("episode_*.npz"))) >= 3)
+    process.kill()
+    process.wait()
+    stored = sorted(p.name for p in folder.glob("episode_*.npz"))
+    assert stored == [f"episode_{i:06d}.npz" for i in range(len(stored))]
+    assert 3 <= len(stored) < 200
+    journal = Journal(folder, CollectionSpec.make(config(), "random", 200, STEPS, 0))
+    whole = Journal(made.parent / "journal_copy", CollectionSpec.make(config(), "random", 2, STEPS, 0))
+    for index in range(len(stored)):
+        assert journal.read(index).frames.shape == (STEPS + 1, 32, 32, 3)
+    np.testing.assert_array_equal(journal.read(1).frames, whole.read(1).frames)
+    assert journal.missing() == list(range(len(stored), 200))
+    assert not out.exists()
+
+
+def test_kill_during_export_leaves_nothing_half_made(made: Path, tmp_path: Path) -> None:
+    out = tmp_path / "data"
+    restore(made, out)
+    process = start(tmp_path, out, episodes=2, workers=1)
+    temporary = tmp_path / ".data.export"
+    wait_for(process, lambda: (temporary / "meta").exists())
+    process.kill()
+    process.wait()
+    assert not out.exists()
+    assert len(list(journal_path(out).glob("episode_*.npz"))) == 2
+    small(out)
+    np.testing.assert_array_equal(frames_of(out), frames_of(made))
+    assert not temporary.exists()
+    assert not journal_path(out).exists()
+
+
+@pytest.mark.slow
+def test_two_workers_record_the_same_data_and_die_with_their_parent(made: Path, tmp_path: Path) -> None:
+    one, two = tmp_path / "one", tmp_path / "two"
+    process = start(tmp_path, two, episodes=150, workers=2)
+    wait_for(process, lambda: len(list(journal_path(two).glob("episode_*.npz"))) >= 4, timeout=240)
+    workers = children(process.pid)
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 10
+    while any(alive(w) for w in workers) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert len(workers) >= 2
+    assert not any(alive(w) for w in workers)
+    shutil.rmtree(journal_path(two))
+
+    process = start(tmp_path, two, episodes=5, workers=2)
+    errors = process.communicate(timeout=300)[1].decode()
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+    small(one, episodes=5)
+    np.testing.assert_array_equal(frames_of(one), frames_of(two))
+
+
+@pytest.mark.slow
+def test_interrupt_leaves_a_journal_to_go_on_from(tmp_path: Path) -> None:
+    out = tmp_path / "data"
+    process = start(tmp_path, out, episodes=400, workers=2)
+    wait_for(process, lambda: len(list(journal_path(out).glob("episode_*.npz"))) >= 2, timeout=240)
+    os.killpg(process.pid, signal.SIGINT)
+    errors = process.communicate(timeout=60)[1].decode()
+    assert process.returncode != 0
+    assert errors.strip().endswith("KeyboardInterrupt")
+    assert errors.count("Traceback") == 1, errors  # ours, which the command line catches; none from the workers
+    stored = len(list(journal_path(out).glob("episode_*.npz")))
+    journal = Journal(journal_path(out), CollectionSpec.make(config(), "random", 400, STEPS, 0))
+    assert len(journal.missing()) == 400 - stored
