@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
+import os
 import typing
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -24,6 +25,8 @@ CONTINUES: Final = frozenset({"evaluate", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
 SHIPPED: Final = "pretrained"
 """`run=pretrained` names the shipped world model, which is not a run folder."""
+
+_FOLDERS: Final = frozenset({"out", "run", "data.root", "data.demos", "data.cache"})
 
 # These say what one invocation does, on which machine; a stored run does not hand them on.
 _OF_THE_CALL: Final = ("out", "run", "episodes", "policy", "protocol", "workers", "device")
@@ -50,22 +53,24 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
             range, or a run folder without a usable `config.json`.
     """
     pairs = _parse(overrides)
+    for group in GROUPS:
+        if group in pairs:
+            _check_choice(group, pairs[group])
     try:
-        run = pairs.get("run", "")
-        if command in CONTINUES and run and run != SHIPPED:
-            return _from_run(Path(_unquote(run)), pairs)
-        groups = {key: value for key, value in pairs.items() if key in GROUPS}
-        for group, name in groups.items():
-            _check_choice(group, name)
-        values = {key: value for key, value in pairs.items() if key not in GROUPS}
-        plain = _hydra("config", [f"{g}={n}" for g, n in groups.items()] + _assignments(values))
-        config = from_dict(ExperimentConfig, plain)
-        _check_choice("env", config.env.name)
-        return config
+        run = _expand_home(_unquote(pairs.get("run", "")))
+        continues = command in CONTINUES and run not in ("", SHIPPED)
+        config = _from_run(Path(run), pairs) if continues else _from_preset(pairs)
     except ConfigError:
         raise
     except ValueError as error:
         raise ConfigError(str(error)) from error
+    _check_choice("env", config.env.name)
+    return config
+
+
+def _from_preset(pairs: Mapping[str, str]) -> ExperimentConfig:
+    groups = [f"{group}={pairs[group]}" for group in GROUPS if group in pairs]
+    return from_dict(ExperimentConfig, _hydra("config", groups + _assignments(pairs)))
 
 
 def _parse(overrides: Sequence[str]) -> dict[str, str]:
@@ -134,15 +139,23 @@ def _unquote(value: str) -> str:
     return value
 
 
+def _expand_home(folders: str) -> str:
+    """Replace a leading `~`, which shells leave alone after `key=`, in each of some comma-separated folders."""
+    return ",".join(os.path.expanduser(folder) for folder in folders.split(","))  # noqa: PTH111  Path drops a final /
+
+
 def _assignments(pairs: Mapping[str, str]) -> list[str]:
     """Hydra overrides that set (`++`) values.
 
-    Text is quoted here, since Hydra's grammar gives commas, equals signs, brackets, `${` and digits in a path a meaning.
+    Text is quoted here, since commas, equals signs, brackets, `${` and digits in a path mean something to Hydra.
     """
     assignments = []
     for key, value in pairs.items():
+        if key in GROUPS:
+            continue
         if _hint(key) is str and value != "null":
-            text = _unquote(value).replace("\\", "\\\\").replace("'", "\\'")
+            text = _expand_home(_unquote(value)) if key in _FOLDERS else _unquote(value)
+            text = text.replace("\\", "\\\\").replace("'", "\\'")
             value = "'" + text.replace("${", "\\${") + "'"
         assignments.append(f"++{key}={value}")
     return assignments
@@ -171,7 +184,6 @@ def _from_run(run: Path, pairs: Mapping[str, str]) -> ExperimentConfig:
     stored = _read_stored(run)
     for group in GROUPS:
         if group in pairs:
-            _check_choice(group, pairs[group])
             have = stored.preset if group == "preset" else stored.env.name
             if pairs[group] != have:
                 raise ConfigError(
@@ -181,7 +193,7 @@ def _from_run(run: Path, pairs: Mapping[str, str]) -> ExperimentConfig:
     values = to_dict(stored)
     defaults = to_dict(ExperimentConfig())
     values.update({key: defaults[key] for key in _OF_THE_CALL})
-    typed = _hydra(None, _assignments({key: value for key, value in pairs.items() if key not in GROUPS}))
+    typed = _hydra(None, _assignments(pairs))
     config = from_dict(ExperimentConfig, _merge(values, typed))
     return config if config.out else dataclasses.replace(config, out=str(run))
 
@@ -193,7 +205,10 @@ def _read_stored(run: Path) -> ExperimentConfig:
             f"run={run}: got no {path}, expected the folder of a run; make one with `playslot pipeline out={run}`"
         )
     try:
-        return from_dict(ExperimentConfig, json.loads(path.read_text(encoding="utf-8")))
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(values, dict):
+            raise ValueError(f"got a {type(values).__name__}, expected a group of keys")
+        return from_dict(ExperimentConfig, values)
     except ValueError as error:
         raise ConfigError(f"{path} cannot be used: {error}; restore it or start a new run") from error
 

@@ -1,0 +1,1 @@
+../../playslot_rl/__main__.py

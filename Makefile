@@ -1,0 +1,102 @@
+# `make demo` and `make test` set everything up first and skip what is done. Needs git, Python 3.12 and nothing else.
+# Arguments of the command and of pytest: make demo ARGS="seed=1", make test ARGS="-k savi".
+
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+
+VENV := .venv
+BIN := $(VENV)/bin
+UV := $(BIN)/uv
+UV_VERSION := 0.13.8
+STAMP := $(VENV)/.setup-done
+LOCK := requirements.lock
+ARGS ?=
+PYTHON ?=
+
+export UV_PYTHON := $(BIN)/python
+export UV_PYTHON_DOWNLOADS := never
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+# A .venv of another Python, or one moved here with its folder, is made anew.
+VENV_OK := $(shell $(BIN)/python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' 2>/dev/null \
+	&& grep -qsF '$(CURDIR)/$(VENV)' $(VENV)/pyvenv.cfg && echo yes)
+
+define FIND_PYTHON
+for candidate in $(PYTHON) python3.12 python3 python; do
+	if "$$candidate" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' 2>/dev/null; then
+		echo "$$candidate"
+		exit 0
+	fi
+done
+echo "error: found no Python 3.12 (tried: $(PYTHON) python3.12 python3 python)." \
+	"Install it, or name one: make setup PYTHON=/path/to/python3.12" >&2
+exit 1
+endef
+export FIND_PYTHON
+
+.PHONY: help setup demo test test-all lint format typing lock clean FORCE
+
+help:
+	@echo "make demo      set up, then the main job: success in simulation and in imagination, in minutes"
+	@echo "make test      set up, then the quick tests"
+	@echo "make test-all  set up, then all tests"
+	@echo "make lint      ruff, format check, mypy strict"
+	@echo "make setup     .venv with the pinned packages and $(BIN)/playslot"
+	@echo "make format    format the code"
+	@echo "make lock      renew the pins in $(LOCK)"
+	@echo "make clean     remove .venv, caches and builds; runs and data stay"
+
+setup: $(STAMP)
+	@echo "set up: $(BIN)/playslot"
+
+$(UV): $(if $(VENV_OK),,FORCE)
+	@python="$$(bash -c "$$FIND_PYTHON")"; \
+	if ! "$$python" -c 'import ensurepip, venv' 2>/dev/null; then \
+		echo "error: $$python has no venv module. Install it (Debian, Ubuntu: apt-get install python3.12-venv)" >&2; \
+		exit 1; \
+	fi; \
+	if [ -z "$(VENV_OK)" ]; then "$$python" -m venv --clear $(VENV); fi
+	@$(BIN)/python -m pip install --quiet "uv==$(UV_VERSION)"
+
+$(STAMP): $(UV) $(LOCK) pyproject.toml
+	@$(UV) pip install --require-hashes -r $(LOCK)
+	@$(UV) pip install --no-deps --editable .
+	@touch $@
+
+demo: $(STAMP)
+	@$(BIN)/playslot demo $(ARGS)
+
+test: $(STAMP)
+	@$(BIN)/python -m pytest -m "not slow" $(ARGS)
+
+test-all: $(STAMP)
+	@$(BIN)/python -m pytest $(ARGS)
+
+lint: $(STAMP) typing
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+
+format: $(STAMP)
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+# mypy and editors do not know the mapped folders: links that look like the installed package.
+typing:
+	@mkdir -p .typing/playslot_rl
+	@find .typing/playslot_rl -xtype l -delete
+	@for entry in playslot_rl/*; do \
+		case "$$entry" in */__pycache__) ;; *) ln -sfn "../../$$entry" .typing/playslot_rl/ ;; esac; \
+	done
+	@for folder in envs collectors recipes; do ln -sfn "../../$$folder" .typing/playslot_rl/; done
+
+lock: $(UV)
+	@$(UV) pip compile pyproject.toml --extra dev --upgrade --generate-hashes --python-version 3.12 --quiet \
+		--no-header --no-annotate --no-emit-index-url --no-emit-find-links --output-file $(LOCK)
+	@echo "renewed $(LOCK); make setup installs it"
+
+clean:
+	@rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

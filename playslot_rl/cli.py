@@ -1,0 +1,237 @@
+"""The `playslot` command: a thin front of the recipes.
+
+Every sub-command is one module of `playslot_rl.recipes` (except `doctor`); its arguments are `key=value` overrides.
+Exit codes: 0 done, 1 an error of the run, 2 bad arguments, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import importlib
+import os
+import sys
+import textwrap
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NoReturn
+
+from playslot_rl import __version__
+from playslot_rl.errors import ConfigError, PlaySlotError
+
+DEBUG: Final = "PLAYSLOT_DEBUG"
+"""Set to 1: errors show their traceback."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """One sub-command: what `--help` says about it."""
+
+    summary: str
+    details: str
+    examples: tuple[str, ...]
+
+
+COMMANDS: Final[dict[str, Command]] = {
+    "collect": Command(
+        "record episodes into a LeRobot v3.0 data set",
+        "Records `episodes` episodes of the `random` or the `expert` policy with several worker processes. Episodes "
+        "go to a journal first: after a kill the same command carries on. The data depend on the seed, not on workers.",
+        (
+            "playslot collect policy=random episodes=400 out=data/random",
+            "playslot collect policy=expert episodes=150 seed=1 workers=2 out=data/expert",
+        ),
+    ),
+    "train-slots": Command(
+        "stage 1: SAVi, object slots from unlabelled videos",
+        "Trains SAVi on the frames of any LeRobot v3.0 data set with a camera. The same command resumes after a kill.",
+        ("playslot train-slots preset=compact data.root=data/random,data/expert out=runs/mine",),
+    ),
+    "train-dynamics": Command(
+        "stage 2: latent actions (InvDyn) and the predictor (cOCVP)",
+        "Trains inverse dynamics and the predictor on the slots of a run's frozen SAVi; no actions are read.",
+        (
+            "playslot train-dynamics run=runs/mine data.root=data/random,data/expert",
+            "playslot train-dynamics run=runs/mine dynamics.steps=5000",
+        ),
+    ),
+    "train-policy": Command(
+        "stage 3: latent policy, action decoder and slot oracle from demonstrations",
+        "Clones latent actions from demo videos; only `behaviour.labelled_demos` of them lend their real actions to "
+        "the action decoder. run=pretrained uses the shipped world model.",
+        (
+            "playslot train-policy run=runs/mine data.demos=data/expert",
+            "playslot train-policy run=pretrained data.demos=data/expert behaviour.labelled_demos=20 out=runs/few",
+        ),
+    ),
+    "evaluate": Command(
+        "success rate in simulation (closed loop) or in imagination (open loop)",
+        "Evaluates a fixed list of held-out seeds, one episode each, and writes "
+        "RUN/evaluation/PROTOCOL/eval_info.json.",
+        (
+            "playslot evaluate run=runs/mine protocol=simulation episodes=50",
+            "playslot evaluate run=runs/mine protocol=imagination episodes=50 seed=3",
+        ),
+    ),
+    "pipeline": Command(
+        "all stages from nothing: data, three trainings, evaluation, report",
+        "Runs every stage and skips the finished ones, so the same command carries on after a stop.",
+        (
+            "playslot pipeline preset=compact env=button_press out=runs/mine",
+            "playslot pipeline preset=smoke out=runs/smoke",
+        ),
+    ),
+    "demo": Command(
+        "the main job with the shipped world model, in minutes",
+        "Collects fresh expert demos, trains the policy on their videos and the action decoder on the labels of a "
+        "third of them, evaluates under both protocols and writes a report under runs/demo/ (or out=).",
+        ("playslot demo", "playslot demo seed=1 out=runs/demo-1"),
+    ),
+    "bench": Command(
+        "speed of this machine, as ratios: training steps, rollout, sampling, rendering",
+        "Times the fast paths against the plain ones in one run, medians over repeats. Leave the machine idle.",
+        ("playslot bench", "playslot bench --json bench.json"),
+    ),
+    "doctor": Command(
+        "what works on this machine, and the cure for what does not",
+        "Checks Python, torch and device, the GL backend by rendering a frame, PyAV and FFmpeg, disk, cores and cache "
+        "folders. Exits with 1 if something essential fails.",
+        ("playslot doctor",),
+    ),
+}
+
+KEYS_HELP: Final = """common keys (any key of playslot_rl/config.py works, with dots: slots.optim.lr=5e-4):
+  env=button_press      the task
+  preset=compact        sizes and schedule: smoke (seconds, for tests), compact (two CPU cores), paper (one GPU)
+  policy=expert         collector policy: random or expert
+  episodes=N            episodes to collect or to evaluate
+  seed=0                seed of collection, training or evaluation
+  workers=0             collector processes; 0 means one per core
+  out=DIR               folder to write
+  data.root=DIR[,DIR]   LeRobot v3.0 data set(s) of videos; data.demos=DIR for demonstrations
+  run=DIR               run folder to go on from, with its stored config; `pretrained` is the shipped model
+  protocol=simulation   evaluation protocol: simulation or imagination
+
+environment variables: PLAYSLOT_DEBUG=1 shows tracebacks, PLAYSLOT_CACHE=DIR moves the caches,
+MUJOCO_GL chooses the GL backend (egl by default on Linux)."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Bad arguments end with one line and exit code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message}; see `{self.prog} --help`\n")
+
+
+def _top_parser() -> argparse.ArgumentParser:
+    width = max(map(len, COMMANDS))
+    lines = "\n".join(f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items())
+    parser = _Parser(
+        prog="playslot",
+        usage="playslot COMMAND [key=value ...]",
+        description="Robot behaviours from unlabelled videos: object slots, latent actions, imagination.",
+        epilog=f"commands:\n{lines}\n\n`playslot COMMAND --help` explains one of them.\n\n{KEYS_HELP}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"playslot {__version__}")
+    parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="one of the commands below")
+    return parser
+
+
+def _command_parser(name: str) -> argparse.ArgumentParser:
+    command = COMMANDS[name]
+    examples = "\n".join(f"  {example}" for example in command.examples)
+    flag = " [--json FILE]" if name == "bench" else ""
+    parser = _Parser(
+        prog=f"playslot {name}",
+        usage=f"playslot {name} [key=value ...]{flag}",
+        description=f"{command.summary}\n\n{textwrap.fill(command.details, 100)}",
+        epilog=f"examples:\n{examples}\n\n{KEYS_HELP}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="changes one value of the config")
+    if name == "bench":
+        parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures to FILE")
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        argv: arguments without the program's name; None reads `sys.argv`.
+
+    Returns:
+        The exit code. `--help`, `--version` and bad usage raise `SystemExit`, as argparse does.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments:
+        _top_parser().print_help()
+        return 2
+    name = arguments[0]
+    if name not in COMMANDS:
+        # Ends here unless it is --help or --version: the rest of the line belongs to no known command.
+        _top_parser().parse_args(arguments[:1])
+    options = _command_parser(name).parse_intermixed_args(arguments[1:])
+    return _guarded(name, lambda: _run(name, options))
+
+
+def _run(name: str, options: argparse.Namespace) -> int:
+    from playslot_rl.compose import compose
+
+    try:
+        config = compose(options.overrides, name)
+    except ConfigError as error:
+        if _debugging():
+            raise
+        return _fail(name, str(error), 2)
+    # Before anything imports mujoco, which needs a display by default; the same backend everywhere, the same frames.
+    if sys.platform == "linux":
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    if name == "doctor":
+        from playslot_rl import doctor
+
+        return doctor.main(config)
+    recipe = importlib.import_module(f"playslot_rl.recipes.{name.replace('-', '_')}")
+    if name == "bench":
+        recipe.main(config, json_path=options.json)
+    else:
+        recipe.main(config)
+    return 0
+
+
+def _guarded(name: str, run: Callable[[], int]) -> int:
+    """Turn every error into one line and an exit code, or show it whole where `PLAYSLOT_DEBUG=1`."""
+    try:
+        return run()
+    except KeyboardInterrupt:
+        return _fail(name, "interrupted; the same command carries on from the last checkpoint or episode", 130)
+    except Exception as error:
+        if _debugging():
+            raise
+        return _fail(name, _explain(error), 1)
+
+
+def _explain(error: BaseException) -> str:
+    """One line about an error, the full disk first: libraries wrap it in errors of their own."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(error, PlaySlotError):
+        if (isinstance(cause, OSError) and cause.errno == errno.ENOSPC) or os.strerror(errno.ENOSPC) in str(cause):
+            where = getattr(cause, "filename", None)
+            place = f" for {where}" if where else ""
+            return f"got a full disk{place}, expected free space: free some and run the same command again"
+        cause = cause.__cause__ or cause.__context__
+    text = " ".join(str(error).split()) or "no message"
+    if isinstance(error, PlaySlotError):
+        return text
+    return f"{type(error).__name__}: {text} (unexpected; {DEBUG}=1 shows where)"
+
+
+def _debugging() -> bool:
+    return os.environ.get(DEBUG, "") not in ("", "0")
+
+
+def _fail(name: str, message: str, code: int) -> int:
+    print(f"playslot {name}: error: {message}", file=sys.stderr)
+    return code

@@ -1,0 +1,235 @@
+"""`playslot doctor`: what works on this machine, and the cure for what does not."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import io
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.threads import available_cores
+
+Status = Literal["ok", "warn", "FAIL"]
+
+_MIN_DISK_GB: Final = 2.0
+_GOOD_DISK_GB: Final = 10.0
+_REINSTALL: Final = "run `make setup` again, or `pip install .` in a fresh environment of Python 3.12"
+
+# In a process of its own: a broken GL library may end the process instead of raising.
+_DRAW_ONE_FRAME: Final = """
+import mujoco, os
+from playslot_rl.config import RenderConfig
+from playslot_rl.envs.rendering import Camera, FrameRenderer
+scene = "<mujoco><worldbody><light pos='0 0 3'/><geom type='sphere' size='.3' rgba='1 0 0 1'/></worldbody></mujoco>"
+model = mujoco.MjModel.from_xml_string(scene)
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+frame = FrameRenderer(model, Camera(2.0, 90.0, -20.0, (0.0, 0.0, 0.0)), 64, RenderConfig())(data)
+assert frame.shape == (64, 64, 3) and frame.max() > 60, f"an empty frame, brightest value {frame.max()}"
+print(f"drew a {frame.shape[0]}x{frame.shape[1]} frame with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')}")
+"""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding.
+
+    Attributes:
+        name: what was looked at.
+        status: `ok`, `warn` (works, but something is missing or slow) or `FAIL` (an essential part does not work).
+        found: what was found.
+        cure: what to do; empty where all is well.
+    """
+
+    name: str
+    status: Status
+    found: str
+    cure: str = ""
+
+    def line(self) -> str:
+        """The finding as printed: one line, or two with a cure."""
+        text = f"{self.status:<5} {self.name:<14} {self.found}"
+        return f"{text}\n{'':<21}-> {self.cure}" if self.cure else text
+
+
+def check_python() -> Check:
+    """Python 3.12, the only version that the pinned libraries share."""
+    found = f"{platform.python_version()} at {sys.prefix}"
+    if sys.version_info[:2] == (3, 12):
+        return Check("Python", "ok", found)
+    return Check("Python", "FAIL", found, "expected Python 3.12: install it and run `make setup`")
+
+
+def check_packages() -> Check:
+    """Every requirement of the package is installed, in the version asked for where one is pinned."""
+    try:
+        requirements = importlib.metadata.requires("playslot_rl") or []
+    except importlib.metadata.PackageNotFoundError:
+        return Check("packages", "FAIL", "playslot_rl is not installed", _REINSTALL)
+    wrong = []
+    for requirement in requirements:
+        match = re.match(r"([A-Za-z0-9._-]+)(?:\[[^]]*\])?(?:==([^;,\s]+))?\s*(;.*)?", requirement)
+        if match is None or "extra" in (match[3] or ""):
+            continue
+        name, wanted = match[1], match[2]
+        try:
+            have = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            wrong.append(f"{name} is missing")
+            continue
+        if wanted and have.split("+")[0] != wanted:
+            wrong.append(f"{name} is {have}, expected {wanted}")
+    if wrong:
+        return Check("packages", "FAIL", "; ".join(wrong), _REINSTALL)
+    return Check("packages", "ok", "all requirements, in the pinned versions")
+
+
+def check_torch(device: str = "") -> Check:
+    """Torch computes on the device that a command would take."""
+    try:
+        import torch
+
+        name = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        total = float(torch.ones(8, 8, device=name).matmul(torch.ones(8, 8, device=name)).sum())
+    except Exception as error:  # noqa: BLE001  a broken torch fails with whatever its libraries raise
+        return Check("torch", "FAIL", _one_line(error), "choose device=cpu" if device else _REINSTALL)
+    if total != 512.0:
+        return Check("torch", "FAIL", f"a product of ones sums to {total}, expected 512", _REINSTALL)
+    what = torch.cuda.get_device_name() if name.startswith("cuda") else f"{torch.get_num_threads()} threads"
+    return Check("torch", "ok", f"{torch.__version__}, device {name} ({what})")
+
+
+def check_rendering() -> Check:
+    """The GL backend, by drawing a frame."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _DRAW_ONE_FRAME], capture_output=True, text=True, timeout=120, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Check("rendering", "FAIL", "no frame within 120 s", "try MUJOCO_GL=osmesa")
+    if done.returncode == 0:
+        return Check("rendering", "ok", done.stdout.strip().splitlines()[-1])
+    lines = done.stderr.strip().splitlines() or [f"the process ended with code {done.returncode}"]
+    cure = (
+        "set MUJOCO_GL to egl, osmesa or glfw and install its library "
+        "(Debian, Ubuntu: apt-get install libegl1 libgl1 libosmesa6)"
+    )
+    return Check("rendering", "FAIL", f"MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r}: {lines[-1]}", cure)
+
+
+def check_video() -> Check:
+    """PyAV writes and reads lossless h264, which `collect.storage=video` and foreign data sets need."""
+    try:
+        import av
+        import numpy as np
+
+        frame = np.full((64, 64, 3), 128, np.uint8)
+        buffer = io.BytesIO()
+        with av.open(buffer, "w", format="mp4") as container:
+            stream = container.add_stream("libx264", rate=10, options={"crf": "0"})
+            stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv444p"
+            for packet in [*stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")), *stream.encode(None)]:
+                container.mux(packet)
+        buffer.seek(0)
+        with av.open(buffer) as container:
+            count = sum(1 for _ in container.decode(video=0))
+    except Exception as error:  # noqa: BLE001  av raises its own and FFmpeg's errors
+        cure = f"only collect.storage=video and data sets with video need it; {_REINSTALL}"
+        return Check("PyAV", "warn", _one_line(error), cure)
+    if count != 1:
+        return Check("PyAV", "warn", f"wrote 1 frame and read {count}", _REINSTALL)
+    return Check("PyAV", "ok", f"{av.__version__}, h264 yuv444p written and read")
+
+
+def check_ffmpeg() -> Check:
+    """A system FFmpeg is never needed, since PyAV brings its own."""
+    path = shutil.which("ffmpeg")
+    return Check("FFmpeg", "ok", path or "none on the path (not needed: PyAV brings its own)")
+
+
+def check_disk(folder: Path) -> Check:
+    """Free space where data and runs go."""
+    try:
+        free = shutil.disk_usage(_existing(folder)).free / 1e9
+    except OSError as error:
+        return Check("disk", "FAIL", _one_line(error), f"choose another folder than {folder}")
+    found = f"{free:.0f} GB free in {folder}"
+    if free < _MIN_DISK_GB:
+        return Check("disk", "FAIL", found, f"free at least {_MIN_DISK_GB:.0f} GB, or choose another folder with out=")
+    if free < _GOOD_DISK_GB:
+        return Check("disk", "warn", found, f"a full pipeline may need {_GOOD_DISK_GB:.0f} GB")
+    return Check("disk", "ok", found)
+
+
+def check_cores() -> Check:
+    """Cores that this process may use."""
+    cores = available_cores()
+    if cores < 2:
+        return Check("cores", "warn", "1 core", "the times in the README are for two cores; expect twice as long")
+    return Check("cores", "ok", f"{cores} cores, {platform.machine()}")
+
+
+def check_cache(folder: Path) -> Check:
+    """The folder of the frame and slot caches can be written."""
+    cure = "set PLAYSLOT_CACHE (or data.cache=) to a folder that you can write"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder) as probe:
+            probe.write(b"playslot")
+    except OSError as error:
+        return Check("cache", "FAIL", f"{folder}: {_one_line(error)}", cure)
+    return Check("cache", "ok", f"{folder} can be written")
+
+
+def cache_folder(config: ExperimentConfig) -> Path:
+    """Where a command with this config keeps its caches."""
+    return Path(config.data.cache or os.environ.get("PLAYSLOT_CACHE") or Path.home() / ".cache" / "playslot_rl")
+
+
+def main(config: ExperimentConfig) -> int:
+    """Print one finding after the other.
+
+    Args:
+        config: `device`, `out` and `data.cache` are looked at.
+
+    Returns:
+        0 if everything essential works, otherwise 1.
+    """
+    failed = 0
+    for check in _checks(config):
+        finding = check()
+        print(finding.line(), flush=True)
+        failed += finding.status == "FAIL"
+    print("\neverything essential works" if not failed else f"\n{failed} essential part(s) do not work")
+    return 1 if failed else 0
+
+
+def _checks(config: ExperimentConfig) -> Iterator[Callable[[], Check]]:
+    yield check_python
+    yield check_packages
+    yield lambda: check_torch(config.device)
+    yield check_rendering
+    yield check_video
+    yield check_ffmpeg
+    yield lambda: check_disk(Path(config.out or ".").resolve())
+    yield check_cores
+    yield lambda: check_cache(cache_folder(config))
+
+
+def _existing(folder: Path) -> Path:
+    """The folder, or its nearest ancestor that exists."""
+    return next(path for path in (folder, *folder.parents) if path.exists())
+
+
+def _one_line(error: BaseException) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

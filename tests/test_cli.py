@@ -1,0 +1,190 @@
+"""The command line: help that explains, errors of one line, exit codes, nothing hidden by a traceback."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from playslot_rl import __version__, cli
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.errors import ConfigError, DataError, OutputError
+
+COMMANDS = [
+    "collect",
+    "train-slots",
+    "train-dynamics",
+    "train-policy",
+    "evaluate",
+    "pipeline",
+    "demo",
+    "bench",
+    "doctor",
+]
+KEYS = ["env=", "preset=", "policy=", "episodes=", "seed=", "workers=", "out=", "data.root=", "run=", "protocol="]
+
+Recipe = Callable[..., None]
+
+
+@pytest.fixture
+def recipe(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Recipe], None]:
+    """Put a function in the place of a recipe."""
+
+    def replace(name: str, main: Recipe) -> None:
+        module = types.ModuleType(f"playslot_rl.recipes.{name}")
+        module.main = main  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+
+    monkeypatch.delenv("PLAYSLOT_DEBUG", raising=False)
+    return replace
+
+
+def raising(error: BaseException) -> Recipe:
+    def main(config: ExperimentConfig) -> None:
+        raise error
+
+    return main
+
+
+def test_the_commands_are_the_promised_ones() -> None:
+    assert list(cli.COMMANDS) == COMMANDS
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_explains_with_examples_and_the_common_keys(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main([command, "--help"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert f"playslot {command}" in text
+    assert "examples:" in text
+    assert all(f"  {key}" in text for key in KEYS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_example_in_the_help_is_accepted(command: str, recipe: Callable[[str, Recipe], None]) -> None:
+    from playslot_rl.compose import compose
+
+    for example in cli.COMMANDS[command].examples:
+        words = example.split()
+        assert words[:2] == ["playslot", command]
+        typed = [word for word in words[2:] if "=" in word]
+        # Examples name runs that are not here: compose them as a command that reads no run.
+        assert compose(typed, "collect")
+
+
+def test_help_names_every_command_and_is_quick_to_load() -> None:
+    code = "import sys; from playslot_rl import cli\ntry: cli.main(['--help'])\nfinally: print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert all(f"  {command} " in done.stdout for command in COMMANDS)
+    assert done.stdout.strip().endswith("False")
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.strip() == f"playslot {__version__}"
+
+
+def test_no_command_prints_the_help_and_fails(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 2
+    assert "commands:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arguments", [["colect"], ["seed=1"], ["collect", "--fast"], ["bench", "--json"]])
+def test_bad_usage_is_one_line_and_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(arguments)
+    assert ended.value.code == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "--help" in err
+
+
+@pytest.mark.parametrize("argument", ["preset=smol", "env=kitchen", "sed=1", "fast", "seed=x"])
+def test_a_bad_argument_is_one_line_and_code_2(argument: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["pipeline", argument]) == 2
+    out, err = capsys.readouterr()
+    assert not out
+    assert err.startswith("playslot pipeline: error: ")
+    assert err.count("\n") == 1
+    assert "expected" in err
+
+
+def test_a_command_calls_its_recipe_with_the_config(recipe: Callable[[str, Recipe], None]) -> None:
+    got: list[ExperimentConfig] = []
+    recipe("train_slots", got.append)
+    assert cli.main(["train-slots", "preset=smoke", "seed=4"]) == 0
+    assert (got[0].preset, got[0].seed) == ("smoke", 4)
+
+
+@pytest.mark.parametrize("arguments", [["seed=4", "--json", "f.json"], ["--json", "f.json", "seed=4"]])
+def test_bench_hands_its_file_on(arguments: list[str], recipe: Callable[[str, Recipe], None]) -> None:
+    got: list[tuple[int, Path | None]] = []
+    recipe("bench", lambda config, json_path: got.append((config.seed, json_path)))
+    assert cli.main(["bench", *arguments, "preset=smoke"]) == 0
+    assert cli.main(["bench"]) == 0
+    assert got == [(4, Path("f.json")), (0, None)]
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (DataError("data.root=x: got no data set, expected one: collect it"), 1, "got no data set, expected one"),
+        (ConfigError("several\nlines"), 1, "several lines"),
+        (OutputError("out=x holds something else"), 1, "out=x holds something else"),
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "a/b"), 1, "got a full disk for a/b, expected free space"),
+        (RuntimeError("zip writer: No space left on device"), 1, "got a full disk, expected free space"),
+        (PermissionError(errno.EACCES, "Permission denied", "a/b"), 1, "PermissionError: .*Permission denied: 'a/b'"),
+        (ZeroDivisionError("division by zero"), 1, "ZeroDivisionError: division by zero .*PLAYSLOT_DEBUG=1"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+)
+def test_an_error_is_one_line_and_an_exit_code(
+    error: BaseException,
+    code: int,
+    text: str,
+    recipe: Callable[[str, Recipe], None],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    import re
+
+    recipe("demo", raising(error))
+    assert cli.main(["demo", "preset=smoke"]) == code
+    err = capsys.readouterr().err
+    assert re.search(text, err)
+    assert err.count("\n") == 1
+
+
+def test_a_wrapped_full_disk_is_still_a_full_disk(
+    recipe: Callable[[str, Recipe], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrapped = RuntimeError("cannot write")
+    wrapped.__cause__ = OSError(errno.ENOSPC, "full")
+    recipe("demo", raising(wrapped))
+    assert cli.main(["demo"]) == 1
+    assert "full disk" in capsys.readouterr().err
+
+
+def test_debugging_shows_the_traceback(recipe: Callable[[str, Recipe], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe("demo", raising(DataError("broken")))
+    monkeypatch.setenv("PLAYSLOT_DEBUG", "1")
+    with pytest.raises(DataError, match="broken"):
+        cli.main(["demo"])
+    with pytest.raises(ConfigError, match="unknown preset"):
+        cli.main(["demo", "preset=smol"])
+
+
+def test_the_installed_command_works_from_another_folder(tmp_path: Path) -> None:
+    command = Path(sys.executable).parent / "playslot"
+    done = subprocess.run([command, "evaluate", "run=nothing"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "run=nothing: got no nothing/config.json" in done.stderr
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,97 @@
+"""`playslot doctor`: every check finds what is broken, names a cure, and only essential ones fail the command."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from playslot_rl import doctor
+from playslot_rl.allocator import tune_allocator
+from playslot_rl.config import DataConfig, ExperimentConfig
+from playslot_rl.threads import available_cores, set_threads
+
+
+def test_all_is_well_here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert doctor.main(ExperimentConfig(data=DataConfig(cache=str(tmp_path / "cache")), device="cpu")) == 0
+    out = capsys.readouterr().out
+    for name in ("Python", "packages", "torch", "rendering", "PyAV", "FFmpeg", "disk", "cores", "cache"):
+        assert f" {name} " in out
+    assert "drew a 64x64 frame" in out
+    assert "everything essential works" in out
+
+
+def test_one_failure_fails_the_command_and_shows_its_cure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doctor, "check_rendering", lambda: doctor.Check("rendering", "FAIL", "no GL", "install GL"))
+    (tmp_path / "file").touch()
+    assert doctor.main(ExperimentConfig(data=DataConfig(cache=str(tmp_path / "file" / "cache")))) == 1
+    out = capsys.readouterr().out
+    assert "FAIL  rendering" in out
+    assert "-> install GL" in out
+    assert "-> set PLAYSLOT_CACHE" in out
+    assert "2 essential part(s) do not work" in out
+
+
+def test_a_gl_backend_that_cannot_draw_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    found = doctor.check_rendering()
+    assert found.status == "FAIL"
+    assert "nonsense" in found.found
+    assert "libegl1" in found.cure
+
+
+def test_a_device_that_is_not_there_is_found() -> None:
+    found = doctor.check_torch("cuda:99")
+    assert (found.status, found.cure) == ("FAIL", "choose device=cpu")
+
+
+def test_a_wrong_version_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "0.0.1")
+    found = doctor.check_packages()
+    assert found.status == "FAIL"
+    assert "torch is 0.0.1, expected 2.11.0" in found.found
+
+
+@pytest.mark.parametrize(("free", "status"), [(1e9, "FAIL"), (5e9, "warn"), (50e9, "ok")])
+def test_little_disk_space_is_found(free: float, status: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def usage(path: Any) -> Any:
+        return shutil._ntuple_diskusage(100e9, 0, free)  # type: ignore[attr-defined]
+
+    monkeypatch.setattr(shutil, "disk_usage", usage)
+    assert doctor.check_disk(tmp_path / "not" / "there" / "yet").status == status
+
+
+def test_the_allocator_setting_is_accepted_and_changes_no_result() -> None:
+    # In a process of its own, since it cannot be undone.
+    code = (
+        "from playslot_rl.allocator import tune_allocator\n"
+        "print(tune_allocator(), tune_allocator(), len(bytes(300_000_000)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "True", "300000000"]
+
+
+def test_the_allocator_is_left_alone_without_glibc(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("platform.libc_ver", lambda: ("", ""))
+    assert tune_allocator() is False
+
+
+def test_threads() -> None:
+    import torch
+
+    before = torch.get_num_threads()
+    try:
+        assert set_threads(0) == before
+        assert set_threads(2) == 2
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    with pytest.raises(ValueError, match="threads: got -1, expected 0"):
+        set_threads(-1)
+    assert available_cores() >= 1
