@@ -98,6 +98,9 @@ class CollectConfig:
         expert_episodes: demonstrations that `pipeline` collects for the policy.
         expert_steps: agent steps of each; clips go on past success.
         noise: standard deviation of Gaussian noise added to the expert's actions.
+        noisy_episodes: episodes of the noisy expert that `pipeline` adds to the world model's videos.
+        exploration_noise: standard deviation of its noise.
+        learn_from_demos: whether the world model learns from the demonstrations' videos too (never their actions).
         storage: `image` (PNG in parquet, lossless) or `video` (h264 yuv444p, crf 0).
     """
 
@@ -106,6 +109,9 @@ class CollectConfig:
     expert_episodes: int = 150
     expert_steps: int = 20
     noise: float = 0.0
+    noisy_episodes: int = 0
+    exploration_noise: float = 0.5
+    learn_from_demos: bool = False
     storage: Literal["image", "video"] = "image"
 
 
@@ -312,6 +318,7 @@ class DynamicsStageConfig(StageConfig):
     Attributes:
         seed_frames: parsed frames a rollout starts from.
         predicted_frames: frames predicted after the seed.
+        from_start: fraction of the clips that start at their episode's first frame, as imagination does.
         teacher_steps: first steps in which every input is a parsed slot (one parallel pass; 0 in the paper).
         decoded_frames: predicted frames decoded for the image loss, drawn at random; 0 decodes all of them.
         image_weight, slot_weight, vq_weight: loss weights (lambda of Eq. "full loss").
@@ -319,6 +326,7 @@ class DynamicsStageConfig(StageConfig):
 
     seed_frames: int = 6
     predicted_frames: int = 8
+    from_start: float = 0.0
     teacher_steps: int = 0
     decoded_frames: int = 0
     image_weight: float = 1.0

@@ -53,7 +53,7 @@ def slot_cache(
     Raises:
         OutputError: full disk.
 
-    Note: sampled initial slots (`gaussian`) are drawn by a generator seeded with the episode's number.
+    Note: sampled initial slots (`gaussian`) are drawn by generators with fixed seeds, so the slots repeat.
     """
     key = hashlib.sha256(json.dumps([_FORMAT, source.fingerprint, source.camera, source.image_size, savi_fingerprint])
                          .encode()).hexdigest()[:24]  # fmt: skip

@@ -80,6 +80,10 @@ class InverseDynamics(nn.Module):
             )
             self.to_mean = nn.Linear(c.dim, c.latent_dim)
             self.to_variance = nn.Linear(c.dim, c.latent_dim)
+            # Start with little noise: a softplus of 0 would drown the differences of neighbouring frames.
+            nn.init.constant_(self.to_variance.bias, -4.0)
+            with torch.no_grad():
+                self.to_variance.weight.mul_(0.1)
         if config.mode in ("hybrid", "discrete"):
             self.quantizer = ActionQuantizer(
                 c.latent_dim, c.n_prototypes, c.decay, c.dead_threshold, c.commitment

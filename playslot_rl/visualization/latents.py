@@ -122,7 +122,10 @@ def _probes(sets: list[LatentData]) -> list[Block]:
                 rows.append([f"{d.name}: {label}", _r2(score["mean_r2"]), *(_r2(v) for v in score["r2"])])
     headers = ["probe", "mean R²", *(f"action {i + 1}" for i in range(width))]
     held = ", ".join(f"{d.name}: {d.probe['test_episodes']} episodes" for d in probed if d.probe is not None)
-    caption = f"Variance of the real action recovered on held-out episodes ({held}); 1 is all of it, 0 or less is none."
+    caption = (
+        f"Variance of the real action recovered on held-out episodes ({held}); 1 is all of it, 0 or less is none. "
+        "Random actions are the stricter test: an expert's can partly be guessed from the scene alone."
+    )
     return [Table(headers, rows, caption)]
 
 

@@ -60,7 +60,7 @@ class ReportInput:
 def png(picture: Image.Image) -> bytes:
     """Bytes of a picture."""
     buffer = io.BytesIO()
-    picture.save(buffer, format="PNG", optimize=True)
+    picture.save(buffer, format="PNG")
     return buffer.getvalue()
 
 

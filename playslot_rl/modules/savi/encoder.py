@@ -7,6 +7,8 @@ Full (paper): four 5x5 stride-1 convs, L = H * W. Strided (compact): the same wi
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
+
 import torch
 from torch import Tensor, nn
 
@@ -59,8 +61,10 @@ class SAViEncoder(nn.Module):
             nn.LayerNorm(width), nn.Linear(width, token_dim), nn.ReLU(), nn.Linear(token_dim, token_dim)
         )
 
-    def forward(self, frames: Tensor) -> Tensor:
-        """Frames (B, 3, H, W) in [0, 1] to tokens (B, L, token_dim)."""
-        maps = self.convs(frames.contiguous(memory_format=torch.channels_last)) + self.position()
+    def forward(self, frames: Tensor, autocast: AbstractContextManager[object] | None = None) -> Tensor:
+        """Frames (B, 3, H, W) in [0, 1] to tokens (B, L, token_dim); `autocast` surrounds the convolutions only."""
+        with autocast or nullcontext():
+            maps = self.convs(frames.contiguous(memory_format=torch.channels_last))
+        maps = maps.float() + self.position()
         tokens: Tensor = self.mlp(maps.flatten(2).transpose(1, 2))
         return tokens

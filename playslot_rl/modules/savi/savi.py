@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.config import SAViConfig
+from playslot_rl.config import Precision, SAViConfig
 from playslot_rl.modules.savi.corrector import SlotAttention
 from playslot_rl.modules.savi.decoder import BroadcastDecoder, PixelShuffleDecoder
 from playslot_rl.modules.savi.encoder import SAViEncoder
@@ -37,7 +37,7 @@ class SAVi(nn.Module):
 
     Example:
         >>> import torch
-        >>> from playslot_rl.config import SAViConfig
+        >>> from playslot_rl.config import Precision, SAViConfig
         >>> savi = SAVi(SAViConfig(n_slots=3), image_size=32)
         >>> slots, state = savi(torch.rand(2, 4, 3, 32, 32))
         >>> slots.shape, savi.decode(slots).frames.shape
@@ -47,6 +47,7 @@ class SAVi(nn.Module):
     def __init__(self, config: SAViConfig, image_size: int) -> None:
         super().__init__()
         self.config, self.image_size = config, image_size
+        self.precision: Precision = "fp32"
         c = config
         self.encoder = SAViEncoder(image_size, c.encoder_channels, c.encoder_strides, c.token_dim)
         self.initializer = SlotInitializer(c.n_slots, c.slot_dim, c.initial)
@@ -73,7 +74,7 @@ class SAVi(nn.Module):
             Slots (B, T, N, D), and the state to go on from.
         """
         b, t = frames.shape[:2]
-        tokens = self.encoder(frames.flatten(0, 1))
+        tokens = self.encoder(frames.flatten(0, 1), self._autocast(frames))
         keys, values = self.corrector.keys_values(tokens)
         keys, values = keys.view(b, t, *keys.shape[1:]), values.view(b, t, *values.shape[1:])
         first = state is None
@@ -89,11 +90,16 @@ class SAVi(nn.Module):
     def decode(self, slots: Tensor) -> Decoded:
         """Render slots (..., N, D)."""
         lead = slots.shape[:-1]
-        out = self.decoder(slots.reshape(-1, slots.shape[-1])).float()
+        with self._autocast(slots):
+            out = self.decoder(slots.reshape(-1, slots.shape[-1]))
+        out = out.float()
         out = out.reshape(*lead, *out.shape[1:])
         rgb, logits = out[..., :3, :, :], out[..., 3:, :, :]
         masks = torch.softmax(logits, dim=-4)
         return Decoded((rgb * masks).sum(dim=-4), rgb, masks)
+
+    def _autocast(self, x: Tensor) -> torch.autocast:
+        return torch.autocast(x.device.type, torch.bfloat16, enabled=self.precision == "bf16")
 
 
 def _initialise(module: nn.Module) -> None:

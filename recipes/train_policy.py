@@ -1,0 +1,85 @@
+"""`playslot train-policy run=RUN data.root=DEMOS`: stage 3, latent policy, slot oracle and action decoder.
+
+`run=pretrained out=RUN` builds on the shipped world model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.recipes.run import demo_root, open_device, open_run, open_videos, parent_run, said
+
+
+def main(config: ExperimentConfig) -> None:
+    """Train policy, oracle and decoder into `RUN/policy`; killed, the same command carries on.
+
+    Raises:
+        CheckpointError: no finished world model, or the run was begun otherwise.
+        DataError: no demonstrations, none with actions, or fewer than `behaviour.labelled_demos`.
+        OutputError, TrainingError: see `playslot_rl.errors`.
+    """
+    import torch
+
+    from playslot_rl.data.demonstrations import label_demonstrations
+    from playslot_rl.data.slot_cache import slot_cache
+    from playslot_rl.training.checkpoints import (
+        checkpoint_folder, link_world_model, load_world_model, read_stage, require_parents, save_stage,
+        world_model_checkpoints, world_model_folder,
+    )  # fmt: skip
+    from playslot_rl.training.fit import fit
+    from playslot_rl.training.seeding import derived_seed
+    from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage
+    from playslot_rl.world_model import Agent
+
+    parent = parent_run(config, open_run(config))
+    run = open_run(config)
+    parents = world_model_checkpoints(parent)
+    if world_model_folder(parent).resolve() != run.resolve():
+        link_world_model(run, parent if parent == "pretrained" else world_model_folder(parent))
+    if said("policy", run):
+        require_parents(read_stage(checkpoint_folder(run, "policy"), "policy"), parents)
+        return
+    device = open_device(config)
+    world = load_world_model(parent, device)
+    world.config = replace(world.config, policy=config.model.policy, action_decoder=config.model.action_decoder)
+    source = open_videos(replace(config, env=world.env), demo_root(config), "train-policy")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derived_seed(config.seed, 0, "policy"))
+        agent = Agent.untrained(world, oracle=config.behaviour.oracle).to(device)
+    prints = {name: checkpoint.fingerprint for name, checkpoint in parents.items()}
+    cached = slot_cache(source, world.savi, prints["slots"], config.data.cache, device, progress=True)
+    demos = label_demonstrations(world, source, cached, device)
+    demos.labelled(config.behaviour.labelled_demos)  # too few are refused before anything is trained
+    clone = CloneStage(agent.policy, agent.oracle, demos, config.behaviour)
+    sizes = to_dict(world.config)
+    identity = {"model": sizes, "data": source.fingerprint, **prints}
+    cloned = fit(
+        clone, config.behaviour, run / "policy", name="policy", seed=config.seed, device=device,
+        logging=config.logging, identity=identity,
+    )  # fmt: skip
+    agent.eval()
+    decode = DecoderStage(agent.action_decoder, agent.policy, demos, config.behaviour)
+    decoder_config = replace(config.behaviour, steps=config.behaviour.decoder_steps)
+    decoded = fit(
+        decode, decoder_config, run / "policy" / "decoder", name="decoder", seed=config.seed, device=device,
+        logging=config.logging, identity=identity,
+    )  # fmt: skip
+    save_stage(
+        checkpoint_folder(run, "policy"),
+        stage="policy",
+        modules={**clone.modules, **decode.modules},
+        config={"env": to_dict(world.env), "model": sizes, "policy": to_dict(config.behaviour)},
+        data={"demos": source.fingerprint},
+        parents=prints,
+        metrics={**cloned.metrics, **{f"decoder_{key}": value for key, value in decoded.metrics.items()}},
+        steps=cloned.step,
+        seconds=cloned.seconds + decoded.seconds,
+        extra={
+            "demos": len(demos.lengths),
+            "labelled_demos": config.behaviour.labelled_demos,
+            "seed": config.seed,
+            "data_root": demo_root(config),
+        },
+    )
+    print(f"policy: {len(demos.lengths)} demos, {config.behaviour.labelled_demos} labelled, {run / 'policy'}", flush=True)

@@ -1,0 +1,53 @@
+"""`playslot train-slots env=E preset=P data.root=DIR out=RUN`: stage 1, SAVi on unlabelled videos."""
+
+from __future__ import annotations
+
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.recipes.run import open_device, open_run, open_videos, said
+
+
+def main(config: ExperimentConfig) -> None:
+    """Train SAVi into `RUN/slots`; killed, the same command carries on; finished, it says so.
+
+    Raises:
+        DataError, OutputError, CheckpointError, TrainingError: see `playslot_rl.errors`.
+    """
+    import torch
+
+    from playslot_rl.modules.savi import SAVi
+    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
+    from playslot_rl.training.fit import fit
+    from playslot_rl.training.seeding import derived_seed
+    from playslot_rl.training.stage_slots import SlotsStage
+
+    run = open_run(config)
+    wanted = {"env": {"image_size": config.env.image_size}, "model": {"savi": to_dict(config.model.savi)}}
+    if said("slots", run):
+        require_config(read_stage(checkpoint_folder(run, "slots"), "slots"), wanted)
+        return
+    device = open_device(config)
+    source = open_videos(config, config.data.root, "train-slots")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derived_seed(config.seed, 0, "slots"))
+        savi = SAVi(config.model.savi, config.env.image_size).to(device)
+    stage = SlotsStage(
+        savi, source, config.slots, validation=config.data.validation, seed=config.seed, device=device
+    )
+    identity = {**wanted, "data": source.fingerprint}
+    result = fit(
+        stage, config.slots, run / "slots", name="slots", seed=config.seed, device=device,
+        logging=config.logging, identity=identity,
+    )  # fmt: skip
+    save_stage(
+        checkpoint_folder(run, "slots"),
+        stage="slots",
+        modules=stage.modules,
+        config={"env": to_dict(config.env), "model": to_dict(config.model), "slots": to_dict(config.slots)},
+        data={"train": source.fingerprint},
+        parents={},
+        metrics=result.metrics,
+        steps=result.step,
+        seconds=result.seconds,
+        extra={"episodes": source.episodes, "seed": config.seed},
+    )
+    print(f"slots: {result.metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {run / 'slots'}", flush=True)
