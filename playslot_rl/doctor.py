@@ -65,7 +65,7 @@ class Check:
 def check_python() -> Check:
     """Python 3.12, the only version that the pinned libraries share."""
     found = f"{platform.python_version()} at {sys.prefix}"
-    if sys.version_info[:2] == (3, 12):
+    if platform.python_version_tuple()[:2] == ("3", "12"):
         return Check("Python", "ok", found)
     return Check("Python", "FAIL", found, "expected Python 3.12: install it and run `make setup`")
 
@@ -141,8 +141,8 @@ def check_video() -> Check:
             for packet in [*stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")), *stream.encode(None)]:
                 container.mux(packet)
         buffer.seek(0)
-        with av.open(buffer) as container:
-            count = sum(1 for _ in container.decode(video=0))
+        with av.open(buffer, "r") as source:
+            count = len(list(source.decode(video=0)))
     except Exception as error:  # noqa: BLE001  av raises its own and FFmpeg's errors
         cure = f"only collect.storage=video and data sets with video need it; {_REINSTALL}"
         return Check("PyAV", "warn", _one_line(error), cure)

@@ -124,7 +124,7 @@ def test_out_stays_apart_from_the_run_where_it_is_typed(tmp_path: Path) -> None:
 def test_a_run_refuses_another_preset(tmp_path: Path) -> None:
     run = store(compose(["preset=smoke"]), tmp_path / "run")
     assert compose([f"run={run}", "preset=smoke"], "evaluate").preset == "smoke"
-    with pytest.raises(ConfigError, match="got preset=paper with run=.* made with preset=smoke"):
+    with pytest.raises(ConfigError, match=r"got preset=paper with run=.* made with preset=smoke"):
         compose([f"run={run}", "preset=paper"], "evaluate")
 
 
@@ -138,7 +138,7 @@ def test_other_commands_do_not_read_the_run(tmp_path: Path) -> None:
 def test_a_run_without_a_usable_config_is_refused(tmp_path: Path, content: str | None) -> None:
     if content is not None:
         (tmp_path / "config.json").write_text(content)
-    with pytest.raises(ConfigError, match="config.json"):
+    with pytest.raises(ConfigError, match=r"config\.json"):
         compose([f"run={tmp_path}"], "evaluate")
 
 
@@ -150,5 +150,5 @@ def test_equal_configs_have_equal_fingerprints() -> None:
 def test_a_config_checks_its_values() -> None:
     with pytest.raises(ValueError, match="transition_heads: got 5, expected a divisor of slot_dim 128"):
         SAViConfig(transition_heads=5)
-    with pytest.raises(ValueError, match="unknown key nslots.*did you mean n_slots"):
+    with pytest.raises(ValueError, match=r"unknown key nslots.*did you mean n_slots"):
         from_dict(SAViConfig, {"nslots": 3})
