@@ -25,15 +25,15 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
         OutputError: the result cannot be written.
     """
     run = check_run(config)
+    from playslot_rl.recipes.run import open_device
+
     from playslot_rl.evaluation.episodes import TaskPool
     from playslot_rl.evaluation.success import check_protocol, evaluate_run, run_facts
-    from playslot_rl.threads import set_threads
     from playslot_rl.training.checkpoints import load_agent
 
     check_protocol(config.protocol)
     run_facts(run)  # a run without a policy is refused before anything is loaded
-    set_threads(config.threads)
-    agent = load_agent(run, device(config))
+    agent = load_agent(run, open_device(config))
     check_environment(config, agent.world_model.env.image_size, agent.world_model.env.action_dim)
     with TaskPool(config.env, config.render) as pool:
         result = evaluate_run(run, agent, config, config.protocol, pool)
@@ -77,13 +77,6 @@ def check_environment(config: ExperimentConfig, image_size: int, action_dim: int
     ):
         if got != expected:
             raise ConfigError(f"env.{name}: got {got}, expected {expected}, with which run={config.run} was trained")
-
-
-def device(config: ExperimentConfig) -> str:
-    """The configured device; a GPU if there is one and none was configured."""
-    import torch
-
-    return config.device or ("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def describe(result: dict[str, Any], run: Path) -> str:

@@ -21,6 +21,8 @@ from playslot_rl.visualization.palette import DARK, LIGHT, Theme
 from playslot_rl.world_model import Agent, WorldModel
 
 STAGES = ("slots", "dynamics", "policy")
+HISTORIES = {"slots": "slots", "dynamics": "dynamics", "policy": "policy", "action decoder": "policy/decoder"}
+"""What was trained -> folder of its `metrics.jsonl` in the run."""
 EPISODES_SHOWN = 3
 
 
@@ -256,11 +258,11 @@ def training_section(given: ReportInput) -> Section:
         )
     if rows:
         blocks.insert(0, Table(["stage", "steps", "time", "machine", "commit", "held-out metrics at the end"], rows))
-    paths = {stage: given.run / stage / "metrics.jsonl" for stage in STAGES}
-    histories = {stage: history for stage, path in paths.items() if loss_names(history := read_history(path))}
+    paths = {name: given.run / folder / "metrics.jsonl" for name, folder in HISTORIES.items()}
+    histories = {name: history for name, path in paths.items() if loss_names(history := read_history(path))}
     if histories:
         names = ", ".join(histories)
-        caption = f"Logarithmic where all values are positive. Stages trained in this run: {names}."
+        caption = f"Logarithmic where all values are positive. Trained in this run: {names}."
         drawn = chart("losses", lambda theme: loss_chart(histories, theme), f"Loss curves of {names}.", caption)
         blocks.append(drawn)
     elsewhere = [stage for stage in given.metas if stage not in histories]
