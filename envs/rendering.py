@@ -95,6 +95,19 @@ def _close(renderer: Any) -> None:
     renderer.close()
 
 
+def box_mean(frame: npt.NDArray[np.uint8], factor: int) -> npt.NDArray[np.uint8]:
+    """Average boxes of `factor` x `factor` pixels: uint8 (H * factor, W * factor, 3) to (H, W, 3).
+
+    Integer arithmetic, rounded to nearest, so exact on every machine; sums of strided slices, because a reduction over
+    two axes of a reshaped array is ten times slower.
+    """
+    wide = frame.astype(np.uint16)
+    tall = sum(wide[i::factor] for i in range(1, factor)) + wide[0::factor]
+    total = sum(tall[:, i::factor] for i in range(1, factor)) + tall[:, 0::factor]
+    mean: npt.NDArray[np.uint8] = ((total + factor**2 // 2) // factor**2).astype(np.uint8)
+    return mean
+
+
 class FrameRenderer:
     """Draws the scene of one MuJoCo model.
 
@@ -139,10 +152,7 @@ class FrameRenderer:
         frame: npt.NDArray[np.uint8] = self._renderer.render()
         if self._factor == 1:
             return frame.copy()
-        boxes = frame.reshape(self.size, self._factor, self.size, self._factor, 3)
-        area = self._factor**2
-        # Integer arithmetic, rounded to nearest: exact on every machine.
-        return ((boxes.sum(axis=(1, 3), dtype=np.uint32) + area // 2) // area).astype(np.uint8)
+        return box_mean(frame, self._factor)
 
     def close(self) -> None:
         """Free the GL context; safe to call twice."""

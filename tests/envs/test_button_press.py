@@ -115,6 +115,16 @@ def test_fast_rendering_looks_like_full_quality(env: ButtonPressEnv) -> None:
     assert 0.0 < np.abs(a - b).mean() < 20.0
 
 
+@pytest.mark.parametrize("factor", [1, 2, 3, 8])
+def test_boxes_are_averaged_exactly(factor: int) -> None:
+    from playslot_rl.envs.rendering import box_mean
+
+    frame = np.random.default_rng(0).integers(0, 256, (8 * factor, 4 * factor, 3), dtype=np.uint8)
+    exact = frame.reshape(8, factor, 4, factor, 3).astype(float).mean(axis=(1, 3))
+    np.testing.assert_array_equal(box_mean(frame, factor), np.floor(exact + 0.5))
+    np.testing.assert_array_equal(box_mean(np.full_like(frame, 255), factor), 255)
+
+
 def run_python(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
     import os
 
