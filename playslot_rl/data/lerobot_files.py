@@ -1,8 +1,8 @@
 """Reading LeRobot v3.0 data sets from their files, with errors that say what to do.
 
 LeRobot's own reader turns a missing root into a Hub request, copies the parquet into an Arrow cache and decodes one row
-at a time. A cache is built from all rows in order, so we read parquet and PNG directly and give video to LeRobot's
-decoder, an episode at a time. `tests/data` checks that the frames are those of `LeRobotDataset`.
+at a time. A cache is built from all rows in order, so we read parquet, PNG and video directly, in order. `tests/data`
+checks that the frames are those of `LeRobotDataset`.
 
 Shapes: F frames, E episodes, H W image height and width, A action width.
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import itertools
 import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +23,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from playslot_rl.data.video import frames_at
 from playslot_rl.errors import DataError
 
 FRAMES_A_PIECE = 256
@@ -94,7 +96,9 @@ class LeRobotFiles:
             pieces.append(np.asarray(column.to_pylist()))
         values = np.concatenate(pieces)
         shape = tuple(self.info["features"][name].get("shape") or ())
-        return values.reshape(len(values), *shape) if shape not in ((), (1,)) else values.reshape(len(values))
+        flat = shape in ((), (1,))
+        rows: npt.NDArray[Any] = values.reshape(len(values), *(() if flat else shape))
+        return rows
 
     def camera(self, wanted: str) -> str:
         """The camera to read: the wanted one, or the only one.
@@ -156,25 +160,17 @@ class LeRobotFiles:
             return np.asarray(image.convert("RGB"))
 
     def _video_pieces(self, camera: str) -> Iterator[npt.NDArray[np.uint8]]:
-        from lerobot.datasets.video_utils import decode_video_frames
-
-        for row in self.episodes:
+        def file_of(row: dict[str, Any]) -> Path:
             chunk, file = row[f"videos/{camera}/chunk_index"], row[f"videos/{camera}/file_index"]
-            path = self.root / self.info["video_path"].format(video_key=camera, chunk_index=chunk, file_index=file)
-            begin = float(row[f"videos/{camera}/from_timestamp"])
-            for first in range(0, row["length"], FRAMES_A_PIECE):
-                count = min(FRAMES_A_PIECE, row["length"] - first)
-                times = [begin + (first + i) / self.fps for i in range(count)]
-                try:
-                    # torchcodec does not load without a system FFmpeg; PyAV brings its own.
-                    frames = decode_video_frames(path, times, 0.25 / self.fps, backend="pyav", return_uint8=True)
-                except Exception as error:
-                    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-                    raise DataError(
-                        f"{path}: cannot decode {camera} of episode {row['episode_index']} ({reason}), expected a "
-                        "whole video: the data set is damaged, collect or pull it again"
-                    ) from error
-                yield np.ascontiguousarray(frames.permute(0, 2, 3, 1).numpy())
+            name = str(self.info["video_path"])
+            return self.root / name.format(video_key=camera, chunk_index=chunk, file_index=file)
+
+        for path, rows in itertools.groupby(self.episodes, file_of):
+            begins = [(float(row[f"videos/{camera}/from_timestamp"]), int(row["length"])) for row in rows]
+            times = [begin + i / self.fps for begin, length in begins for i in range(length)]
+            frames = frames_at(path, times, 0.25 / self.fps)
+            while piece := list(itertools.islice(frames, FRAMES_A_PIECE)):
+                yield np.stack(piece)
 
 
 def open_files(root: str | Path) -> LeRobotFiles:

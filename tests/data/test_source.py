@@ -197,9 +197,23 @@ def test_a_damaged_video_is_refused(foreign_video: Path, tmp_path: Path) -> None
     root = Path(shutil.copytree(foreign_video, tmp_path / "video"))
     for path in root.rglob("*.mp4"):
         path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(DataError, match=r"cannot decode observation\.images\.top of episode 0") as caught:
+    with pytest.raises(DataError, match=r"cannot decode the frame at 0\.000 s") as caught:
         open_source(root, "observation.images.top", tmp_path / "cache")
     assert one_line(caught)
+
+
+def test_a_video_that_ends_too_early_is_refused(foreign_video: Path, tmp_path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    root = Path(shutil.copytree(foreign_video, tmp_path / "video"))
+    path = next((root / "meta" / "episodes").rglob("*.parquet"))
+    table = pq.read_table(path)
+    name = "videos/observation.images.top/from_timestamp"
+    later = pa.array([0.0, 0.5, 3.0], table.schema.field(name).type)
+    pq.write_table(table.set_column(table.column_names.index(name), name, later), path)
+    with pytest.raises(DataError, match=r"at 3\.000 s \(it ends too early\)"):
+        open_source(root, "observation.images.top", tmp_path / "cache")
 
 
 def test_a_full_disk_leaves_no_cache(foreign_images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,59 @@
+"""Slots of a whole data set, computed once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from playslot_rl.data.slot_cache import parse_episodes, slot_cache
+from playslot_rl.data.source import EpisodeFrames, open_source
+from playslot_rl.modules.savi import SAVi
+from playslot_rl.testing import tiny_config
+
+
+@pytest.fixture
+def source(foreign_images: Path, tmp_path: Path) -> EpisodeFrames:
+    return open_source(foreign_images, cache=tmp_path)
+
+
+@pytest.fixture
+def savi() -> SAVi:
+    torch.manual_seed(0)
+    return SAVi(replace(tiny_config().model.savi, decoder_channels=(16, 16)), 32)
+
+
+def test_slots_equal_parsing_each_episode_by_itself(source: EpisodeFrames, savi: SAVi, tmp_path: Path) -> None:
+    slots = slot_cache(source, savi, "f" * 16, tmp_path)
+    assert slots.shape == (15, 4, 32)
+    assert slots.dtype == np.float32
+    for episode in range(source.episodes):
+        rows = source.episode_rows(episode)
+        with torch.no_grad():
+            expected, _ = savi(source.pixels(rows)[None].float() / 255)
+        # The cache parses several episodes in one batch: equal up to the order of float additions.
+        torch.testing.assert_close(torch.from_numpy(slots[rows]), expected[0], atol=1e-5, rtol=1e-4)
+
+
+def test_slots_are_computed_once_for_weights_and_data(
+    source: EpisodeFrames, savi: SAVi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = slot_cache(source, savi, "a" * 16, tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(SAVi, "forward", None)
+        assert np.array_equal(slot_cache(source, savi, "a" * 16, tmp_path), first)
+        with pytest.raises(TypeError):
+            slot_cache(source, savi, "b" * 16, tmp_path)
+        with pytest.raises(TypeError):
+            slot_cache(replace(source, fingerprint="c" * 16), savi, "a" * 16, tmp_path)
+    assert len(list((tmp_path / "slots").glob("[0-9a-f]*"))) == 1
+
+
+def test_sampled_initial_slots_repeat(source: EpisodeFrames) -> None:
+    torch.manual_seed(0)
+    savi = SAVi(replace(tiny_config().model.savi, initial="gaussian", decoder_channels=(16, 16)), 32)
+    one, two = (np.concatenate(list(parse_episodes(source, savi))) for _ in range(2))
+    assert np.array_equal(one, two)
