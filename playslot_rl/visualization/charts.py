@@ -38,9 +38,9 @@ def _style(axes: Axes, theme: Theme) -> None:
         spine.set_color(theme.grid)
 
 
-def _png(figure: Figure) -> bytes:
+def _png(figure: Figure, theme: Theme) -> bytes:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=144, transparent=True)
+    figure.savefig(buffer, format="png", dpi=144, facecolor=theme.ground)
     return buffer.getvalue()
 
 
@@ -71,7 +71,7 @@ def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], bool]], 
     axes.set_xlabel("success rate, % (bar: 95 % Wilson interval)")
     _style(axes, theme)
     axes.grid(False, axis="y")
-    return _png(figure)
+    return _png(figure, theme)
 
 
 def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Theme, columns: int = 3) -> bytes:
@@ -113,7 +113,7 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
     figure.legend(
         handles.values(), handles.keys(), loc="outside upper right", ncols=2, frameon=False, labelcolor=theme.text
     )
-    return _png(figure)
+    return _png(figure, theme)
 
 
 def loss_names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -153,5 +153,5 @@ def usage_chart(counts: Mapping[str, Sequence[int]], theme: Theme) -> bytes:
     _style(axes, theme)
     axes.grid(False, axis="x")
     if len(counts) > 1:
-        axes.legend(frameon=False, labelcolor=theme.text, fontsize=9)
-    return _png(figure)
+        figure.legend(loc="outside upper right", ncols=4, frameon=False, labelcolor=theme.text, fontsize=9)
+    return _png(figure, theme)

@@ -12,17 +12,19 @@ LABEL: Final = "#767676"
 
 @dataclass(frozen=True)
 class Theme:
-    """Colours of a chart on a light or a dark page."""
+    """Colours of a chart on a light or a dark page; opaque, since files meet pages of other colours."""
 
     name: str
+    ground: str
     text: str
     grid: str
     series: tuple[str, ...]
 
 
-LIGHT: Final = Theme("light", "#22262b", "#d8dbe0", OKABE_ITO)
+LIGHT: Final = Theme("light", "#ffffff", "#22262b", "#d8dbe0", OKABE_ITO)
 DARK: Final = Theme(
     "dark",
+    "#16181c",
     "#e4e6ea",
     "#3b4048",
     ("#56B4E9", "#E69F00", "#2FC79A", "#E39AC4", "#9AD1F3", "#F08A4B", "#F0E442", "#B5B5B5"),

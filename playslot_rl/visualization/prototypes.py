@@ -67,4 +67,5 @@ def change_map(before: Frames, after: Frames) -> Frames:
     strength = np.clip(np.abs(difference) / 48.0, 0, 1)[..., None]
     blue, orange = np.array([0, 114, 178], np.float32), np.array([213, 94, 0], np.float32)
     colour = np.where(difference[..., None] > 0, orange, blue)
-    return (255 * (1 - strength) + colour * strength).astype(np.uint8)
+    picture: Frames = (255 * (1 - strength) + colour * strength).astype(np.uint8)
+    return picture

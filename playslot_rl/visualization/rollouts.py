@@ -61,7 +61,8 @@ def record(pool: TaskPool, controller: Controller, seeds: Sequence[int]) -> tupl
 
 def expert_frames(pool: TaskPool, seed: int) -> Frames:
     """Frames (T + 1, H, W, 3) of one episode of the scripted expert."""
-    return record(pool, ExpertController(), [seed])[0][0]
+    frames: Frames = record(pool, ExpertController(), [seed])[0][0]
+    return frames
 
 
 @torch.no_grad()

@@ -57,7 +57,8 @@ def segmentation(frames: Frames, masks: npt.NDArray[np.float32]) -> Frames:
     colours = np.array([rgb(OKABE_ITO[n % len(OKABE_ITO)]) for n in range(masks.shape[1])], np.float32)
     colour = colours[masks[:, :, 0].argmax(1)]
     grey = frames.astype(np.float32).mean(-1, keepdims=True)
-    return np.clip(0.6 * colour + 0.4 * grey, 0, 255).astype(np.uint8)
+    mixed: Frames = np.clip(0.6 * colour + 0.4 * grey, 0, 255).astype(np.uint8)
+    return mixed
 
 
 def draw_slots(model: HasSAVi, frames: Frames, columns: int = 6) -> Image.Image:
