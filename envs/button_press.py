@@ -41,6 +41,10 @@ class ButtonPressEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         render: how frames are drawn; None means the defaults.
         render_mode: `rgb_array` or None.
 
+    Attributes:
+        draw_steps: False makes `step` return the last frame that was drawn instead of a new one, for controllers that
+            do not look at it: rendering is nine tenths of a step's time. `reset` always draws.
+
     Raises:
         ConfigError: `env.action_dim` is not 4.
         RenderError: there is no working GL backend.
@@ -88,6 +92,7 @@ class ButtonPressEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         self._full: npt.NDArray[np.float64] = np.zeros(0)
         self._frame: npt.NDArray[np.uint8] | None = None
         self._steps = 0
+        self.draw_steps = True
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -145,7 +150,7 @@ class ButtonPressEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             raise ValueError(f"action: got {action!r}, expected {ACTION_DIM} finite numbers in [-1, 1]")
         reward, success = self._simulate(np.clip(action, -1.0, 1.0))
         self._steps += 1
-        return self._observe(), reward, False, self._steps >= self.config.max_steps, {"success": success}
+        return self._observe(self.draw_steps), reward, False, self._steps >= self.config.max_steps, {"success": success}
 
     def expert_action(self) -> npt.NDArray[np.float32]:
         """Action of Meta-World's scripted expert for the present state: float32 (4,) in [-1, 1]."""
@@ -154,8 +159,9 @@ class ButtonPressEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
             action = self._expert.get_action(self._full)
         return np.clip(action, -1.0, 1.0).astype(np.float32)
 
-    def _observe(self) -> Observation:
-        self._frame = self._renderer(self._env.data)
+    def _observe(self, draw: bool = True) -> Observation:
+        if draw or self._frame is None:
+            self._frame = self._renderer(self._env.data)
         return {"pixels": self._frame, "state": self._full[HAND_STATE].astype(np.float32)}
 
     def render(self) -> npt.NDArray[np.uint8] | None:

@@ -34,6 +34,8 @@ class ClosedLoop:
         ValueError: the agent has no oracle.
     """
 
+    sees_frames = True
+
     def __init__(self, agent: Agent, oracle: bool = False) -> None:
         if oracle and agent.oracle is None:
             raise ValueError(
@@ -140,6 +142,8 @@ class OpenLoop:
         agent: in evaluation mode.
         steps: agent steps to imagine.
     """
+
+    sees_frames = False
 
     def __init__(self, agent: Agent, steps: int) -> None:
         self._agent, self._steps = agent, steps

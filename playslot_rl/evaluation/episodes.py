@@ -27,6 +27,8 @@ MAX_REDRAWS = 20
 class Task(Protocol):
     """What the evaluation needs of an environment."""
 
+    draw_steps: bool
+
     def reset(self, *, seed: int | None = None) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
         """Start the episode of `seed`; `info["success"]` says whether it starts solved."""
 
@@ -59,7 +61,13 @@ class Moment(NamedTuple):
 
 
 class Controller(Protocol):
-    """Chooses the actions of episodes that run in lock-step."""
+    """Chooses the actions of episodes that run in lock-step.
+
+    Attributes:
+        sees_frames: it looks at the frames after the first; if not, they are not drawn.
+    """
+
+    sees_frames: bool
 
     def begin(self, moment: Moment) -> None:
         """New episodes, all running at step 0."""
@@ -170,6 +178,8 @@ def _run_chunk(
     stop: bool,
 ) -> list[Episode]:
     tasks = pool.take(len(seeds))
+    for task in tasks:
+        task.draw_steps = controller.sees_frames or on_frame is not None
     started = [start_episode(task, seed, stride) for task, seed in zip(tasks, seeds, strict=True)]
     frames = [frame for frame, _, _ in started]
     solved: list[int | None] = [None] * len(seeds)

@@ -22,6 +22,8 @@ from playslot_rl.world_model import Agent
 class RandomController:
     """Uniform actions in [-1, 1]; an episode's actions depend on its seed alone."""
 
+    sees_frames = False
+
     def __init__(self, action_dim: int) -> None:
         self._action_dim = action_dim
         self._streams: list[np.random.Generator] = []
@@ -37,6 +39,8 @@ class RandomController:
 
 class ExpertController:
     """The scripted expert, which sees the simulator's state."""
+
+    sees_frames = False
 
     def begin(self, moment: Moment) -> None:
         """Nothing to remember."""

@@ -17,6 +17,7 @@ class Counter:
     """Solved at the step that its seed's last digit says (0: never; 9: from the start)."""
 
     def __init__(self) -> None:
+        self.draw_steps = True
         self.seed, self.steps, self.log = -1, 0, list[tuple[int, Actions]]()
 
     def reset(self, *, seed: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -52,6 +53,8 @@ class CounterPool(TaskPool):
 
 class Recorder(ExpertController):
     """Remembers what it saw."""
+
+    sees_frames = True
 
     def __init__(self) -> None:
         self.moments: list[Moment] = []

@@ -17,7 +17,8 @@ from playslot_rl.config import EvaluationConfig, ExperimentConfig
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation import references
 from playslot_rl.evaluation.controllers import ClosedLoop, unfold
-from playslot_rl.evaluation.episodes import Moment, TaskPool
+from playslot_rl.evaluation.episodes import Moment, TaskPool, run_episodes
+from playslot_rl.evaluation.references import ExpertController
 from playslot_rl.evaluation.success import RunFacts, evaluate, evaluate_run, run_facts
 from playslot_rl.testing import tiny_config
 from playslot_rl.world_model import Agent, WorldModel, latent_policy_module
@@ -150,6 +151,14 @@ def test_training_seeds_are_never_evaluated(
         evaluate(agent, config, "simulation", 1, 0, run=tmp_path, pool=pool)
     moved = replace(config, evaluation=EvaluationConfig(references=False, seed_offset=SEED + 5))
     assert evaluate(agent, moved, "simulation", 1, 0, run=tmp_path, pool=pool)["seeds"] == [SEED + 5]
+
+
+def test_undrawn_frames_change_no_outcome(config: ExperimentConfig) -> None:
+    with TaskPool(replace(config.env, max_steps=20), config.render) as pool:
+        blind = run_episodes(pool, ExpertController(), [SEED, SEED + 1])
+        drawn = run_episodes(pool, ExpertController(), [SEED, SEED + 1], on_frame=lambda *_: None)
+    assert blind == drawn
+    assert all(e.success for e in blind)
 
 
 def test_result_file_is_written_where_it_is_promised(
