@@ -25,10 +25,9 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
         OutputError: the result cannot be written.
     """
     run = check_run(config)
-    from playslot_rl.recipes.run import open_device
-
     from playslot_rl.evaluation.episodes import TaskPool
     from playslot_rl.evaluation.success import check_protocol, evaluate_run, run_facts
+    from playslot_rl.recipes.run import open_device
     from playslot_rl.training.checkpoints import load_agent
 
     check_protocol(config.protocol)

@@ -20,8 +20,15 @@ def main(config: ExperimentConfig) -> None:
 
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.training.checkpoints import (
-        checkpoint_folder, load_weights, read_stage, require_config, require_parents, run_folder, save_stage, stage_model,
-    )  # fmt: skip
+        checkpoint_folder,
+        load_weights,
+        read_stage,
+        require_config,
+        require_parents,
+        run_folder,
+        save_stage,
+        stage_model,
+    )
     from playslot_rl.training.fit import fit
     from playslot_rl.training.seeding import derived_seed
     from playslot_rl.training.stage_dynamics import DynamicsStage
@@ -52,9 +59,15 @@ def main(config: ExperimentConfig) -> None:
         world, source, cached, config.dynamics, validation=config.data.validation, seed=config.seed, device=device
     )
     result = fit(
-        stage, config.dynamics, run / "dynamics", name="dynamics", seed=config.seed, device=device,
-        logging=config.logging, identity={**wanted, "slots": slots.fingerprint, "data": source.fingerprint},
-    )  # fmt: skip
+        stage,
+        config.dynamics,
+        run / "dynamics",
+        name="dynamics",
+        seed=config.seed,
+        device=device,
+        logging=config.logging,
+        identity={**wanted, "slots": slots.fingerprint, "data": source.fingerprint},
+    )
     save_stage(
         checkpoint_folder(run, "dynamics"),
         stage="dynamics",

@@ -24,9 +24,15 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.data.demonstrations import label_demonstrations
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.training.checkpoints import (
-        checkpoint_folder, link_world_model, load_world_model, read_stage, require_parents, save_stage,
-        world_model_checkpoints, world_model_folder,
-    )  # fmt: skip
+        checkpoint_folder,
+        link_world_model,
+        load_world_model,
+        read_stage,
+        require_parents,
+        save_stage,
+        world_model_checkpoints,
+        world_model_folder,
+    )
     from playslot_rl.training.fit import fit
     from playslot_rl.training.seeding import derived_seed
     from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage
@@ -55,16 +61,28 @@ def main(config: ExperimentConfig) -> None:
     sizes = to_dict(world.config)
     identity = {"model": sizes, "data": source.fingerprint, **prints}
     cloned = fit(
-        clone, config.behaviour, run / "policy", name="policy", seed=config.seed, device=device,
-        logging=config.logging, identity=identity,
-    )  # fmt: skip
+        clone,
+        config.behaviour,
+        run / "policy",
+        name="policy",
+        seed=config.seed,
+        device=device,
+        logging=config.logging,
+        identity=identity,
+    )
     agent.eval()
     decode = DecoderStage(agent.action_decoder, agent.policy, demos, config.behaviour)
     decoder_config = replace(config.behaviour, steps=config.behaviour.decoder_steps)
     decoded = fit(
-        decode, decoder_config, run / "policy" / "decoder", name="decoder", seed=config.seed, device=device,
-        logging=config.logging, identity=identity,
-    )  # fmt: skip
+        decode,
+        decoder_config,
+        run / "policy" / "decoder",
+        name="decoder",
+        seed=config.seed,
+        device=device,
+        logging=config.logging,
+        identity=identity,
+    )
     save_stage(
         checkpoint_folder(run, "policy"),
         stage="policy",
@@ -82,4 +100,5 @@ def main(config: ExperimentConfig) -> None:
             "data_root": demo_root(config),
         },
     )
-    print(f"policy: {len(demos.lengths)} demos, {config.behaviour.labelled_demos} labelled, {run / 'policy'}", flush=True)
+    labelled = config.behaviour.labelled_demos
+    print(f"policy: {len(demos.lengths)} demos, {labelled} labelled, {run / 'policy'}", flush=True)

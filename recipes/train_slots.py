@@ -30,14 +30,18 @@ def main(config: ExperimentConfig) -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derived_seed(config.seed, 0, "slots"))
         savi = SAVi(config.model.savi, config.env.image_size).to(device)
-    stage = SlotsStage(
-        savi, source, config.slots, validation=config.data.validation, seed=config.seed, device=device
-    )
+    stage = SlotsStage(savi, source, config.slots, validation=config.data.validation, seed=config.seed, device=device)
     identity = {**wanted, "data": source.fingerprint}
     result = fit(
-        stage, config.slots, run / "slots", name="slots", seed=config.seed, device=device,
-        logging=config.logging, identity=identity,
-    )  # fmt: skip
+        stage,
+        config.slots,
+        run / "slots",
+        name="slots",
+        seed=config.seed,
+        device=device,
+        logging=config.logging,
+        identity=identity,
+    )
     save_stage(
         checkpoint_folder(run, "slots"),
         stage="slots",

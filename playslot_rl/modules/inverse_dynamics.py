@@ -85,9 +85,7 @@ class InverseDynamics(nn.Module):
             with torch.no_grad():
                 self.to_variance.weight.mul_(0.1)
         if config.mode in ("hybrid", "discrete"):
-            self.quantizer = ActionQuantizer(
-                c.latent_dim, c.n_prototypes, c.decay, c.dead_threshold, c.commitment
-            )
+            self.quantizer = ActionQuantizer(c.latent_dim, c.n_prototypes, c.decay, c.dead_threshold, c.commitment)
 
     @property
     def n_prototypes(self) -> int:

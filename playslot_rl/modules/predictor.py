@@ -46,9 +46,7 @@ class COCVP(nn.Module):
         self.embed_slots = nn.Linear(slot_dim, c.dim)
         self.embed_prototype = nn.Linear(latent_dim, c.dim)
         self.embed_variability = nn.Linear(latent_dim, c.dim)
-        self.blocks = nn.ModuleList(
-            TransformerBlock(c.dim, c.heads, c.head_dim, c.mlp_dim) for _ in range(c.layers)
-        )
+        self.blocks = nn.ModuleList(TransformerBlock(c.dim, c.heads, c.head_dim, c.mlp_dim) for _ in range(c.layers))
         self.norm = nn.LayerNorm(c.dim)
         self.head = nn.Linear(c.dim, slot_dim)
         if c.residual:
@@ -81,7 +79,7 @@ class COCVP(nn.Module):
         Raises:
             ValueError: more frames than the context.
         """
-        b, t, n, _ = slots.shape
+        t, n = slots.shape[1:3]
         if t > self.config.context:
             raise ValueError(
                 f"frames: got {t}, expected at most model.predictor.context={self.config.context}; use rollout"

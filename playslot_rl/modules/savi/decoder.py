@@ -12,6 +12,7 @@ Pixel shuffle (compact): broadcast to 8x8, then a 3x3 conv and pixel shuffle for
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import torch
@@ -32,18 +33,20 @@ class BroadcastDecoder(nn.Module):
         slot_dim: D.
         channels: channels of the 5x5 convs.
         collapse: compute the first layer in its collapsed form.
+
+    Attributes:
+        channels_last: memory format of the maps (results do not change); False is what PyTorch does by itself.
     """
 
     inside: Tensor
+    channels_last = True
 
     def __init__(self, image_size: int, slot_dim: int, channels: tuple[int, ...], collapse: bool = True) -> None:
         super().__init__()
         self.image_size, self.collapse = image_size, collapse
         self.position = SoftPositionEmbedding(image_size, slot_dim)
         widths = (slot_dim, *channels)
-        self.convs = nn.ModuleList(
-            nn.Conv2d(a, b, 5, padding=2) for a, b in zip(widths[:-1], widths[1:], strict=True)
-        )
+        self.convs = nn.ModuleList(nn.Conv2d(a, b, 5, padding=2) for a, b in itertools.pairwise(widths))
         self.head = nn.Conv2d(widths[-1], 4, 3, padding=1)
         # Row r: which of the 5 kernel rows lie inside the image for output rows 0, 1, inside, H-2, H-1.
         cases = torch.tensor([[0, 0, 1, 1, 1], [0, 1, 1, 1, 1], [1, 1, 1, 1, 1], [1, 1, 1, 1, 0], [1, 1, 1, 0, 0]])
@@ -54,14 +57,17 @@ class BroadcastDecoder(nn.Module):
         conv = self.convs[0]
         if not self.collapse:
             maps = slots[:, :, None, None] + self.position()
-            return conv(maps.contiguous(memory_format=torch.channels_last))  # type: ignore[no-any-return]
+            return conv(self._formatted(maps))  # type: ignore[no-any-return]
         weight = torch.einsum("oikl,rk,cl->rcoi", conv.weight, self.inside, self.inside)  # type: ignore[operator]
         small = torch.einsum("mi,rcoi->morc", slots, weight.to(slots.dtype))
         middle = self.image_size - 4
         # cat and expand, not an index gather: the gather's backward is slow.
         rows = torch.cat((small[:, :, :2], small[:, :, 2:3].expand(-1, -1, middle, -1), small[:, :, 3:]), dim=2)
         maps = torch.cat((rows[..., :2], rows[..., 2:3].expand(-1, -1, -1, middle), rows[..., 3:]), dim=3)
-        return maps.contiguous(memory_format=torch.channels_last) + conv(self.position())
+        return self._formatted(maps) + self._formatted(conv(self.position()))
+
+    def _formatted(self, maps: Tensor) -> Tensor:
+        return maps.contiguous(memory_format=torch.channels_last if self.channels_last else torch.contiguous_format)
 
     def forward(self, slots: Tensor) -> Tensor:
         """Slots (M, D) to RGB and mask logit (M, 4, H, W)."""
@@ -92,9 +98,7 @@ class PixelShuffleDecoder(nn.Module):
         self.project = nn.Linear(slot_dim, channels[0])
         self.position = SoftPositionEmbedding(BASE, channels[0])
         outs = (*channels[1:], 4)
-        self.convs = nn.ModuleList(
-            nn.Conv2d(a, 4 * b, 3, padding=1) for a, b in zip(channels, outs, strict=True)
-        )
+        self.convs = nn.ModuleList(nn.Conv2d(a, 4 * b, 3, padding=1) for a, b in zip(channels, outs, strict=True))
 
     def forward(self, slots: Tensor) -> Tensor:
         """Slots (M, D) to RGB and mask logit (M, 4, H, W)."""

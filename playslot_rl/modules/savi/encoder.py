@@ -44,7 +44,12 @@ class SAViEncoder(nn.Module):
         channels: output channels of each 5x5 conv.
         strides: stride of each conv.
         token_dim: width of the tokens.
+
+    Attributes:
+        channels_last: memory format of the maps (results do not change); False is what PyTorch does by itself.
     """
+
+    channels_last = True
 
     def __init__(self, image_size: int, channels: tuple[int, ...], strides: tuple[int, ...], token_dim: int) -> None:
         super().__init__()
@@ -63,8 +68,9 @@ class SAViEncoder(nn.Module):
 
     def forward(self, frames: Tensor, autocast: AbstractContextManager[object] | None = None) -> Tensor:
         """Frames (B, 3, H, W) in [0, 1] to tokens (B, L, token_dim); `autocast` surrounds the convolutions only."""
+        memory_format = torch.channels_last if self.channels_last else torch.contiguous_format
         with autocast or nullcontext():
-            maps = self.convs(frames.contiguous(memory_format=torch.channels_last))
+            maps = self.convs(frames.contiguous(memory_format=memory_format))
         maps = maps.float() + self.position()
         tokens: Tensor = self.mlp(maps.flatten(2).transpose(1, 2))
         return tokens

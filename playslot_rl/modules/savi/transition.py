@@ -1,6 +1,6 @@
 """SAVi's transition: one pre-norm transformer block over the slots of a frame (system.md section 1).
 
-    S_{t+1}^init = Block(S_t)        slots (B, N, D) -> (B, N, D), no output projection, since heads * head_dim = D
+S_{t+1}^init = Block(S_t)        slots (B, N, D) -> (B, N, D), no output projection, since heads * head_dim = D
 """
 
 from __future__ import annotations

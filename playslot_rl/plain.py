@@ -1,0 +1,76 @@
+"""Configs as plain values: dataclass to nested dict and back, strictly."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import hashlib
+import json
+import types
+import typing
+from typing import Any, Literal, Union, get_args, get_origin
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Nested plain dict of a config (tuples become lists, as in JSON)."""
+    plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
+    return plain
+
+
+def fingerprint(config: Any) -> str:
+    """Short content hash of a config: equal configs, equal names."""
+    text = json.dumps(to_dict(config), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def from_dict[T](cls: type[T], values: dict[str, Any], where: str = "") -> T:
+    """Build a config from nested dicts.
+
+    Args:
+        cls: the dataclass.
+        values: nested plain values; missing keys keep their defaults.
+        where: dotted prefix for error messages.
+
+    Raises:
+        ValueError: unknown key, wrong type, or a value outside its range.
+    """
+    hints = typing.get_type_hints(cls)
+    names = {f.name for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    for key in values:
+        if key not in names:
+            near = difflib.get_close_matches(str(key), names, n=1)
+            hint = f"; did you mean {where}{near[0]!s}?" if near else ""
+            raise ValueError(f"unknown key {where}{key}: expected one of {', '.join(sorted(names))}{hint}")
+    kwargs = {key: _convert(hints[key], value, f"{where}{key}") for key, value in values.items()}
+    return cls(**kwargs)
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    origin = get_origin(hint)
+    if dataclasses.is_dataclass(hint):
+        if not isinstance(value, dict):
+            raise ValueError(f"{where}: got {value!r}, expected a group of keys")
+        return from_dict(typing.cast(type, hint), value, f"{where}.")
+    if origin is Literal:
+        if value not in get_args(hint):
+            raise ValueError(f"{where}: got {value!r}, expected one of {', '.join(map(str, get_args(hint)))}")
+        return value
+    if origin in (Union, types.UnionType):
+        if value is None:
+            return None
+        return _convert(next(a for a in get_args(hint) if a is not type(None)), value, where)
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise ValueError(f"{where}: got {value!r}, expected a list")
+        return tuple(_convert(get_args(hint)[0], v, where) for v in value)
+    return _convert_scalar(hint, value, where)
+
+
+def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if hint is str and value is None:
+        return ""
+    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
+        raise ValueError(f"{where}: got {value!r} ({type(value).__name__}), expected {hint.__name__}")
+    return value
