@@ -396,7 +396,7 @@ class ExperimentConfig:
     """
 
     preset: str = "paper"
-    policy: str = "expert"
+    policy: Literal["random", "expert"] = "expert"
     episodes: int | None = None
     seed: int = 0
     workers: int = 0

@@ -158,8 +158,8 @@ class ImaginationEnv(ModelBasedEnvBase):
     @torch.no_grad()
     def _parse(self, pixels: Tensor, batch: torch.Size) -> Tensor:
         frames = normalise(pixels.to(self.device)).reshape(-1, 1, *pixels.shape[-3:])
-        slots, _ = self.savi(frames, generator=self.generator)
-        return slots[:, 0].reshape(*batch, *self.slot_shape)
+        parsed: tuple[Tensor, Tensor] = self.savi(frames, generator=self.generator)
+        return parsed[0][:, 0].reshape(*batch, *self.slot_shape)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         with torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled()):

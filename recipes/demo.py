@@ -29,7 +29,7 @@ def main(config: ExperimentConfig) -> None:
     config = replace(config, data=replace(config.data, demos=str(demos)))
     train_policy.main(config)
     for protocol in ("simulation", "imagination"):
-        chosen = replace(config, run=name, out="", protocol=protocol)  # type: ignore[arg-type]
+        chosen = replace(config, run=name, out="", protocol=protocol)
         evaluate.main(chosen, report=protocol == "imagination")
     print(f"demo: {time.monotonic() - began:.0f} s")
     print(f"open {folder / 'report.html'}", flush=True)

@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.recipes import evaluate, train_dynamics, train_policy, train_slots
 from playslot_rl.recipes.run import open_run
 
@@ -20,7 +20,7 @@ def main(config: ExperimentConfig) -> None:
     name = config.out or config.run or f"runs/{config.env.name}_{config.preset}"
     config = replace(config, out=name, run="")
     folder = open_run(config)
-    config = replace(config, data=replace(config.data, **_collect(config, folder)))
+    config = replace(config, data=_collect(config, folder))
     open_run(config)
     for stage in (train_slots, train_dynamics, train_policy):
         since = time.monotonic()
@@ -28,12 +28,12 @@ def main(config: ExperimentConfig) -> None:
         print(f"{stage.__name__.rsplit('.', 1)[-1]}: {time.monotonic() - since:.0f} s", flush=True)
     trained = replace(config, run=name, out="")
     for protocol in ("simulation", "imagination"):
-        evaluate.main(replace(trained, protocol=protocol), report=protocol == "imagination")  # type: ignore[arg-type]
+        evaluate.main(replace(trained, protocol=protocol), report=protocol == "imagination")
     print(f"pipeline: {time.monotonic() - began:.0f} s, report {folder / 'report.html'}", flush=True)
 
 
-def _collect(config: ExperimentConfig, folder: Path) -> dict[str, str]:
-    """Record what is missing; returns the data keys to go on with."""
+def _collect(config: ExperimentConfig, folder: Path) -> DataConfig:
+    """Record what is missing; returns where the data are."""
     from playslot_rl.collectors import collect
 
     given, want = config.data, config.collect
@@ -41,7 +41,7 @@ def _collect(config: ExperimentConfig, folder: Path) -> dict[str, str]:
     if not given.demos:
         collect(config, "expert", want.expert_episodes, want.expert_steps, Path(demos), config.seed, config.workers)
     if given.root:
-        return {"root": given.root, "demos": demos}
+        return replace(given, demos=demos)
     random = folder / "data" / "random"
     collect(config, "random", want.random_episodes, want.random_steps, random, config.seed, config.workers)
     roots = [str(random)]
@@ -55,4 +55,4 @@ def _collect(config: ExperimentConfig, folder: Path) -> dict[str, str]:
         roots.append(str(noisy))
     if want.learn_from_demos:
         roots.append(demos)
-    return {"root": ",".join(roots), "demos": demos}
+    return replace(given, root=",".join(roots), demos=demos)

@@ -59,7 +59,8 @@ class COCVP(nn.Module):
         action = self.embed_prototype(p) + self.embed_variability(v)
         if p.dim() == 3:
             action = action.unsqueeze(2)
-        return (self.embed_slots(slots) + action + code).flatten(1, 2)
+        tokens: Tensor = self.embed_slots(slots) + action + code
+        return tokens.flatten(1, 2)
 
     def _output(self, x: Tensor, slots: Tensor) -> Tensor:
         out: Tensor = self.head(self.norm(x)).view(slots.shape)

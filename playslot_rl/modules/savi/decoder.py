@@ -58,7 +58,7 @@ class BroadcastDecoder(nn.Module):
         if not self.collapse:
             maps = slots[:, :, None, None] + self.position()
             return conv(self._formatted(maps))  # type: ignore[no-any-return]
-        weight = torch.einsum("oikl,rk,cl->rcoi", conv.weight, self.inside, self.inside)  # type: ignore[operator]
+        weight = torch.einsum("oikl,rk,cl->rcoi", conv.weight, self.inside, self.inside)
         small = torch.einsum("mi,rcoi->morc", slots, weight.to(slots.dtype))
         middle = self.image_size - 4
         # cat and expand, not an index gather: the gather's backward is slow.
@@ -72,7 +72,7 @@ class BroadcastDecoder(nn.Module):
     def forward(self, slots: Tensor) -> Tensor:
         """Slots (M, D) to RGB and mask logit (M, 4, H, W)."""
         x = F.relu(self.first_layer(slots))
-        for conv in self.convs[1:]:  # type: ignore[index]
+        for conv in self.convs[1:]:
             x = F.relu(conv(x))
         out: Tensor = self.head(x)
         return out
