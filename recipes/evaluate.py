@@ -5,11 +5,15 @@ Writes `DIR/evaluation/PROTOCOL/eval_info.json` and renews `DIR/report.md` and `
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.errors import CheckpointError, ConfigError
+
+PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")
 
 
 def main(config: ExperimentConfig, report: bool = True) -> None:
@@ -41,6 +45,30 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
             from playslot_rl.visualization.report import write_report
 
             print(f"report: {write_report(run, agent=agent, pool=pool)}")
+
+
+def main_if_needed(config: ExperimentConfig) -> None:
+    """Evaluate under both protocols and renew the report, leaving out what this policy was measured on before."""
+    from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts
+
+    run, fresh = check_run(config), True
+    for protocol in PROTOCOLS:
+        wanted = {
+            "episodes": config.episodes or DEFAULT_EPISODES,
+            "seed": config.seed,
+            "fingerprints": run_facts(run).fingerprints,
+        }
+        path = run / "evaluation" / protocol / "eval_info.json"
+        stored = json.loads(path.read_text()) if path.is_file() else {}
+        if {key: stored.get(key) for key in wanted} == wanted:
+            print(f"{protocol}: measured before, {100 * stored['success_rate']:.0f} % success, skipped", flush=True)
+            continue
+        main(replace(config, protocol=protocol), report=False)
+        fresh = False
+    if not fresh or not (run / "report.html").is_file():
+        from playslot_rl.visualization.report import write_report
+
+        print(f"report: {write_report(run)}", flush=True)
 
 
 def check_run(config: ExperimentConfig) -> Path:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.recipes import evaluate, train_dynamics, train_policy, train_slots
-from playslot_rl.recipes.run import open_run
+from playslot_rl.recipes.run import open_run, store_config
 
 
 def main(config: ExperimentConfig) -> None:
@@ -20,15 +20,14 @@ def main(config: ExperimentConfig) -> None:
     name = config.out or config.run or f"runs/{config.env.name}_{config.preset}"
     config = replace(config, out=name, run="")
     folder = open_run(config)
+    if not (folder / "config.json").is_file():  # a stage stores it anew once it finds that it fits
+        store_config(config, folder)
     config = replace(config, data=_collect(config, folder))
-    open_run(config)
     for stage in (train_slots, train_dynamics, train_policy):
         since = time.monotonic()
         stage.main(config)
         print(f"{stage.__name__.rsplit('.', 1)[-1]}: {time.monotonic() - since:.0f} s", flush=True)
-    trained = replace(config, run=name, out="")
-    for protocol in ("simulation", "imagination"):
-        evaluate.main(replace(trained, protocol=protocol), report=protocol == "imagination")
+    evaluate.main_if_needed(replace(config, run=name, out=""))
     print(f"pipeline: {time.monotonic() - began:.0f} s, report {folder / 'report.html'}", flush=True)
 
 
