@@ -1,0 +1,49 @@
+"""The latent policy and the action decoder."""
+
+from __future__ import annotations
+
+import torch
+
+from playslot_rl.config import ActionDecoderConfig, PolicyConfig
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.modules.policy import LatentPolicy
+
+SMALL = PolicyConfig(dim=16, layers=2, heads=2, head_dim=8, mlp_dim=32)
+
+
+def policy() -> LatentPolicy:
+    torch.manual_seed(0)
+    return LatentPolicy(SMALL, slot_dim=12, out_dim=6)
+
+
+def test_the_policy_does_not_depend_on_the_order_of_the_slots() -> None:
+    slots, order = torch.randn(2, 3, 12), torch.tensor([2, 0, 1])
+    z = policy()(slots)
+    torch.testing.assert_close(policy()(slots[:, order]), z)
+    assert not torch.allclose(z[0], z[1])
+
+
+def test_the_policy_sees_every_slot() -> None:
+    slots = torch.randn(1, 3, 12)
+    expected = policy()(slots)
+    for n in range(3):
+        other = slots.clone()
+        other[:, n] = torch.randn(12)  # a constant would vanish in the layer norm
+        assert not torch.allclose(policy()(other), expected, atol=1e-5)
+
+
+def test_the_policy_takes_any_leading_shape_row_by_row() -> None:
+    slots = torch.randn(2, 4, 3, 12)
+    z = policy()(slots)
+    assert z.shape == (2, 4, 6)
+    torch.testing.assert_close(z[1, 2], policy()(slots[1, 2]))
+
+
+def test_decoded_actions_stay_inside_the_action_space() -> None:
+    torch.manual_seed(0)
+    decoder = ActionDecoder(ActionDecoderConfig(hidden_dim=16), latent_dim=6, action_dim=4)
+    actions = decoder(torch.randn(5, 7, 6) * 100)
+    assert actions.shape == (5, 7, 4)
+    assert actions.abs().max() <= 1
+    assert actions.abs().max() > 0.99
+    assert sum(isinstance(layer, torch.nn.Linear) for layer in decoder.layers) == 3
