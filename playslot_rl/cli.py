@@ -40,7 +40,7 @@ COMMANDS: Final[dict[str, Command]] = {
         "go to a journal first: after a kill the same command carries on. The data depend on the seed, not on workers.",
         (
             "playslot collect policy=random episodes=400 out=data/random",
-            "playslot collect policy=expert episodes=150 seed=1 workers=2 out=data/expert",
+            "playslot collect policy=expert episodes=150 seed=5 workers=2 out=data/expert",
         ),
     ),
     "train-slots": Command(
@@ -86,7 +86,7 @@ COMMANDS: Final[dict[str, Command]] = {
         "the main job with the shipped world model, in minutes",
         "Collects fresh expert demos, trains the policy on their videos and the action decoder on the labels of a "
         "third of them, evaluates under both protocols and writes a report under runs/demo/ (or out=).",
-        ("playslot demo", "playslot demo seed=1 out=runs/demo-1"),
+        ("playslot demo", "playslot demo seed=5 out=runs/demo-1"),
     ),
     "bench": Command(
         "speed of this machine, as ratios: training steps, rollout, sampling, rendering",
@@ -205,8 +205,9 @@ def _guarded(name: str, run: Callable[[], int]) -> int:
     """Turn every error into one line and an exit code, or show it whole where `PLAYSLOT_DEBUG=1`."""
     try:
         return run()
-    except KeyboardInterrupt:
-        return _fail(name, "interrupted; the same command carries on from the last checkpoint or episode", 130)
+    except KeyboardInterrupt as error:
+        where = str(error) or "interrupted; the same command carries on from the last checkpoint or episode"
+        return _fail(name, where, 130)
     except Exception as error:
         if _debugging():
             raise

@@ -95,7 +95,11 @@ class Agent(nn.Module):
             ConfigError: the world model has one latent action per slot, the policy gives one per step.
         """
         if world_model.inverse_dynamics.per_slot:
-            raise ConfigError("model.inverse_dynamics.variant: got multi, expected single: the policy gives one latent")
+            raise ConfigError(
+                "model.inverse_dynamics.variant: got multi, expected single: the policy gives one latent action a "
+                "step; "
+                "train dynamics with variant=single"
+            )
         config, env = world_model.config, world_model.env
         slot_dim, width = config.savi.slot_dim, world_model.inverse_dynamics.latent_dim
         return cls(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import ExperimentConfig, StageConfig, to_dict
 from playslot_rl.errors import ConfigError, DataError, OutputError
 
 if TYPE_CHECKING:
@@ -14,31 +15,50 @@ if TYPE_CHECKING:
 
     from playslot_rl.data.source import EpisodeFrames
 
-OURS = ("config.json", "data", "slots", "dynamics", "policy", "evaluation", "figures")
+OURS = ("slots", "dynamics", "policy", "world_model.json", "config.json")
 """Names by which a run folder is known."""
 
 
 def open_run(config: ExperimentConfig) -> Path:
-    """Make or open the folder that this command writes, `out` or else `run`, and store the config in it.
+    """The folder that this command writes, `out` or else `run`. Nothing is written yet.
 
     Raises:
         ConfigError: neither is given.
-        OutputError: the folder holds something else, or cannot be written.
+        OutputError: the folder holds something else.
     """
-    from playslot_rl.training.atomic import explain_write_errors, write_json
-
-    name = config.out or config.run
-    if not name or name == "pretrained":
+    folder = Path(config.out or config.run)
+    if str(folder) in (".", "pretrained"):
         raise ConfigError("out: got nothing, expected the run folder to write, such as out=runs/first")
-    folder = Path(name)
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"out={folder}: got a file, expected a folder: choose another out=")
-    if folder.is_dir() and any(folder.iterdir()) and not any((folder / known).exists() for known in OURS):
+    if folder.is_dir() and any(folder.iterdir()) and not _is_run(folder):
         raise OutputError(f"out={folder}: got a folder that holds something else, expected a run: choose another out=")
-    with explain_write_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "config.json", to_dict(config))
     return folder
+
+
+def _is_run(folder: Path) -> bool:
+    if (folder / "meta" / "info.json").exists():
+        return False  # a data set: nothing is ever written into one
+    path = folder / "config.json"
+    if path.is_file():  # a file that many tools write
+        try:
+            values = json.loads(path.read_text())
+        except ValueError:
+            return False
+        return isinstance(values, dict) and {"preset", "env", "model"} <= values.keys()
+    collected = any((folder / "data").glob("*/meta/info.json")) or any((folder / "data").glob("*.journal"))
+    return collected or any((folder / known).exists() for known in OURS)
+
+
+def store_config(config: ExperimentConfig, folder: Path) -> None:
+    """Write the run's config. Called when everything fits, so that a refused command leaves the stored one as it was.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    from playslot_rl.training.atomic import write_json
+
+    write_json(folder / "config.json", to_dict(config))
 
 
 def open_device(config: ExperimentConfig) -> torch.device:
@@ -85,10 +105,46 @@ def parent_run(config: ExperimentConfig, folder: Path) -> str:
     return config.run or str(folder)
 
 
-def said(stage: str, folder: Path) -> bool:
-    """Whether a stage is finished; if so, say that it is skipped."""
-    meta = folder / stage / "checkpoint" / "meta.json"
-    if not meta.is_file():
+def finished(
+    config: ExperimentConfig,
+    folder: Path,
+    stage: str,
+    wanted: Mapping[str, Any],
+    parents: Mapping[str, Any],
+    roots: str,
+) -> bool:
+    """Whether a stage of a run is finished; if so, say that it is skipped.
+
+    Args:
+        wanted: parts of the config that the checkpoint must have been trained with.
+        parents: checkpoints it must have been trained on, by stage.
+        roots: data sets it must have been trained on; empty if the command names none.
+
+    Raises:
+        CheckpointError: it was trained otherwise.
+    """
+    from playslot_rl.errors import CheckpointError
+    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, require_parents
+
+    path = checkpoint_folder(folder, stage)
+    if not (path / "meta.json").is_file():
         return False
-    print(f"{stage}: finished before ({json.loads(meta.read_text()).get('steps')} steps), skipped", flush=True)
+    done = read_stage(path, stage)
+    require_parents(done, parents)
+    require_config(done, wanted)
+    facts = {"seed": (config.seed, done.meta.get("seed", config.seed))}
+    if roots:
+        data = next(iter(done.meta["data"].values()), "none")
+        facts["data"] = (open_videos(config, roots, stage).fingerprint, data)
+    for name, (got, old) in facts.items():
+        if got != old:
+            raise CheckpointError(f"{name}: got {got}, expected {old} as {path} was trained with: use another out=")
+    print(f"{stage}: finished before ({done.meta.get('steps')} steps), skipped", flush=True)
     return True
+
+
+def fixed_keys(stage: StageConfig) -> dict[str, Any]:
+    """A stage's config without the intervals, which a resumed or finished stage may change."""
+    from playslot_rl.training.fit import FREE_KEYS
+
+    return {key: value for key, value in to_dict(stage).items() if key not in FREE_KEYS}

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import open_device, open_run, open_videos, parent_run, said
+from playslot_rl.recipes.run import finished, fixed_keys, open_device, open_run, open_videos, parent_run, store_config
 
 
 def main(config: ExperimentConfig) -> None:
@@ -20,11 +19,12 @@ def main(config: ExperimentConfig) -> None:
 
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.training.checkpoints import (
+        adopt_stage,
         checkpoint_folder,
         load_weights,
         read_stage,
+        require_adoptable,
         require_config,
-        require_parents,
         run_folder,
         save_stage,
         stage_model,
@@ -34,19 +34,22 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.training.stage_dynamics import DynamicsStage
     from playslot_rl.world_model import WorldModel
 
-    parent = run_folder(parent_run(config, open_run(config)))
     run = open_run(config)
+    parent = run_folder(parent_run(config, run))
     slots = read_stage(checkpoint_folder(parent, "slots"), "slots")
-    if parent.resolve() != run.resolve():
-        _adopt(slots.path, checkpoint_folder(run, "slots"))
+    require_config(slots, {"env": {"image_size": config.env.image_size}})
+    require_adoptable(slots, run)
     model = replace(config.model, savi=stage_model(slots)[0].savi)
     sizes = to_dict(model)
     wanted = {"model": {name: sizes[name] for name in ("inverse_dynamics", "predictor")}}
-    if said("dynamics", run):
-        done = read_stage(checkpoint_folder(run, "dynamics"), "dynamics")
-        require_parents(done, {"slots": slots})
-        require_config(done, wanted)
+    trained_as = {**wanted, "dynamics": fixed_keys(config.dynamics)}
+    if finished(config, run, "dynamics", trained_as, {"slots": slots}, config.data.root):
         return
+
+    def ready() -> None:
+        adopt_stage(slots, run)
+        store_config(config, run)
+
     device = open_device(config)
     source = open_videos(config, config.data.root, "train-dynamics")
     with torch.random.fork_rng(devices=[]):
@@ -54,10 +57,11 @@ def main(config: ExperimentConfig) -> None:
         world = WorldModel(model, config.env)
     load_weights(slots, {"savi": world.savi})
     world.to(device)
-    cached = slot_cache(source, world.savi, slots.fingerprint, config.data.cache, device, progress=True)
+    cached = slot_cache(source, world.savi, slots.fingerprint, config.data.cache, device, config.logging.progress)
     stage = DynamicsStage(
         world, source, cached, config.dynamics, validation=config.data.validation, seed=config.seed, device=device
     )
+    prints = {"slots": slots.fingerprint, "data": source.fingerprint}
     result = fit(
         stage,
         config.dynamics,
@@ -66,7 +70,8 @@ def main(config: ExperimentConfig) -> None:
         seed=config.seed,
         device=device,
         logging=config.logging,
-        identity={**wanted, "slots": slots.fingerprint, "data": source.fingerprint},
+        identity={**wanted, **prints, "data.validation": config.data.validation},
+        ready=ready,
     )
     save_stage(
         checkpoint_folder(run, "dynamics"),
@@ -85,18 +90,3 @@ def main(config: ExperimentConfig) -> None:
         f"code perplexity {result.metrics.get('perplexity', float('nan')):.1f}, {run / 'dynamics'}",
         flush=True,
     )
-
-
-def _adopt(source: Path, target: Path) -> None:
-    """Copy a finished parent stage into the run that builds on it, so that the run is whole."""
-    import shutil
-
-    from playslot_rl.training.atomic import explain_write_errors, replace_dir, temporary_name
-
-    if target.exists():
-        return
-    temporary = temporary_name(target)
-    with explain_write_errors(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copytree(source, temporary)
-        replace_dir(temporary, target)

@@ -6,9 +6,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import demo_root, open_device, open_run, open_videos, parent_run, said
+from playslot_rl.recipes.run import (
+    demo_root,
+    finished,
+    fixed_keys,
+    open_device,
+    open_run,
+    open_videos,
+    parent_run,
+    store_config,
+)
 
 
 def main(config: ExperimentConfig) -> None:
@@ -27,8 +37,8 @@ def main(config: ExperimentConfig) -> None:
         checkpoint_folder,
         link_world_model,
         load_world_model,
-        read_stage,
-        require_parents,
+        require_adoptable,
+        require_config,
         save_stage,
         world_model_checkpoints,
         world_model_folder,
@@ -38,23 +48,35 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage
     from playslot_rl.world_model import Agent
 
-    parent = parent_run(config, open_run(config))
     run = open_run(config)
-    parents = world_model_checkpoints(parent)
-    if world_model_folder(parent).resolve() != run.resolve():
-        link_world_model(run, parent if parent == "pretrained" else world_model_folder(parent))
-    if said("policy", run):
-        require_parents(read_stage(checkpoint_folder(run, "policy"), "policy"), parents)
+    parent = parent_run(config, run)
+    parents, model = world_model_checkpoints(parent), config.model
+    for checkpoint in parents.values():
+        require_adoptable(checkpoint, run)
+        env = {"image_size": config.env.image_size, "action_dim": config.env.action_dim}
+        require_config(checkpoint, {"env": env})
+    trained_as = {
+        "model": {"policy": to_dict(model.policy), "action_decoder": to_dict(model.action_decoder)},
+        "policy": fixed_keys(config.behaviour),
+    }
+    if finished(config, run, "policy", trained_as, parents, demo_root(config)):
         return
+
+    def ready() -> None:
+        home = world_model_folder(parent)
+        if Path(parent).resolve() != run.resolve() and home.resolve() != run.resolve():
+            link_world_model(run, parent if parent == "pretrained" else home)
+        store_config(config, run)
+
     device = open_device(config)
     world = load_world_model(parent, device)
     world.config = replace(world.config, policy=config.model.policy, action_decoder=config.model.action_decoder)
-    source = open_videos(replace(config, env=world.env), demo_root(config), "train-policy")
+    source = open_videos(config, demo_root(config), "train-policy")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derived_seed(config.seed, 0, "policy"))
         agent = Agent.untrained(world, oracle=config.behaviour.oracle).to(device)
     prints = {name: checkpoint.fingerprint for name, checkpoint in parents.items()}
-    cached = slot_cache(source, world.savi, prints["slots"], config.data.cache, device, progress=True)
+    cached = slot_cache(source, world.savi, prints["slots"], config.data.cache, device, config.logging.progress)
     demos = label_demonstrations(world, source, cached, device)
     demos.labelled(config.behaviour.labelled_demos)  # too few are refused before anything is trained
     clone = CloneStage(agent.policy, agent.oracle, demos, config.behaviour)
@@ -69,6 +91,7 @@ def main(config: ExperimentConfig) -> None:
         device=device,
         logging=config.logging,
         identity=identity,
+        ready=ready,
     )
     agent.eval()
     decode = DecoderStage(agent.action_decoder, agent.policy, demos, config.behaviour)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import open_device, open_run, open_videos, said
+from playslot_rl.recipes.run import finished, fixed_keys, open_device, open_run, open_videos, store_config
 
 
 def main(config: ExperimentConfig) -> None:
@@ -15,15 +15,14 @@ def main(config: ExperimentConfig) -> None:
     import torch
 
     from playslot_rl.modules.savi import SAVi
-    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
+    from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
     from playslot_rl.training.fit import fit
     from playslot_rl.training.seeding import derived_seed
     from playslot_rl.training.stage_slots import SlotsStage
 
     run = open_run(config)
     wanted = {"env": {"image_size": config.env.image_size}, "model": {"savi": to_dict(config.model.savi)}}
-    if said("slots", run):
-        require_config(read_stage(checkpoint_folder(run, "slots"), "slots"), wanted)
+    if finished(config, run, "slots", {**wanted, "slots": fixed_keys(config.slots)}, {}, config.data.root):
         return
     device = open_device(config)
     source = open_videos(config, config.data.root, "train-slots")
@@ -31,7 +30,7 @@ def main(config: ExperimentConfig) -> None:
         torch.manual_seed(derived_seed(config.seed, 0, "slots"))
         savi = SAVi(config.model.savi, config.env.image_size).to(device)
     stage = SlotsStage(savi, source, config.slots, validation=config.data.validation, seed=config.seed, device=device)
-    identity = {**wanted, "data": source.fingerprint}
+    identity = {**wanted, "data": source.fingerprint, "data.validation": config.data.validation}
     result = fit(
         stage,
         config.slots,
@@ -41,6 +40,7 @@ def main(config: ExperimentConfig) -> None:
         device=device,
         logging=config.logging,
         identity=identity,
+        ready=lambda: store_config(config, run),
     )
     save_stage(
         checkpoint_folder(run, "slots"),

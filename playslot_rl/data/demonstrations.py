@@ -69,11 +69,13 @@ def label_demonstrations(
         device: where to compute.
 
     Raises:
-        DataError: no episode has two frames, or mode `ground_truth` without actions.
+        DataError: no episode has two frames, mode `ground_truth` without actions, or actions of another width.
     """
     kept = np.nonzero(source.lengths >= 2)[0]
     if not len(kept):
         raise DataError("demonstrations: got no episode of two frames or more, expected videos: collect again")
+    if source.actions is not None:
+        source.require_actions(model.env.action_dim)
     parts: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
     for length in np.unique(source.lengths[kept]):
         same = kept[source.lengths[kept] == length]

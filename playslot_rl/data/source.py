@@ -105,15 +105,23 @@ class EpisodeFrames:
         """Row numbers of an episode."""
         return np.arange(self.starts[episode], self.starts[episode] + self.lengths[episode])
 
-    def require_actions(self) -> npt.NDArray[np.float32]:
+    def require_actions(self, width: int | None = None) -> npt.NDArray[np.float32]:
         """The actions.
 
+        Args:
+            width: A; None takes what there is.
+
         Raises:
-            DataError: the data set has none.
+            DataError: the data set has none, or of another width.
         """
         if self.actions is None:
             raise DataError(
                 "got a data set without actions, expected the feature `action`: use labelled demonstrations"
+            )
+        if width is not None and self.actions.shape[1] != width:
+            raise DataError(
+                f"got actions of width {self.actions.shape[1]}, expected {width} as in env.action_dim: "
+                "use a data set of this robot, or set env.action_dim when the world model is trained"
             )
         return self.actions
 

@@ -25,7 +25,7 @@ from torch import nn
 
 from playslot_rl.config import EnvConfig, ModelConfig, from_dict
 from playslot_rl.errors import CheckpointError
-from playslot_rl.training.atomic import explain_write_errors, replace_dir, temporary_name, write_json
+from playslot_rl.training.atomic import explain_write_errors, replace_dir, temporary_name, write_bytes, write_json
 from playslot_rl.training.provenance import provenance
 from playslot_rl.training.resume import first_difference
 from playslot_rl.training.tensors import (
@@ -102,6 +102,8 @@ def save_stage(
     """
     temporary = temporary_name(path)
     with explain_write_errors(path):
+        for leftover in path.parent.glob(f".{path.name}.tmp-*"):
+            shutil.rmtree(leftover)  # of a process killed while it wrote this checkpoint
         temporary.mkdir(parents=True)
         try:
             save_tensors(temporary / "weights.safetensors", module_tensors(modules))
@@ -170,13 +172,21 @@ def load_weights(checkpoint: StageCheckpoint, modules: Mapping[str, nn.Module]) 
     Raises:
         CheckpointError: missing, unexpected or misshapen tensors, or a file that is not the one that was saved.
     """
-    weights = checkpoint.path / "weights.safetensors"
-    load_modules(modules, load_tensors(weights), str(checkpoint.path))
+    load_modules(modules, load_tensors(checkpoint.path / "weights.safetensors"), str(checkpoint.path))
+    require_whole(checkpoint)
+
+
+def require_whole(checkpoint: StageCheckpoint) -> None:
+    """Check that the weights are the ones that were saved.
+
+    Raises:
+        CheckpointError: they are not.
+    """
     saved = checkpoint.meta.get("fingerprint")
     if checkpoint.fingerprint != saved:
         raise CheckpointError(
-            f"{weights}: got fingerprint {checkpoint.fingerprint}, expected {saved} from its meta.json: "
-            f"the file was changed or damaged; train {checkpoint.stage} again"
+            f"{checkpoint.path / 'weights.safetensors'}: got fingerprint {checkpoint.fingerprint}, expected {saved} "
+            f"from its meta.json: the file was changed or damaged; put it back, or train {checkpoint.stage} again"
         )
 
 
@@ -184,9 +194,10 @@ def require_parents(child: StageCheckpoint, parents: Mapping[str, StageCheckpoin
     """Check that a child was trained on exactly these parents.
 
     Raises:
-        CheckpointError: a parent is another one.
+        CheckpointError: a parent is another one, or damaged.
     """
     for name, parent in parents.items():
+        require_whole(parent)
         expected = child.meta.get("parents", {}).get(name)
         if parent.fingerprint != expected:
             raise CheckpointError(
@@ -253,6 +264,45 @@ def run_folder(run: Path | str, env: str = "button_press") -> Path:
     if not str(run) or not folder.is_dir():
         raise CheckpointError(f"run={run}: no such folder, expected a run folder or `{PRETRAINED}`: check run=")
     return folder
+
+
+def adopt_stage(checkpoint: StageCheckpoint, run: Path) -> None:
+    """Copy a finished parent stage into the run that builds on it, so that the run is whole.
+
+    Raises:
+        CheckpointError: the run has another checkpoint of that stage.
+        OutputError: full disk.
+    """
+    target = checkpoint_folder(run, checkpoint.stage)
+    require_adoptable(checkpoint, run)
+    if target.exists():
+        return
+    temporary = temporary_name(target)
+    with explain_write_errors(target):
+        try:
+            temporary.mkdir(parents=True)
+            for file in sorted(checkpoint.path.iterdir()):
+                write_bytes(temporary / file.name, file.read_bytes())
+            replace_dir(temporary, target)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def require_adoptable(checkpoint: StageCheckpoint, run: Path) -> None:
+    """Check that a run has no checkpoint of that stage, or this one.
+
+    Raises:
+        CheckpointError: it has another one.
+    """
+    target = checkpoint_folder(run, checkpoint.stage)
+    if not (target / "meta.json").is_file():
+        return
+    own = read_stage(target, checkpoint.stage)
+    if own.fingerprint != checkpoint.fingerprint:
+        raise CheckpointError(
+            f"{run} has {checkpoint.stage} {own.fingerprint} of its own, got {checkpoint.stage} "
+            f"{checkpoint.fingerprint} from {checkpoint.path}: leave run= out to build on its own, or use another out="
+        )
 
 
 def link_world_model(run: Path, source: Path | str) -> None:

@@ -7,9 +7,8 @@ checkpoints. Killed at any moment and started again, it ends with the same weigh
 from __future__ import annotations
 
 import math
-import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,9 +23,10 @@ from playslot_rl.training.optim import build_adam, clip_gradients, learning_rate
 from playslot_rl.training.progress import StageProgress
 from playslot_rl.training.resume import TrainingCheckpoints, TrainingState
 from playslot_rl.training.seeding import StepGenerators, global_seed
+from playslot_rl.training.tensors import module_tensors
 
 # How often we look does not change what is learned: these may differ when a run is resumed.
-_FREE_KEYS = ("checkpoint_every", "validate_every", "log_every")
+FREE_KEYS = ("checkpoint_every", "validate_every", "log_every")
 
 
 class Stage(Protocol):
@@ -70,6 +70,7 @@ def fit(
     device: torch.device | str = "cpu",
     logging: LoggingConfig | None = None,
     identity: Mapping[str, Any] | None = None,
+    ready: Callable[[], None] | None = None,
 ) -> FitResult:
     """Train a stage to `config.steps`, carrying on from its newest checkpoint if it has one.
 
@@ -84,14 +85,18 @@ def fit(
         device: device of the generators.
         logging: backend and progress bar; None logs to `metrics.jsonl` only, silently.
         identity: further plain values a resumed run must share (model config, data and parent fingerprints).
+        ready: called once, before the first step, when a stage begun before was found to be the same.
 
     Raises:
         TrainingError: a loss or gradient is not finite; the last good checkpoint stays.
         CheckpointError: the folder was begun with another config, or its checkpoint is damaged.
         OutputError: full disk; the last good checkpoint stays.
+        KeyboardInterrupt: Ctrl-C; its message says where the same command carries on.
     """
     logging = logging or LoggingConfig(backend="none", progress=False)
     run = _Run(stage, config, folder, name, seed, device, identity or {})
+    if ready is not None:
+        ready()
     start = run.state.step
     run.history.rewind(start)
     if start >= config.steps:
@@ -105,8 +110,7 @@ def fit(
     except KeyboardInterrupt:
         last = run.checkpoints.last()
         where = f"step {int(last.name.removeprefix('step_'))} ({last})" if last else "the beginning"
-        print(f"{name}: interrupted; the same command carries on from {where}", file=sys.stderr, flush=True)
-        raise
+        raise KeyboardInterrupt(f"{name} interrupted; the same command carries on from {where}") from None
     finally:
         logger.close()
     return FitResult(run.state.step, start, run.state.seconds, run.state.metrics)
@@ -128,7 +132,7 @@ class _Run:
         self.stage, self.config, self.name, self.seed, self.device = stage, config, name, seed, device
         self.parameters = trainable_parameters(stage.modules)
         self.optimizer = build_adam(self.parameters, config.optim)
-        fixed = {key: value for key, value in to_dict(config).items() if key not in _FREE_KEYS}
+        fixed = {key: value for key, value in to_dict(config).items() if key not in FREE_KEYS}
         self.checkpoints = TrainingCheckpoints(folder / "checkpoints", {name: fixed, "seed": seed, **identity})
         self.history = History(folder / "metrics.jsonl")
         self.state = self.checkpoints.resume(stage.modules, self.optimizer, self.parameters)
@@ -151,6 +155,7 @@ class _Run:
             self.state = replace(self.state, metrics=self._validate(done))
             self._log("validation", done, self.state.metrics, logger)
         if done % config.checkpoint_every == 0 or last:
+            self._require_finite(done)
             self.checkpoints.save(self.state, self.stage.modules, self.optimizer, self.parameters)
 
     def _step(self, step: int) -> dict[str, Tensor | float]:
@@ -165,13 +170,22 @@ class _Run:
         # One transfer for both, so that a GPU is waited for once a step.
         loss, size = torch.stack([losses["loss"].detach().float(), norm.float()]).tolist()
         if not (math.isfinite(loss) and math.isfinite(size)):
-            raise self._not_finite(step, loss, size)
+            raise self._diverged(step, loss, size)
         self.optimizer.step()
         values: dict[str, Tensor | float] = {key: value.detach() for key, value in losses.items()}
         return values | {"loss": loss, "lr": rate, "grad_norm": size}
 
-    def _not_finite(self, step: int, loss: float, norm: float) -> TrainingError:
+    def _require_finite(self, done: int) -> None:
+        """A finite loss may still have made an infinite weight or buffer: never keep that as a good checkpoint."""
+        for key, value in module_tensors(self.stage.modules).items():
+            if value.is_floating_point() and not bool(value.isfinite().all()):
+                raise self._not_finite(done - 1, key, "not finite")
+
+    def _diverged(self, step: int, loss: float, norm: float) -> TrainingError:
         what, got = ("loss", loss) if not math.isfinite(loss) else ("gradient norm", norm)
+        return self._not_finite(step, what, str(got))
+
+    def _not_finite(self, step: int, what: str, got: str) -> TrainingError:
         last = self.checkpoints.last()
         kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
         return TrainingError(

@@ -50,7 +50,7 @@ class DynamicsStage:
         self.model, self.source, self.slots, self.config, self.device = model, source, slots, config, device
         self.criterion = DynamicsLoss(model.inverse_dynamics, model.predictor, model.savi, config)
         if self.criterion.needs_actions:
-            source.require_actions()
+            source.require_actions(model.env.action_dim)
         self.frames = config.seed_frames + config.predicted_frames
         self.train_episodes, held_out = split_episodes(source.episodes, validation, seed)
         windows = all_windows(source.starts, source.lengths, self.frames, self.frames, held_out)
