@@ -344,14 +344,17 @@ class BehaviourStageConfig(StageConfig):
     Attributes:
         labelled_demos: demonstrations whose real actions the action decoder may see.
         imagined: also clone from slots that cOCVP predicts along each demonstration.
-        decoder_inputs: `policy` (the policy's outputs) or `inverse_dynamics` (InvDyn's latents; paper).
+        slot_noise: standard deviation of Gaussian noise added to the slots that policy and oracle clone from (0 in the
+            paper); slots have a standard deviation of about 0.7, and a prediction is about 0.03 off.
+        decoder_inputs: `inverse_dynamics` (InvDyn's latents; paper), `policy` (the policy's outputs) or `both`.
         decoder_steps: optimiser steps of the action decoder.
         oracle: also train the slot oracle (same network on the real actions of all demos).
     """
 
     labelled_demos: int = 50
     imagined: bool = True
-    decoder_inputs: Literal["policy", "inverse_dynamics"] = "inverse_dynamics"
+    slot_noise: float = 0.0
+    decoder_inputs: Literal["inverse_dynamics", "policy", "both"] = "inverse_dynamics"
     decoder_steps: int = 2000
     oracle: bool = True
 

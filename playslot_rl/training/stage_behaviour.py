@@ -30,7 +30,8 @@ class CloneStage:
     """Clone latents from parsed slots, and from imagined ones with `config.imagined`; the oracle clones real actions.
 
     Note: the paper clones from parsed slots only. Imagination then feeds the policy slots it never saw; with the
-    predicted slots of the same demonstrations among its inputs (still without any action label) it has.
+    predicted slots of the same demonstrations among its inputs (still without any action label) it has. Noise on the
+    slots (`config.slot_noise`) makes both networks smooth over errors of about that size: 150 demonstrations are few.
 
     Args:
         policy: trained in place.
@@ -67,13 +68,25 @@ class CloneStage:
         """Cloning error of one batch; the networks share no weights, so the sum trains each as alone."""
         demos, device = self.demos, self.inputs.device
         rows = _draw(len(self.inputs), self.config.batch_size, generators, "policy", device)
-        batch = {keys.SLOTS: self.inputs[rows], keys.LATENT_ACTION: demos.latents[rows % len(demos.latents)]}
+        batch = {
+            keys.SLOTS: self._noisy(self.inputs[rows], generators, "policy_noise"),
+            keys.LATENT_ACTION: demos.latents[rows % len(demos.latents)],
+        }
         losses = {"policy": self.criterion(TensorDict(batch, [len(rows)]))["loss_policy"]}
         if self.oracle_criterion is not None and demos.actions is not None:
             rows = _draw(len(demos.slots), self.config.batch_size, generators, "oracle", device)
-            batch = {keys.SLOTS: demos.slots[rows], keys.ACTION: demos.actions[rows]}
+            batch = {
+                keys.SLOTS: self._noisy(demos.slots[rows], generators, "oracle_noise"),
+                keys.ACTION: demos.actions[rows],
+            }
             losses["oracle"] = self.oracle_criterion(TensorDict(batch, [len(rows)]))["loss_policy"]
         return {"loss": torch.stack(list(losses.values())).sum(), **losses}
+
+    def _noisy(self, slots: Tensor, generators: StepGenerators, stream: str) -> Tensor:
+        if self.config.slot_noise == 0:
+            return slots
+        generator = generators.torch(stream, slots.device)
+        return slots + self.config.slot_noise * torch.randn(slots.shape, generator=generator, device=slots.device)
 
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
         """Unexplained fraction of the latents' variance on the demonstrations, from parsed and from imagined slots."""
@@ -88,6 +101,7 @@ class DecoderStage:
 
     Note: with `config.decoder_inputs=policy` the inputs are the trained policy's outputs, on parsed slots and (with
     `config.imagined`) on imagined ones, which is what the decoder gets at test time; the paper feeds InvDyn's latents.
+    `both` takes them all.
 
     Args:
         decoder: trained in place.
@@ -107,10 +121,10 @@ class DecoderStage:
         self.decoder, self.config = decoder, config
         self.criterion = ActionDecoderLoss(decoder)
         rows = demos.labelled(config.labelled_demos)
-        inputs = [demos.latents[rows]]
-        if config.decoder_inputs == "policy":
+        inputs = [] if config.decoder_inputs == "policy" else [demos.latents[rows]]
+        if config.decoder_inputs != "inverse_dynamics":
             seen = [demos.slots[rows], *([demos.imagined[rows]] if config.imagined else [])]
-            inputs = [_apply(policy, slots) for slots in seen]
+            inputs += [_apply(policy, slots) for slots in seen]
         self.inputs = torch.cat(inputs)
         self.targets = demos.actions[rows].repeat(len(inputs), 1)
 
