@@ -72,6 +72,7 @@ class DataConfig:
         root: LeRobot v3.0 data set(s) of unlabelled videos; several are separated by commas.
         demos: data set of demonstrations; empty means `root`.
         camera: image feature to read; empty means the only one.
+        resize: resize frames of another size than `env.image_size` (area averaging) instead of refusing them.
         cache: folder of the frame and slot caches; empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
         validation: fraction of episodes held out from training.
     """
@@ -79,6 +80,7 @@ class DataConfig:
     root: str = ""
     demos: str = ""
     camera: str = ""
+    resize: bool = False
     cache: str = ""
     validation: float = 0.05
 

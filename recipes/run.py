@@ -92,7 +92,9 @@ def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrame
 
     if not roots:
         raise DataError(f"{what}: got no data set, expected data.root=DIR; record one by `playslot collect`")
-    return open_sources(roots, config.data.camera, config.data.cache, image_size=config.env.image_size)
+    return open_sources(
+        roots, config.data.camera, config.data.cache, image_size=config.env.image_size, resize=config.data.resize
+    )
 
 
 def demo_root(config: ExperimentConfig) -> str:

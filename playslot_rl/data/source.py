@@ -232,5 +232,5 @@ def _check_size(files: LeRobotFiles, camera: str, image_size: int | None, resize
 def _wrong_size(files: LeRobotFiles, camera: str, got: tuple[int, int], expected: int) -> DataError:
     return DataError(
         f"{files.root}: got frames of {got[0]}x{got[1]} from {camera}, expected {expected}x{expected}: "
-        f"set env.image_size, or record at that size"
+        "set env.image_size, resize them by data.resize=true, or record at that size"
     )
