@@ -13,8 +13,11 @@ PolicyName = Literal["random", "expert"]
 def collect(
     config: ExperimentConfig, policy: PolicyName, episodes: int, steps: int, out: Path, seed: int, workers: int
 ) -> Path:
-    """Record episodes as a LeRobot data set at `out`; see `playslot_rl.collectors.collect`."""
-    from playslot_rl.collectors.collect import collect as run
+    """Record episodes as a LeRobot data set at `out`; see `playslot_rl.collectors.collection`."""
+    from playslot_rl.envs.rendering import import_mujoco
+
+    import_mujoco()  # before torchrl, which imports it too
+    from playslot_rl.collectors.collection import collect as run
 
     return run(config, policy, episodes, steps, out, seed, workers)
 

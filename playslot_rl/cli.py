@@ -193,6 +193,9 @@ def _run(name: str, options: argparse.Namespace) -> int:
         from playslot_rl import doctor
 
         return doctor.main(config)
+    from playslot_rl.envs.rendering import import_mujoco
+
+    import_mujoco()  # torchrl imports it too, and would fail without our cure
     recipe = importlib.import_module(f"playslot_rl.recipes.{name.replace('-', '_')}")
     if name == "bench":
         recipe.main(config, json_path=options.json)

@@ -19,11 +19,11 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.collectors import collect
     from playslot_rl.training.checkpoints import world_model_checkpoints
 
-    world_model_checkpoints("pretrained")  # a missing or damaged one is refused before anything is recorded
     began = time.monotonic()
     name = config.out or "runs/demo"
     config = replace(config, out=name, run="pretrained", seed=FIRST_SEED + config.seed)
     folder = open_run(config)
+    world_model_checkpoints("pretrained")  # a missing or damaged one is refused before anything is recorded
     if not (folder / "config.json").is_file():
         store_config(config, folder)
     demos = Path(config.data.demos or folder / "data" / "expert")

@@ -102,8 +102,7 @@ def save_stage(
     """
     temporary = temporary_name(path)
     with explain_write_errors(path):
-        for leftover in path.parent.glob(f".{path.name}.tmp-*"):
-            shutil.rmtree(leftover)  # of a process killed while it wrote this checkpoint
+        _remove_leftovers(path)
         temporary.mkdir(parents=True)
         try:
             save_tensors(temporary / "weights.safetensors", module_tensors(modules))
@@ -127,6 +126,12 @@ def save_stage(
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
     return StageCheckpoint(path, stage, dict(config), meta, fingerprint)
+
+
+def _remove_leftovers(path: Path) -> None:
+    """Remove what a process killed while it wrote this checkpoint has left."""
+    for leftover in path.parent.glob(f".{path.name}.tmp-*"):
+        shutil.rmtree(leftover)
 
 
 def read_stage(path: Path, stage: str) -> StageCheckpoint:
@@ -279,6 +284,7 @@ def adopt_stage(checkpoint: StageCheckpoint, run: Path) -> None:
         return
     temporary = temporary_name(target)
     with explain_write_errors(target):
+        _remove_leftovers(target)
         try:
             temporary.mkdir(parents=True)
             for file in sorted(checkpoint.path.iterdir()):

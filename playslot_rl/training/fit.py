@@ -198,7 +198,11 @@ class _Run:
         with torch.no_grad(), global_seed(self.seed, done, "validation"):
             values = {key: float(value) for key, value in self.stage.validate(done).items()}
         self._train_mode(True)
-        return values
+        # JSON has no NaN; a number that could not be computed is left out, never invented.
+        finite = {key: value for key, value in values.items() if math.isfinite(value)}
+        if values and not finite:
+            raise self._not_finite(done - 1, "validation", next(iter(values)) + " not finite")
+        return finite
 
     def _train_mode(self, on: bool) -> None:
         for module in self.stage.modules.values():

@@ -1,0 +1,75 @@
+"""Running `playslot` commands in this process, and looking at what they leave on disk."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from playslot_rl import cli
+
+ONE_CORE = ("threads=1", "workers=1", "device=cpu")
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a command did: exit code, standard output, standard error."""
+
+    code: int
+    out: str
+    err: str
+
+
+def playslot(*arguments: str) -> Done:
+    """Run a command as the console script would, without paying for the imports again."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = cli.main(arguments)
+    return Done(code, out.getvalue(), err.getvalue())
+
+
+def smoke(command: str, *arguments: object) -> Done:
+    """A command of preset smoke that must succeed and be silent on standard error."""
+    done = playslot(command, *_defaults(arguments), *map(str, arguments), *ONE_CORE)
+    assert (done.code, done.err) == (0, ""), done.err
+    return done
+
+
+def refused(command: str, *arguments: object, message: str, code: int = 1) -> Done:
+    """A command that must fail with one line that matches `message`, and without a traceback."""
+    done = playslot(command, *_defaults(arguments), *map(str, arguments), *ONE_CORE)
+    assert done.code == code, (done.code, done.err)
+    assert_one_line(done.err, command)
+    assert re.search(message, done.err), done.err
+    return done
+
+
+def assert_one_line(err: str, command: str) -> None:
+    """One line that names the command, and no error that nobody thought of."""
+    assert err.count("\n") == 1, err
+    assert err.startswith(f"playslot {command}: error: "), err
+    assert "unexpected" not in err, err
+
+
+def _defaults(arguments: tuple[object, ...]) -> tuple[str, ...]:
+    """Preset smoke, where no run brings its own config and the caller names none."""
+    texts = [str(argument) for argument in arguments]
+    own_config = any(text.startswith("run=") and text != "run=pretrained" for text in texts)
+    named = any(text.startswith("preset=") for text in texts)
+    return () if own_config or named else ("preset=smoke",)
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Relative path -> hash of every file below a folder; also of hidden and temporary ones."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "folder"
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+def weights(run: Path, stage: str) -> bytes:
+    """The weights of a finished stage."""
+    return (run / stage / "checkpoint" / "weights.safetensors").read_bytes()

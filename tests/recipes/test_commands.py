@@ -1,0 +1,149 @@
+"""The recipes from end to end: what each command makes, and that commands compose in every promised way."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from commands import Done, contents, playslot, refused, smoke, weights
+
+from playslot_rl.evaluation.intervals import wilson
+
+KEYS = {
+    "protocol", "episodes", "seeds", "success_rate", "ci95", "mean_steps_to_success", "labelled_demos", "demos",
+    "references",
+}  # fmt: skip
+
+
+def test_the_pipeline_makes_a_whole_run(pipeline: tuple[Path, Done]) -> None:
+    run, done = pipeline
+    for stage in ("slots", "dynamics", "policy"):
+        files = {path.name for path in (run / stage / "checkpoint").iterdir()}
+        assert files == {"weights.safetensors", "config.json", "meta.json"}
+        assert any((run / stage / "logs").rglob("*"))
+    assert {path.name for path in (run / "data").iterdir()} == {"random", "expert"}
+    assert not [path for path in run.rglob("*") if ".tmp-" in path.name or path.name.endswith(".journal")]
+    assert json.loads((run / "config.json").read_text())["preset"] == "smoke"
+    assert done.err == ""
+    assert str(run / "report.html") in done.out
+
+
+@pytest.mark.parametrize("protocol", ["simulation", "imagination"])
+def test_eval_info_has_the_promised_keys(shared_run: Path, protocol: str) -> None:
+    info = json.loads((shared_run / "evaluation" / protocol / "eval_info.json").read_text())
+    assert info.keys() >= KEYS
+    assert (info["protocol"], info["episodes"], len(info["seeds"])) == (protocol, 2, 2)
+    assert 0.0 <= info["success_rate"] <= 1.0
+    assert info["ci95"] == list(wilson(round(2 * info["success_rate"]), 2))
+    assert (info["demos"], info["labelled_demos"]) == (6, 3)
+    assert info["references"].keys() == {"random", "expert", "slot_oracle"}
+    for reference in info["references"].values():
+        assert 0.0 <= reference["success_rate"] <= 1.0
+        assert reference["ci95"] == list(wilson(round(2 * reference["success_rate"]), 2))
+
+
+def test_evaluation_seeds_are_none_of_the_collected_ones(shared_run: Path) -> None:
+    collected = set()
+    for name in ("random", "expert"):
+        record = json.loads((shared_run / "data" / name / "meta" / "playslot.json").read_text())
+        collected |= {episode["seed"] for episode in record["episodes"]}
+    assert len(collected) == 12
+    for protocol in ("simulation", "imagination"):
+        info = json.loads((shared_run / "evaluation" / protocol / "eval_info.json").read_text())
+        assert not collected & set(info["seeds"])
+
+
+def test_the_report_needs_no_other_file_and_no_network(shared_run: Path) -> None:
+    page = (shared_run / "report.html").read_text()
+    assert re.findall(r"""(?:src|href|url\()\s*=?\s*["']?((?:https?:)?//[^"')\s]*)""", page) == []
+    assert set(re.findall(r"""<img[^>]*src=["']([a-z]+:)""", page)) == {"data:"}
+    assert not re.findall(r"""<(?:script|link|iframe)[^>]*(?:src|href)=""", page)
+    text = (shared_run / "report.md").read_text()
+    figures = re.findall(r"\]\((figures/[^)]+)\)", text)
+    assert figures
+    assert all((shared_run / figure).is_file() for figure in figures)
+
+
+def test_a_finished_pipeline_is_skipped_and_left_as_it_was(shared_run: Path, tmp_path: Path) -> None:
+    before = contents(shared_run)
+    done = playslot("train-slots", "preset=smoke", f"out={shared_run}", f"data.root={shared_run}/data/random")
+    assert (done.code, done.err) == (0, "")
+    assert done.out == "slots: finished before (6 steps), skipped\n"
+    for command, stage in (("train-dynamics", "dynamics"), ("train-policy", "policy")):
+        assert f"{stage}: finished before (6 steps), skipped" in smoke(command, f"run={shared_run}").out
+    assert contents(shared_run) == before
+
+
+def test_stages_one_by_one_equal_the_pipeline(shared_run: Path, videos: Path, demos: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    smoke("train-slots", f"out={run}", f"data.root={videos}")
+    smoke("train-dynamics", f"run={run}")
+    smoke("train-policy", f"run={run}", f"data.root={demos}")
+    for stage in ("slots", "dynamics", "policy"):
+        assert weights(run, stage) == weights(shared_run, stage)
+
+
+def test_stages_with_nothing_but_out_equal_the_pipeline(
+    shared_run: Path, videos: Path, demos: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    smoke("train-slots", f"out={run}", f"data.root={videos}")
+    smoke("train-dynamics", f"out={run}", f"data.root={videos}")
+    smoke("train-policy", f"out={run}", f"data.root={demos}")
+    assert all(weights(run, stage) == weights(shared_run, stage) for stage in ("slots", "dynamics", "policy"))
+
+
+def test_a_stage_may_build_on_another_run(shared_run: Path, videos: Path, demos: Path, tmp_path: Path) -> None:
+    before = contents(shared_run)
+    smoke("train-dynamics", f"run={shared_run}", f"out={tmp_path / 'b'}", f"data.root={videos}", "seed=3")
+    assert weights(tmp_path / "b", "slots") == weights(shared_run, "slots")
+    assert weights(tmp_path / "b", "dynamics") != weights(shared_run, "dynamics")
+    smoke("train-policy", f"run={shared_run}", f"out={tmp_path / 'c'}", f"data.demos={demos}")
+    assert weights(tmp_path / "c", "policy") == weights(shared_run, "policy")
+    smoke("train-policy", f"out={tmp_path / 'c'}", f"data.demos={demos}")  # its world model is still found
+    smoke("evaluate", f"run={tmp_path / 'c'}", "episodes=1", "evaluation.references=false")
+    info = json.loads((tmp_path / "c" / "evaluation" / "simulation" / "eval_info.json").read_text())
+    assert info["episodes"] == 1
+    assert info["references"]["expert"] == {"success_rate": None, "ci95": None}
+    assert contents(shared_run) == before
+
+
+@pytest.mark.parametrize("mode", ["discrete", "continuous", "ground_truth"])
+def test_each_latent_mode_trains_to_a_policy(slots_only: Path, demos: Path, mode: str) -> None:
+    changes = [f"model.inverse_dynamics.mode={mode}"]
+    if mode == "ground_truth":
+        changes.append("model.inverse_dynamics.latent_dim=4")
+    smoke("train-dynamics", f"run={slots_only}", *changes)
+    smoke("train-policy", f"run={slots_only}")
+    assert weights(slots_only, "policy")
+
+
+def test_a_latent_action_a_slot_trains_but_has_no_policy(slots_only: Path, demos: Path) -> None:
+    smoke("train-dynamics", f"run={slots_only}", "model.inverse_dynamics.variant=multi")
+    before = contents(slots_only)
+    refused("train-policy", f"run={slots_only}", message="variant: got multi, expected single: .*train dynamics")
+    assert contents(slots_only) == before
+
+
+def test_a_foreign_data_set_trains_slots_and_dynamics(foreign: Path, tmp_path: Path) -> None:
+    run, before = tmp_path / "run", contents(foreign)
+    arguments = (f"data.root={foreign}", "data.camera=observation.images.side", "data.validation=0")
+    smoke("train-slots", f"out={run}", *arguments)
+    smoke("train-dynamics", f"run={run}")
+    assert contents(foreign) == before
+    refused("train-policy", f"run={run}", message="actions of width 2, expected 4 as in env.action_dim")
+
+
+def test_videos_without_actions_train_the_unlabelled_stages_only(videos: Path, tmp_path: Path) -> None:
+    mute = Path(shutil.copytree(videos, tmp_path / "mute"))
+    info = json.loads((mute / "meta" / "info.json").read_text())
+    for name in ("action", "seed", "is_last_observation", "next.success"):
+        info["features"].pop(name, None)
+    (mute / "meta" / "info.json").write_text(json.dumps(info))
+    run = tmp_path / "run"
+    smoke("train-slots", f"out={run}", f"data.root={mute}")
+    smoke("train-dynamics", f"run={run}")
+    refused("train-policy", f"run={run}", message="demonstrations without actions")

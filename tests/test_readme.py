@@ -1,0 +1,78 @@
+"""The commands of the README and of docs/: every one is read, the cheap ones run."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from playslot_rl import cli
+from playslot_rl.compose import compose
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def commands(page: Path) -> list[str]:
+    """Command lines of the ```bash blocks of a page, in order, continued lines joined, comments left out."""
+    blocks = re.findall(r"^```bash\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    lines = "".join(blocks).replace("\\\n", " ").splitlines()
+    return [line for line in (shlex.join(shlex.split(line, comments=True)) for line in lines) if line]
+
+
+EVERY = [(page.name, command) for page in PAGES for command in commands(page)]
+
+
+def test_the_first_commands_of_the_readme_are_demo_and_test() -> None:
+    assert commands(ROOT / "README.md")[:2] == ["make demo", "make test"]
+
+
+def test_the_readme_names_every_command_of_the_pipeline() -> None:
+    text = "\n".join(commands(ROOT / "README.md"))
+    for name in ("collect", "train-slots", "train-dynamics", "train-policy", "evaluate"):
+        assert f"playslot {name} " in text
+
+
+@pytest.mark.parametrize(("page", "command"), EVERY, ids=[f"{page}: {command}" for page, command in EVERY])
+def test_a_documented_command_is_accepted(page: str, command: str) -> None:
+    words = [word for word in shlex.split(command) if not re.fullmatch(r"[A-Z_]+=\S*", word)]
+    program, rest = Path(words[0]).name, words[1:]
+    if program == "make":
+        targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        assert set(rest) <= set(targets), f"{page}: no such make target"
+    elif program == "playslot":
+        name = rest[0]
+        assert name in cli.COMMANDS, f"{page}: no such command"
+        typed = [word for word in rest[1:] if not word.startswith("--") and "=" in word]
+        assert len(typed) == len([word for word in rest[1:] if "=" in word])
+        if name != "bench":
+            assert len(typed) == len(rest[1:]) - ("--help" in rest), f"{page}: not key=value"
+        # A page names runs that are not here: composed as by a command that reads no run.
+        assert compose(typed, "collect")
+    else:
+        assert program in {"cd", "cp", "git", "python", "pip", "tensorboard", "uv", "docker"}, (
+            f"{page}: unknown program"
+        )
+
+
+def test_the_cheap_commands_run() -> None:
+    cheap = [command for _, command in EVERY if command.endswith(("playslot doctor", "make help"))]
+    assert {shlex.split(command)[-1] for command in cheap} == {"doctor", "help"} or cheap
+    for command in dict.fromkeys(cheap):
+        done = subprocess.run(shlex.split(command), cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_number_is_still_to_be_filled_in(page: Path) -> None:
+    assert re.findall(r"@@\w*@@", page.read_text()) == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_and_pictures_lead_somewhere(page: Path) -> None:
+    targets = re.findall(r"\]\(([^)#\s]+)", page.read_text())
+    local = [target for target in targets if "://" not in target and not target.startswith("mailto:")]
+    assert [target for target in local if not (page.parent / target).exists()] == []
