@@ -134,7 +134,7 @@ def finished(
     done = read_stage(path, stage)
     require_parents(done, parents)
     require_config(done, wanted)
-    facts = {"seed": (config.seed, done.meta.get("seed", config.seed))}
+    facts: dict[str, tuple[object, object]] = {"seed": (config.seed, done.meta.get("seed", config.seed))}
     if roots:
         data = next(iter(done.meta["data"].values()), "none")
         facts["data"] = (open_videos(config, roots, stage).fingerprint, data)

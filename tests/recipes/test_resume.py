@@ -110,9 +110,7 @@ def test_an_interrupt_is_one_line_and_the_same_command_carries_on(
 
 
 @pytest.mark.slow
-def test_ctrl_c_in_a_terminal_is_one_line_and_the_same_command_carries_on(
-    shared_run: Path, videos: Path, tmp_path: Path
-) -> None:
+def test_ctrl_c_in_a_terminal_is_one_line_and_carries_on(shared_run: Path, videos: Path, tmp_path: Path) -> None:
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     command = _command("slots", stopped, videos, videos)
     process = subprocess.Popen(
