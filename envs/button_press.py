@@ -161,8 +161,12 @@ class ButtonPressEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
 
     def _observe(self, draw: bool = True) -> Observation:
         if draw or self._frame is None:
-            self._frame = self._renderer(self._env.data)
+            self._frame = self.draw()
         return {"pixels": self._frame, "state": self._full[HAND_STATE].astype(np.float32)}
+
+    def draw(self) -> npt.NDArray[np.uint8]:
+        """Draw the present state anew: uint8 (H, W, 3). `render` returns the frame that was last observed."""
+        return self._renderer(self._env.data)
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """The present frame, uint8 (H, W, 3); None without a render mode or before the first reset."""
