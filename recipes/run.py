@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
     from playslot_rl.data.source import EpisodeFrames
 
-OURS = ("slots", "dynamics", "policy", "world_model.json", "config.json")
-"""Names by which a run folder is known."""
+OURS = ("slots", "dynamics", "policy", "world_model.json")  # known names of a run folder without config.json
 
 
 def open_run(config: ExperimentConfig) -> Path:
@@ -46,8 +45,8 @@ def _is_run(folder: Path) -> bool:
         except ValueError:
             return False
         return isinstance(values, dict) and {"preset", "env", "model"} <= values.keys()
-    collected = any((folder / "data").glob("*/meta/info.json")) or any((folder / "data").glob("*.journal"))
-    return collected or any((folder / known).exists() for known in OURS)
+    collected = [*(folder / "data").glob("*/meta/info.json"), *(folder / "data").glob("*.journal")]
+    return bool(collected) or any((folder / known).exists() for known in OURS)
 
 
 def store_config(config: ExperimentConfig, folder: Path) -> None:
@@ -134,11 +133,11 @@ def finished(
     done = read_stage(path, stage)
     require_parents(done, parents)
     require_config(done, wanted)
-    facts: dict[str, tuple[object, object]] = {"seed": (config.seed, done.meta.get("seed", config.seed))}
+    facts: list[tuple[str, object, object]] = [("seed", config.seed, done.meta.get("seed", config.seed))]
     if roots:
         data = next(iter(done.meta["data"].values()), "none")
-        facts["data"] = (open_videos(config, roots, stage).fingerprint, data)
-    for name, (got, old) in facts.items():
+        facts.append(("data", open_videos(config, roots, stage).fingerprint, data))
+    for name, got, old in facts:
         if got != old:
             raise CheckpointError(f"{name}: got {got}, expected {old} as {path} was trained with: use another out=")
     print(f"{stage}: finished before ({done.meta.get('steps')} steps), skipped", flush=True)
