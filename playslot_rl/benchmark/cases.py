@@ -70,7 +70,8 @@ def dynamics_loss(
         rows = torch.arange(len(decoded))[:, None]
         decoded, targets = decoded[rows, order], targets[rows, order]
     image_error = (savi.decode(decoded).frames - targets).square().mean()
-    return image_error + slot_error + 0.25 * latent.vq_loss
+    total: Tensor = image_error + slot_error + 0.25 * latent.vq_loss
+    return total
 
 
 def _savi_step(variant: Variant, sizes: Sizes) -> Step:
