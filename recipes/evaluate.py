@@ -51,24 +51,31 @@ def main_if_needed(config: ExperimentConfig) -> None:
     """Evaluate under both protocols and renew the report, leaving out what this policy was measured on before."""
     from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts
 
-    run, fresh = check_run(config), True
-    for protocol in PROTOCOLS:
-        wanted = {
-            "episodes": config.episodes or DEFAULT_EPISODES,
-            "seed": config.seed,
-            "fingerprints": run_facts(run).fingerprints,
-        }
-        path = run / "evaluation" / protocol / "eval_info.json"
-        stored = json.loads(path.read_text()) if path.is_file() else {}
-        if {key: stored.get(key) for key in wanted} == wanted:
-            print(f"{protocol}: measured before, {100 * stored['success_rate']:.0f} % success, skipped", flush=True)
-            continue
+    run = check_run(config)
+    facts = {
+        "episodes": config.episodes or DEFAULT_EPISODES,
+        "seed": config.seed,
+        "fingerprints": run_facts(run).fingerprints,
+    }
+    due = [protocol for protocol in PROTOCOLS if not _measured(run, protocol, facts)]
+    for protocol in due:
         main(replace(config, protocol=protocol), report=False)
-        fresh = False
-    if not fresh or not (run / "report.html").is_file():
+    if due or not (run / "report.html").is_file():
+        from playslot_rl.recipes.run import open_device
+        from playslot_rl.training.checkpoints import load_agent
         from playslot_rl.visualization.report import write_report
 
-        print(f"report: {write_report(run)}", flush=True)
+        print(f"report: {write_report(run, agent=load_agent(run, open_device(config)))}", flush=True)
+
+
+def _measured(run: Path, protocol: str, facts: dict[str, Any]) -> bool:
+    """Whether this policy was measured so before; if so, say it."""
+    path = run / "evaluation" / protocol / "eval_info.json"
+    stored = json.loads(path.read_text()) if path.is_file() else {}
+    if {key: stored.get(key) for key in facts} != facts:
+        return False
+    print(f"{protocol}: measured before, {100 * stored['success_rate']:.0f} % success, skipped", flush=True)
+    return True
 
 
 def check_run(config: ExperimentConfig) -> Path:

@@ -31,7 +31,7 @@ def main(config: ExperimentConfig) -> None:
     """
     import torch
 
-    from playslot_rl.data.demonstrations import label_demonstrations
+    from playslot_rl.data.demonstrations import label_demonstrations, unfold_policy
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.training.checkpoints import (
         checkpoint_folder,
@@ -43,7 +43,7 @@ def main(config: ExperimentConfig) -> None:
         world_model_checkpoints,
         world_model_folder,
     )
-    from playslot_rl.training.fit import fit
+    from playslot_rl.training.fit import FitResult, Stage, fit
     from playslot_rl.training.seeding import derived_seed
     from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage
     from playslot_rl.world_model import Agent
@@ -82,30 +82,33 @@ def main(config: ExperimentConfig) -> None:
     clone = CloneStage(agent.policy, agent.oracle, demos, config.behaviour)
     sizes = to_dict(world.config)
     identity = {"model": sizes, "data": source.fingerprint, **prints}
-    cloned = fit(
-        clone,
-        config.behaviour,
-        run / "policy",
-        name="policy",
-        seed=config.seed,
-        device=device,
-        logging=config.logging,
-        identity=identity,
-        ready=ready,
-    )
+
+    def train(stage: Stage, name: str, steps: int) -> FitResult:
+        part = run / "policy" if name == "policy" else run / "policy" / name
+        return fit(
+            stage,
+            replace(config.behaviour, steps=steps),
+            part,
+            name=name,
+            seed=config.seed,
+            device=device,
+            logging=config.logging,
+            identity=identity,
+            ready=ready,
+        )
+
+    cloned = train(clone, "policy", config.behaviour.steps)
     agent.eval()
+    seconds = cloned.seconds
+    for number in range(1, config.behaviour.on_policy_rounds + 1):
+        demos = unfold_policy(agent, demos)
+        again = CloneStage(agent.policy, None, demos, config.behaviour)
+        seconds += train(again, f"round{number}", config.behaviour.on_policy_steps).seconds
+        agent.eval()
+    if config.behaviour.on_policy_rounds:
+        demos = unfold_policy(agent, demos)
     decode = DecoderStage(agent.action_decoder, agent.policy, demos, config.behaviour)
-    decoder_config = replace(config.behaviour, steps=config.behaviour.decoder_steps)
-    decoded = fit(
-        decode,
-        decoder_config,
-        run / "policy" / "decoder",
-        name="decoder",
-        seed=config.seed,
-        device=device,
-        logging=config.logging,
-        identity=identity,
-    )
+    decoded = train(decode, "decoder", config.behaviour.decoder_steps)
     save_stage(
         checkpoint_folder(run, "policy"),
         stage="policy",
@@ -115,7 +118,7 @@ def main(config: ExperimentConfig) -> None:
         parents=prints,
         metrics={**cloned.metrics, **{f"decoder_{key}": value for key, value in decoded.metrics.items()}},
         steps=cloned.step,
-        seconds=cloned.seconds + decoded.seconds,
+        seconds=seconds + decoded.seconds,
         extra={
             "demos": len(demos.lengths),
             "labelled_demos": config.behaviour.labelled_demos,

@@ -26,6 +26,12 @@ def _draw(count: int, batch: int, generators: StepGenerators, stream: str, devic
     return drawn.to(device)
 
 
+def _inputs(demos: Demonstrations, config: BehaviourStageConfig) -> list[Tensor]:
+    """What the policy clones from, each (M, N, D): parsed slots, imagined ones, and those it reached itself."""
+    imagined = [demos.imagined] if config.imagined else []
+    return [demos.slots, *imagined, *([] if demos.unfolded is None else [demos.unfolded])]
+
+
 class CloneStage:
     """Clone latents from parsed slots, and from imagined ones with `config.imagined`; the oracle clones real actions.
 
@@ -57,7 +63,7 @@ class CloneStage:
         if oracle is not None:
             self.oracle_criterion = BehaviourLoss(oracle)
             self.oracle_criterion.set_keys(action=keys.ACTION)
-        self.inputs = torch.cat((demos.slots, demos.imagined)) if config.imagined else demos.slots
+        self.inputs = torch.cat(_inputs(demos, config))
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -123,8 +129,7 @@ class DecoderStage:
         rows = demos.labelled(config.labelled_demos)
         inputs = [] if config.decoder_inputs == "policy" else [demos.latents[rows]]
         if config.decoder_inputs != "inverse_dynamics":
-            seen = [demos.slots[rows], *([demos.imagined[rows]] if config.imagined else [])]
-            inputs += [_apply(policy, slots) for slots in seen]
+            inputs += [_apply(policy, slots[rows]) for slots in _inputs(demos, config)]
         self.inputs = torch.cat(inputs)
         self.targets = demos.actions[rows].repeat(len(inputs), 1)
 
