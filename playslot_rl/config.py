@@ -353,6 +353,7 @@ class BehaviourStageConfig(StageConfig):
             paper); slots have a standard deviation of about 0.7, and a prediction is about 0.03 off.
         decoder_inputs: `inverse_dynamics` (InvDyn's latents; paper), `policy` (the policy's outputs) or `both`.
         decoder_steps: optimiser steps of the action decoder.
+        decoder_lr: its base learning rate; the rest of `optim` is shared.
         oracle: also train the slot oracle (same network on the real actions of all demos).
     """
 
@@ -363,6 +364,7 @@ class BehaviourStageConfig(StageConfig):
     slot_noise: float = 0.0
     decoder_inputs: Literal["inverse_dynamics", "policy", "both"] = "inverse_dynamics"
     decoder_steps: int = 2000
+    decoder_lr: float = 2e-4
     oracle: bool = True
 
 

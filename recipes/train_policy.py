@@ -79,15 +79,16 @@ def main(config: ExperimentConfig) -> None:
     cached = slot_cache(source, world.savi, prints["slots"], config.data.cache, device, config.logging.progress)
     demos = label_demonstrations(world, source, cached, device)
     demos.labelled(config.behaviour.labelled_demos)  # too few are refused before anything is trained
+    lr = config.behaviour.optim.lr
     clone = CloneStage(agent.policy, agent.oracle, demos, config.behaviour)
     sizes = to_dict(world.config)
     identity = {"model": sizes, "data": source.fingerprint, **prints}
 
-    def train(stage: Stage, name: str, steps: int) -> FitResult:
+    def train(stage: Stage, name: str, steps: int, lr: float) -> FitResult:
         part = run / "policy" if name == "policy" else run / "policy" / name
         return fit(
             stage,
-            replace(config.behaviour, steps=steps),
+            replace(config.behaviour, steps=steps, optim=replace(config.behaviour.optim, lr=lr)),
             part,
             name=name,
             seed=config.seed,
@@ -97,18 +98,18 @@ def main(config: ExperimentConfig) -> None:
             ready=ready,
         )
 
-    cloned = train(clone, "policy", config.behaviour.steps)
+    cloned = train(clone, "policy", config.behaviour.steps, lr)
     agent.eval()
     seconds = cloned.seconds
     for number in range(1, config.behaviour.on_policy_rounds + 1):
         demos = unfold_policy(agent, demos)
         again = CloneStage(agent.policy, None, demos, config.behaviour)
-        seconds += train(again, f"round{number}", config.behaviour.on_policy_steps).seconds
+        seconds += train(again, f"round{number}", config.behaviour.on_policy_steps, lr).seconds
         agent.eval()
     if config.behaviour.on_policy_rounds:
         demos = unfold_policy(agent, demos)
     decode = DecoderStage(agent.action_decoder, agent.policy, demos, config.behaviour)
-    decoded = train(decode, "decoder", config.behaviour.decoder_steps)
+    decoded = train(decode, "decoder", config.behaviour.decoder_steps, config.behaviour.decoder_lr)
     save_stage(
         checkpoint_folder(run, "policy"),
         stage="policy",

@@ -131,6 +131,7 @@ class DecoderStage:
         if config.decoder_inputs != "inverse_dynamics":
             inputs += [_apply(policy, slots[rows]) for slots in _inputs(demos, config)]
         self.inputs = torch.cat(inputs)
+        decoder.standardise(self.inputs)
         self.targets = demos.actions[rows].repeat(len(inputs), 1)
 
     @property
