@@ -5,7 +5,6 @@ A LeRobot data set is unreadable until it is finalised, so none is ever open whi
 
 from __future__ import annotations
 
-import contextlib
 import io
 import shutil
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ from playslot_rl import keys
 from playslot_rl.collectors.episodes import Episode
 from playslot_rl.collectors.journal import Journal
 from playslot_rl.collectors.spec import CollectionSpec
+from playslot_rl.data.quiet import quiet_datasets
 from playslot_rl.errors import OutputError
 from playslot_rl.training.atomic import explain_write_errors, replace_dir, write_json
 
@@ -94,20 +94,6 @@ def env_metadata(spec: CollectionSpec) -> dict[str, Any]:
     creator: Any = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
     metadata: dict[str, Any] = creator.metadata
     return metadata
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without the progress bar that `datasets` draws for every episode."""
-    import datasets
-
-    shown = datasets.utils.logging.is_progress_bar_enabled()
-    datasets.disable_progress_bars()
-    try:
-        yield
-    finally:
-        if shown:
-            datasets.enable_progress_bars()
 
 
 def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str, Any]]:
@@ -210,7 +196,7 @@ def export(journal: Journal, out: Path) -> None:
     """
     spec = journal.spec
     temporary = out.with_name(f".{out.name}.export")
-    with explain_write_errors(out), _quiet():
+    with explain_write_errors(out), quiet_datasets():
         try:
             shutil.rmtree(temporary, ignore_errors=True)  # of an export that was killed
             records = _write(temporary, spec, journal)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from playslot_rl import keys
 from playslot_rl.benchmark.spec import Sizes
+from playslot_rl.data.quiet import quiet_datasets
 from playslot_rl.data.source import open_source
 from playslot_rl.data.windows import sample_windows
 from playslot_rl.threads import available_cores
@@ -34,7 +35,7 @@ def sampling_rates(sizes: Sizes) -> dict[str, float]:
     """
     rates: dict[str, list[float]] = {"lerobot": [], "cache": []}
     frames = sizes.window_batch * sizes.window
-    with tempfile.TemporaryDirectory(prefix="playslot-bench-") as folder, _quiet():
+    with tempfile.TemporaryDirectory(prefix="playslot-bench-") as folder, quiet_datasets():
         root = write_dataset(Path(folder) / "data", sizes)
         cached = cache_batches(root, Path(folder) / "cache", sizes)
         for _ in range(sizes.repeats + 1):
@@ -54,20 +55,6 @@ def _seconds(read: Callable[[], Tensor], batches: int, sizes: Sizes) -> float:
         batch = read()
         assert tuple(batch.shape) == expected, f"got {tuple(batch.shape)}, expected {expected}"
     return (time.perf_counter() - begin) / batches
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without the progress bars that `datasets` draws for every episode."""
-    import datasets
-
-    shown = datasets.utils.logging.is_progress_bar_enabled()
-    datasets.disable_progress_bars()
-    try:
-        yield
-    finally:
-        if shown:
-            datasets.enable_progress_bars()
 
 
 def write_dataset(root: Path, sizes: Sizes) -> Path:

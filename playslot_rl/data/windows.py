@@ -71,6 +71,21 @@ def all_windows(
     return rows
 
 
+def spread_windows(
+    starts: npt.ArrayLike, lengths: npt.ArrayLike, window: int, count: int, episodes: Sequence[int] | IntArray
+) -> IntArray:
+    """At most `count` disjoint windows, spread evenly over the episodes; a stage's validation set.
+
+    Returns:
+        Row indices (at most `count`, T).
+
+    Raises:
+        DataError: no episode has `window` frames.
+    """
+    windows = all_windows(starts, lengths, window, window, episodes)
+    return windows[:: max(1, len(windows) // count)][:count]
+
+
 def _valid_starts(
     starts: npt.ArrayLike, lengths: npt.ArrayLike, window: int, episodes: Sequence[int] | IntArray | None
 ) -> tuple[IntArray, IntArray]:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.config import DynamicsStageConfig
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import all_windows, sample_windows, split_episodes
+from playslot_rl.data.windows import sample_windows, split_episodes, spread_windows
 from playslot_rl.losses.common import total_loss
 from playslot_rl.losses.dynamics import DynamicsLoss
 from playslot_rl.training.seeding import StepGenerators, step_generator
@@ -53,8 +53,7 @@ class DynamicsStage:
             source.require_actions(model.env.action_dim)
         self.frames = config.seed_frames + config.predicted_frames
         self.train_episodes, held_out = split_episodes(source.episodes, validation, seed)
-        windows = all_windows(source.starts, source.lengths, self.frames, self.frames, held_out)
-        self.validation_rows = windows[:: max(1, len(windows) // VALIDATION_WINDOWS)][:VALIDATION_WINDOWS]
+        self.validation_rows = spread_windows(source.starts, source.lengths, self.frames, VALIDATION_WINDOWS, held_out)
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:

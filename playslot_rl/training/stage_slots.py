@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.config import SlotsStageConfig
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import all_windows, sample_windows, split_episodes
+from playslot_rl.data.windows import sample_windows, split_episodes, spread_windows
 from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.training.seeding import StepGenerators, step_generator
@@ -45,8 +45,9 @@ class SlotsStage:
         self.savi, self.source, self.config, self.device = savi, source, config, device
         self.criterion = SlotsLoss(savi)
         self.train_episodes, held_out = split_episodes(source.episodes, validation, seed)
-        windows = all_windows(source.starts, source.lengths, config.clip_frames, config.clip_frames, held_out)
-        self.validation_rows = windows[:: max(1, len(windows) // VALIDATION_WINDOWS)][:VALIDATION_WINDOWS]
+        self.validation_rows = spread_windows(
+            source.starts, source.lengths, config.clip_frames, VALIDATION_WINDOWS, held_out
+        )
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
