@@ -1,7 +1,8 @@
 """Off-screen rendering: one path for training data and for evaluation.
 
 What makes MuJoCo's default slow under software GL is the 4096-pixel shadow map and 4x multisampling. The `fast` path
-switches both off, draws at `supersample` times the size and averages boxes: about 4 ms a 64x64 frame instead of 80.
+switches both off, leaves out what the camera cannot see, draws at `supersample` times the size and averages boxes:
+about 3 ms a 64x64 frame instead of 46 to 80.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import RenderConfig
+from playslot_rl.envs.culling import FrustumCuller
 from playslot_rl.errors import RenderError
 
 if TYPE_CHECKING:
@@ -145,10 +147,21 @@ class FrameRenderer:
         self._camera.azimuth = camera.azimuth
         self._camera.elevation = camera.elevation
         self._camera.lookat[:] = camera.lookat
+        self._culler: FrustumCuller | None = None
+        if fast:
+            self._renderer.update_scene(mj.MjData(model), self._camera)
+            self._culler = FrustumCuller(model, self._renderer.scene)
 
     def __call__(self, data: mujoco.MjData) -> npt.NDArray[np.uint8]:
         """Draw one frame: uint8 [0, 255] of shape (H, W, 3)."""
-        self._renderer.update_scene(data, self._camera)
+        if self._culler is None:
+            self._renderer.update_scene(data, self._camera)
+        else:
+            self._culler.hide(data)
+            try:
+                self._renderer.update_scene(data, self._camera)
+            finally:
+                self._culler.show()
         frame: npt.NDArray[np.uint8] = self._renderer.render()
         if self._factor == 1:
             return frame.copy()
