@@ -13,7 +13,7 @@ from playslot_rl.config import ExperimentConfig, ModelConfig, SAViConfig, finger
 from playslot_rl.errors import ConfigError
 
 PRESETS = ["compact", "paper", "smoke"]
-ENVS = ["button_press"]
+ENVS = ["button_press", "grid_shapes"]
 
 
 def store(config: ExperimentConfig, run: Path) -> Path:
@@ -58,6 +58,20 @@ def test_a_command_line_value_beats_the_preset() -> None:
     assert config.slots.steps == compose(["preset=smoke"]).slots.steps
 
 
+def test_a_task_changes_any_preset_and_a_command_line_value_beats_the_task() -> None:
+    for preset in PRESETS:
+        latents = compose([f"preset={preset}", "env=grid_shapes"]).model.inverse_dynamics
+        assert (latents.variant, latents.n_prototypes, latents.latent_dim) == ("multi", 5, 8)
+        assert latents.dim == compose([f"preset={preset}"]).model.inverse_dynamics.dim
+    config = compose(["model.savi.n_slots=7", "env=grid_shapes", "model.inverse_dynamics.variant=single"])
+    assert (config.model.savi.n_slots, config.model.inverse_dynamics.variant) == (7, "single")
+
+
+def test_what_a_task_changes_names_a_task_and_a_preset() -> None:
+    assert set(choices("env_model")) <= set(ENVS)
+    assert set(choices("env_preset")) <= {f"{env}_{preset}" for env in ENVS for preset in PRESETS}
+
+
 def test_the_last_of_equal_keys_wins() -> None:
     config = compose(["preset=paper", "seed=1", "preset=smoke", "seed=2"])
     assert (config.preset, config.seed) == ("smoke", 2)
@@ -82,7 +96,7 @@ def test_a_folder_in_the_home_folder_may_be_written_with_a_tilde(monkeypatch: py
     ("argument", "message"),
     [
         ("preset=smol", "unknown preset 'smol': expected one of compact, paper, smoke; did you mean preset=smoke"),
-        ("env=kitchen", "unknown env 'kitchen': expected one of button_press"),
+        ("env=kitchen", "unknown env 'kitchen': expected one of .*button_press"),
         ("env.name=kitchen", "unknown env 'kitchen'"),
         ("sed=1", "unknown key sed: expected one of .*did you mean seed"),
         ("slots.lr=1", "unknown key slots.lr: expected one of .*slots.optim"),
