@@ -14,6 +14,7 @@ from playslot_rl.collectors.export import META_NAME, export
 from playslot_rl.collectors.journal import Journal, journal_path, read_spec
 from playslot_rl.collectors.spec import CollectionSpec, difference
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import DataError, OutputError
 from playslot_rl.training.progress import format_seconds
 
@@ -158,7 +159,10 @@ def _record_missing(journal: Journal, workers: int, shown: bool) -> None:
     from playslot_rl.envs.rendering import import_mujoco
 
     import_mujoco()  # before torchrl, which imports it too
-    from playslot_rl.collectors.episodes import record
+    if journal.spec.env.name in PROCEDURAL:
+        from playslot_rl.collectors.procedural import record
+    else:
+        from playslot_rl.collectors.episodes import record
 
     if shown and len(missing) < total:
         print(f"collect: {total - len(missing)} of {total} episodes are there already", file=sys.stderr, flush=True)

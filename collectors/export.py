@@ -83,7 +83,13 @@ def rows(episode: Episode, task: str) -> Iterator[dict[str, Any]]:
 
 
 def env_metadata(spec: CollectionSpec) -> dict[str, Any]:
-    """Gymnasium's metadata of the task."""
+    """Gymnasium's metadata of the task, or those of an environment without a simulator."""
+    from playslot_rl.envs import PROCEDURAL
+
+    if spec.env.name in PROCEDURAL:
+        from playslot_rl.envs.grid_shapes import METADATA
+
+        return METADATA
     import gymnasium
     from gymnasium.envs.registration import load_env_creator
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from playslot_rl.config import EnvConfig, ExperimentConfig, RenderConfig
-from playslot_rl.envs import gym_id
+from playslot_rl.envs import PROCEDURAL, gym_id
 from playslot_rl.errors import ConfigError
 
 FORMAT = 1
@@ -49,14 +49,17 @@ class CollectionSpec:
         """Check the request and name it.
 
         Raises:
-            ConfigError: unknown policy or environment, too few or too many episodes or steps, or a seed whose episodes
+            ConfigError: unknown policy or environment, an expert of an environment without one, too few or too many episodes or steps, or a seed whose episodes
                 would be evaluation episodes.
         """
         if policy not in OFFSETS:
             near = difflib.get_close_matches(policy, OFFSETS, n=1)
             hint = f"; did you mean policy={near[0]}?" if near else "; choose one of these"
             raise ConfigError(f"unknown policy: got {policy!r}, expected one of {', '.join(sorted(OFFSETS))}{hint}")
-        gym_id(config.env.name)
+        if config.env.name in PROCEDURAL:
+            _check_procedural(config.env, policy)
+        else:
+            gym_id(config.env.name)
         if not 1 <= episodes <= BLOCK // 2:
             raise ConfigError(f"episodes: got {episodes}, expected 1 to {BLOCK // 2}; split larger sets over seeds")
         if steps < 2:
@@ -75,8 +78,28 @@ class CollectionSpec:
         return self.seed * BLOCK + OFFSETS[self.policy] + index
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain nested dict."""
-        return asdict(self)
+        """Plain nested dict; groups of the environment that have their default values (those of other tasks) left out.
+
+        So a data set made before a task with settings of its own was added is still the same collection.
+        """
+        values, default = asdict(self), asdict(EnvConfig())
+        values["env"] = {k: v for k, v in values["env"].items() if not isinstance(v, dict) or v != default[k]}
+        return values
+
+
+def _check_procedural(env: EnvConfig, policy: str) -> None:
+    """Refuse what an environment without a simulator cannot give.
+
+    Raises:
+        ConfigError: an expert, or an action of the wrong width.
+    """
+    from playslot_rl.envs.grid_shapes import check_actions
+
+    if policy != "random":
+        raise ConfigError(
+            f"policy: got {policy} for env={env.name}, expected random: its shapes move by themselves; leave policy out"
+        )
+    check_actions(env)
 
 
 def redraw(seed: int, attempt: int) -> int:

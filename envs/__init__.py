@@ -19,6 +19,9 @@ ENVIRONMENTS: dict[str, tuple[str, str]] = {
 }
 """Name in the configuration -> Gymnasium id and entry point."""
 
+PROCEDURAL = ("grid_shapes",)
+"""Environments that are drawn, not simulated: they give videos, there is nothing to act on and no success."""
+
 
 class TaskEnv(Protocol):
     """What the collectors and the evaluation need of an environment, beyond Gymnasium's own interface."""
@@ -54,6 +57,10 @@ def gym_id(name: str) -> str:
     Raises:
         ConfigError: there is no such environment.
     """
+    if name in PROCEDURAL:
+        raise ConfigError(
+            f"env={name}: got videos without a simulator, expected one of {', '.join(sorted(ENVIRONMENTS))}"
+        )
     if name not in ENVIRONMENTS:
         near = difflib.get_close_matches(name, ENVIRONMENTS, n=1)
         hint = f"; did you mean env={near[0]}?" if near else "; choose one of these"
@@ -94,4 +101,4 @@ def make_torchrl_env(env: EnvConfig | None = None, render: RenderConfig | None =
     return make(env or EnvConfig(), render or RenderConfig())
 
 
-__all__ = ["ENVIRONMENTS", "TaskEnv", "gym_id", "make_env", "make_torchrl_env", "register", "task_env"]
+__all__ = ["ENVIRONMENTS", "PROCEDURAL", "TaskEnv", "gym_id", "make_env", "make_torchrl_env", "register", "task_env"]

@@ -39,16 +39,40 @@ class RenderConfig:
 
 
 @dataclass(frozen=True)
+class GridConfig:
+    """GridShapes, read by `env=grid_shapes` only.
+
+    Attributes:
+        objects: shapes in a clip, 1 to 5; `action_dim` is twice that.
+        size: side of a shape, pixels.
+        speed: pixels a step.
+        change: probability that a shape draws a new direction at a step.
+    """
+
+    objects: int = 2
+    size: int = 15
+    speed: int = 2
+    change: float = 0.25
+
+    def __post_init__(self) -> None:
+        _check(1 <= self.objects <= 5, "env.grid.objects", self.objects, "1 to 5")
+        _check(self.size >= 3, "env.grid.size", self.size, "at least 3 pixels")
+        _check(self.speed >= 1, "env.grid.speed", self.speed, "at least 1 pixel")
+        _check(0.0 <= self.change <= 1.0, "env.grid.change", self.change, "a probability")
+
+
+@dataclass(frozen=True)
 class EnvConfig:
     """The task.
 
     Attributes:
-        name: registered environment name (`button_press`).
+        name: environment name (`button_press`, `grid_shapes`).
         image_size: side of the square frames, pixels.
         action_dim: width A of the real action.
         frame_skip: environment steps per agent step, all with the same action.
         max_steps: agent steps in an episode.
         warmup_steps: random agent steps after each reset, before the first observation.
+        grid: settings of `grid_shapes`.
     """
 
     name: str = "button_press"
@@ -57,6 +81,7 @@ class EnvConfig:
     frame_skip: int = 5
     max_steps: int = 20
     warmup_steps: int = 12
+    grid: GridConfig = field(default_factory=GridConfig)
 
     def __post_init__(self) -> None:
         _check(self.image_size in (32, 64, 128), "env.image_size", self.image_size, "32, 64 or 128")
@@ -113,6 +138,27 @@ class CollectConfig:
     exploration_noise: float = 0.5
     learn_from_demos: bool = False
     storage: Literal["image", "video"] = "image"
+
+
+@dataclass(frozen=True)
+class CollectorConfig:
+    """How episodes are recorded, never what: the data do not depend on it.
+
+    Attributes:
+        backend: `local` processes of this machine, or actors of a `ray` cluster.
+        timeout_s: seconds without an episode after which a worker counts as hanging and is started again.
+        restarts: how many dead or hanging workers are replaced before the collection gives up.
+        ray_address: address of the Ray cluster; empty means `$RAY_ADDRESS`, or a cluster of this machine alone.
+    """
+
+    backend: Literal["local", "ray"] = "local"
+    timeout_s: float = 120.0
+    restarts: int = 5
+    ray_address: str = ""
+
+    def __post_init__(self) -> None:
+        _check(self.timeout_s > 0.0, "collector.timeout_s", self.timeout_s, "a number of seconds above 0")
+        _check(self.restarts >= 0, "collector.restarts", self.restarts, "0 or more")
 
 
 @dataclass(frozen=True)
@@ -421,6 +467,7 @@ class ExperimentConfig:
     render: RenderConfig = field(default_factory=RenderConfig)
     data: DataConfig = field(default_factory=DataConfig)
     collect: CollectConfig = field(default_factory=CollectConfig)
+    collector: CollectorConfig = field(default_factory=CollectorConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     slots: SlotsStageConfig = field(default_factory=SlotsStageConfig)
     dynamics: DynamicsStageConfig = field(default_factory=DynamicsStageConfig)
