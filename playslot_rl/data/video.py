@@ -17,7 +17,7 @@ from playslot_rl.errors import DataError
 
 
 def frames_at(path: Path, times: Sequence[float], tolerance: float) -> Iterator[npt.NDArray[np.uint8]]:
-    """Frames of a video at ascending times.
+    """Frames of a video at ascending times, as pixels.
 
     Args:
         path: video file.
@@ -30,6 +30,12 @@ def frames_at(path: Path, times: Sequence[float], tolerance: float) -> Iterator[
     Raises:
         DataError: the video cannot be opened or decoded, or has no frame at one of the times.
     """
+    for frame in decoded_at(path, times, tolerance):
+        yield frame.to_ndarray(format="rgb24")
+
+
+def decoded_at(path: Path, times: Sequence[float], tolerance: float) -> Iterator[Any]:
+    """Frames of a video at ascending times, as PyAV's `VideoFrame`: arguments and errors of `frames_at`."""
     import av
 
     wanted = iter(times)
@@ -44,7 +50,7 @@ def frames_at(path: Path, times: Sequence[float], tolerance: float) -> Iterator[
                 if due is None or now > due + tolerance:
                     break
                 if now >= due - tolerance:
-                    yield frame.to_ndarray(format="rgb24")
+                    yield frame
                     due = next(wanted, None)
     except (av.FFmpegError, OSError, IndexError) as error:
         reason = str(error).splitlines()[0]

@@ -1,0 +1,122 @@
+"""Statistics as LeRobot keeps them: of each episode in `meta/episodes`, of all in `meta/stats.json`.
+
+Numbers: per component. Cameras: per channel, scaled to [0, 1], from some evenly spread frames of each episode.
+Quantiles of the whole are the weighted means of those of the episodes, as LeRobot makes them.
+
+Note: exact quantiles; LeRobot reads them off a histogram of 5000 bins. `tests/datasets` compares the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.datasets.contents import Array, Stats
+
+QUANTILES: Final = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+BASIC: Final = ("min", "max", "mean", "std", "count")
+LARGE_IMAGE: Final = 300
+"""From this side on LeRobot thins out the pixels."""
+THINNED_SIDE: Final = 150
+
+
+def has_statistics(feature: dict[str, Any]) -> bool:
+    """Whether LeRobot keeps statistics of such a feature."""
+    return feature["dtype"] not in ("string", "language")
+
+
+def is_depth(feature: dict[str, Any]) -> bool:
+    """Whether a camera feature is a depth map, whose values are not scaled to [0, 1]."""
+    info = {**(feature.get("video_info") or {}), **(feature.get("info") or {})}
+    return bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
+
+
+def sampled(length: int) -> list[int]:
+    """Frames of an episode that LeRobot takes for a camera's statistics."""
+    count = max(min(100, length), min(int(length**0.75), 10_000))
+    return [int(i) for i in np.round(np.linspace(0, length - 1, count))]
+
+
+def thinned(frame: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """(H, W, C) -> fewer rows and columns where the frame is large."""
+    height, width = frame.shape[:2]
+    if max(height, width) < LARGE_IMAGE:
+        return frame
+    factor = max(height, width) // THINNED_SIDE
+    return frame[::factor, ::factor]
+
+
+def of_numbers(values: Array) -> dict[str, Array]:
+    """Statistics of one episode's values, (n,) or (n, ...): float64 of the shape of one, at least (1,)."""
+    rows = np.asarray(values, np.float64)
+    rows = rows.reshape(len(rows), -1) if rows.ndim == 1 else rows
+    return _summary(rows, len(rows))
+
+
+def of_frames(frames: Sequence[npt.NDArray[np.uint8]]) -> dict[str, Array]:
+    """Statistics of one episode's sampled frames (H, W, C): float64 (C, 1, 1), in [0, 1]."""
+    pixels = np.stack(frames).reshape(-1, frames[0].shape[-1]) / 255.0
+    stats = _summary(pixels, len(frames))
+    return {name: value if name == "count" else value.reshape(-1, 1, 1) for name, value in stats.items()}
+
+
+def _summary(rows: Array, count: int) -> dict[str, Array]:
+    stats = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
+    quantiles = np.quantile(rows, list(QUANTILES.values()), axis=0)
+    return {**stats, "count": np.array([count]), **dict(zip(QUANTILES, quantiles, strict=True))}
+
+
+def aggregate(episodes: Sequence[Stats]) -> Stats:
+    """Statistics of all from those of the episodes, weighted by their counts; features that none has are left out."""
+    names = dict.fromkeys(name for stats in episodes for name in stats)
+    return {name: _aggregate([stats[name] for stats in episodes if name in stats]) for name in names}
+
+
+def _aggregate(parts: Sequence[dict[str, Array]]) -> dict[str, Array]:
+    count = np.array([float(np.asarray(part["count"]).reshape(-1)[0]) for part in parts])
+    weight = count / count.sum()
+
+    def stacked(name: str) -> Array:
+        return np.stack([np.asarray(part[name], np.float64) for part in parts])
+
+    def weighted(values: Array) -> Array:
+        result: Array = np.tensordot(weight, values, axes=1)
+        return result
+
+    mean = weighted(stacked("mean"))
+    variance = weighted(stacked("std") ** 2 + (stacked("mean") - mean) ** 2)
+    total = {"min": stacked("min").min(0), "max": stacked("max").max(0), "mean": mean, "std": np.sqrt(variance)}
+    total["count"] = np.array([int(count.sum())])
+    for name in parts[0]:
+        if name not in total and all(name in part for part in parts):
+            total[name] = weighted(stacked(name))
+    return total
+
+
+def differing(stored: dict[str, Array], actual: dict[str, Array], loose: float = 0.0) -> list[str]:
+    """Names of the basic statistics that are missing, not finite, or differ.
+
+    Args:
+        stored: as the data set has them.
+        actual: recomputed.
+        loose: tolerance of mean and standard deviation; with one, count, min and max are not compared. 0 compares
+            all of them within LeRobot's float32 rounding.
+    """
+    found = []
+    scale = float(max(np.abs(actual["min"]).max(), np.abs(actual["max"]).max(), 1e-6))
+    # LeRobot takes the variance as a difference of squares in float32: about 3.5e-4 of the mean is lost.
+    tolerance = {"std": 2e-3 * scale} if not loose else {"std": loose, "mean": loose}
+    for name in BASIC:
+        got = stored.get(name)
+        if got is None or not np.isfinite(got).all():
+            found.append(name)
+        elif got.size != actual[name].size:
+            found.append(name)
+        elif loose and name not in tolerance:
+            continue
+        elif np.abs(got.reshape(-1) - actual[name].reshape(-1)).max() > tolerance.get(name, 1e-4 * scale):
+            found.append(name)
+    return found
