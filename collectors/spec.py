@@ -6,7 +6,7 @@ import difflib
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
-from playslot_rl.config import EnvConfig, ExperimentConfig, RenderConfig
+from playslot_rl.config import EnvConfig, ExperimentConfig, RenderConfig, from_dict
 from playslot_rl.envs import PROCEDURAL, gym_id
 from playslot_rl.errors import ConfigError
 
@@ -49,8 +49,8 @@ class CollectionSpec:
         """Check the request and name it.
 
         Raises:
-            ConfigError: unknown policy or environment, an expert of an environment without one, too few or too many episodes or steps, or a seed whose episodes
-                would be evaluation episodes.
+            ConfigError: unknown policy or environment, an expert of an environment without one, too few or too many
+                episodes or steps, or a seed whose episodes would be evaluation episodes.
         """
         if policy not in OFFSETS:
             near = difflib.get_close_matches(policy, OFFSETS, n=1)
@@ -105,6 +105,16 @@ def _check_procedural(env: EnvConfig, policy: str) -> None:
 def redraw(seed: int, attempt: int) -> int:
     """Seed of the `attempt`-th draw (from 0) of the episode with this seed."""
     return seed + attempt * REDRAW_STRIDE
+
+
+def completed(stored: object) -> dict[str, Any]:
+    """A stored record with the defaults of settings that did not exist when it was written."""
+    if not isinstance(stored, dict):
+        return {}
+    try:
+        return from_dict(CollectionSpec, stored).to_dict()
+    except (TypeError, ValueError):
+        return stored  # `difference` names what is foreign in it
 
 
 def difference(got: dict[str, Any], expected: dict[str, Any]) -> str:

@@ -11,13 +11,17 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.recipes import objects
 
 PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")
 
 
 def main(config: ExperimentConfig, report: bool = True) -> None:
     """Evaluate the policy of `config.run` under `config.protocol` and print the result.
+
+    Where there is no simulator (GridShapes) its slots and latent actions are scored instead: see `recipes.objects`.
 
     Args:
         config: `run`, `protocol`, `episodes` (50 if None), `seed`, `device`, `env`, `render`, `evaluation`.
@@ -29,6 +33,9 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
         OutputError: the result cannot be written.
     """
     run = check_run(config)
+    if config.env.name in PROCEDURAL:
+        objects.main(config, run)
+        return
     from playslot_rl.evaluation.episodes import TaskPool
     from playslot_rl.evaluation.success import check_protocol, evaluate_run, run_facts
     from playslot_rl.recipes.run import open_device
@@ -52,6 +59,9 @@ def main_if_needed(config: ExperimentConfig) -> None:
     from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts
 
     run = check_run(config)
+    if config.env.name in PROCEDURAL:
+        objects.main_if_needed(config, run)
+        return
     facts = {
         "episodes": config.episodes or DEFAULT_EPISODES,
         "seed": config.seed,

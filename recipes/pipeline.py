@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from playslot_rl.config import DataConfig, ExperimentConfig
+from playslot_rl.envs import PROCEDURAL
 from playslot_rl.recipes import evaluate, train_dynamics, train_policy, train_slots
 from playslot_rl.recipes.run import open_run, store_config
 
@@ -14,7 +15,8 @@ from playslot_rl.recipes.run import open_run, store_config
 def main(config: ExperimentConfig) -> None:
     """Collect, train the three stages, evaluate under both protocols, write the report.
 
-    With `data.root` set nothing is collected but missing demonstrations (`data.demos`).
+    With `data.root` set nothing is collected but missing demonstrations (`data.demos`). Where nothing can be acted on
+    (GridShapes) there are neither demonstrations nor a policy, and slots and latent actions are scored instead.
     """
     began = time.monotonic()
     name = config.out or config.run or f"runs/{config.env.name}_{config.preset}"
@@ -23,7 +25,8 @@ def main(config: ExperimentConfig) -> None:
     if not (folder / "config.json").is_file():  # a stage stores it anew once it finds that it fits
         store_config(config, folder)
     config = replace(config, data=_collect(config, folder))
-    for stage in (train_slots, train_dynamics, train_policy):
+    behaves = config.env.name not in PROCEDURAL
+    for stage in (train_slots, train_dynamics, *([train_policy] if behaves else [])):
         since = time.monotonic()
         stage.main(config)
         print(f"{stage.__name__.rsplit('.', 1)[-1]}: {time.monotonic() - since:.0f} s", flush=True)
@@ -36,12 +39,17 @@ def _collect(config: ExperimentConfig, folder: Path) -> DataConfig:
     from playslot_rl.collectors import collect
 
     given, want = config.data, config.collect
+    random = folder / "data" / "random"
+    if config.env.name in PROCEDURAL:
+        if given.root:
+            return given
+        collect(config, "random", want.random_episodes, want.random_steps, random, config.seed, config.workers)
+        return replace(given, root=str(random))
     demos = given.demos or str(folder / "data" / "expert")
     if not given.demos:
         collect(config, "expert", want.expert_episodes, want.expert_steps, Path(demos), config.seed, config.workers)
     if given.root:
         return replace(given, demos=demos)
-    random = folder / "data" / "random"
     collect(config, "random", want.random_episodes, want.random_steps, random, config.seed, config.workers)
     roots = [str(random)]
     if want.noisy_episodes:

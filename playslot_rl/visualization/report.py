@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from playslot_rl.config import ExperimentConfig, from_dict
+from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.episodes import TaskPool
 from playslot_rl.evaluation.success import hardware
@@ -59,6 +60,11 @@ def write_report(
         OutputError: a file cannot be written.
     """
     config = config or stored_config(run)
+    if config.env.name in PROCEDURAL:
+        from playslot_rl.visualization.object_report import build as build_objects
+
+        model = world_model.eval() if world_model is not None else None
+        return save(run, build_objects(run, config, model, shown_path(run), read_metas(run)))
     own = TaskPool(config.env, config.render) if pool is None else None
     used = pool or own
     assert used is not None
@@ -72,6 +78,15 @@ def write_report(
     finally:
         if own is not None:
             own.close()
+    return save(run, document)
+
+
+def save(run: Path, document: Document) -> Path:
+    """Write a report and its figures into a run folder; returns the path of the HTML file.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
     figures = run / "figures"
     figures.mkdir(parents=True, exist_ok=True)
     for section in document.sections:

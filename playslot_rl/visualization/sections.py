@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -193,8 +193,11 @@ def _outcome(steps: int | None) -> str:
     return "not solved" if steps is None else f"solved at step {steps}"
 
 
-def slots_section(given: ReportInput, clip: Callable[[], Any]) -> Section:
-    """Slot masks and reconstructions."""
+EXPERT_CLIP = "A held-out episode of the scripted expert."
+
+
+def slots_section(given: ReportInput, clip: Callable[[], Any], what: str = EXPERT_CLIP) -> Section:
+    """Slot masks and reconstructions; `what` says which clip it is."""
     title = "Slots"
     if given.world_model is None:
         return Section(title, [Missing("There is no trained SAVi.", given.command("train-slots"))])
@@ -202,7 +205,7 @@ def slots_section(given: ReportInput, clip: Callable[[], Any]) -> Section:
 
     alt = "Rows: frames, their reconstructions, the segmentation by slot, and the part of the frame each slot holds."
     caption = (
-        "A held-out episode of the scripted expert. Segmentation: each pixel in the colour of the slot with the "
+        f"{what} Segmentation: each pixel in the colour of the slot with the "
         "largest mask. Slot rows: the slot's colours weighted by its mask, on white."
     )
     return Section(title, [Picture("slots", png(draw_slots(given.world_model, clip())), alt, caption)])
@@ -241,11 +244,11 @@ def read_history(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def training_section(given: ReportInput) -> Section:
+def training_section(given: ReportInput, stages: Sequence[str] = STAGES) -> Section:
     """Stage table and loss curves."""
     blocks: list[Block] = []
     rows = []
-    for stage in STAGES:
+    for stage in stages:
         meta = given.metas.get(stage)
         if meta is None:
             blocks.append(Missing(f"Stage {stage} is not finished.", given.command(f"train-{stage}")))

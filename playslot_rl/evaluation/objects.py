@@ -1,0 +1,214 @@
+"""Slots and latent actions scored against known objects and moves (GridShapes), on clips no training has seen.
+
+Shapes: C clips, T steps (T + 1 frames), O objects, N slots, Z latent-action width, K prototypes, H W image size.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.envs.grid_shapes import MOVES, Clips, generate
+from playslot_rl.errors import ConfigError
+from playslot_rl.evaluation.move_probe import probe_moves
+from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
+from playslot_rl.evaluation.segmentation import adjusted_rand_index, match_slots
+from playslot_rl.evaluation.success import hardware
+from playslot_rl.evaluation.video import video_metrics
+from playslot_rl.training.atomic import write_json
+from playslot_rl.training.checkpoints import world_model_checkpoints
+from playslot_rl.world_model import WorldModel, module_device, normalise
+
+DEFAULT_CLIPS: Final = 100
+CLIPS_AT_ONCE: Final = 10
+SEED_FRAMES: Final = 6
+"""Parsed frames before the predicted ones, as in the paper's table."""
+PREDICTED_FRAMES: Final = 15
+RESULT: Final = Path("evaluation") / "objects" / "eval_info.json"
+"""The result, relative to the run folder."""
+
+
+@dataclass(frozen=True)
+class Parsed:
+    """What a world model makes of clips.
+
+    Attributes:
+        slots: (C, T + 1, N, D).
+        labels: int64 (C, T + 1, H, W), slot with the largest mask.
+        reconstructed: (C, T + 1, 3, H, W) float.
+        prototypes, latents: (C, T, N, Z); with one latent a step (InvDyn_S) every slot has the same.
+        codes: int64 (C, T, N).
+        predicted: (C, P, 3, H, W), the frames that follow the seed frames.
+    """
+
+    slots: Tensor
+    labels: npt.NDArray[np.int64]
+    reconstructed: Tensor
+    prototypes: npt.NDArray[np.float32]
+    latents: npt.NDArray[np.float32]
+    codes: npt.NDArray[np.int64]
+    predicted: Tensor
+
+
+def seed_frames(steps: int) -> int:
+    """Seed frames of clips of T steps: the paper's 6, or fewer in short clips."""
+    return min(SEED_FRAMES, max(1, steps // 2))
+
+
+def _pixels(frames: npt.NDArray[np.uint8], device: torch.device) -> Tensor:
+    """(..., H, W, 3) uint8 to (..., 3, H, W) float [0, 1]."""
+    return normalise(torch.from_numpy(frames).to(device).movedim(-1, -3))
+
+
+@torch.no_grad()
+def parse_clips(model: WorldModel, frames: npt.NDArray[np.uint8]) -> Parsed:
+    """Parse clips (C, T + 1, H, W, 3), infer their latent actions and predict the frames after the seed frames."""
+    device = module_device(model.savi)
+    generator = torch.Generator(device).manual_seed(0)
+    slots, _ = model.savi(_pixels(frames, device), generator=generator)
+    decoded = model.savi.decode(slots)
+    latent = model.inverse_dynamics(slots)
+    seed = seed_frames(frames.shape[1] - 1)
+    steps = min(seed - 1 + PREDICTED_FRAMES, frames.shape[1] - 1)
+    p, v = latent.prototype[:, :steps], latent.variability[:, :steps]
+    ahead = model.predictor.rollout(slots[:, :seed], p, v)[:, seed - 1 :]
+
+    def per_slot(values: Tensor) -> npt.NDArray[Any]:
+        if not model.inverse_dynamics.per_slot:
+            values = values.unsqueeze(2).expand(*values.shape[:2], slots.shape[2], *values.shape[2:])
+        array: npt.NDArray[Any] = values.cpu().numpy()
+        return array
+
+    return Parsed(
+        slots=slots,
+        labels=decoded.masks[:, :, :, 0].argmax(2).cpu().numpy(),
+        reconstructed=decoded.frames,
+        prototypes=per_slot(latent.prototype),
+        latents=per_slot(latent.mean),
+        codes=per_slot(latent.code),
+        predicted=model.savi.decode(ahead).frames,
+    )
+
+
+@dataclass
+class _Tally:
+    """Scores of the clips so far, and the transitions of their matched objects."""
+
+    ari: list[float]
+    foreground: list[float]
+    pixels: list[tuple[float, float, float, float]]
+    unmatched: int
+    transitions: list[tuple[npt.NDArray[Any], ...]]
+
+
+def _score(model: WorldModel, clips: Clips, first: int, tally: _Tally) -> None:
+    """Add some clips; `first` is the number of the first of them."""
+    parsed = parse_clips(model, clips.frames)
+    objects, slots = clips.moves.shape[2], parsed.slots.shape[2]
+    real = _pixels(clips.frames, parsed.predicted.device)
+    seed = seed_frames(clips.moves.shape[1])
+    again = video_metrics(parsed.reconstructed, real)
+    ahead = video_metrics(parsed.predicted, real[:, seed : seed + parsed.predicted.shape[1]])
+    tally.pixels += [(again.psnr, again.ssim, ahead.psnr, ahead.ssim)] * len(clips.frames)
+    for c in range(len(clips.frames)):
+        tally.ari.append(adjusted_rand_index(clips.masks[c], parsed.labels[c]))
+        tally.foreground.append(adjusted_rand_index(clips.masks[c], parsed.labels[c], foreground=True))
+        chosen = match_slots(clips.masks[c], parsed.labels[c], objects, slots)
+        tally.unmatched += int((chosen < 0).sum())
+        for o in np.flatnonzero(chosen >= 0):
+            n, moves = chosen[o], clips.moves[c, :, o]
+            of = np.full(len(moves), first + c, np.int64)
+            tally.transitions.append(
+                (parsed.prototypes[c, :, n], parsed.latents[c, :, n], parsed.codes[c, :, n], moves, of)
+            )
+
+
+def evaluate_objects(model: WorldModel, config: ExperimentConfig, clips: int, seeds: list[int]) -> dict[str, Any]:
+    """Score a world model.
+
+    Args:
+        model: in evaluation mode.
+        config: its `env` says which clips; `env.max_steps` is T.
+        clips: C, at least 2.
+        seeds: of the clips.
+
+    Returns:
+        `ari` and `foreground_ari` (means over clips), `reconstruction` and `prediction` (`psnr` in dB, `ssim`),
+        `probes` (`prototype`, `latent`: see `probe_moves`), `codes` (K rows of counts by move; None without
+        prototypes), `unmatched` (objects without a slot).
+    """
+    tally = _Tally([], [], [], 0, [])
+    for first in range(0, clips, CLIPS_AT_ONCE):
+        drawn = generate(seeds[first : first + CLIPS_AT_ONCE], config.env.max_steps, config.env)
+        _score(model, drawn, first, tally)
+    prototypes, latents, codes, moves, of = (np.concatenate(part) for part in zip(*tally.transitions, strict=True))
+    k = model.inverse_dynamics.n_prototypes
+    probes = {"latent": probe_moves(latents, moves, of, len(MOVES), config.seed)}
+    if k:
+        probes = {"prototype": probe_moves(prototypes, moves, of, len(MOVES), config.seed), **probes}
+    table = np.bincount(codes * len(MOVES) + moves, minlength=k * len(MOVES)).reshape(k, -1).tolist() if k else None
+    psnr, ssim, ahead_psnr, ahead_ssim = np.mean(tally.pixels, 0).tolist()
+    seed = seed_frames(config.env.max_steps)
+    return {
+        "ari": float(np.mean(tally.ari)),
+        "foreground_ari": float(np.mean(tally.foreground)),
+        "reconstruction": {"psnr": psnr, "ssim": ssim},
+        "prediction": {
+            "psnr": ahead_psnr,
+            "ssim": ahead_ssim,
+            "seed_frames": seed,
+            "predicted_frames": min(PREDICTED_FRAMES, config.env.max_steps + 1 - seed),
+        },
+        "probes": probes,
+        "moves": list(MOVES),
+        "codes": table,
+        "objects": config.env.grid.objects,
+        "unmatched": tally.unmatched,
+    }
+
+
+def evaluate_run_objects(run: Path, model: WorldModel, config: ExperimentConfig) -> dict[str, Any]:
+    """Score a run's world model on `config.episodes` clips (100) and write `RUN/evaluation/objects/eval_info.json`.
+
+    Raises:
+        CheckpointError: the run has no finished world model.
+        ConfigError: fewer than two clips, or a training data set holds one of the seeds.
+        OutputError: the file cannot be written.
+    """
+    clips, began = config.episodes or DEFAULT_CLIPS, time.perf_counter()
+    if clips < 2:
+        raise ConfigError(f"episodes: got {clips}, expected at least 2, since a probe is tested on clips held out")
+    start = first_seed(config, config.seed)
+    seeds = list(range(start, start + clips))
+    check_disjoint(seeds, training_seeds(config, run))
+    model.eval()
+    result = {
+        "protocol": "objects",
+        "episodes": clips,
+        "seed": config.seed,
+        "seeds": seeds,
+        **evaluate_objects(model, config, clips, seeds),
+        "fingerprints": run_fingerprints(run),
+        "wall_seconds": round(time.perf_counter() - began, 2),
+        "hardware": hardware(),
+    }
+    (run / RESULT).parent.mkdir(parents=True, exist_ok=True)
+    write_json(run / RESULT, result)
+    return result
+
+
+def run_fingerprints(run: Path) -> dict[str, str]:
+    """Weights of the world model's stages.
+
+    Raises:
+        CheckpointError: one is missing or damaged.
+    """
+    return {name: stage.fingerprint for name, stage in world_model_checkpoints(run).items()}

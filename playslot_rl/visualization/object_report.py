@@ -1,0 +1,167 @@
+"""The report of a run on videos whose objects and moves are known (GridShapes): no policy, but ARI and probes.
+
+Shapes: T steps (T + 1 frames), K prototypes, H W image height and width.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.envs.grid_shapes import generate
+from playslot_rl.evaluation.episodes import TaskPool
+from playslot_rl.evaluation.objects import RESULT, parse_clips, seed_frames
+from playslot_rl.evaluation.seeds import first_seed
+from playslot_rl.evaluation.success import hardware
+from playslot_rl.visualization.document import Block, Document, Missing, Picture, Section, Table, Text
+from playslot_rl.visualization.frames import to_uint8
+from playslot_rl.visualization.grid import image_grid
+from playslot_rl.visualization.sections import (
+    ReportInput,
+    percent,
+    png,
+    prototype_section,
+    seconds,
+    slots_section,
+    training_section,
+)
+from playslot_rl.world_model import WorldModel
+
+WORLD_MODEL_STAGES = ("slots", "dynamics")
+CLIPS_SHOWN = 3
+PROBES = {"prototype": "from the slot's prototype", "latent": "from the slot's latent action (mean)"}
+
+
+def build(
+    run: Path, config: ExperimentConfig, model: WorldModel | None, shown: str, metas: dict[str, dict[str, Any]]
+) -> Document:
+    """All sections; what is missing is named with its command.
+
+    Args:
+        run: the run folder.
+        config: of the run.
+        model: trained world model; None where there is none yet.
+        shown: how the run folder is written in commands.
+        metas: stage -> `meta.json` of its finished checkpoint.
+    """
+    pool = TaskPool(config.env, config.render)  # stays empty: there is no simulator
+    given = ReportInput(run, config, model, None, pool, shown, metas)
+    path = run / RESULT
+    result = json.loads(path.read_text()) if path.is_file() else None
+    seed = first_seed(config, config.seed) if result is None else int(result["seeds"][0])
+    clips = generate(range(seed, seed + CLIPS_SHOWN), config.env.max_steps, config.env)
+    sections = [
+        scores_section(given, result),
+        prediction_section(given, clips.frames, result),
+        slots_section(given, lambda: clips.frames[0], "The first evaluated clip."),
+        prototype_section(given, lambda: clips.frames[0]),
+        code_section(result),
+        training_section(given, WORLD_MODEL_STAGES),
+        settings_section(given, result),
+    ]
+    grid = config.env.grid
+    lead = (
+        f"`{config.env.name}` with {grid.objects} objects, preset `{config.preset}`, seed {config.seed}. A PlaySlot "
+        "world model learned from videos alone; where the objects are and what they did is known, and only scores it."
+    )
+    return Document(f"PlaySlot report: {run.resolve().name}", lead, sections)
+
+
+def scores_section(given: ReportInput, result: dict[str, Any] | None) -> Section:
+    """ARI and probes."""
+    title = "Objects and moves"
+    if result is None:
+        return Section(title, [Missing("Nothing has been scored yet.", given.command("evaluate"))])
+    ari = [
+        ["all pixels", f"{result['ari']:.3f}"],
+        ["pixels of objects (FG-ARI)", f"{result['foreground_ari']:.3f}"],
+    ]
+    caption = (
+        f"Slot masks against the true masks, {result['episodes']} held-out clips scored as wholes; 1 is perfect, 0 is "
+        "chance. Each pixel belongs to the slot with the largest mask."
+    )
+    probes = [
+        [label, percent(p["accuracy"]), percent(p["majority"]), percent(p["chance"]), str(p["test"])]
+        for name, label in PROBES.items()
+        if (p := result["probes"].get(name)) is not None
+    ]
+    headers = ["move of an object, read", "accuracy", "most frequent move", "chance", "moves tested"]
+    note = "Logistic regression, fitted and tested on different clips. A slot belongs to the object it overlaps most."
+    blocks: list[Block] = [Table(["adjusted Rand index", "mean"], ari, caption), Table(headers, probes, note)]
+    if result["unmatched"]:
+        blocks.append(
+            Text(f"{result['unmatched']} objects got no slot: there are fewer slots than objects and ground.")
+        )
+    return Section(title, blocks)
+
+
+def prediction_section(given: ReportInput, frames: Any, result: dict[str, Any] | None) -> Section:
+    """Predicted beside true frames."""
+    title = "Prediction"
+    if given.world_model is None:
+        return Section(title, [Missing("There is no trained dynamics model.", given.command("train-dynamics"))])
+    parsed = parse_clips(given.world_model, frames)
+    predicted, seed = to_uint8(parsed.predicted), seed_frames(given.config.env.max_steps)
+    steps = predicted.shape[1]
+    chosen = np.unique(np.linspace(0, steps - 1, min(8, steps)).round().astype(int))
+    cells, labels = [], []
+    for c in range(len(frames)):
+        cells += [frames[c, seed + chosen], predicted[c, chosen]]
+        labels += [f"{c + 1} true", f"{c + 1} predicted"]
+    drawn = image_grid(np.stack(cells), labels, [f"t = {seed + t}" for t in chosen])
+    blocks: list[Block] = []
+    if result is not None:
+        ahead = result["prediction"]
+        blocks.append(
+            Text(
+                f"{ahead['predicted_frames']} frames predicted from {ahead['seed_frames']} seen ones, under the latent "
+                f"actions inferred from the true video: PSNR {ahead['psnr']:.1f} dB, SSIM {ahead['ssim']:.3f}; "
+                f"reconstruction {result['reconstruction']['psnr']:.1f} dB. The paper (two objects): 54.1 dB and 0.996."
+            )
+        )
+    alt = "Two rows a clip: true frames and the predictions for the same times."
+    return Section(title, [*blocks, Picture("prediction", png(drawn), alt, "The first evaluated clips, not chosen.")])
+
+
+def code_section(result: dict[str, Any] | None) -> Section:
+    """What the objects did, by prototype."""
+    title = "Prototypes and moves"
+    if result is None or result["codes"] is None:
+        return Section(title, [Text("No prototypes have been scored.")])
+    rows = []
+    for code, counts in enumerate(result["codes"]):
+        total = sum(counts)
+        rows.append([f"code {code}", str(total), *(percent(n / total if total else None) for n in counts)])
+    caption = "Transitions of objects whose slot has this prototype, and what the object did."
+    return Section(title, [Table(["", "transitions", *result["moves"]], rows, caption)])
+
+
+def settings_section(given: ReportInput, result: dict[str, Any] | None) -> Section:
+    """Settings and sizes."""
+    env, model, machine = given.config.env, given.world_model, hardware()
+    grid = env.grid
+    rows = [
+        ["frames", f"{env.image_size} x {env.image_size} pixels, drawn from seeds"],
+        ["objects", f"{grid.objects} of {grid.size} pixels, {grid.speed} pixels a step"],
+        ["new direction", f"with probability {grid.change} at each step"],
+    ]
+    if model is not None:
+        c = model.config
+        rows += [
+            ["slots", f"{c.savi.n_slots} of width {c.savi.slot_dim}"],
+            [
+                "latent actions",
+                f"{c.inverse_dynamics.mode}, {c.inverse_dynamics.variant}, {c.inverse_dynamics.latent_dim} wide",
+            ],
+            ["prototypes", str(model.inverse_dynamics.n_prototypes)],
+        ]
+    if result is not None:
+        seeds, took = result["seeds"], seconds(result.get("wall_seconds"))
+        rows.append(["scored", f"{len(seeds)} clips, seeds {min(seeds)} to {max(seeds)}, {took}"])
+    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
+    rows.append(["report made on", f"{machine['machine']}, {machine['cores']} cores{gpu}, torch {machine['torch']}"])
+    return Section("Settings", [Table(["setting", "value"], rows)])

@@ -1,0 +1,69 @@
+"""What `playslot evaluate` does where nothing can be acted on (GridShapes): slots against known objects and moves.
+
+Writes `RUN/evaluation/objects/eval_info.json` and renews `RUN/report.md` and `RUN/report.html`.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from playslot_rl.config import ExperimentConfig
+
+
+def main(config: ExperimentConfig, run: Path) -> None:
+    """Score the world model of `run` and print the result.
+
+    Raises:
+        CheckpointError: the run has no finished world model, or one for another frame size.
+        ConfigError: fewer than two clips, other frames than the run's, or seeds that it was trained on.
+    """
+    from playslot_rl.evaluation.objects import evaluate_run_objects
+    from playslot_rl.recipes.evaluate import check_environment
+    from playslot_rl.recipes.run import open_device
+    from playslot_rl.training.checkpoints import load_world_model
+    from playslot_rl.visualization.report import write_report
+
+    model = load_world_model(run, open_device(config))
+    check_environment(config, model.env.image_size, model.env.action_dim)
+    print(
+        f"{config.env.name}: nothing to act on, so slots and latent actions are scored instead of a policy", flush=True
+    )
+    print(describe(evaluate_run_objects(run, model, config), run), flush=True)
+    print(f"report: {write_report(run, world_model=model)}", flush=True)
+
+
+def main_if_needed(config: ExperimentConfig, run: Path) -> None:
+    """As `main`, unless this world model was scored on these clips before."""
+    from playslot_rl.evaluation.objects import DEFAULT_CLIPS, RESULT, run_fingerprints
+
+    facts = {
+        "episodes": config.episodes or DEFAULT_CLIPS,
+        "seed": config.seed,
+        "fingerprints": run_fingerprints(run),
+    }
+    path = run / RESULT
+    stored = json.loads(path.read_text()) if path.is_file() else {}
+    if {key: stored.get(key) for key in facts} == facts and (run / "report.html").is_file():
+        print(f"objects: scored before, ARI {stored['ari']:.2f}, skipped", flush=True)
+        return
+    main(config, run)
+
+
+def describe(result: dict[str, Any], run: Path) -> str:
+    """The result in a few lines."""
+    from playslot_rl.evaluation.objects import RESULT
+
+    ahead = result["prediction"]
+    seen = f"over {ahead['predicted_frames']} frames after {ahead['seed_frames']} seen"
+    lines = [
+        f"{'ARI':>22}: {result['ari']:.2f}, of the objects alone {result['foreground_ari']:.2f}",
+        f"{'prediction':>22}: {ahead['psnr']:.1f} dB {seen}, reconstruction {result['reconstruction']['psnr']:.1f} dB",
+    ]
+    for name, probe in result["probes"].items():
+        lines.append(
+            f"{f'move from {name}':>22}: {100 * probe['accuracy']:.0f} % of {probe['test']} moves in "
+            f"{probe['test_clips']} held-out clips (most frequent move {100 * probe['majority']:.0f} %)"
+        )
+    return "\n".join([*lines, f"{result['episodes']} clips, {result['wall_seconds']:.0f} s; written to {run / RESULT}"])
