@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -12,10 +11,10 @@ from pathlib import Path
 
 from playslot_rl.collectors.export import META_NAME, export
 from playslot_rl.collectors.journal import Journal, journal_path, read_spec
-from playslot_rl.collectors.spec import CollectionSpec, difference
-from playslot_rl.config import ExperimentConfig
-from playslot_rl.envs import PROCEDURAL
+from playslot_rl.collectors.spec import CollectionSpec, completed, difference
+from playslot_rl.config import CollectorConfig, ExperimentConfig
 from playslot_rl.errors import DataError, OutputError
+from playslot_rl.threads import available_cores
 from playslot_rl.training.progress import format_seconds
 
 PLAIN_EVERY_S = 10.0
@@ -38,7 +37,7 @@ def is_complete(out: Path, spec: CollectionSpec) -> bool:
     if not record.is_file():
         raise OutputError(f"{out}: got a folder or file of something else, expected none; choose another out=")
     stored = read_spec(record).get("spec")
-    differs = difference(stored if isinstance(stored, dict) else {}, spec.to_dict())
+    differs = difference(completed(stored), spec.to_dict())
     if differs:
         raise OutputError(f"{out} was collected with other settings ({differs}); repeat them or choose another out=")
     try:
@@ -104,9 +103,10 @@ def collect(
 
     Episodes go to a journal, `OUT.journal`, and from there in one transaction to `out`. Killed at any moment, it loses
     at most the episodes in hand (one per worker), and the same call carries on. A finished data set is left alone.
+    Workers that die or hang are replaced, at most `config.collector.restarts` times.
 
     Args:
-        config: its `env`, `render`, `collect` and `logging` are used.
+        config: its `env`, `render`, `collect`, `collector` and `logging` are used.
         policy: `random` or `expert`.
         episodes: how many.
         steps: agent steps of each; an episode has one more frame.
@@ -123,10 +123,11 @@ def collect(
             into it, or the disk is full.
         DataError: the finished data set at `out` is damaged.
         RenderError: there is no working GL backend.
+        PlaySlotError: too many workers died or hung.
 
     Examples:
         >>> import tempfile
-        >>> from playslot_rl.config import ExperimentConfig
+        >>> from playslot_rl.config import CollectorConfig, ExperimentConfig
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     root = collect(ExperimentConfig(), "expert", 1, 2, Path(folder) / "demos", seed=0, workers=1)
         ...     (root / "meta" / "info.json").is_file()
@@ -144,29 +145,29 @@ def collect(
         return out
     journal = Journal(folder, spec)
     with journal.lock():
-        _record_missing(journal, workers or os.cpu_count() or 1, shown)
-        if shown:
-            print(f"collect: exporting {episodes} episodes to {out}", file=sys.stderr, flush=True)
-        export(journal, out)
-    journal.remove()
+        if not is_complete(out, spec):  # another process may have finished it while this one was starting
+            _record_missing(journal, workers or available_cores(), config.collector, shown)
+            if shown:
+                print(f"collect: exporting {episodes} episodes to {out}", file=sys.stderr, flush=True)
+            export(journal, out)
+        journal.remove()
     return out
 
 
-def _record_missing(journal: Journal, workers: int, shown: bool) -> None:
+def _record_missing(journal: Journal, workers: int, settings: CollectorConfig, shown: bool) -> None:
     missing, total = journal.missing(), journal.spec.episodes
     if not missing:
         return
     from playslot_rl.envs.rendering import import_mujoco
 
     import_mujoco()  # before torchrl, which imports it too
-    if journal.spec.env.name in PROCEDURAL:
-        from playslot_rl.collectors.procedural import record
-    else:
-        from playslot_rl.collectors.episodes import record
+    from playslot_rl.collectors.recording import record_into
+
+    def say(text: str) -> None:
+        print(f"collect: {text}", file=sys.stderr, flush=True)
 
     if shown and len(missing) < total:
-        print(f"collect: {total - len(missing)} of {total} episodes are there already", file=sys.stderr, flush=True)
+        say(f"{total - len(missing)} of {total} episodes are there already")
     with progress(f"collect {journal.spec.policy}", total - len(missing), total, shown) as advance:
-        for episode in record(journal.spec, missing, workers):
-            journal.add(episode)
+        for _ in record_into(journal, missing, workers, settings, say):
             advance()

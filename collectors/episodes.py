@@ -1,40 +1,39 @@
-"""Episodes from TorchRL's collectors, each with a seed of its own.
+"""Episodes from TorchRL's collector, each with a seed of its own.
 
 Shapes: T agent steps, A action dim, S proprioception, H W image height and width.
 """
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import os
-import signal
-import sys
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from tensordict import TensorDictBase
-from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from playslot_rl import keys
 from playslot_rl.collectors.policies import EPISODE_SEED, EPISODE_STEP, EXPERT_ACTION, make_policy
 from playslot_rl.collectors.spec import CollectionSpec, redraw
-from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.envs import make_env, task_env
-from playslot_rl.envs.rendering import check_rendering
 from playslot_rl.envs.torchrl import TensorView, View, wrap
-from playslot_rl.errors import ConfigError, PlaySlotError
+from playslot_rl.errors import ConfigError
 
 EPISODE_INDEX = "episode_index"
 REDRAWN = "redrawn"
 MAX_REDRAWS = 20
-PR_SET_PDEATHSIG = 1
+
+
+class Job(NamedTuple):
+    """An episode to record: its place in the collection and its seed."""
+
+    index: int
+    seed: int
 
 
 @dataclass(frozen=True)
@@ -63,20 +62,25 @@ class Episode:
 
 
 class SeededView(TensorView):
-    """A task that runs a fixed list of episodes, one per reset.
+    """A task that runs the episodes it is given, one per reset, and idles where there is none.
 
-    A reset before the running episode's end starts it again: TorchRL resets more often than there are episodes. After
-    the last episode the last one is repeated.
+    A reset before the running episode's end starts it again. TorchRL resets more often than there are episodes (when it
+    looks at the environment, and after an episode's last step): a reset without a job touches neither the simulator nor
+    the renderer, and its observation is all zeros.
 
     Args:
         env: the task.
-        jobs: (index, seed) of each episode.
+        jobs: the first episodes.
+
+    Attributes:
+        jobs: episodes that have not been started.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]]) -> None:
+    def __init__(self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]] = ()) -> None:
         super().__init__(env)
-        self._jobs, self._next = list(jobs), 0
-        self._index = self._episode_seed = self._redrawn = self._step = 0
+        self.jobs: deque[Job] = deque(Job(*job) for job in jobs)
+        self._running: Job | None = None
+        self._episode_seed = self._redrawn = self._step = 0
         counter = gym.spaces.Box(0, 2**62, (1,), np.int64)
         self.declare(
             {
@@ -90,26 +94,30 @@ class SeededView(TensorView):
         return {
             **super().view(observation, info),
             EXPERT_ACTION: task_env(self.env).expert_action(),
-            EPISODE_INDEX: np.array([self._index], np.int64),
+            EPISODE_INDEX: np.array([self._running.index if self._running else 0], np.int64),
             EPISODE_SEED: np.array([self._episode_seed], np.int64),
             EPISODE_STEP: np.array([self._step], np.int64),
             REDRAWN: np.array([self._redrawn], np.int64),
         }
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[View, dict[str, Any]]:
-        """Start the next episode of the list that does not start solved; `seed` and `options` are ignored.
+        """Start the next job at the first seed that does not start solved; `seed` and `options` are ignored.
 
         Raises:
             ConfigError: every draw starts solved.
         """
         del seed, options
-        self._index, first = self._jobs[min(self._next, len(self._jobs) - 1)]
-        self._step = 0
+        if self._running is None:
+            if not self.jobs:
+                return self._idle(), {"success": False}
+            self._running = self.jobs.popleft()
+        first, self._step = self._running.seed, 0
         for attempt in range(MAX_REDRAWS):
             self._episode_seed, self._redrawn = redraw(first, attempt), attempt
             observation, info = self.env.reset(seed=self._episode_seed)
             if not info["success"]:
                 return self.view(observation, info), info
+        self._running = None
         raise ConfigError(
             f"env: got {MAX_REDRAWS} episodes in a row that start solved (seed {first}), expected unsolved starts; "
             "lower env.warmup_steps"
@@ -121,42 +129,76 @@ class SeededView(TensorView):
         observation, reward, terminated, truncated, info = self.env.step(action)
         result = self.view(observation, info), reward, terminated, truncated, info
         if terminated or truncated:
-            self._next += 1
+            self._running = None
         return result
 
-
-def make_seeded_env(env: EnvConfig, render: RenderConfig, jobs: Sequence[tuple[int, int]]) -> EnvBase:
-    """A worker's environment."""
-    return wrap(SeededView(make_env(env, render), jobs))
-
-
-def start_worker() -> None:
-    """Run first in a worker process: leave Ctrl-C to the parent, die with it, use one core."""
-    import torch
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
-    if sys.platform.startswith("linux"):
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() == 1:  # the parent died before the line above
-            os._exit(1)
+    def _idle(self) -> View:
+        spaces = self.observation_space.spaces  # type: ignore[attr-defined]
+        return {name: np.zeros(space.shape, space.dtype) for name, space in spaces.items()}
 
 
-def _make_collector(spec: CollectionSpec, jobs: Sequence[tuple[int, int]], workers: int) -> Any:
-    """A collector whose batches are one whole episode of each worker: (T,) for one worker, else (workers, T)."""
-    makers = [partial(make_seeded_env, spec.env, spec.render, jobs[w::workers]) for w in range(workers)]
-    policy = make_policy(spec.policy, spec.noise)
-    common: dict[str, Any] = {
-        "frames_per_batch": spec.steps * workers,
+class TaskMaker:
+    """Makes a worker's environment and hands it its jobs; goes to other processes and machines as it is.
+
+    Args:
+        spec: the collection.
+    """
+
+    def __init__(self, spec: CollectionSpec) -> None:
+        self.spec = spec
+        self._view: SeededView | None = None
+
+    def __call__(self) -> EnvBase:
+        """The environment."""
+        self._view = SeededView(make_env(self.spec.env, self.spec.render))
+        return wrap(self._view)
+
+    def add(self, job: Job) -> None:
+        """Queue an episode."""
+        assert self._view is not None
+        self._view.jobs.append(job)
+
+
+class EpisodeCollector(Collector):
+    """TorchRL's collector, whose batch is the one whole episode it is asked for.
+
+    Args:
+        create_env_fn: makes the environment in the process that uses it.
+        policy: writes `keys.ACTION`.
+        **kwargs: TorchRL's.
+    """
+
+    def __init__(self, create_env_fn: TaskMaker, policy: Any = None, **kwargs: Any) -> None:
+        self._maker = create_env_fn
+        super().__init__(create_env_fn, policy, **kwargs)
+
+    @classmethod
+    def make(cls, spec: CollectionSpec) -> EpisodeCollector:
+        """A collector in this process."""
+        return cls(TaskMaker(spec), make_policy(spec.policy, spec.noise), **collector_settings(spec))
+
+    def record(self, job: Job) -> Episode:
+        """Record one episode.
+
+        Raises:
+            RenderError: there is no working GL backend.
+            ConfigError: every draw of the episode starts solved.
+        """
+        self._maker.add(job)
+        return _episode(self.next())
+
+
+def collector_settings(spec: CollectionSpec) -> dict[str, Any]:
+    """TorchRL's settings for batches of shape (T,) that are one episode each."""
+    return {
+        "frames_per_batch": spec.steps,
         "total_frames": -1,
+        "reset_at_each_iter": True,
         "split_trajs": False,
         "trust_policy": True,
         "traj_format": None,
         "auto_register_policy_transforms": False,
     }
-    if workers == 1:
-        return Collector(makers[0], policy, **common)
-    return MultiSyncCollector(makers, policy, cat_results="stack", init_fn=start_worker, **common)
 
 
 def _episode(batch: TensorDictBase) -> Episode:
@@ -178,45 +220,16 @@ def _episode(batch: TensorDictBase) -> Episode:
     )
 
 
-def record(spec: CollectionSpec, indices: Sequence[int], workers: int) -> Iterator[Episode]:
-    """Record the episodes `indices` of a collection.
-
-    Args:
-        spec: the collection.
-        indices: which of its episodes.
-        workers: processes; 1 runs in this one. The episodes do not depend on it, only their order does.
-
-    Yields:
-        Each episode once, as soon as it is there.
+def record(spec: CollectionSpec, indices: Sequence[int]) -> Iterator[Episode]:
+    """Record the episodes `indices` of a collection in this process, one after the other.
 
     Raises:
         RenderError: there is no working GL backend.
         ConfigError: every draw of an episode starts solved.
-        PlaySlotError: a worker process died.
     """
-    wanted = set(indices)
-    workers = max(1, min(workers, len(wanted)))
-    if not wanted:
-        return
-    if workers > 1:
-        check_rendering()  # a missing GL backend is one line here, many in the workers
-    collector = _make_collector(spec, [(i, spec.episode_seed(i)) for i in sorted(wanted)], workers)
+    collector = EpisodeCollector.make(spec)
     try:
-        batches = iter(collector)
-        while wanted:
-            try:
-                batch = next(batches)
-            except RuntimeError as error:
-                if workers == 1:
-                    raise
-                raise PlaySlotError(
-                    f"a collector process died ({error}); run the same command again to go on"
-                ) from error
-            for row in [batch] if workers == 1 else batch.unbind(0):
-                episode = _episode(row)
-                if episode.index in wanted:
-                    wanted.discard(episode.index)
-                    yield episode
+        for index in indices:
+            yield collector.record(Job(index, spec.episode_seed(index)))
     finally:
-        with contextlib.suppress(Exception):  # must not hide what ended the collection
-            collector.shutdown()
+        collector.shutdown()

@@ -4,30 +4,40 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import io
 import json
 import os
 import shutil
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from playslot_rl.collectors.encoding import encode, read
 from playslot_rl.collectors.episodes import Episode
-from playslot_rl.collectors.spec import CollectionSpec, difference
+from playslot_rl.collectors.spec import CollectionSpec, completed, difference
 from playslot_rl.errors import OutputError
 from playslot_rl.training.atomic import explain_write_errors, write_bytes, write_json
 
 SPEC_NAME = "collection.json"
 LOCK_NAME = "lock"
-ARRAYS = ("frames", "states", "actions", "rewards", "success")
 
 
 def journal_path(out: Path) -> Path:
     """Folder of the journal of the data set `out`."""
     return out.with_name(f"{out.name}.journal")
+
+
+def episode_path(folder: Path, index: int) -> Path:
+    """File of episode `index` in a journal's folder."""
+    return folder / f"episode_{index:06d}.npz"
+
+
+def store(folder: Path, episode: Episode) -> None:
+    """Write an episode's file into a journal's folder; when this returns it survives a kill and a power cut.
+
+    Raises:
+        OutputError: full disk.
+    """
+    write_bytes(episode_path(folder, episode.index), encode(episode))
 
 
 class Journal:
@@ -48,7 +58,7 @@ class Journal:
         stored = folder / SPEC_NAME
         if stored.is_file():
             found = read_spec(stored)
-            differs = difference(found, spec.to_dict())
+            differs = difference(completed(found), spec.to_dict())
             if differs:
                 raise OutputError(
                     f"{folder} holds an unfinished collection with other settings ({differs}); "
@@ -75,13 +85,31 @@ class Journal:
                 raise OutputError(
                     f"{self.folder}: got another process collecting into it, expected none; wait for it or choose out="
                 ) from error
+            if not self._is_still_there(handle):
+                raise OutputError(
+                    f"{self.folder}: got a journal that another process has just removed, expected ours; "
+                    "run the same command again"
+                )
+            self._sweep()
             yield
         finally:
             os.close(handle)
 
+    def _is_still_there(self, handle: int) -> bool:
+        """Whether the locked file is the one that others would lock: the folder's owner may have removed it."""
+        try:
+            return os.path.samestat(os.fstat(handle), (self.folder / LOCK_NAME).stat())
+        except FileNotFoundError:
+            return False
+
+    def _sweep(self) -> None:
+        """Remove halves that killed processes left; the lock is ours, so nobody is writing them."""
+        for half in self.folder.glob(".*.tmp-*"):
+            half.unlink(missing_ok=True)
+
     def path(self, index: int) -> Path:
         """File of episode `index`."""
-        return self.folder / f"episode_{index:06d}.npz"
+        return episode_path(self.folder, index)
 
     def add(self, episode: Episode) -> None:
         """Store an episode; when this returns it survives a kill and a power cut.
@@ -89,12 +117,11 @@ class Journal:
         Raises:
             OutputError: full disk.
         """
-        arrays: dict[str, Any] = {name: getattr(episode, name) for name in ARRAYS}
-        buffer = io.BytesIO()
-        np.savez_compressed(
-            buffer, numbers=np.array([episode.index, episode.seed, episode.redrawn], np.int64), **arrays
-        )
-        write_bytes(self.path(episode.index), buffer.getvalue())
+        store(self.folder, episode)
+
+    def add_encoded(self, index: int, content: bytes) -> None:
+        """Store an episode that was encoded elsewhere (see `add`)."""
+        write_bytes(self.path(index), content)
 
     def read(self, index: int) -> Episode:
         """Load episode `index`.
@@ -102,19 +129,26 @@ class Journal:
         Raises:
             OutputError: its file is missing or damaged.
         """
-        path = self.path(index)
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                numbers = [int(n) for n in file["numbers"]]
-                return Episode(numbers[0], numbers[1], numbers[2], **{name: file[name] for name in ARRAYS})
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        return self.read_with_images(index)[0]
+
+    def read_with_images(self, index: int) -> tuple[Episode, list[bytes]]:
+        """Load episode `index` and the PNGs of its frames.
+
+        Raises:
+            OutputError: its file is missing or damaged, or holds another episode.
+        """
+        episode, images = read(self.path(index))
+        if episode.index != index:
             raise OutputError(
-                f"{path}: got a damaged file ({error}), expected an episode; delete it and run the same command again"
-            ) from error
+                f"{self.path(index)}: got episode {episode.index}, expected {index}; delete it and run the same "
+                "command again"
+            )
+        return episode, images
 
     def missing(self) -> list[int]:
         """Episodes that are not stored yet."""
-        return [i for i in range(self.spec.episodes) if not self.path(i).is_file()]
+        there = {entry.name for entry in os.scandir(self.folder)}
+        return [i for i in range(self.spec.episodes) if self.path(i).name not in there]
 
     def remove(self) -> None:
         """Delete the journal."""

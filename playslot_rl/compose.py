@@ -29,7 +29,7 @@ SHIPPED: Final = "pretrained"
 _FOLDERS: Final = frozenset({"out", "run", "data.root", "data.demos", "data.cache"})
 
 # These say what one invocation does, on which machine; a stored run does not hand them on.
-_OF_THE_CALL: Final = ("out", "run", "episodes", "policy", "protocol", "workers", "device")
+_OF_THE_CALL: Final = ("out", "run", "episodes", "policy", "protocol", "workers", "collector", "device")
 
 
 def choices(group: str) -> list[str]:

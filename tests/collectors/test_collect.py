@@ -58,7 +58,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     spec = CollectionSpec.make(config(), "random", 2, STEPS, 0)
     journal = Journal(journal_path(out), spec)
-    for episode in record(spec, [0, 1], 1):
+    for episode in record(spec, [0, 1]):
         journal.add(episode)
     shutil.copytree(journal.folder, folder / "journal_copy")
     return small(out)
@@ -114,19 +114,19 @@ def test_finished_collection_is_skipped_and_its_journal_removed(made: Path, caps
 
 
 def test_only_missing_episodes_are_recorded(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from playslot_rl.collectors import episodes
+    from playslot_rl.collectors import recording
 
     out = tmp_path / "data"
     restore(made, out)
     next(journal_path(out).glob("episode_000001*")).unlink()
     asked: list[list[int]] = []
-    original = episodes.record
+    original = recording.record
 
-    def spy(spec: CollectionSpec, indices: list[int], workers: int) -> Any:
+    def spy(spec: CollectionSpec, indices: list[int]) -> Any:
         asked.append(list(indices))
-        return original(spec, indices, workers)
+        return original(spec, indices)
 
-    monkeypatch.setattr(episodes, "record", spy)
+    monkeypatch.setattr(recording, "record", spy)
     small(out)
     assert asked == [[1]]
     np.testing.assert_array_equal(frames_of(out), frames_of(made))

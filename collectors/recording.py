@@ -1,0 +1,147 @@
+"""Hands episodes out to workers, and replaces workers that die or hang."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+
+from playslot_rl.collectors import procedural
+from playslot_rl.collectors.episodes import Job, record
+from playslot_rl.collectors.journal import Journal
+from playslot_rl.collectors.workers import LocalWorkers, Report, Workers
+from playslot_rl.config import CollectorConfig
+from playslot_rl.envs import PROCEDURAL
+from playslot_rl.envs.rendering import check_rendering
+from playslot_rl.errors import PlaySlotError
+
+AHEAD = 2
+"""Episodes in a worker's hands: while it records one, the next is there already."""
+POLL_S = 1.0
+
+
+def record_into(
+    journal: Journal,
+    indices: Sequence[int],
+    workers: int,
+    settings: CollectorConfig | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> Iterator[int]:
+    """Record the episodes `indices` of a journal's collection into it.
+
+    Args:
+        journal: locked by the caller.
+        indices: which episodes.
+        workers: how many; 1 local one records in this process. The episodes do not depend on it, only their order.
+        settings: backend and patience.
+        say: told of workers that were replaced.
+
+    Yields:
+        Each index once, when its episode is stored.
+
+    Raises:
+        RenderError: there is no working GL backend.
+        ConfigError: every draw of an episode starts solved, or Ray is missing.
+        OutputError: full disk.
+        PlaySlotError: more workers died or hung than `settings.restarts`.
+    """
+    settings = settings or CollectorConfig()
+    workers = max(1, min(workers, len(indices)))
+    if not indices:
+        return
+    drawn = journal.spec.env.name in PROCEDURAL  # quicker than any pool would start
+    if drawn or (settings.backend == "local" and workers == 1):
+        for episode in (procedural.record if drawn else record)(journal.spec, indices):
+            journal.add(episode)
+            yield episode.index
+        return
+    pool: Workers
+    if settings.backend == "ray":
+        from playslot_rl.collectors.ray_workers import RayWorkers
+
+        pool = RayWorkers(journal, workers, settings.ray_address)
+    else:
+        check_rendering()  # a missing GL backend is one line here, many in the workers
+        pool = LocalWorkers(journal, workers)
+    try:
+        yield from _Dispatch(pool, journal, indices, workers, settings, say).run()
+    finally:
+        pool.close()
+
+
+class _Dispatch:
+    """Which episodes wait, which are in whose hands, and for how long each worker has been silent."""
+
+    def __init__(
+        self,
+        pool: Workers,
+        journal: Journal,
+        indices: Sequence[int],
+        workers: int,
+        settings: CollectorConfig,
+        say: Callable[[str], None],
+    ) -> None:
+        self.pool, self.journal, self.settings, self.say = pool, journal, settings, say
+        self.waiting = deque(sorted(set(indices)))
+        self.in_hand: list[list[int]] = [[] for _ in range(workers)]
+        self.silent_s = [0.0] * workers
+        self.replaced = 0
+
+    def run(self) -> Iterator[int]:
+        for slot in range(len(self.in_hand)):
+            self.pool.start(slot)
+        while self.waiting or any(self.in_hand):
+            self._hand_out()
+            begin = time.monotonic()
+            reports = self.pool.reports(POLL_S)
+            # Time in which this process was itself stopped, or busy with the caller's work, is nobody's silence.
+            waited = min(time.monotonic() - begin, 2 * POLL_S)
+            for slot, held in enumerate(self.in_hand):
+                self.silent_s[slot] += waited if held else 0.0
+            for report in reports:
+                index = self._take(report)
+                if index is not None:
+                    yield index
+            self._replace_silent()
+
+    def _hand_out(self) -> None:
+        # The last episodes go to whoever is free, not on top of another.
+        ahead = AHEAD if len(self.waiting) > len(self.in_hand) else 1
+        for depth in range(ahead):
+            for slot, held in enumerate(self.in_hand):
+                if len(held) <= depth and self.waiting:
+                    index = self.waiting.popleft()
+                    held.append(index)
+                    self.pool.submit(slot, Job(index, self.journal.spec.episode_seed(index)))
+
+    def _take(self, report: Report) -> int | None:
+        """A report's episode, if it stored one."""
+        self.silent_s[report.slot] = 0.0
+        if report.error is not None:
+            raise report.error
+        if report.index is None:
+            self._replace(report.slot, report.reason)
+            return None
+        self.in_hand[report.slot].remove(report.index)
+        return report.index
+
+    def _replace_silent(self) -> None:
+        for slot, silent in enumerate(self.silent_s):
+            if silent >= self.settings.timeout_s:
+                self.pool.kill(slot)
+                self._replace(slot, f"gave no episode for {self.settings.timeout_s:g} s")
+
+    def _replace(self, slot: int, reason: str) -> None:
+        """Start another worker in a dead one's place; its episodes wait again."""
+        lost = sorted(self.in_hand[slot])
+        self.waiting.extendleft(reversed(lost))
+        self.in_hand[slot], self.silent_s[slot] = [], 0.0
+        if self.replaced >= self.settings.restarts:
+            raise PlaySlotError(
+                f"a collector worker {reason}, after {self.replaced} were replaced: got more than collector.restarts="
+                f"{self.settings.restarts}, expected workers that live; the same command carries on"
+            )
+        self.replaced += 1
+        names = ", ".join(map(str, lost))
+        self.say(f"a worker {reason}: another takes its place (episodes in hand: {names or 'none'})")
+        self.pool.start(slot)
