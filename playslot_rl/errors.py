@@ -32,3 +32,7 @@ class OutputError(PlaySlotError, OSError):
 
 class RenderError(PlaySlotError, RuntimeError):
     """There is no working GL backend."""
+
+
+class HubError(PlaySlotError, RuntimeError):
+    """A push or pull failed: no token, bad token, no network, no repository, no revision, offline, or a server error."""

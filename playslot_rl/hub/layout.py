@@ -1,0 +1,83 @@
+"""Which files of a LeRobot data set travel, and how a file is compared with what the Hub says about it."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+FORMAT_TAG = "v3.0"
+"""Tag that LeRobot looks for on the Hub; equal to its CODEBASE_VERSION, whose import costs seconds."""
+CARD_NAME = "README.md"
+REMOTE_RECORD = "meta/playslot_hub.json"
+"""Written by a push: fingerprint and counts, for whoever pulls."""
+LOCAL_RECORD = "meta/playslot_pull.json"
+"""Written by a pull: where the folder came from. Never uploaded."""
+
+_SUFFIXES = {"data": {".parquet"}, "meta": {".parquet", ".json", ".jsonl"}, "videos": {".mp4"}}
+_GENERATED = {REMOTE_RECORD, LOCAL_RECORD}
+_PIECE = 8 << 20
+
+
+@dataclass(frozen=True)
+class RemoteFile:
+    """What the Hub says about a file.
+
+    Attributes:
+        size: bytes.
+        sha256: of the content, for files in large-file storage; else None.
+        blob: git's object id, for the others.
+    """
+
+    size: int
+    sha256: str | None
+    blob: str
+
+
+def is_data(path: str) -> bool:
+    """Whether a path (from the root, with slashes) is part of a data set: rows, videos or metadata, nothing hidden."""
+    parts = PurePosixPath(path).parts
+    if len(parts) < 2 or any(part.startswith(".") for part in parts):
+        return False
+    return PurePosixPath(path).suffix in _SUFFIXES.get(parts[0], set())
+
+
+def is_pulled(path: str) -> bool:
+    """Whether a pull fetches this path: the data set, its card and its licence, no more."""
+    return (is_data(path) and path != LOCAL_RECORD) or path == CARD_NAME or path.startswith("LICENSE")
+
+
+def local_files(root: Path) -> tuple[dict[str, int], list[str]]:
+    """Files below `root` that a push uploads, and those that it leaves.
+
+    Left are caches, journals, lock and temporary files, images/ that LeRobot did not clean up, hidden files, and the
+    two records this package writes itself. The card and the record are made by the push.
+
+    Returns:
+        Sizes in bytes by path, in order; and the paths that stay here.
+    """
+    sizes: dict[str, int] = {}
+    left: list[str] = []
+    for file in sorted(root.rglob("*")):
+        if not file.is_file():
+            continue
+        path = file.relative_to(root).as_posix()
+        if (is_data(path) and path not in _GENERATED) or ("/" not in path and path.startswith("LICENSE")):
+            sizes[path] = file.stat().st_size
+        elif path != CARD_NAME and path not in _GENERATED:
+            left.append(path)
+    return sizes, left
+
+
+def same_content(item: Path | bytes, remote: RemoteFile) -> bool:
+    """Whether a file, or bytes, has the size and the hash that the Hub names."""
+    if isinstance(item, Path) and not item.is_file():
+        return False
+    if (len(item) if isinstance(item, bytes) else item.stat().st_size) != remote.size:
+        return False
+    digest = hashlib.sha256() if remote.sha256 else hashlib.sha1(b"blob %d\0" % remote.size, usedforsecurity=False)
+    with io.BytesIO(item) if isinstance(item, bytes) else item.open("rb") as stream:
+        while piece := stream.read(_PIECE):
+            digest.update(piece)
+    return digest.hexdigest() == (remote.sha256 or remote.blob)

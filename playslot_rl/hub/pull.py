@@ -1,0 +1,228 @@
+"""A data set from the Hub: fetched beside its place, compared with what the Hub lists, then renamed into place."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from playslot_rl.errors import DataError, HubError, OutputError
+from playslot_rl.hub.checks import check_data_set, fingerprint
+from playslot_rl.hub.layout import FORMAT_TAG, RemoteFile, is_pulled, same_content
+from playslot_rl.hub.record import SCHEME, read_origin, read_record, write_origin
+from playslot_rl.hub.session import Repository, open_repository
+from playslot_rl.training.atomic import explain_write_errors, replace_dir
+
+INFO = "meta/info.json"
+SPARE = 64 << 20
+"""Bytes to leave free on the disk."""
+
+
+@dataclass(frozen=True)
+class PullResult:
+    """What a pull did.
+
+    Attributes:
+        repo_id: `user/name`.
+        root: the new folder.
+        revision: what was fetched: a branch, tag or commit.
+        why: how it was chosen; empty if it was asked for.
+        commit: the full commit.
+        episodes, frames: counts.
+        files, size: how many files and bytes.
+        fingerprint: content hash.
+        compared: whether the Hub named a fingerprint to compare it with.
+    """
+
+    repo_id: str
+    root: str
+    revision: str
+    why: str
+    commit: str
+    episodes: int
+    frames: int
+    files: int
+    size: int
+    fingerprint: str
+    compared: bool
+
+    def lines(self) -> list[str]:
+        """For people."""
+        checked = "as pushed" if self.compared else "the Hub names none to compare; files and counts were checked"
+        return [
+            f"pulled: {self.episodes} episodes, {self.frames} frames, {self.files} files of {self.size / 1e6:.1f} MB",
+            f"from: {self.repo_id}, revision {self.revision}" + (f" ({self.why})" if self.why else ""),
+            f"commit: {self.commit}",
+            f"fingerprint: {self.fingerprint} ({checked})",
+            f"to: {self.root}",
+        ]
+
+
+def pull(repo_id: str, root: Path, *, revision: str | None = None, token: str | None = None) -> PullResult:
+    """Download a LeRobot data set. After an interruption the same command carries on with the files still missing.
+
+    Args:
+        repo_id: `user/name`.
+        root: a folder that is not there, or empty.
+        revision: branch, tag or commit; None means the tag of LeRobot's format version, or main where there is none.
+        token: None takes HF_TOKEN or what `hf auth login` stored; not needed for public data sets.
+
+    Raises:
+        HubError: no such repository or revision, a bad token, offline, no network, an error of the Hub, or a data set
+            whose rows, counts or fingerprint differ from what the Hub says.
+        DataError: it is no LeRobot data set, or of another format version.
+        OutputError: `root` holds something, another pull into it is running, or the disk is full.
+    """
+    root = Path(root).expanduser().absolute()
+    if not root.name:
+        raise OutputError(f"{root}: got no name of a folder, expected one that can be made: give it a name")
+    _refuse_existing(root)
+    with open_repository(repo_id, root, token=token, writing=False, revision=revision or "") as hub:
+        name, why, commit = _choose(hub, revision)
+        wanted = {path: file for path, file in hub.tree(commit).items() if is_pulled(path)}
+        if INFO not in wanted:
+            raise DataError(f"{hub.name}: got no {INFO} at {name}, expected a LeRobot data set: check the name")
+        with explain_write_errors(root), _alone(root):
+            _refuse_existing(root)
+            partial = _partial(root, commit)
+            _check_version(hub, partial, commit)
+            _check_room(root, partial, wanted)
+            hub.download(list(wanted), commit, partial)
+            _check_files(hub, partial, wanted)
+            result = _finish(hub, partial, root, name, why, commit, wanted)
+    return result
+
+
+def _refuse_existing(root: Path) -> None:
+    if root.is_dir() and not any(root.iterdir()):
+        return
+    if root.exists() or root.is_symlink():
+        origin = read_origin(root)
+        held = f", commit {str(origin['commit'])[:12]} of {origin.get('repo_id')}" if origin.get("commit") else ""
+        raise OutputError(f"{root}: got a folder that holds something{held}, expected none: choose another, or move it")
+
+
+def _choose(hub: Repository, revision: str | None) -> tuple[str, str, str]:
+    """What to fetch: its name, why, and its commit."""
+    if revision:
+        return revision, "", hub.commit_of(revision)
+    branches, tags = hub.refs()
+    if FORMAT_TAG not in tags:
+        return "main", f"the Hub has no tag {FORMAT_TAG}", hub.commit_of("main")
+    why = "the tag LeRobot loads"
+    # A tag may be an object of its own: what it names is asked for, not taken from the list.
+    commit = hub.commit_of(FORMAT_TAG)
+    if branches.get("main", commit) != commit:
+        why += f"; main is another commit, {branches['main'][:12]}: revision=main for that"
+    return FORMAT_TAG, why, commit
+
+
+def _partial(root: Path, commit: str) -> Path:
+    """Where the files of a commit gather; those of another commit are never mixed in."""
+    return root.with_name(f".{root.name}.pull-{commit[:16]}")
+
+
+@contextlib.contextmanager
+def _alone(root: Path) -> Iterator[None]:
+    """Refuse two pulls into one folder. The system drops the lock of a killed process."""
+    root.parent.mkdir(parents=True, exist_ok=True)
+    path = root.with_name(f".{root.name}.pull.lock")
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OutputError(f"{root}: got another pull into it running, expected one at a time: wait") from error
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def _check_version(hub: Repository, partial: Path, commit: str) -> None:
+    """Look at the metadata before gigabytes are fetched."""
+    try:
+        version = str(json.loads(hub.read(INFO, commit, partial))["codebase_version"])
+    except (ValueError, KeyError, TypeError) as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise DataError(f"{hub.name}: got a damaged {INFO} ({error!r}), expected LeRobot's metadata") from error
+    if not version.startswith("v3."):
+        shutil.rmtree(partial, ignore_errors=True)
+        raise DataError(
+            f"{hub.name}: got LeRobot format {version}, expected v3.0: ask for another revision, or convert it by "
+            "LeRobot's convert_dataset_v21_to_v30"
+        )
+
+
+def _check_room(root: Path, partial: Path, wanted: dict[str, RemoteFile]) -> None:
+    size = sum(file.size for path, file in wanted.items() if not (partial / path).is_file())
+    free = shutil.disk_usage(root.parent).free
+    if size + SPARE > free:
+        raise OutputError(
+            f"cannot write {root}: got {free / 1e6:.0f} MB of free disk, expected {(size + SPARE) / 1e6:.0f} MB; free "
+            "some or choose another folder; the same command carries on"
+        )
+
+
+def _check_files(hub: Repository, partial: Path, wanted: dict[str, RemoteFile]) -> None:
+    """Compare every file's size and hash with what the Hub lists."""
+    damaged = [path for path, file in wanted.items() if not same_content(partial / path, file)]
+    for path in damaged:
+        (partial / path).unlink(missing_ok=True)
+        (partial / ".cache" / "huggingface" / "download" / f"{path}.metadata").unlink(missing_ok=True)
+    if damaged:
+        raise HubError(
+            f"{hub.name}: got {len(damaged)} damaged files ({', '.join(damaged[:3])}), expected what the Hub lists: "
+            "run the same command again, it fetches these anew"
+        )
+
+
+def _finish(
+    hub: Repository, partial: Path, root: Path, name: str, why: str, commit: str, wanted: dict[str, RemoteFile]
+) -> PullResult:
+    """Check counts and fingerprint, note the origin, and put the folder in its place."""
+    shutil.rmtree(partial / ".cache", ignore_errors=True)
+    try:
+        episodes, frames, found, compared = _check_content(hub, partial, commit)
+    except (DataError, HubError):
+        shutil.rmtree(partial, ignore_errors=True)  # whole and wrong: fetching it again would not help
+        raise
+    size = sum(file.size for file in wanted.values())
+    result = PullResult(hub.name, str(root), name, why, commit, episodes, frames, len(wanted), size, found, compared)
+    endpoint = {"endpoint": hub.place.endpoint, "pulled": datetime.now(UTC).isoformat(timespec="seconds")}
+    write_origin(
+        partial, {key: value for key, value in asdict(result).items() if key not in ("root", "why")} | endpoint
+    )
+    if root.is_dir():
+        root.rmdir()  # empty, or it would have been refused
+    replace_dir(partial, root)
+    for old in root.parent.glob(f".{root.name}.pull-*"):
+        shutil.rmtree(old, ignore_errors=True)  # of a commit that has been superseded
+    return result
+
+
+def _check_content(hub: Repository, partial: Path, commit: str) -> tuple[int, int, str, bool]:
+    """Counts and fingerprint; and whether there was a fingerprint to compare."""
+    try:
+        files = check_data_set(partial)
+    except DataError as error:
+        said = str(error).replace(str(partial), hub.name).partition(";")[0]
+        raise DataError(
+            f"{said} at commit {commit[:12]}: files of an earlier push may have stayed on the Hub; expected rows that "
+            "agree with the metadata: ask its owner to push it again, by `playslot dataset push`"
+        ) from error
+    found, record = fingerprint(partial), read_record(partial)
+    if record is None or record.scheme != SCHEME:
+        return len(files.episodes), files.frames, found, False
+    expected = (record.episodes, record.frames, record.fingerprint)
+    if (len(files.episodes), files.frames, found) != expected:
+        raise HubError(
+            f"{hub.name}: got {len(files.episodes)} episodes, {files.frames} frames, fingerprint {found}, expected "
+            f"{record.episodes}, {record.frames}, {record.fingerprint} as pushed: the data set was changed on the Hub "
+            "by something else; ask its owner to push it again"
+        )
+    return len(files.episodes), files.frames, found, True

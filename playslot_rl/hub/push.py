@@ -1,0 +1,200 @@
+"""A data set to the Hub: checked first, sent in one commit, compared with what the Hub then lists."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from playslot_rl.errors import HubError
+from playslot_rl.hub.card import is_ours, make_card
+from playslot_rl.hub.checks import check_data_set
+from playslot_rl.hub.layout import CARD_NAME, REMOTE_RECORD, RemoteFile, is_data, local_files, same_content
+from playslot_rl.hub.record import HubRecord
+from playslot_rl.hub.session import Repository, open_repository
+
+MAIN = "main"
+_VERSION = re.compile(r"v?\d+(\.\d+)*")
+
+
+@dataclass(frozen=True)
+class PushResult:
+    """What a push did.
+
+    Attributes:
+        repo_id: `user/name`.
+        address: its page.
+        branch: pushed to.
+        commit: what the branch now is.
+        changed: whether there was anything to send.
+        private: whether the repository is.
+        tags: set on the commit.
+        record: fingerprint and counts.
+        files, size: how many files and bytes the data set has there.
+        stale: files deleted on the Hub because they are no longer part of the data set.
+        left: local files that stayed here.
+        card: `made`, or `kept` where somebody wrote one by hand.
+    """
+
+    repo_id: str
+    address: str
+    branch: str
+    commit: str
+    changed: bool
+    private: bool
+    tags: tuple[str, ...]
+    record: HubRecord
+    files: int
+    size: int
+    stale: tuple[str, ...]
+    left: tuple[str, ...]
+    card: str
+
+    def lines(self) -> list[str]:
+        """For people."""
+        what = "pushed" if self.changed else "nothing to push: the Hub has the same files already"
+        record = self.record
+        counts = f"{record.episodes} episodes, {record.frames} frames, {self.files} files"
+        lines = [
+            f"{what}: {counts} of {self.size / 1e6:.1f} MB, fingerprint {record.fingerprint}",
+            f"to: {self.address} ({'private' if self.private else 'public'}), branch {self.branch}",
+            f"commit: {self.commit}",
+        ]
+        if self.tags:
+            lines.append(f"tag: {', '.join(self.tags)}")
+        else:
+            lines.append(f"tag: none moved; pull this branch by revision={self.branch}")
+        if self.stale:
+            lines.append(f"deleted on the Hub: {_few(self.stale)}")
+        if self.left:
+            lines.append(f"not uploaded: {_few(self.left)}")
+        if self.card == "kept":
+            lines.append(f"card: the one written by hand is kept ({CARD_NAME})")
+        return lines
+
+
+def _few(paths: tuple[str, ...]) -> str:
+    more = f" and {len(paths) - 3} more" if len(paths) > 3 else ""
+    return ", ".join(paths[:3]) + more
+
+
+def push(
+    root: Path, repo_id: str, *, private: bool, branch: str | None = None, tag: str | None = None,
+    token: str | None = None,
+) -> PushResult:  # fmt: skip
+    """Upload a LeRobot data set. An interrupted push changes nothing there; the same command carries on.
+
+    Args:
+        root: its folder; nothing is written into it.
+        repo_id: `user/name`; made if it is not there.
+        private: make it private; refused where it is public.
+        branch: made from main if it is not there; None means main. The version tag moves with main only.
+        tag: one more tag for the commit; never moved.
+        token: None takes HF_TOKEN or what `hf auth login` stored.
+
+    Raises:
+        DataError: the data set is not whole.
+        HubError: bad names, no or bad token, offline, no network, an error of the Hub, or a tag that is taken.
+    """
+    root = Path(root).expanduser()
+    files = check_data_set(root)
+    target = branch or MAIN
+    _check_names(target, tag, str(files.info["codebase_version"]))
+    with open_repository(repo_id, root, token=token, writing=True, revision=target) as hub:
+        hub.check_token()
+        record = HubRecord.of(files)
+        is_private = hub.create(private)
+        branches, tags = hub.refs()
+        if target not in branches:
+            hub.make_branch(target)
+        head = hub.commit_of(target)
+        remote = hub.tree(head)
+        sizes, left = local_files(root)
+        content: dict[str, Path | bytes] = {path: root / path for path in sizes}
+        content[REMOTE_RECORD] = record.to_bytes()
+        card = _card(hub, root, head, remote)
+        if card is None:
+            content[CARD_NAME] = make_card(files, hub.name, record).encode()
+        elif CARD_NAME not in remote or isinstance(card, Path):
+            content[CARD_NAME] = card
+        stale = tuple(sorted(path for path in remote if is_data(path) and path not in content))
+        _check_tag(hub, tag, tags, content)
+        message = f"{record.episodes} episodes, {record.frames} frames, fingerprint {record.fingerprint}"
+        commit = hub.commit(content, stale, message, target, head)
+        expected = {path: _size(item) for path, item in content.items()}
+        _check_remote(hub, commit, expected)
+        version = str(files.info["codebase_version"]) if target == MAIN else None
+        set_tags = _set_tags(hub, commit, version, tag, tags)
+    return PushResult(
+        hub.name, hub.address, target, commit, commit != head, is_private, set_tags, record, len(expected),
+        sum(expected.values()), stale, tuple(left), "made" if card is None else "kept",
+    )  # fmt: skip
+
+
+def _size(item: Path | bytes) -> int:
+    return len(item) if isinstance(item, bytes) else item.stat().st_size
+
+
+def _check_names(branch: str, tag: str | None, version: str) -> None:
+    """Refuse branches and tags that LeRobot would take for a format version."""
+    if branch != MAIN and _VERSION.fullmatch(branch):
+        raise HubError(
+            f"branch={branch}: got the name of a format version, expected another: LeRobot would load it as that"
+        )
+    if tag is not None and _VERSION.fullmatch(tag):
+        raise HubError(
+            f"tag={tag}: got the name of a format version, expected another: LeRobot would load it as that; "
+            f"{version} is set by every push to main"
+        )
+
+
+def _check_tag(hub: Repository, tag: str | None, tags: dict[str, str], content: dict[str, Path | bytes]) -> None:
+    """A tag never moves: it may be there already only where it names exactly what is pushed."""
+    if tag is None or tag not in tags:
+        return
+    tagged = hub.tree(tags[tag])
+    data = {path for path in tagged if is_data(path)}
+    same = data <= content.keys() and all(
+        path in tagged and same_content(item, tagged[path]) for path, item in content.items()
+    )
+    if not same:
+        raise HubError(
+            f"tag={tag}: {hub.name} has it on commit {tags[tag][:12]}, which holds something else, expected a new "
+            "name: tags of data are not moved, choose another"
+        )
+
+
+def _card(hub: Repository, root: Path, head: str, remote: dict[str, RemoteFile]) -> Path | bytes | None:
+    """A card written by hand, in the folder or else on the Hub; None if there is none."""
+    local = root / CARD_NAME
+    if local.is_file() and not is_ours(local.read_text(errors="replace")):
+        return local
+    if CARD_NAME not in remote:
+        return None
+    with tempfile.TemporaryDirectory(prefix="playslot-card-") as folder:
+        there = hub.read(CARD_NAME, head, Path(folder))
+    return None if is_ours(there.decode(errors="replace")) else there
+
+
+def _check_remote(hub: Repository, commit: str, expected: dict[str, int]) -> None:
+    """Compare the commit's tree with what was sent."""
+    listed = hub.tree(commit)
+    wrong = [path for path, size in expected.items() if path not in listed or listed[path].size != size]
+    extra = [path for path in listed if is_data(path) and path not in expected]
+    if wrong or extra:
+        raise HubError(
+            f"{hub.name}: got commit {commit[:12]} with {len(wrong)} missing or different and {len(extra)} foreign "
+            f"files ({_few(tuple(wrong + extra))}), expected exactly the local ones: run the same command again"
+        )
+
+
+def _set_tags(
+    hub: Repository, commit: str, version: str | None, tag: str | None, tags: dict[str, str]
+) -> tuple[str, ...]:
+    """The version tag moves with main, as LeRobot expects; a tag of the user's is set once."""
+    if version is not None and tags.get(version) != commit:
+        hub.set_tag(version, commit, replace=version in tags)
+    if tag is not None and tag not in tags:
+        hub.set_tag(tag, commit, replace=False)
+    return tuple(name for name in (version, tag) if name)

@@ -1,0 +1,427 @@
+"""A small Hugging Face Hub on localhost, for data sets only, with faults on demand.
+
+It answers the requests that huggingface_hub 1.33 makes for a push and a pull: whoami, create, info, refs, tree,
+validate-yaml, preupload, large files (batch, upload, verify), commit (ndjson), branch, tag, resolve with ranges.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import parse_qs, unquote, urlsplit
+
+LARGE = (".parquet", ".mp4")
+WRITE_TOKEN = "hf_MARKERofTheOwner0123456789abcdef"
+READ_TOKEN = "hf_MARKERofAReader0123456789abcdef"
+TOKENS = {WRITE_TOKEN: "owner", READ_TOKEN: "reader"}
+
+
+@dataclass
+class Repository:
+    """Commits as whole trees; branches and tags by name."""
+
+    name: str
+    private: bool
+    commits: dict[str, dict[str, bytes]] = field(default_factory=dict)
+    history: list[tuple[str, str]] = field(default_factory=list)  # (branch, commit)
+    branches: dict[str, str] = field(default_factory=dict)
+    tags: dict[str, str] = field(default_factory=dict)
+
+    def commit(self, branch: str, files: dict[str, bytes]) -> str:
+        content = "".join(f"{path}{hashlib.sha1(data).hexdigest()}" for path, data in sorted(files.items()))
+        commit = hashlib.sha1(f"{len(self.commits)}{content}".encode()).hexdigest()
+        self.commits[commit] = files
+        self.branches[branch] = commit
+        self.history.append((branch, commit))
+        return commit
+
+    def resolve(self, revision: str) -> str | None:
+        if revision in self.commits:
+            return revision
+        return self.branches.get(revision) or self.tags.get(revision)
+
+    def files(self, revision: str = "main") -> dict[str, bytes]:
+        commit = self.resolve(revision)
+        assert commit is not None
+        return self.commits[commit]
+
+
+@dataclass
+class Fault:
+    """Answers requests in place of the Hub.
+
+    Attributes:
+        method, pattern: which requests; the pattern is searched in the path.
+        status: answer with this status; or
+        cut: send so many bytes of the answer's body and close the connection; or
+        corrupt: flip the last byte of the body.
+        times: how often; -1 means always.
+        echo: repeat the request's token in the error, as no Hub should.
+    """
+
+    method: str
+    pattern: str
+    status: int = 0
+    cut: int = 0
+    corrupt: bool = False
+    times: int = 1
+    echo: bool = False
+    code: str = ""
+
+
+class FakeHub:
+    """The server. `requests` lists what was asked: (method, path, headers, body)."""
+
+    def __init__(self) -> None:
+        self.repositories: dict[str, Repository] = {}
+        self.large: dict[str, bytes] = {}
+        self.faults: list[Fault] = []
+        self.requests: list[tuple[str, str, dict[str, str], bytes]] = []
+        self.lock = threading.RLock()
+        hub = self
+
+        class Handler(_Handler):
+            server_hub = hub
+
+        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.server.daemon_threads = True
+        self.url = f"http://127.0.0.1:{self.server.server_address[1]}"
+
+    @contextmanager
+    def running(self) -> Iterator[FakeHub]:
+        thread = threading.Thread(target=self.server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
+        thread.start()
+        try:
+            yield self
+        finally:
+            self.server.shutdown()
+            self.server.server_close()
+            thread.join()
+
+    def make(self, name: str, private: bool = False) -> Repository:
+        repository = self.repositories[name] = Repository(name, private)
+        repository.commit("main", {".gitattributes": b"*.parquet filter=lfs\n"})
+        return repository
+
+    def fault(self, method: str, path: str) -> Fault | None:
+        with self.lock:
+            for fault in self.faults:
+                if fault.times and fault.method in (method, "*") and re.search(fault.pattern, path):
+                    fault.times -= 1
+                    return fault
+        return None
+
+    def asked(self, method: str, pattern: str) -> list[tuple[str, dict[str, str], bytes]]:
+        return [(p, h, b) for m, p, h, b in self.requests if m == method and re.search(pattern, p)]
+
+
+class RefusedError(Exception):
+    def __init__(self, status: int, message: str, code: str = "", **content: str) -> None:
+        super().__init__(message)
+        self.status, self.message, self.code, self.content = status, message, code, content
+
+
+Route = Callable[..., Any]
+ROUTES: list[tuple[str, re.Pattern[str], str]] = [
+    (method, re.compile(pattern + r"\Z"), name)
+    for method, pattern, name in (
+        ("GET", r"/api/whoami-v2", "whoami"),
+        ("POST", r"/api/repos/create", "create"),
+        ("POST", r"/api/validate-yaml", "validate"),
+        ("GET", r"/api/datasets/([^/]+/[^/]+)", "info"),
+        ("GET", r"/api/datasets/([^/]+/[^/]+)/revision/(.+)", "info"),
+        ("GET", r"/api/datasets/([^/]+/[^/]+)/refs", "refs"),
+        ("GET", r"/api/datasets/([^/]+/[^/]+)/tree/([^/]+)", "tree"),
+        ("POST", r"/api/datasets/([^/]+/[^/]+)/preupload/([^/]+)", "preupload"),
+        ("POST", r"/api/datasets/([^/]+/[^/]+)/commit/([^/]+)", "commit"),
+        ("POST", r"/api/datasets/([^/]+/[^/]+)/branch/([^/]+)", "branch"),
+        ("POST", r"/api/datasets/([^/]+/[^/]+)/tag/([^/]+)", "tag"),
+        ("DELETE", r"/api/datasets/([^/]+/[^/]+)/tag/([^/]+)", "untag"),
+        ("POST", r"/datasets/([^/]+/[^/]+)\.git/info/lfs/objects/batch", "batch"),
+        ("PUT", r"/large/([0-9a-f]{64})", "upload"),
+        ("POST", r"/large/([0-9a-f]{64})/verify", "verify"),
+    )
+]
+RESOLVE = re.compile(r"/datasets/([^/]+/[^/]+)/resolve/([^/]+)/(.+)\Z")
+
+
+def blob_id(data: bytes) -> str:
+    return hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
+
+
+def is_large(path: str) -> bool:
+    return path.endswith(LARGE)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server_hub: FakeHub
+    protocol_version = "HTTP/1.1"
+
+    def log_message(self, *_: Any) -> None:
+        pass
+
+    def do_GET(self) -> None:
+        self._answer()
+
+    do_POST = do_PUT = do_DELETE = do_HEAD = do_GET  # noqa: N815
+
+    def _answer(self) -> None:
+        hub = self.server_hub
+        path = unquote(urlsplit(self.path).path)
+        self.body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
+        if "chunked" in self.headers.get("Transfer-Encoding", ""):
+            self.body = self._chunks()
+        with hub.lock:
+            hub.requests.append((self.command, path, dict(self.headers), self.body))
+        self.failure = hub.fault(self.command, path)
+        try:
+            if self.failure and self.failure.status:
+                raise RefusedError(self.failure.status, "made to fail", self.failure.code)
+            raw = urlsplit(self.path).path  # matched before it is unquoted: a branch's slash arrives as %2F
+            matched = RESOLVE.match(raw)
+            if matched and self.command in ("GET", "HEAD"):
+                return self._file(*map(unquote, matched.groups()))
+            for method, pattern, name in ROUTES:
+                matched = pattern.match(raw)
+                if method == self.command and matched:
+                    with hub.lock:
+                        return self._json(200, getattr(self, f"_on_{name}")(*map(unquote, matched.groups())))
+            raise RefusedError(404, f"no such route: {self.command} {path}")
+        except RefusedError as refused:
+            self._refuse(refused)
+
+    def _chunks(self) -> bytes:
+        body = b""
+        while size := int(self.rfile.readline(), 16):
+            body += self.rfile.read(size)
+            self.rfile.readline()
+        self.rfile.readline()
+        return body
+
+    def _refuse(self, refused: RefusedError) -> None:
+        message = refused.message
+        if self.failure and self.failure.echo:
+            message += f": you sent {self.headers.get('Authorization')}"
+        self._json(
+            refused.status,
+            {"error": message} | refused.content,
+            {"X-Error-Message": message, "X-Error-Code": refused.code},
+        )
+
+    def _json(self, status: int, content: Any, headers: dict[str, str] | None = None) -> None:
+        data = json.dumps(content).encode()
+        self._send(status, data, {"Content-Type": "application/json", **(headers or {})})
+
+    def _send(self, status: int, data: bytes, headers: dict[str, str]) -> None:
+        self.send_response(status)
+        for name, value in headers.items():
+            if value:
+                self.send_header(name, value)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        if self.command == "HEAD":
+            return
+        failure = self.failure
+        if failure and failure.cut:
+            self.wfile.write(data[: failure.cut])
+            self.wfile.flush()
+            self.close_connection = True
+            self.connection.shutdown(2)
+            return
+        if failure and failure.corrupt:
+            data = data[:-1] + bytes([data[-1] ^ 0xFF])
+        self.wfile.write(data)
+
+    # --- who and what -----------------------------------------------------------------------------------------------
+
+    def _user(self, write: bool = False) -> str | None:
+        header = self.headers.get("Authorization")
+        if header is None:
+            if write:
+                raise RefusedError(401, "Invalid username or password.")
+            return None
+        user = TOKENS.get(header.removeprefix("Bearer "))
+        if user is None:
+            raise RefusedError(401, "Invalid credentials in Authorization header")
+        if write and user == "reader":
+            raise RefusedError(403, "You don't have the rights to do that")
+        return user
+
+    def _repository(self, name: str, write: bool = False) -> Repository:
+        user = self._user(write)
+        repository = self.server_hub.repositories.get(name)
+        if repository is None or (repository.private and user != "owner"):
+            raise RefusedError(401 if user is None else 404, "Repository not found", "RepoNotFound")
+        return repository
+
+    def _commit(self, repository: Repository, revision: str) -> str:
+        commit = repository.resolve(revision)
+        if commit is None:
+            raise RefusedError(404, f"Invalid rev id: {revision}", "RevisionNotFound")
+        return commit
+
+    def _on_whoami(self) -> Any:
+        return {"type": "user", "name": self._user(write=False) or self._user(write=True), "auth": {}}
+
+    def _on_create(self) -> Any:
+        self._user(write=True)
+        asked = json.loads(self.body)
+        name = f"{asked['organization']}/{asked['name']}"
+        address = f"{self.server_hub.url}/datasets/{name}"
+        if name in self.server_hub.repositories:
+            raise RefusedError(409, "You already created this dataset repo", url=address)
+        self.server_hub.make(name, private=asked.get("visibility") == "private")
+        return {"url": address}
+
+    def _on_validate(self) -> Any:
+        import yaml
+
+        header = json.loads(self.body)["content"].split("---")[1]
+        try:
+            yaml.safe_load(header)
+        except yaml.YAMLError as error:
+            raise RefusedError(400, str(error)) from error
+        return {"errors": [], "warnings": []}
+
+    def _on_info(self, name: str, revision: str = "main") -> Any:
+        repository = self._repository(name)
+        commit = self._commit(repository, revision)
+        siblings = [{"rfilename": path} for path in sorted(repository.commits[commit])]
+        return {"id": name, "sha": commit, "private": repository.private, "tags": [], "siblings": siblings}
+
+    def _on_refs(self, name: str) -> Any:
+        repository = self._repository(name)
+
+        def listed(kind: str, refs: dict[str, str]) -> list[dict[str, str]]:
+            return [{"name": n, "ref": f"refs/{kind}/{n}", "targetCommit": c} for n, c in refs.items()]
+
+        return {"branches": listed("heads", repository.branches), "tags": listed("tags", repository.tags),
+                "converts": []}  # fmt: skip
+
+    def _on_tree(self, name: str, revision: str) -> Any:
+        repository = self._repository(name)
+        files = repository.commits[self._commit(repository, revision)]
+        if parse_qs(urlsplit(self.path).query).get("recursive", ["false"])[0].lower() != "true":
+            raise RefusedError(400, "only recursive listings")
+        folders = sorted({parent for path in files for parent in _parents(path)})
+        entries: list[dict[str, Any]] = [{"type": "directory", "path": f, "size": 0, "oid": "0" * 40} for f in folders]
+        for path, data in sorted(files.items()):
+            entry = {"type": "file", "path": path, "size": len(data), "oid": blob_id(data)}
+            if is_large(path):
+                entry["lfs"] = {"oid": hashlib.sha256(data).hexdigest(), "size": len(data), "pointerSize": 130}
+            entries.append(entry)
+        return entries
+
+    # --- writing ----------------------------------------------------------------------------------------------------
+
+    def _on_preupload(self, name: str, revision: str) -> Any:
+        repository = self._repository(name, write=True)
+        files = repository.commits[self._commit(repository, revision)]
+
+        def answer(path: str) -> dict[str, Any]:
+            data = files.get(path)
+            oid = None if data is None else hashlib.sha256(data).hexdigest() if is_large(path) else blob_id(data)
+            mode = "lfs" if is_large(path) else "regular"
+            return {"path": path, "uploadMode": mode, "shouldIgnore": False, "oid": oid}
+
+        return {"files": [answer(file["path"]) for file in json.loads(self.body)["files"]]}
+
+    def _on_batch(self, name: str) -> Any:
+        self._repository(name, write=True)
+        objects = []
+        for item in json.loads(self.body)["objects"]:
+            answer = {"oid": item["oid"], "size": item["size"]}
+            if item["oid"] not in self.server_hub.large:
+                url = f"{self.server_hub.url}/large/{item['oid']}"
+                answer["actions"] = {"upload": {"href": url}, "verify": {"href": f"{url}/verify"}}
+            objects.append(answer)
+        return {"transfer": "basic", "objects": objects}
+
+    def _on_upload(self, oid: str) -> Any:
+        # Storage is signed by its address: a token that arrives here has leaked.
+        if self.headers.get("Authorization"):
+            raise RefusedError(400, "a token was sent to the storage")
+        if hashlib.sha256(self.body).hexdigest() != oid:
+            raise RefusedError(400, "content differs from its hash")
+        self.server_hub.large[oid] = self.body
+        return {}
+
+    def _on_verify(self, oid: str) -> Any:
+        if len(self.server_hub.large.get(oid, b"")) != json.loads(self.body)["size"]:
+            raise RefusedError(400, "not uploaded")
+        return {}
+
+    def _on_commit(self, name: str, branch: str) -> Any:
+        repository = self._repository(name, write=True)
+        if branch not in repository.branches:
+            raise RefusedError(404, f"Invalid rev id: {branch}", "RevisionNotFound")
+        items = [json.loads(line) for line in self.body.splitlines()]
+        header = items[0]["value"]
+        if header.get("parentCommit") not in (None, repository.branches[branch]):
+            raise RefusedError(412, "A commit has happened since. Please refresh and try again.")
+        files = dict(repository.files(branch))
+        for item in items[1:]:
+            value, key = item["value"], item["key"]
+            if key == "file":
+                files[value["path"]] = base64.b64decode(value["content"])
+            elif key == "lfsFile":
+                files[value["path"]] = self.server_hub.large[value["oid"]]
+            elif key == "deletedFile":
+                del files[value["path"]]
+            else:
+                raise RefusedError(400, f"unknown operation {key}")
+        commit = repository.commit(branch, files)
+        return {"commitUrl": f"{self.server_hub.url}/datasets/{name}/commit/{commit}", "commitOid": commit}
+
+    def _on_branch(self, name: str, branch: str) -> Any:
+        repository = self._repository(name, write=True)
+        if branch in repository.branches:
+            raise RefusedError(409, "Reference already exists")
+        start = json.loads(self.body or b"{}").get("startingPoint", "main")
+        repository.branches[branch] = self._commit(repository, start)
+        return {}
+
+    def _on_tag(self, name: str, revision: str) -> Any:
+        repository = self._repository(name, write=True)
+        tag = json.loads(self.body)["tag"]
+        if tag in repository.tags:
+            raise RefusedError(409, "Tag reference exists already")
+        repository.tags[tag] = self._commit(repository, revision)
+        return {}
+
+    def _on_untag(self, name: str, tag: str) -> Any:
+        repository = self._repository(name, write=True)
+        if repository.tags.pop(tag, None) is None:
+            raise RefusedError(404, "no such tag", "RevisionNotFound")
+        return {}
+
+    # --- reading ----------------------------------------------------------------------------------------------------
+
+    def _file(self, name: str, revision: str, path: str) -> None:
+        repository = self._repository(name)
+        commit = self._commit(repository, revision)
+        data = repository.commits[commit].get(path)
+        if data is None:
+            raise RefusedError(404, "Entry not found", "EntryNotFound")
+        etag = hashlib.sha256(data).hexdigest() if is_large(path) else blob_id(data)
+        headers = {"ETag": f'"{etag}"', "X-Repo-Commit": commit, "Accept-Ranges": "bytes",
+                   "Content-Type": "application/octet-stream"}  # fmt: skip
+        wanted = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
+        if wanted is None:
+            return self._send(200, data, headers)
+        begin = int(wanted[1])
+        headers["Content-Range"] = f"bytes {begin}-{len(data) - 1}/{len(data)}"
+        return self._send(206, data[begin:], headers)
+
+
+def _parents(path: str) -> list[str]:
+    parts = path.split("/")[:-1]
+    return ["/".join(parts[: i + 1]) for i in range(len(parts))]
