@@ -101,6 +101,9 @@ COMMANDS: Final[dict[str, Command]] = {
     ),
 }
 
+GROUPS: Final = {"dataset": "data sets: info, verify, repair, merge, split, viz, push, pull"}
+"""Commands with actions and options of their own instead of `key=value`."""
+
 KEYS_HELP: Final = """common keys (any key of playslot_rl/config.py works, with dots: slots.optim.lr=5e-4):
   env=button_press      the task
   preset=compact        sizes and schedule: smoke (seconds, for tests), compact (two CPU cores), paper (one GPU)
@@ -126,7 +129,8 @@ class _Parser(argparse.ArgumentParser):
 
 def _top_parser() -> argparse.ArgumentParser:
     width = max(map(len, COMMANDS))
-    lines = "\n".join(f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items())
+    summaries = {name: command.summary for name, command in COMMANDS.items()} | GROUPS
+    lines = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in summaries.items())
     parser = _Parser(
         prog="playslot",
         usage="playslot COMMAND [key=value ...]",
@@ -135,7 +139,7 @@ def _top_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"playslot {__version__}")
-    parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="one of the commands below")
+    parser.add_argument("command", choices=[*COMMANDS, *GROUPS], metavar="COMMAND", help="one of the commands below")
     return parser
 
 
@@ -170,6 +174,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         _top_parser().print_help()
         return 2
     name = arguments[0]
+    if name == "dataset":
+        from playslot_rl.datasets import command
+
+        options = command.parser(_Parser).parse_args(arguments[1:])
+        return _guarded(f"{name} {options.action}", lambda: command.run(options))
     if name not in COMMANDS:
         # Ends here unless it is --help or --version: the rest of the line belongs to no known command.
         _top_parser().parse_args(arguments[:1])

@@ -5,6 +5,7 @@ Shapes: F rows (frames), E episodes.
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -123,9 +124,7 @@ class Contents:
         for number, rows in enumerate(self.file_rows):
             index = self.columns["episode_index"][begin : begin + rows]
             cuts = [0, *(np.flatnonzero(np.diff(index)) + 1).tolist(), rows]
-            found += [
-                Span(int(index[a]), begin + a, begin + b, number) for a, b in zip(cuts, cuts[1:], strict=False) if b > a
-            ]
+            found += [Span(int(index[a]), begin + a, begin + b, number) for a, b in itertools.pairwise(cuts) if b > a]
             begin += rows
         return found
 

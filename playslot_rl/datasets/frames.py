@@ -41,9 +41,9 @@ def scan_frames(contents: Contents, problems: Problems) -> dict[str, CameraScan]
     scans = {}
     for camera in contents.images:
         frames = _images(contents, camera, problems)
-        scans[camera] = _scan(contents, camera, (item for file in frames for item in file))
+        scans[camera] = _scan(contents, (item for file in frames for item in file))
     for camera in contents.videos:
-        scans[camera] = _scan(contents, camera, _video(contents, camera, problems))
+        scans[camera] = _scan(contents, _video(contents, camera, problems))
     return scans
 
 
@@ -51,7 +51,7 @@ Decoded = tuple[int, bytes, "npt.NDArray[np.uint8] | None"]
 """Row, digest, and pixels (H, W, 3) or None where nobody needs them."""
 
 
-def _scan(contents: Contents, camera: str, frames: Iterator[Decoded]) -> CameraScan:
+def _scan(contents: Contents, frames: Iterator[Decoded]) -> CameraScan:
     scan = CameraScan([b""] * contents.rows, [None] * len(contents.spans))
     wanted = _wanted(contents.spans)
     kept: dict[int, list[npt.NDArray[np.uint8]]] = {}
@@ -105,7 +105,7 @@ def _image_rows(
     size, depth = stated_size(contents.features[camera]), is_depth(contents.features[camera])
 
     def decode(cell: dict[str, Any] | None) -> Array | str:
-        return _decode(contents.root, cell)
+        return decode_image(contents.root, cell)
 
     row = begin
     for batch in file.iter_batches(ROWS_A_PIECE, columns=[camera]):
@@ -123,7 +123,7 @@ def _image_rows(
             row += 1
 
 
-def _decode(root: Path, cell: dict[str, Any] | None) -> Array | str:
+def decode_image(root: Path, cell: dict[str, Any] | None) -> Array | str:
     """Pixels of a stored image, (H, W, 3) uint8 for colours, or why it cannot be decoded."""
     from PIL import Image
 

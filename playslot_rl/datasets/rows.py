@@ -153,10 +153,8 @@ def _check_episode(contents: Contents, episode: Episode, span: Span, problems: P
         )
     try:
         if contents.data_file(episode.row) != contents.data_files[span.file]:
-            problems.error(
-                "wrong file", f"episode {span.index}: got rows in {contents.data_files[span.file].name} of another chunk "
-                f"or number than {contents.data_file(episode.row)}, which meta/episodes names",
-            )  # fmt: skip
+            got, named = contents.data_files[span.file], contents.data_file(episode.row)
+            problems.error("wrong file", f"episode {span.index}: got rows in {got}, expected them in {named} as stated")
     except (KeyError, ValueError, TypeError):
         return  # noted with the files
     for camera in contents.videos:
@@ -164,7 +162,7 @@ def _check_episode(contents: Contents, episode: Episode, span: Span, problems: P
         if begin is None or end is None or abs((end - begin) * contents.fps - span.length) > 0.5:
             problems.error(
                 "video timestamps",
-                f"episode {span.index}: got {camera} from {begin} to {end} s, expected {span.length / contents.fps:.4g} s",
+                f"episode {span.index}: got {camera} from {begin} to {end} s, expected {span.length} frames of it",
             )
 
 

@@ -111,9 +111,7 @@ def differing(stored: dict[str, Array], actual: dict[str, Array], loose: float =
     tolerance = {"std": 2e-3 * scale} if not loose else {"std": loose, "mean": loose}
     for name in BASIC:
         got = stored.get(name)
-        if got is None or not np.isfinite(got).all():
-            found.append(name)
-        elif got.size != actual[name].size:
+        if got is None or not np.isfinite(got).all() or got.size != actual[name].size:
             found.append(name)
         elif loose and name not in tolerance:
             continue

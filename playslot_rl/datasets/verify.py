@@ -134,7 +134,7 @@ def episode_statistics(contents: Contents, scans: Mapping[str, CameraScan], numb
 
 
 def _looseness(contents: Contents, name: str, stored: dict[str, Array], actual: dict[str, Array]) -> float:
-    """Frames in videos have lost something since their statistics were taken; others may have been sampled otherwise."""
+    """Frames in videos have lost something since; frames in images may have been sampled in another way."""
     if contents.features[name]["dtype"] == "video":
         return LOOSE_CAMERA
     other = contents.features[name]["dtype"] == "image" and "count" in stored

@@ -116,6 +116,35 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
     return _png(figure, theme)
 
 
+def curve_chart(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[Any, Any]]], theme: Theme) -> bytes:
+    """Numbers over the frames of an episode, one panel a feature and one line a component.
+
+    Args:
+        panels: feature -> component -> one value a frame.
+        theme: page.
+
+    Returns:
+        PNG.
+
+    Raises:
+        ValueError: there is nothing to draw.
+    """
+    if not panels:
+        raise ValueError("curve_chart: got no feature, expected at least one")
+    figure = _figure(3.1 * len(panels), 2.2)
+    for index, (name, lines) in enumerate(panels.items()):
+        axes = figure.add_subplot(1, len(panels), index + 1)
+        for number, (label, values) in enumerate(lines.items()):
+            colour = theme.series[number % len(theme.series)]
+            axes.plot(np.arange(len(values)), values, color=colour, linewidth=1.3, label=label)
+        axes.set_title(name, fontsize=10)
+        axes.set_xlabel("frame", fontsize=9)
+        _style(axes, theme)
+        if 1 < len(lines) <= len(theme.series):
+            axes.legend(frameon=False, labelcolor=theme.text, fontsize=7, ncols=2)
+    return _png(figure, theme)
+
+
 def loss_names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Names of loss terms in a history: `loss` first, then `loss_...` in the order of appearance."""
     names = dict.fromkeys(k for r in rows for k in r if k == "loss" or k.startswith("loss_"))

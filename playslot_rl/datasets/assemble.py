@@ -1,0 +1,309 @@
+"""Writing a data set from whole episodes of others: what merge, split and repair have in common.
+
+Rows are copied as they are stored, images without decoding, videos packet by packet; only a row's place (`index`,
+`episode_index`, `task_index`) and its statistics are made anew.
+
+Note: LeRobot's `aggregate_datasets` and `split_dataset` do the same with pandas, but leave the statistics of places
+stale, name wrong files of `meta/episodes` after merging sets of several shards, and encode videos again when they
+split; `split_dataset` also reads the whole metadata once an episode.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from playslot_rl.datasets.contents import (
+    DATA_PATH,
+    EPISODES_PATH,
+    INFO_NAME,
+    RECORD_NAME,
+    STATS_NAME,
+    TASKS_NAME,
+    VIDEO_PATH,
+    Contents,
+    Episode,
+    Span,
+    Stats,
+)
+from playslot_rl.datasets.statistics import aggregate, of_numbers
+from playslot_rl.datasets.video_copy import DEFAULT_FILES, DEFAULT_SIZE_MB, VideoCopier
+from playslot_rl.errors import DataError
+from playslot_rl.training.atomic import write_json
+
+DATA_SIZE_MB: Final = 100
+ROWS_OF_METADATA: Final = 1000
+MEGABYTE: Final = 2**20
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Episodes of one data set.
+
+    Attributes:
+        contents: the data set.
+        spans: rows of the episodes to take, in order.
+        episodes: their metadata, in the same order; statistics as they shall be, those of places are made anew.
+    """
+
+    contents: Contents
+    spans: Sequence[Span]
+    episodes: Sequence[Episode]
+
+
+def choose(contents: Contents, indices: Sequence[int]) -> Choice:
+    """Episodes of a sound data set by their index."""
+    spans = {span.index: span for span in contents.spans}
+    episodes = {episode.index: episode for episode in contents.episodes}
+    return Choice(contents, [spans[i] for i in indices], [episodes[i] for i in indices])
+
+
+def assemble(choices: Sequence[Choice], out: Path, made_by: str) -> None:
+    """Write the data set `out` from the chosen episodes, one data set after the other.
+
+    Args:
+        choices: of data sets with the same features and rate.
+        out: folder; must not exist.
+        made_by: command, for our own record.
+
+    Raises:
+        DataError: no episode was chosen, or a source cannot be read.
+        OSError: full disk.
+    """
+    if not any(choice.spans for choice in choices):
+        raise DataError(f"{out}: got no episode to write, expected at least one")
+    out.mkdir(parents=True)
+    info = _info(choices)
+    tasks = _Tasks()
+    copiers = {camera: _copier(out, camera, info) for camera in choices[0].contents.videos}
+    rows = _RowWriter(out, info)
+    table = _EpisodeWriter(out)
+    all_stats: list[Stats] = []
+    try:
+        for choice in choices:
+            for span, episode, piece in zip(choice.spans, choice.episodes, _pieces(choice), strict=True):
+                numbers = choice.contents.columns["task_index"][span.start : span.stop]
+                placed = rows.write(piece, tasks.renumber(choice.contents.tasks, numbers))
+                videos = {c: copier.copy(*_video(choice.contents, c, episode)) for c, copier in copiers.items()}
+                stats = {**episode.stats, **placed.stats}
+                places = {k: v for place in videos.values() for k, v in place.items()}
+                table.write(episode, {**placed.row, **places}, stats)
+                all_stats.append(stats)
+    finally:
+        rows.close()
+        table.close()
+        for copier in copiers.values():
+            copier.close()
+    tasks.save(out)
+    episodes = sum(len(choice.spans) for choice in choices)
+    info |= {"total_episodes": episodes, "total_frames": rows.rows, "total_tasks": len(tasks.words)}
+    info["splits"] = {"train": f"0:{episodes}"}
+    write_json(out / STATS_NAME, _plain(aggregate(all_stats)))
+    write_json(out / INFO_NAME, info)
+    _write_record(choices, out, made_by)
+
+
+def _info(choices: Sequence[Choice]) -> dict[str, Any]:
+    info: dict[str, Any] = copy.deepcopy(choices[0].contents.info)
+    info |= {"data_path": DATA_PATH, "video_path": VIDEO_PATH if choices[0].contents.videos else None}
+    for camera in choices[0].contents.videos:
+        known = [choice.contents.features[camera].get("info") or {} for choice in choices]
+        # How a video was encoded stands there only where it is true of all of them.
+        info["features"][camera]["info"] = {
+            k: v if all(k in other and other[k] == v for other in known) else None for k, v in known[0].items()
+        }
+    return info
+
+
+def _copier(out: Path, camera: str, info: Mapping[str, Any]) -> VideoCopier:
+    limit = int(float(info.get("video_files_size_in_mb") or DEFAULT_SIZE_MB) * MEGABYTE)
+    files = int(info.get("chunks_size") or DEFAULT_FILES)
+    return VideoCopier(out, camera, VIDEO_PATH, float(info["fps"]), limit, files)
+
+
+def _video(contents: Contents, camera: str, episode: Episode) -> tuple[Path, float, int]:
+    begin = float(episode.row[f"videos/{camera}/from_timestamp"])
+    return contents.video_file(camera, episode.row), begin, episode.length
+
+
+def _pieces(choice: Choice) -> Iterator[Any]:
+    """Tables of the chosen episodes' rows; each file is read once where episodes are in order."""
+    import pyarrow.parquet as pq
+
+    contents = choice.contents
+    starts = np.cumsum([0, *contents.file_rows])
+    number, table = -1, None
+    for span in choice.spans:
+        if span.file != number:
+            number, table = span.file, pq.ParquetFile(contents.data_files[span.file]).read()
+        yield table.slice(span.start - int(starts[span.file]), span.length)
+
+
+@dataclass(frozen=True)
+class _Placed:
+    row: dict[str, Any]
+    stats: Stats
+
+
+class _RowWriter:
+    """Rows of the new data set: one row group an episode, as LeRobot writes them."""
+
+    def __init__(self, out: Path, info: Mapping[str, Any]) -> None:
+        self.out, self.rows, self.episodes, self._number = out, 0, 0, -1
+        self._limit = float(info.get("data_files_size_in_mb") or DATA_SIZE_MB) * MEGABYTE
+        self._files = int(info.get("chunks_size") or DEFAULT_FILES)
+        self._writer: Any = None
+        self._schema: Any = None
+
+    def write(self, table: Any, task_index: np.ndarray[Any, Any]) -> _Placed:
+        """Append an episode; returns its place and the statistics that depend on it."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        length = len(table)
+        places = {
+            "index": np.arange(self.rows, self.rows + length),
+            "episode_index": np.full(length, self.episodes),
+            "task_index": task_index,
+        }
+        for name, values in places.items():
+            column = table.schema.get_field_index(name)
+            table = table.set_column(column, table.schema.field(name), pa.array(values, table.schema.field(name).type))
+        if self._schema is None:
+            metadata = {k: v for k, v in (table.schema.metadata or {}).items() if k != b"pandas"}
+            self._schema = table.schema.with_metadata(metadata or None)
+        table = table.select(self._schema.names).cast(self._schema)
+        if self._writer is None or self._path().stat().st_size >= self._limit:
+            self.close()
+            self._number += 1
+            self._path().parent.mkdir(parents=True, exist_ok=True)
+            self._writer = pq.ParquetWriter(self._path(), self._schema, compression="snappy", use_dictionary=True)
+        self._writer.write_table(table)
+        chunk, file = divmod(self._number, self._files)
+        row = {
+            "episode_index": self.episodes,
+            "data/chunk_index": chunk,
+            "data/file_index": file,
+            "dataset_from_index": self.rows,
+            "dataset_to_index": self.rows + length,
+        }
+        self.rows, self.episodes = self.rows + length, self.episodes + 1
+        return _Placed(row, {name: of_numbers(values) for name, values in places.items()})
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+    def _path(self) -> Path:
+        chunk, file = divmod(self._number, self._files)
+        return self.out / DATA_PATH.format(chunk_index=chunk, file_index=file)
+
+
+class _Tasks:
+    """Tasks of the new data set, numbered as they appear."""
+
+    def __init__(self) -> None:
+        self.words: list[str] = []
+
+    def renumber(self, known: Mapping[int, str], numbers: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        """New task numbers of rows."""
+        new = np.empty(len(numbers), np.int64)
+        for number in dict.fromkeys(numbers.tolist()):
+            if known[number] not in self.words:
+                self.words.append(known[number])
+            new[numbers == number] = self.words.index(known[number])
+        return new
+
+    def save(self, out: Path) -> None:
+        import pandas as pd
+
+        frame = pd.DataFrame({"task_index": range(len(self.words))}, index=pd.Index(self.words, name="task"))
+        frame.to_parquet(out / TASKS_NAME)
+
+
+class _EpisodeWriter:
+    """`meta/episodes`: one file, written in pieces."""
+
+    def __init__(self, out: Path) -> None:
+        self._path = out / EPISODES_PATH.format(chunk_index=0, file_index=0)
+        self._path.parent.mkdir(parents=True)
+        self._rows: list[dict[str, Any]] = []
+        self._writer: Any = None
+
+    def write(self, episode: Episode, changes: Mapping[str, Any], stats: Stats) -> None:
+        """Append an episode's row."""
+        flat = {f"stats/{n}/{key}": value for n, group in _plain(stats).items() for key, value in group.items()}
+        kept = {k: v for k, v in episode.row.items() if k not in ("episode_index", "tasks", "length")}
+        row = {"episode_index": 0, "tasks": list(episode.tasks), "length": episode.length, **kept, **changes}
+        self._rows.append(row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0} | flat)
+        if len(self._rows) >= ROWS_OF_METADATA:
+            self._flush()
+
+    def close(self) -> None:
+        self._flush()
+        if self._writer is not None:
+            self._writer.close()
+
+    def _flush(self) -> None:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        if not self._rows:
+            return
+        if self._writer is None:
+            names = dict.fromkeys(name for row in self._rows for name in row)
+            whole = [{name: row.get(name) for name in names} for row in self._rows]
+            table = pa.Table.from_pylist(whole)
+            self._writer = pq.ParquetWriter(self._path, table.schema, compression="snappy", use_dictionary=True)
+        else:
+            table = pa.Table.from_pylist(self._rows, schema=self._writer.schema)
+        self._writer.write_table(table)
+        self._rows.clear()
+
+
+def _plain(stats: Stats) -> dict[str, dict[str, Any]]:
+    """Lists instead of arrays; counts are whole numbers."""
+    return {
+        name: {key: (value.astype(np.int64) if key == "count" else value).tolist() for key, value in group.items()}
+        for name, group in stats.items()
+    }
+
+
+def _write_record(choices: Sequence[Choice], out: Path, made_by: str) -> None:
+    """Our own record of seeds and outcomes, where every source has one."""
+    records = [read_record(choice.contents) for choice in choices]
+    if any(record is None for record in records):
+        return
+    episodes: list[Any] = []
+    sources = []
+    for choice, record in zip(choices, records, strict=True):
+        assert record is not None
+        episodes += [record["episodes"][span.index] for span in choice.spans if span.index < len(record["episodes"])]
+        sources.append({"name": choice.contents.root.name, "episodes": len(choice.spans), "spec": record.get("spec")})
+    content: dict[str, Any] = {"made_by": made_by, "sources": sources, "episodes": episodes}
+    outcomes = [entry.get("success") for entry in episodes]
+    if outcomes and None not in outcomes:
+        content["success_rate"] = sum(map(bool, outcomes)) / len(outcomes)
+    write_json(out / RECORD_NAME, content)
+
+
+def read_record(contents: Contents) -> dict[str, Any] | None:
+    """Our own record of a data set, or None where there is none that can be used."""
+    try:
+        record = json.loads((contents.root / RECORD_NAME).read_text())
+        usable = isinstance(record["episodes"], list) and all(isinstance(e, dict) for e in record["episodes"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return record if usable else None
+
+
+def with_statistics(episode: Episode, stats: Stats) -> Episode:
+    """An episode with other statistics."""
+    return replace(episode, stats=stats)

@@ -1,0 +1,145 @@
+"""What a data set holds, in a few lines; reads no frames."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from playslot_rl import keys
+from playslot_rl.datasets.assemble import read_record
+from playslot_rl.datasets.contents import REQUIRED, Contents
+from playslot_rl.datasets.verify import require_sound
+
+MEBIBYTE = 2**20
+
+
+@dataclass(frozen=True)
+class DatasetSummary:
+    """Summary of a data set.
+
+    Attributes:
+        root: its folder.
+        format: LeRobot's version of it.
+        robot: robot type, empty if not stated.
+        fps: frames a second.
+        episodes, frames: how many.
+        lengths: shortest, mean and longest episode, frames.
+        tasks: words -> episodes.
+        features: name -> type and shape; without those that every data set has.
+        bytes: of rows, videos and metadata.
+        success_rate: share of episodes with a true `next.success`; None where there is no such feature.
+        seeds: smallest and largest seed, or None.
+        source: what our own record says about its making, or None.
+    """
+
+    root: str
+    format: str
+    robot: str
+    fps: float
+    episodes: int
+    frames: int
+    lengths: tuple[int, float, int]
+    tasks: dict[str, int]
+    features: dict[str, str]
+    bytes: dict[str, int]
+    success_rate: float | None
+    seeds: tuple[int, int] | None
+    source: dict[str, Any] | None
+
+    def to_json(self) -> str:
+        """One JSON object."""
+        return json.dumps(asdict(self), indent=2)
+
+    def lines(self) -> list[str]:
+        """For people."""
+        shortest, mean, longest = self.lengths
+        length = f"{shortest}" if shortest == longest else f"{shortest} to {longest}, mean {mean:.1f}"
+        seconds = self.frames / self.fps
+        sizes = ", ".join(f"{name} {size / MEBIBYTE:.1f} MiB" for name, size in self.bytes.items() if size)
+        found = [
+            f"{self.root}: LeRobot {self.format}, robot {self.robot or 'not stated'}",
+            f"episodes  {self.episodes}, {length} frames each",
+            f"frames    {self.frames} at {self.fps:g} fps ({seconds:.0f} s)",
+            *(f"task      {words!r} ({count} episodes)" for words, count in self.tasks.items()),
+            f"size      {sizes}",
+        ]
+        if self.success_rate is not None:
+            found.append(f"success   {100 * self.success_rate:.1f} % of the episodes")
+        if self.seeds is not None:
+            found.append(f"seeds     {self.seeds[0]} to {self.seeds[1]}")
+        if self.source is not None:
+            found.append("made by   " + ", ".join(f"{name} {value}" for name, value in self.source.items()))
+        width = max(map(len, self.features))
+        return [*found, "features", *(f"  {name:<{width}}  {kind}" for name, kind in self.features.items())]
+
+
+def info(root: str | Path) -> DatasetSummary:
+    """Summarise the data set at `root`.
+
+    Raises:
+        DataError: it is missing, of another format version, or its rows and metadata do not agree.
+    """
+    contents = require_sound(root)
+    lengths = [span.length for span in contents.spans]
+    tasks: dict[str, int] = {}
+    for episode in contents.episodes:
+        for words in episode.tasks:
+            tasks[words] = tasks.get(words, 0) + 1
+    return DatasetSummary(
+        root=str(root),
+        format=str(contents.info["codebase_version"]),
+        robot=str(contents.info.get("robot_type") or ""),
+        fps=contents.fps,
+        episodes=len(lengths),
+        frames=contents.rows,
+        lengths=(min(lengths), float(np.mean(lengths)), max(lengths)),
+        tasks=tasks,
+        features={name: _kind(f) for name, f in contents.features.items() if name not in REQUIRED},
+        bytes={name: _bytes(contents.root / folder) for name, folder in _FOLDERS.items()},
+        success_rate=success_rate(contents),
+        seeds=_seeds(contents),
+        source=_source(contents),
+    )
+
+
+_FOLDERS = {"rows": "data", "videos": "videos", "metadata": "meta"}
+
+
+def success_rate(contents: Contents) -> float | None:
+    """Share of episodes in which the task was solved, or None where the data set does not say."""
+    solved = contents.columns.get(keys.FEATURE_SUCCESS)
+    if solved is None or not contents.spans:
+        return None
+    return float(np.mean([bool(solved[span.start : span.stop].any()) for span in contents.spans]))
+
+
+def _kind(feature: Mapping[str, Any]) -> str:
+    shape = "x".join(map(str, feature["shape"]))
+    codec = (feature.get("info") or {}).get("video.codec")
+    return f"{feature['dtype']} {shape}{f' ({codec})' if codec else ''}"
+
+
+def _bytes(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def _seeds(contents: Contents) -> tuple[int, int] | None:
+    seeds = contents.columns.get(keys.FEATURE_SEED)
+    return None if seeds is None or not len(seeds) else (int(seeds.min()), int(seeds.max()))
+
+
+def _source(contents: Contents) -> dict[str, Any] | None:
+    record = read_record(contents)
+    if record is None:
+        return None
+    if "made_by" in record:
+        names = "+".join(str(source.get("name")) for source in record.get("sources") or [])
+        return {"command": record["made_by"], "of": names}
+    spec = record.get("spec") or {}
+    env = spec.get("env") or {}
+    return {"policy": spec.get("policy"), "task": env.get("name"), "seed": spec.get("seed"), "noise": spec.get("noise")}

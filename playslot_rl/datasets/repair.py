@@ -1,0 +1,301 @@
+"""What is whole in a damaged data set, as a sound one.
+
+An episode is kept if its rows are complete and every frame of it can be decoded; the others are left out, and the kept
+ones numbered anew. Counts, indices, statistics and, where a kill before `finalize` left none, the metadata of episodes
+are made anew from the rows and frames. A parquet file without a footer cannot be read: its episodes are lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from playslot_rl.datasets.assemble import Choice, assemble, with_statistics
+from playslot_rl.datasets.contents import Contents, Episode, Span, Stats, read_contents
+from playslot_rl.datasets.frames import CameraScan, scan_frames
+from playslot_rl.datasets.problems import Problems
+from playslot_rl.datasets.rows import length_fault, row_faults
+from playslot_rl.datasets.statistics import differing
+from playslot_rl.datasets.transaction import new_folder, require_free
+from playslot_rl.datasets.verify import LOOSE_CAMERA, Verification, episode_statistics, verify
+from playslot_rl.datasets.video_copy import frame_count
+from playslot_rl.errors import DataError, OutputError
+from playslot_rl.training.atomic import explain_write_errors, fsync_folder
+
+JOURNAL_SUFFIX = ".journal"
+
+
+@dataclass(frozen=True)
+class RepairResult:
+    """What `repair` did.
+
+    Attributes:
+        root: the sound data set.
+        verification: of it.
+        stated: episodes the damaged one said it had; None where nothing was wrong.
+        lost: what is not there any more, a line each.
+        damaged: where the damaged one is kept, or None where it was left in its place.
+        journal: an unfinished collection of ours beside it, or None.
+    """
+
+    root: Path
+    verification: Verification
+    stated: int | None
+    lost: tuple[str, ...]
+    damaged: Path | None
+    journal: Path | None
+
+    def lines(self) -> list[str]:
+        """For people."""
+        made = self.verification
+        if self.stated is None:
+            return [f"{self.root}: sound, nothing to repair ({made.episodes} episodes, {made.frames} frames)"]
+        found = [f"lost: {line}" for line in self.lost] or ["lost: nothing; counts, indices and statistics made anew"]
+        found.append(f"{self.root}: {made.episodes} of {self.stated} episodes restored, {made.frames} frames, verified")
+        if self.damaged is not None:
+            found.append(f"the damaged data set is kept as {self.damaged}")
+        if self.journal is not None:
+            found.append(_journal_note(self.journal))
+        return found
+
+
+def repair(root: str | Path, out: str | Path | None = None) -> RepairResult:
+    """Restore a data set that was never finalised, was interrupted, or is damaged.
+
+    The repaired one is written under a temporary name and verified. Then the damaged one is renamed to `NAME.damaged`
+    and the repaired one takes its place, unless `out` says where it goes. A sound data set is left alone.
+
+    Args:
+        root: the damaged data set; needs a readable `meta/info.json`.
+        out: folder that does not exist yet; None repairs in place.
+
+    Raises:
+        DataError: there is no whole episode, or no metadata to begin with.
+        OutputError: `out` exists, or the disk is full.
+    """
+    folder = Path(root)
+    if out is None:
+        _undo_half_rename(folder)
+    else:
+        require_free(Path(out))
+    before = verify(folder)
+    journal = folder.with_name(folder.name + JOURNAL_SUFFIX)
+    beside = journal if journal.is_dir() else None
+    if before.ok:
+        return RepairResult(folder, before, None, (), None, None)
+    lost: list[str] = []
+    problems = Problems()
+    contents = read_contents(folder, problems)
+    lost += [line for line in problems.errors if "cannot be read" in line]
+    choice = _whole_episodes(contents, lost)
+    if not choice.spans:
+        more = f"; {_journal_note(beside)}" if beside else "; record it again"
+        raise DataError(f"{folder}: got no whole episode to restore ({(lost or before.errors)[0]}), expected one{more}")
+    stated = int(contents.info["total_episodes"])
+    if out is not None:
+        with new_folder(Path(out)) as temporary:
+            result = _write(choice, temporary)
+        return RepairResult(Path(out), result, stated, tuple(lost), None, beside)
+    repaired = folder.with_name(f"{folder.name}.repaired")
+    with new_folder(repaired) as temporary:
+        result = _write(choice, temporary)
+    damaged = _free_name(folder)
+    with explain_write_errors(folder):
+        folder.rename(damaged)
+        repaired.rename(folder)
+        fsync_folder(folder.absolute().parent)
+    return RepairResult(folder, result, stated, tuple(lost), damaged, beside)
+
+
+def _journal_note(journal: Path) -> str:
+    return (
+        f"{journal} holds the episodes of an unfinished collection: `playslot collect` with the same arguments as "
+        "then may restore more than a repair"
+    )
+
+
+def _write(choice: Choice, temporary: Path) -> Verification:
+    assemble([choice], temporary, "playslot dataset repair")
+    result = verify(temporary)
+    if not result.ok:
+        raise DataError(
+            f"{choice.contents.root}: cannot be repaired: got {result.errors[0]} after it, expected a sound data set; "
+            "it was left as it is"
+        )
+    return result
+
+
+def _undo_half_rename(folder: Path) -> None:
+    """A kill between the two renames left no `folder`, but the repaired one beside it."""
+    repaired = folder.with_name(f"{folder.name}.repaired")
+    if not folder.exists() and repaired.is_dir() and verify(repaired).ok:
+        repaired.rename(folder)
+
+
+def _free_name(folder: Path) -> Path:
+    for number in range(1, 1000):
+        name = folder.with_name(f"{folder.name}.damaged" + (f"-{number}" if number > 1 else ""))
+        if not name.exists():
+            return name
+    raise OutputError(f"{folder}: got a thousand damaged copies beside it, expected fewer; delete some")
+
+
+def _whole_episodes(contents: Contents, lost: list[str]) -> Choice:
+    """The episodes that can be kept, with metadata and statistics made anew; the others go to `lost`."""
+    problems = Problems()
+    scans = scan_frames(contents, problems)
+    stale = _stale_files(contents)
+    lost += [
+        f"{contents.data_files[number]}: left from another version, its rows are double" for number in sorted(stale)
+    ]
+    known = {episode.index: episode for episode in contents.episodes}
+    located = _locate_videos(contents, [span for span in contents.spans if span.file not in stale], known)
+    if set(located) != set(known):  # frames of episodes without metadata are found only now
+        contents = _with_episodes(contents, {**known, **located})
+        scans = scan_frames(contents, Problems())
+    spans, episodes, seen = [], [], set()
+    for number, span in enumerate(contents.spans):
+        if span.file in stale:
+            continue
+        episode = located.get(span.index)
+        reason = _reason(contents, scans, span, known.get(span.index), episode, span.index in seen)
+        if reason or episode is None:
+            lost.append(f"episode {span.index} ({span.length} rows): {reason}")
+            continue
+        seen.add(span.index)
+        spans.append(span)
+        episodes.append(with_statistics(episode, _statistics(contents, scans, number, episode)))
+    gone = sorted(set(known) - {span.index for span in contents.spans})
+    stated = int(contents.info["total_episodes"])
+    gone += sorted(set(range(stated)) - set(known) - {span.index for span in contents.spans})
+    if gone:
+        lost.append(f"episodes {_ranges(gone)}: no rows are left of them")
+    return Choice(contents, spans, episodes)
+
+
+def _reason(
+    contents: Contents,
+    scans: Mapping[str, CameraScan],
+    span: Span,
+    known: Episode | None,
+    located: Episode | None,
+    double: bool,
+) -> str:
+    """Why an episode cannot be kept, or nothing."""
+    if double:
+        return "its rows are there twice"
+    fault = length_fault(known, span) if known is not None else ""
+    if fault:
+        return fault
+    faults = row_faults(contents, span)
+    if faults:
+        return faults[0][1]
+    if located is None:
+        return "its video is missing or too short"
+    for camera, scan in scans.items():
+        damaged = sum(not digest for digest in scan.digests[span.start : span.stop])
+        if damaged:
+            return f"{damaged} of {span.length} frames of {camera} cannot be decoded"
+    return ""
+
+
+def _statistics(contents: Contents, scans: Mapping[str, CameraScan], number: int, episode: Episode) -> Stats:
+    """Those of numbers anew; those of cameras as they were taken before compression, where they are there."""
+    fresh = episode_statistics(contents, scans, number)
+    stored = {name: stats for name, stats in episode.stats.items() if name in contents.videos and name in fresh}
+    sound = {name: stats for name, stats in stored.items() if not differing(stats, fresh[name], LOOSE_CAMERA)}
+    depth = {name: stats for name, stats in episode.stats.items() if name in scans and name not in fresh}
+    return {**depth, **fresh, **sound}
+
+
+def _stale_files(contents: Contents) -> set[int]:
+    """Data files that no episode names although all of their episodes have metadata that name others."""
+    named = set()
+    for episode in contents.episodes:
+        try:
+            named.add(contents.data_file(episode.row))
+        except (KeyError, ValueError, TypeError):
+            continue
+    known = {episode.index for episode in contents.episodes}
+    stale = set()
+    for number, path in enumerate(contents.data_files):
+        indices = {span.index for span in contents.spans if span.file == number}
+        if path not in named and indices <= known:
+            stale.add(number)
+    return stale
+
+
+def _locate_videos(contents: Contents, spans: list[Span], known: Mapping[int, Episode]) -> dict[int, Episode]:
+    """Metadata of each episode: its own, or made from its rows and the order in which LeRobot joins videos."""
+    counts = {camera: _video_files(contents, camera) for camera in contents.videos}
+    position = {camera: [0, 0] for camera in contents.videos}
+    located: dict[int, Episode] = {}
+    for span in spans:
+        episode = known.get(span.index)
+        if episode is None:
+            row: dict[str, object] = {}
+            for camera, files in counts.items():
+                row |= _next_place(contents, camera, files, position[camera], span.length)
+            complete = all(f"videos/{camera}/from_timestamp" in row for camera in contents.videos)
+            if not complete:
+                continue
+            numbers = contents.columns["task_index"][span.start : span.stop].tolist()
+            tasks = tuple(dict.fromkeys(contents.tasks[n] for n in numbers if n in contents.tasks))
+            episode = Episode(span.index, span.length, tasks, row, {})
+        located[span.index] = episode
+        for camera, files in counts.items():
+            _advance(contents, camera, files, position[camera], episode)
+    return located
+
+
+Place = tuple[int, int, int]
+"""Chunk, file, and number of frames."""
+
+
+def _video_files(contents: Contents, camera: str) -> list[Place]:
+    found: list[Place] = []
+    for path in sorted((contents.root / "videos" / camera).glob("chunk-*/file-*.mp4")):
+        try:
+            chunk, file = int(path.parent.name.removeprefix("chunk-")), int(path.stem.removeprefix("file-"))
+            found.append((chunk, file, frame_count(path)))
+        except (ValueError, DataError):
+            continue
+    return found
+
+
+def _next_place(
+    contents: Contents, camera: str, files: list[Place], position: list[int], length: int
+) -> dict[str, object]:
+    number, frame = position
+    if number < len(files) and frame + length > files[number][2]:
+        number, frame = number + 1, 0
+    if number >= len(files) or frame + length > files[number][2]:
+        return {}
+    return {
+        f"videos/{camera}/chunk_index": files[number][0],
+        f"videos/{camera}/file_index": files[number][1],
+        f"videos/{camera}/from_timestamp": frame / contents.fps,
+        f"videos/{camera}/to_timestamp": (frame + length) / contents.fps,
+    }
+
+
+def _advance(contents: Contents, camera: str, files: list[Place], position: list[int], episode: Episode) -> None:
+    row = episode.row
+    try:
+        place = (row[f"videos/{camera}/chunk_index"], row[f"videos/{camera}/file_index"])
+        end = round(float(row[f"videos/{camera}/to_timestamp"]) * contents.fps)
+    except (KeyError, TypeError, ValueError):
+        return
+    numbers = [number for number, file in enumerate(files) if file[:2] == place]
+    if numbers:
+        position[:] = [numbers[0], end]
+
+
+def _with_episodes(contents: Contents, episodes: Mapping[int, Episode]) -> Contents:
+    return replace(contents, episodes=[episodes[index] for index in sorted(episodes)])
+
+
+def _ranges(numbers: list[int]) -> str:
+    shown = ", ".join(map(str, numbers[:8]))
+    return f"{shown} and {len(numbers) - 8} more" if len(numbers) > 8 else shown

@@ -1,0 +1,105 @@
+"""One data set as several, by episodes: for training and validation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from playslot_rl.datasets.assemble import assemble, choose
+from playslot_rl.datasets.transaction import new_folder, require_free, require_verified
+from playslot_rl.datasets.verify import Verification, require_sound
+from playslot_rl.errors import DataError
+
+
+@dataclass(frozen=True)
+class SplitResult:
+    """What `split` made.
+
+    Attributes:
+        out: folder of the parts.
+        episodes: part -> episodes of the source, ascending.
+        verifications: part -> its verification.
+    """
+
+    out: Path
+    episodes: dict[str, tuple[int, ...]]
+    verifications: dict[str, Verification]
+
+    def lines(self) -> list[str]:
+        """For people."""
+        return [
+            f"{self.out / name}: {made.episodes} episodes, {made.frames} frames, fingerprint {made.fingerprint}"
+            for name, made in self.verifications.items()
+        ]
+
+
+def split(root: str | Path, out: str | Path, fractions: Mapping[str, float], *, seed: int = 0) -> SplitResult:
+    """Deal a data set's episodes out to new data sets `out/NAME`; each episode goes to exactly one, none is lost.
+
+    Which episodes go where depends on `seed` alone; within a part they keep their order. Frames are unchanged. A kill
+    leaves no `out`.
+
+    Args:
+        root: the data set.
+        out: folder that does not exist yet.
+        fractions: name -> share, each more than 0, together 1.
+        seed: of the draw.
+
+    Raises:
+        DataError: shares that do not add up, too few episodes, or a damaged data set.
+        OutputError: `out` exists, or the disk is full.
+    """
+    target = Path(out)
+    check_fractions(fractions)
+    require_free(target)
+    contents = require_sound(root)
+    parts = draw(len(contents.spans), fractions, seed)
+    made = {}
+    with new_folder(target) as temporary:
+        for name, indices in parts.items():
+            assemble([choose(contents, indices)], temporary / name, "playslot dataset split")
+            made[name] = require_verified(temporary / name, [contents.root])
+    return SplitResult(target, {name: tuple(indices) for name, indices in parts.items()}, made)
+
+
+def check_fractions(fractions: Mapping[str, float]) -> None:
+    """Refuse shares that make no sense.
+
+    Raises:
+        DataError: a name that is no folder name, a share outside (0, 1], or a sum other than 1.
+    """
+    for name, share in fractions.items():
+        if not name.replace("-", "").replace("_", "").isalnum() or not 0 < share <= 1:
+            raise DataError(
+                f"fractions: got {name}={share:g}, expected a plain name and a share of more than 0, at most 1"
+            )
+    total = sum(fractions.values())
+    if abs(total - 1) > 1e-6:
+        raise DataError(f"fractions: got a sum of {total:g}, expected 1, as in train=0.9,val=0.1")
+
+
+def draw(episodes: int, fractions: Mapping[str, float], seed: int) -> dict[str, list[int]]:
+    """Episodes of each part, ascending: sizes by largest remainders, so that they add up.
+
+    Raises:
+        DataError: a part would be empty.
+    """
+    exact = {name: share * episodes for name, share in fractions.items()}
+    sizes = {name: int(value) for name, value in exact.items()}
+    for name in sorted(exact, key=lambda name: sizes[name] - exact[name])[: episodes - sum(sizes.values())]:
+        sizes[name] += 1
+    empty = [name for name, size in sizes.items() if not size]
+    if empty:
+        raise DataError(
+            f"fractions: got {fractions[empty[0]]:g} of {episodes} episodes for {empty[0]}, expected at least one "
+            "episode in each part; use a larger share"
+        )
+    order = np.random.default_rng(seed).permutation(episodes)
+    parts, begin = {}, 0
+    for name, size in sizes.items():
+        parts[name] = sorted(int(i) for i in order[begin : begin + size])
+        begin += size
+    return parts

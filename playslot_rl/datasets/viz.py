@@ -1,0 +1,251 @@
+"""Looking at a data set: one HTML page, or the rerun viewer.
+
+Shapes: T frames of an episode, H W frame height and width, A width of a vector.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl import keys
+from playslot_rl.datasets.contents import Array, Contents, Episode, Span
+from playslot_rl.datasets.info import info
+from playslot_rl.datasets.statistics import is_depth
+from playslot_rl.datasets.verify import require_sound
+from playslot_rl.errors import ConfigError, DataError
+
+STRIP: Final = 8
+"""Frames of the strip: the first, the last, and some between."""
+SHOWN_SIDE: Final = 128
+"""Frames are shown about this large: small ones enlarged pixel for pixel, large ones reduced."""
+ANIMATED: Final = 60
+"""At most this many frames of an animation."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """An episode as it is shown.
+
+    Attributes:
+        span: its rows.
+        episode: its metadata.
+        frames: camera -> uint8 (T, H, W, 3).
+    """
+
+    span: Span
+    episode: Episode
+    frames: dict[str, npt.NDArray[np.uint8]]
+
+
+def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 6) -> Path:
+    """Write one HTML file about a data set; styles and pictures are inside it.
+
+    Args:
+        root: the data set.
+        out: file to write, replaced if it exists; None means `ROOT.html` beside the data set, never in it.
+        episodes: episodes to show, evenly spread.
+
+    Returns:
+        The file.
+
+    Raises:
+        ConfigError: fewer than one episode.
+        DataError: the data set is damaged.
+        OutputError: the file cannot be written.
+    """
+    from playslot_rl.training.atomic import write_text
+    from playslot_rl.visualization.document import Document, Section, Text
+    from playslot_rl.visualization.html import to_html
+
+    contents = require_sound(root)
+    target = Path(out) if out is not None else contents.root.with_name(f"{contents.root.absolute().name}.html")
+    if target.resolve().is_relative_to(contents.root.resolve()):
+        raise ConfigError(f"--out: got {target} inside the data set, expected a file outside: a push would upload it")
+    chosen = spread(len(contents.spans), episodes)
+    summary = info(root)
+    about = [Text(line) for line in summary.lines()[1:] if not line.startswith(("features", "  "))]
+    sections = [Section("Data set", [*about, _feature_table(summary.features)])]
+    sections += [_episode_section(contents, clip) for clip in _clips(contents, chosen)]
+    lead = f"{summary.episodes} episodes, {summary.frames} frames at {summary.fps:g} fps; shown: {_names(chosen)}."
+    write_text(target, to_html(Document(f"Data set {contents.root.absolute().name}", lead, sections)))
+    return target
+
+
+def show_in_rerun(root: str | Path, episodes: int = 6) -> str:
+    """Open the rerun viewer on some episodes.
+
+    Returns:
+        The numbers of the episodes shown, in words.
+
+    Raises:
+        ConfigError: rerun is not installed, or fewer than one episode.
+        DataError: the data set is damaged.
+    """
+    try:
+        import rerun as rr
+    except ImportError as error:
+        raise ConfigError(
+            "--rerun: got no module rerun, expected the viewer: run `pip install rerun-sdk`, or leave --rerun out for "
+            "an HTML page"
+        ) from error
+    contents = require_sound(root)
+    chosen = spread(len(contents.spans), episodes)
+    rr.init(f"playslot dataset {contents.root.absolute().name}", spawn=True)
+    for clip in _clips(contents, chosen):
+        _log_clip(rr, contents, clip)
+    return _names(chosen)
+
+
+def _log_clip(rr: Any, contents: Contents, clip: Clip) -> None:
+    where = f"episode_{clip.span.index}"
+    for t in range(clip.span.length):
+        rr.set_time("frame_index", sequence=t)
+        rr.set_time("timestamp", duration=t / contents.fps)
+        for camera, frames in clip.frames.items():
+            rr.log(f"{where}/{camera}", rr.Image(frames[t]))
+        for name in _curves(contents):
+            rr.log(f"{where}/{name}", rr.Scalars(np.atleast_1d(contents.columns[name][clip.span.start + t])))
+
+
+def spread(total: int, wanted: int) -> list[int]:
+    """`wanted` numbers below `total`, evenly spread, the first and the last among them.
+
+    Raises:
+        ConfigError: `wanted` is less than 1.
+    """
+    if wanted < 1:
+        raise ConfigError(f"--episodes: got {wanted}, expected at least 1")
+    return sorted({int(i) for i in np.round(np.linspace(0, total - 1, min(wanted, total)))})
+
+
+def _names(chosen: Sequence[int]) -> str:
+    return ", ".join(map(str, chosen))
+
+
+def _curves(contents: Contents) -> list[str]:
+    """Features worth a curve: actions, rewards and success, else every vector of numbers."""
+    wanted = (keys.FEATURE_ACTION, keys.FEATURE_REWARD, keys.FEATURE_SUCCESS, "reward", "success")
+    return [name for name in wanted if name in contents.columns and contents.columns[name].ndim <= 2]
+
+
+def _clips(contents: Contents, chosen: Sequence[int]) -> list[Clip]:
+    cameras = [c for c in [*contents.images, *contents.videos] if not is_depth(contents.features[c])]
+    return [
+        Clip(
+            contents.spans[n], contents.episodes[n], {camera: episode_frames(contents, camera, n) for camera in cameras}
+        )
+        for n in chosen
+    ]
+
+
+def episode_frames(contents: Contents, camera: str, number: int) -> npt.NDArray[np.uint8]:
+    """Frames of one episode of a sound data set: uint8 (T, H, W, 3).
+
+    Raises:
+        DataError: one cannot be decoded.
+    """
+    span = contents.spans[number]
+    if camera in contents.videos:
+        from playslot_rl.data.video import frames_at
+
+        row = contents.episodes[number].row
+        begin = float(row[f"videos/{camera}/from_timestamp"])
+        times = [begin + i / contents.fps for i in range(span.length)]
+        return np.stack(list(frames_at(contents.video_file(camera, row), times, 0.25 / contents.fps)))
+    import pyarrow.parquet as pq
+
+    from playslot_rl.datasets.frames import decode_image
+
+    skipped = span.start - sum(contents.file_rows[: span.file])
+    column = pq.read_table(contents.data_files[span.file], columns=[camera]).column(0)
+    frames = [decode_image(contents.root, cell) for cell in column.slice(skipped, span.length).to_pylist()]
+    for frame in frames:
+        if isinstance(frame, str):
+            raise DataError(f"{contents.root}: episode {span.index}: {camera} cannot be decoded ({frame}); run verify")
+    return np.stack(frames)
+
+
+def _feature_table(features: dict[str, str]) -> Any:
+    from playslot_rl.visualization.document import Table
+
+    return Table(("feature", "type and shape"), [[f"`{name}`", kind] for name, kind in features.items()])
+
+
+def _episode_section(contents: Contents, clip: Clip) -> Any:
+    from playslot_rl.visualization.document import Section, Text
+
+    blocks: list[Any] = [Text(_caption(contents, clip))]
+    for camera, frames in clip.frames.items():
+        blocks += _camera_pictures(contents, clip, camera, frames)
+    curves = _curve_picture(contents, clip)
+    return Section(f"Episode {clip.span.index}", [*blocks, *([curves] if curves else [])])
+
+
+def _caption(contents: Contents, clip: Clip) -> str:
+    rows = slice(clip.span.start, clip.span.stop)
+    parts = [f"{clip.span.length} frames, {clip.span.length / contents.fps:.1f} s", *clip.episode.tasks]
+    seeds, solved = contents.columns.get(keys.FEATURE_SEED), contents.columns.get(keys.FEATURE_SUCCESS)
+    if seeds is not None:
+        parts.append(f"seed {int(seeds[clip.span.start])}")
+    if solved is not None:
+        first = np.flatnonzero(solved[rows])
+        parts.append(f"success at step {int(first[0]) + 1}" if len(first) else "no success")
+    return "; ".join(parts) + "."
+
+
+def _camera_pictures(contents: Contents, clip: Clip, camera: str, frames: npt.NDArray[np.uint8]) -> list[Any]:
+    from playslot_rl.visualization.animation import animation
+    from playslot_rl.visualization.document import Picture
+    from playslot_rl.visualization.grid import image_grid
+
+    step = max(1, max(frames.shape[1:3]) // SHOWN_SIDE)
+    small = frames[:, ::step, ::step]
+    scale = max(1, SHOWN_SIDE // max(small.shape[1:3]))
+    every = -(-len(small) // ANIMATED)
+    moving = [image_grid(frame[None, None], scale=scale) for frame in small[::every]]
+    still = _png(moving[0])
+    at = spread(len(small), STRIP)
+    strip = _png(image_grid(small[at][None], columns=[str(t) for t in at], scale=max(1, scale // 2)))
+    name, rate = f"episode-{clip.span.index}-{camera}", contents.fps / every
+    shown = f"{contents.fps:g} fps" if every == 1 else f"every {every}th frame"
+    alt = f"Episode {clip.span.index} from {camera}"
+    alt_strip = f"Frames {_names(at)} of episode {clip.span.index} from {camera}"
+    return [
+        Picture(name, animation(moving, rate), alt, f"`{camera}`, {shown}", still=still),
+        Picture(f"{name}-strip", strip, alt_strip, "Frames by number"),
+    ]
+
+
+def _png(picture: Any) -> bytes:
+    import io
+
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def _curve_picture(contents: Contents, clip: Clip) -> Any:
+    from playslot_rl.visualization.charts import curve_chart
+    from playslot_rl.visualization.document import Picture
+    from playslot_rl.visualization.palette import DARK, LIGHT
+
+    rows = slice(clip.span.start, clip.span.stop)
+    panels: dict[str, dict[str, Array]] = {}
+    for name in _curves(contents):
+        values = contents.columns[name][rows].astype(np.float64).reshape(clip.span.length, -1)
+        labels = contents.features[name].get("names") or []
+        labels = labels if isinstance(labels, list) and len(labels) == values.shape[1] else []
+        parts = itertools.zip_longest(labels, values.T)
+        panels[name] = {str(label or number): line for number, (label, line) in enumerate(parts)}
+    if not panels:
+        return None
+    alt = f"{', '.join(panels)} of episode {clip.span.index} over its frames"
+    light, dark = (curve_chart(panels, theme) for theme in (LIGHT, DARK))
+    return Picture(f"episode-{clip.span.index}-curves", light, alt, "By frame number", dark=dark)
