@@ -59,8 +59,12 @@ def encode(episode: Episode) -> bytes:
     return buffer.getvalue()
 
 
-def read(path: Path) -> tuple[Episode, list[bytes]]:
+def read(path: Path, decode: bool = True) -> tuple[Episode, list[bytes]]:
     """The episode in a file, and the PNGs of its frames.
+
+    Args:
+        path: the file.
+        decode: False leaves `frames` empty, (0,).
 
     Raises:
         OutputError: the file is missing or damaged.
@@ -69,13 +73,14 @@ def read(path: Path) -> tuple[Episode, list[bytes]]:
         with np.load(path, allow_pickle=False) as file:
             numbers = [int(n) for n in file["numbers"]]
             arrays = {name: file[name] for name in ARRAYS}
-            if "frames" in file.files:  # written by version 0.2
+            if "frames" in file.files:  # written by version 0.1
                 frames = file["frames"]
-                return Episode(numbers[0], numbers[1], numbers[2], frames, **arrays), [png(f) for f in frames]
-            ends = np.cumsum(file["image_sizes"]).tolist()
-            content = file["images"].tobytes()
-        images = [content[start:end] for start, end in zip([0, *ends], ends, strict=False)]
-        frames = np.stack([decode_png(image) for image in images])
+                images = [png(frame) for frame in frames]
+            else:
+                ends = np.cumsum(file["image_sizes"]).tolist()
+                content = file["images"].tobytes()
+                images = [content[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+                frames = np.stack([decode_png(i) for i in images]) if decode else np.zeros(0, np.uint8)
         return Episode(numbers[0], numbers[1], numbers[2], frames, **arrays), images
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise OutputError(

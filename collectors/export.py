@@ -5,7 +5,6 @@ A LeRobot data set is unreadable until it is finalised, so none is ever open whi
 
 from __future__ import annotations
 
-import io
 import shutil
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -17,6 +16,7 @@ import numpy.typing as npt
 
 from playslot_rl import keys
 from playslot_rl.collectors.episodes import Episode
+from playslot_rl.collectors.image_set import ImageSetWriter
 from playslot_rl.collectors.journal import Journal
 from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.data.quiet import quiet_datasets
@@ -119,23 +119,49 @@ def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str,
         video_backend="pyav",
         rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=0) if video else None,
     )
+    write = _write_video if video else _write_images
+    return write(dataset, spec, journal, metadata["task"])
+
+
+def _write_images(dataset: Any, spec: CollectionSpec, journal: Journal, task: str) -> list[dict[str, Any]]:
+    """The journal's PNGs go into the data set as they are."""
+    writer = ImageSetWriter(dataset.meta, dataset.root, task)
+    records = []
+    for index in range(spec.episodes):
+        episode, images = journal.read_with_images(index)
+        columns: dict[str, list[Any]] = {}
+        for row in rows(episode, task):
+            for name, value in row.items():
+                columns.setdefault(name, []).append(value)
+        del columns["task"], columns[keys.FEATURE_IMAGE]
+        writer.add({name: np.stack(values) for name, values in columns.items()}, episode.frames, images)
+        records.append(_outcome(episode))
+    writer.close()
+    dataset.finalize()
+    return records
+
+
+def _write_video(dataset: Any, spec: CollectionSpec, journal: Journal, task: str) -> list[dict[str, Any]]:
+    """LeRobot encodes."""
     records = []
     for index in range(spec.episodes):
         episode = journal.read(index)
-        for row in rows(episode, metadata["task"]):
+        for row in rows(episode, task):
             dataset.add_frame(row)
         dataset.save_episode()
-        solved = bool(episode.success.any())
-        records.append(
-            {
-                "seed": episode.seed,
-                "success": solved,
-                "steps_to_success": int(episode.success.argmax()) + 1 if solved else None,
-                "redrawn": episode.redrawn,
-            }
-        )
+        records.append(_outcome(episode))
     dataset.finalize()
     return records
+
+
+def _outcome(episode: Episode) -> dict[str, Any]:
+    solved = bool(episode.success.any())
+    return {
+        "seed": episode.seed,
+        "success": solved,
+        "steps_to_success": int(episode.success.argmax()) + 1 if solved else None,
+        "redrawn": episode.redrawn,
+    }
 
 
 def _check(root: Path, spec: CollectionSpec, journal: Journal) -> None:
@@ -144,44 +170,65 @@ def _check(root: Path, spec: CollectionSpec, journal: Journal) -> None:
     Raises:
         OutputError: it does not hold what was recorded.
     """
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+    meta = LeRobotDatasetMetadata(repo_id(spec), root=root)
+    got, expected = (meta.total_episodes, meta.total_frames), (spec.episodes, spec.episodes * (spec.steps + 1))
+    if got != expected:
+        raise OutputError(f"{root}: got {got} episodes and frames, expected {expected}; run the same command again")
+    if spec.storage == "image":
+        _check_images(root, spec, journal)
+    else:
+        _check_video(root, spec, journal)
+
+
+def _check_images(root: Path, spec: CollectionSpec, journal: Journal) -> None:
+    """Every row against the journal: the PNG byte for byte, and what else an episode is known by."""
+    stored = _stored_rows(root)
+    for index in range(spec.episodes):
+        episode, images = journal.read_with_images(index, decode=False)
+        for t, image in enumerate(images):
+            row = next(stored, None)
+            want = {
+                "index": index * (spec.steps + 1) + t,
+                "episode_index": index,
+                keys.FEATURE_SEED: episode.seed,
+            }
+            if row is None or row[keys.FEATURE_IMAGE]["bytes"] != image or any(row[k] != v for k, v in want.items()):
+                raise OutputError(
+                    f"{root}: got another row {t} of episode {index} than was recorded, expected the same; "
+                    "run the same command again"
+                )
+    if next(stored, None) is not None:
+        raise OutputError(f"{root}: got more rows than were recorded, expected none; run the same command again")
+
+
+def _stored_rows(root: Path) -> Iterator[dict[str, Any]]:
+    from pyarrow import parquet
+
+    columns = [keys.FEATURE_IMAGE, "index", "episode_index", keys.FEATURE_SEED]
+    for path in sorted((root / "data").rglob("*.parquet")):
+        with parquet.ParquetFile(path) as file:
+            for batch in file.iter_batches(1024, columns=columns):
+                yield from batch.to_pylist()
+
+
+def _check_video(root: Path, spec: CollectionSpec, journal: Journal) -> None:
+    """Each stored episode's last frame; decoding all of them costs more than recording did."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     dataset = LeRobotDataset(repo_id(spec), root=root, video_backend="pyav")
-    got, expected = (dataset.num_episodes, len(dataset)), (spec.episodes, spec.episodes * (spec.steps + 1))
-    if got != expected:
-        raise OutputError(f"{root}: got {got} episodes and frames, expected {expected}; run the same command again")
-    errors = _image_errors(root, spec, journal) if spec.storage == "image" else _video_errors(dataset, spec, journal)
-    limit = 0.0 if spec.storage == "image" else VIDEO_ERROR
-    for index, error in errors:
-        if error > limit:
-            raise OutputError(
-                f"{root}: got frames of episode {index} that differ from the recorded ones by {error:.1f}, "
-                f"expected at most {limit}; run the same command again"
-            )
-
-
-def _image_errors(root: Path, spec: CollectionSpec, journal: Journal) -> Iterator[tuple[int, float]]:
-    """Mean difference of each stored episode's frames, all of them: LeRobot only logs an image it could not write."""
-    import pyarrow.parquet as parquet
-    from PIL import Image
-
-    images = (
-        np.asarray(Image.open(io.BytesIO(cell["bytes"])))
-        for file in sorted((root / "data").rglob("*.parquet"))
-        for batch in parquet.ParquetFile(file).iter_batches(columns=[keys.FEATURE_IMAGE])
-        for cell in batch.column(0).to_pylist()
-    )
-    for index in range(spec.episodes):
-        stored = np.stack([next(images) for _ in range(spec.steps + 1)]).astype(np.float32)
-        yield index, float(np.abs(stored - journal.read(index).frames).mean())
-
-
-def _video_errors(dataset: Any, spec: CollectionSpec, journal: Journal) -> Iterator[tuple[int, float]]:
-    """Mean difference of each stored episode's last frame; decoding all of them costs more than recording did."""
+    if len(dataset) != spec.episodes * (spec.steps + 1):
+        raise OutputError(f"{root}: got {len(dataset)} rows, expected one a frame; run the same command again")
     for index in range(spec.episodes):
         stored = dataset[index * (spec.steps + 1) + spec.steps][keys.FEATURE_IMAGE].numpy()
         frame: npt.NDArray[Any] = np.rint(stored.transpose(1, 2, 0) * 255)
-        yield index, float(np.abs(frame - journal.read(index).frames[-1]).mean())
+        error = float(np.abs(frame - journal.read(index).frames[-1]).mean())
+        if error > VIDEO_ERROR:
+            raise OutputError(
+                f"{root}: got frames of episode {index} that differ from the recorded ones by {error:.1f}, "
+                f"expected at most {VIDEO_ERROR}; run the same command again"
+            )
 
 
 def _collection_record(spec: CollectionSpec, records: list[dict[str, Any]]) -> dict[str, Any]:

@@ -131,13 +131,13 @@ class Journal:
         """
         return self.read_with_images(index)[0]
 
-    def read_with_images(self, index: int) -> tuple[Episode, list[bytes]]:
-        """Load episode `index` and the PNGs of its frames.
+    def read_with_images(self, index: int, decode: bool = True) -> tuple[Episode, list[bytes]]:
+        """Load episode `index` and the PNGs of its frames; without `decode` its `frames` are left empty.
 
         Raises:
             OutputError: its file is missing or damaged, or holds another episode.
         """
-        episode, images = read(self.path(index))
+        episode, images = read(self.path(index), decode)
         if episode.index != index:
             raise OutputError(
                 f"{self.path(index)}: got episode {episode.index}, expected {index}; delete it and run the same "

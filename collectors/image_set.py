@@ -1,0 +1,134 @@
+"""LeRobot v3.0 data sets with stored images, written from PNGs that are there already.
+
+LeRobot's own `add_frame` and `save_episode` write each image to a file of its own, read it again for the statistics and
+a third time for the parquet file, and build a `datasets.Dataset` an episode: 77 ms for 21 frames, where recording them
+takes 90. This writer makes the same files with LeRobot's own schema, metadata and statistics in a tenth of that; a test
+holds it to LeRobot's output.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl import keys
+
+EPISODES_AT_ONCE: Final = 32
+"""Episodes in a row group."""
+
+
+class ImageSetWriter:
+    """Appends episodes to a data set that LeRobot has just created.
+
+    Args:
+        meta: LeRobot's metadata of it (`LeRobotDatasetMetadata`); one image feature, `keys.FEATURE_IMAGE`.
+        root: its folder.
+        task: of every frame.
+    """
+
+    def __init__(self, meta: Any, root: Path, task: str) -> None:
+        from lerobot.datasets.feature_utils import get_hf_features_from_features
+
+        self.meta, self.root, self.task = meta, root, task
+        self.schema = get_hf_features_from_features(meta.features).arrow_schema
+        self._columns: list[dict[str, Any]] = []
+        self._file: Any = None
+        self._chunk = self._number = self._bytes = 0
+        meta.save_episode_tasks([task])
+
+    def add(self, values: dict[str, npt.NDArray[Any]], frames: npt.NDArray[np.uint8], images: list[bytes]) -> None:
+        """Append an episode of T frames.
+
+        Args:
+            values: (T, ...) of each feature that is neither the image nor LeRobot's own index.
+            frames: uint8 (T, H, W, 3), for the statistics.
+            images: PNGs of the frames.
+        """
+        size = sum(map(len, images))
+        if self._bytes and self._bytes + size > self.meta.data_files_size_in_mb * 2**20:
+            self._next_file()
+        self._bytes += size
+        count, first, episode = len(images), self.meta.total_frames, self.meta.total_episodes
+        index = np.arange(count)
+        full = {
+            **values,
+            "timestamp": index / self.meta.fps,  # float64 for the statistics, as LeRobot does; stored as float32
+            "frame_index": index,
+            "episode_index": np.full(count, episode),
+            "index": first + index,
+            "task_index": np.full(count, self.meta.get_task_index(self.task)),
+        }
+        self._columns.append({**full, keys.FEATURE_IMAGE: images})
+        place = {
+            "data/chunk_index": self._chunk,
+            "data/file_index": self._number,
+            "dataset_from_index": first,
+            "dataset_to_index": first + count,
+        }
+        self.meta.save_episode(episode, count, [self.task], self._stats(full, frames), place)
+        if len(self._columns) >= EPISODES_AT_ONCE:
+            self._flush()
+
+    def close(self) -> None:
+        """Write what is left; the data set is readable once LeRobot has finalised its metadata too."""
+        self._flush()
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _next_file(self) -> None:
+        from lerobot.datasets.utils import update_chunk_file_indices
+
+        self.close()
+        self._chunk, self._number = update_chunk_file_indices(self._chunk, self._number, self.meta.chunks_size)
+        self._bytes = 0
+
+    def _flush(self) -> None:
+        import pyarrow
+        from pyarrow import parquet
+
+        if not self._columns:
+            return
+        arrays = [
+            pyarrow.chunked_array([_arrow(columns[field.name], field.type) for columns in self._columns])
+            for field in self.schema
+        ]
+        if self._file is None:
+            path = self.root / self.meta.data_path.format(chunk_index=self._chunk, file_index=self._number)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = parquet.ParquetWriter(path, self.schema, compression="snappy", use_dictionary=True)
+        self._file.write_table(pyarrow.table(arrays, schema=self.schema))
+        self._columns = []
+
+    def _stats(self, values: dict[str, npt.NDArray[Any]], frames: npt.NDArray[np.uint8]) -> dict[str, Any]:
+        """LeRobot's statistics of the episode, with its own sampling of the images."""
+        from lerobot.datasets.compute_stats import compute_episode_stats, get_feature_stats, sample_indices
+
+        features = self.meta.features
+        flat = {
+            name: array.reshape(len(array)) if tuple(features[name]["shape"]) == (1,) else array
+            for name, array in values.items()
+        }
+        stats: dict[str, Any] = compute_episode_stats(flat, features)
+        sampled = frames[sample_indices(len(frames))].transpose(0, 3, 1, 2)
+        image = get_feature_stats(sampled, axis=(0, 2, 3), keepdims=True)
+        stats[keys.FEATURE_IMAGE] = {
+            name: value if name == "count" else np.squeeze(value / 255.0, axis=0) for name, value in image.items()
+        }
+        return stats
+
+
+def _arrow(values: Any, kind: Any) -> Any:
+    """Arrow array of one column: images, scalars or vectors of fixed width."""
+    import pyarrow
+
+    if pyarrow.types.is_struct(kind):
+        cells = [{"bytes": image, "path": f"frame-{i:06d}.png"} for i, image in enumerate(values)]
+        return pyarrow.array(cells, type=kind)
+    if pyarrow.types.is_fixed_size_list(kind):
+        flat = pyarrow.array(np.ascontiguousarray(values).reshape(-1), type=kind.value_type)
+        return pyarrow.FixedSizeListArray.from_arrays(flat, type=kind)
+    return pyarrow.array(np.asarray(values, kind.to_pandas_dtype()).reshape(-1), type=kind)

@@ -1,0 +1,166 @@
+"""Workers on a Ray cluster: TorchRL's `RayCollector`, whose remote collectors are asked for one episode at a time.
+
+The cluster's machines need this package (the same version, since episodes are functions of seed and code) and a GL
+backend; no shared disk: episodes come back encoded, and this process stores them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import warnings
+from typing import Any
+
+from playslot_rl.collectors.encoding import encode
+from playslot_rl.collectors.episodes import EpisodeCollector, Job, TaskMaker, collector_settings
+from playslot_rl.collectors.journal import Journal
+from playslot_rl.collectors.policies import make_policy
+from playslot_rl.collectors.workers import Report
+from playslot_rl.errors import ConfigError, PlaySlotError
+
+
+class RemoteEpisodeCollector(EpisodeCollector):
+    """The collector in a Ray actor."""
+
+    def record_encoded(self, job: Job) -> tuple[int, bytes]:
+        """Index and encoded content of one episode (see `EpisodeCollector.record`)."""
+        import torch
+
+        torch.set_num_threads(1)
+        return job.index, encode(self.record(job))
+
+
+class RayWorkers:
+    """Actors of a Ray cluster, one core each.
+
+    Args:
+        journal: where this process stores their episodes.
+        count: how many.
+        address: of the cluster; empty means `$RAY_ADDRESS`, or a cluster of this machine alone.
+
+    Raises:
+        ConfigError: Ray is not installed.
+        PlaySlotError: the cluster cannot be reached.
+    """
+
+    def __init__(self, journal: Journal, count: int, address: str = "") -> None:
+        if importlib.util.find_spec("ray") is None:
+            raise ConfigError(
+                "collector.backend=ray: got no ray package, expected ray 2.60; pip install 'playslot_rl[ray]', "
+                "or use collector.backend=local"
+            )
+        self.journal = journal
+        self._tasks: dict[Any, int] = {}
+        self._actors: list[Any] = [None] * count
+        self._pool = _connect(journal, count, address)
+
+    def start(self, slot: int) -> None:
+        """See `playslot_rl.collectors.workers.Workers`."""
+        spec = self.journal.spec
+        self._pool.add_collectors(
+            [TaskMaker(spec)], 1, make_policy(spec.policy, spec.noise), [_inner_settings(self.journal)], [_resources()]
+        )
+        self._actors[slot] = self._pool.remote_collectors[-1]
+
+    def submit(self, slot: int, job: Job) -> None:
+        """See `playslot_rl.collectors.workers.Workers`."""
+        self._tasks[self._actors[slot].record_encoded.remote(job)] = slot
+
+    def reports(self, timeout: float) -> list[Report]:
+        """See `playslot_rl.collectors.workers.Workers`."""
+        import ray
+
+        waiting = list(self._tasks)
+        ready, _ = ray.wait(waiting, num_returns=len(waiting), timeout=0)
+        if not ready:
+            ready, _ = ray.wait(waiting, num_returns=1, timeout=timeout)
+        return [self._read(task) for task in ready if task in self._tasks]
+
+    def _read(self, task: Any) -> Report:
+        import ray
+
+        slot = self._tasks.pop(task)
+        try:
+            index, content = ray.get(task)
+        except ray.exceptions.ActorDiedError as error:
+            text = str(error)
+            if "ModuleNotFoundError" in text or "creation task" in text:
+                return Report(slot, error=PlaySlotError(_cannot_start(text)))
+            self.kill(slot)
+            return Report(slot, reason="on Ray died")
+        except ray.exceptions.RayTaskError as error:
+            cause = error.cause
+            if isinstance(cause, PlaySlotError):
+                return Report(slot, error=cause)
+            return Report(slot, error=RuntimeError(f"{type(cause).__name__}: {cause}"))
+        except ray.exceptions.RayError as error:
+            self.kill(slot)
+            return Report(slot, reason=f"on Ray was lost ({type(error).__name__})")
+        self.journal.add_encoded(index, content)
+        return Report(slot, index=index)
+
+    def kill(self, slot: int) -> None:
+        """See `playslot_rl.collectors.workers.Workers`."""
+        import ray
+
+        actor, self._actors[slot] = self._actors[slot], None
+        self._tasks = {task: owner for task, owner in self._tasks.items() if owner != slot}
+        if actor is not None:
+            self._pool.remote_collectors.remove(actor)
+            with contextlib.suppress(ray.exceptions.RayError):
+                ray.kill(actor)
+
+    def close(self) -> None:
+        """End the actors, and Ray too if it was started here."""
+        self._tasks = {}
+        self._pool.shutdown()
+
+
+def _connect(journal: Journal, count: int, address: str) -> Any:
+    """TorchRL's Ray collector, without actors yet."""
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray announces a change of its own
+    from torchrl.collectors.distributed import RayCollector
+
+    alone = not (address or os.environ.get("RAY_ADDRESS"))
+    init: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "logging_level": "error"}
+    init |= {"address": "local", "num_cpus": count} if alone else {"address": address or None}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of weight updates: these policies have no weights
+            return RayCollector(
+                [],
+                make_policy(journal.spec.policy, journal.spec.noise),
+                collector_class=RemoteEpisodeCollector,
+                frames_per_batch=journal.spec.steps,
+                collector_kwargs=[],
+                remote_configs=[],
+                ray_init_config=init,
+                weight_sync_schemes={},
+            )
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        text, where = " ".join(str(error).split()), address or os.environ.get("RAY_ADDRESS", "")
+        raise PlaySlotError(
+            f"collector.backend=ray: got {text}, expected a cluster at {where!r}; "
+            "check collector.ray_address, or leave it out to use this machine alone"
+        ) from error
+
+
+def _resources() -> dict[str, Any]:
+    """What an actor takes of the cluster. `max_restarts` 0: we start another one and know its episodes."""
+    return {"num_cpus": 1, "max_restarts": 0}
+
+
+def _inner_settings(journal: Journal) -> dict[str, Any]:
+    """Settings of a remote collector; TorchRL itself gives it the number of frames."""
+    settings = collector_settings(journal.spec)
+    del settings["total_frames"]
+    return settings
+
+
+def _cannot_start(text: str) -> str:
+    last = next((line for line in reversed(text.splitlines()) if line.strip()), "no reason given")
+    return (
+        f"collector.backend=ray: a worker could not start, got {last.strip()}, expected playslot_rl of this version "
+        "and a GL backend on every machine of the cluster; install them there"
+    )
