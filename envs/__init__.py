@@ -22,6 +22,9 @@ ENVIRONMENTS: dict[str, tuple[str, str]] = {
 PROCEDURAL = ("grid_shapes",)
 """Environments that are drawn, not simulated: they give videos, there is nothing to act on and no success."""
 
+RECORDED = ("sketchy",)
+"""Names of data sets recorded on real robots: settings for training on them."""
+
 
 class TaskEnv(Protocol):
     """What the collectors and the evaluation need of an environment, beyond Gymnasium's own interface."""
@@ -101,4 +104,14 @@ def make_torchrl_env(env: EnvConfig | None = None, render: RenderConfig | None =
     return make(env or EnvConfig(), render or RenderConfig())
 
 
-__all__ = ["ENVIRONMENTS", "PROCEDURAL", "TaskEnv", "gym_id", "make_env", "make_torchrl_env", "register", "task_env"]
+__all__ = [
+    "ENVIRONMENTS",
+    "PROCEDURAL",
+    "RECORDED",
+    "TaskEnv",
+    "gym_id",
+    "make_env",
+    "make_torchrl_env",
+    "register",
+    "task_env",
+]

@@ -41,6 +41,16 @@ COMMANDS: Final[dict[str, Command]] = {
         (
             "playslot collect policy=random episodes=400 out=data/random",
             "playslot collect policy=expert episodes=150 seed=5 workers=2 out=data/expert",
+            "playslot collect env=grid_shapes episodes=1000 out=data/shapes",
+        ),
+    ),
+    "convert": Command(
+        "turn Sketchy, as published, into LeRobot v3.0 data sets",
+        "Reads the human demonstrations of an extracted Sketchy download (data.root) and writes OUT/train and OUT/eval "
+        "with the paper's split, cameras and frame size. An error or a kill leaves no OUT.",
+        (
+            "playslot convert env=sketchy data.root=downloads/sketchy out=data/sketchy",
+            "playslot convert env=sketchy data.root=downloads/sketchy data.camera=front_left episodes=10 out=data/few",
         ),
     ),
     "train-slots": Command(
@@ -68,10 +78,12 @@ COMMANDS: Final[dict[str, Command]] = {
     "evaluate": Command(
         "success rate in simulation (closed loop) or in imagination (open loop)",
         "Evaluates a fixed list of held-out seeds, one episode each, and writes "
-        "RUN/evaluation/PROTOCOL/eval_info.json.",
+        "RUN/evaluation/PROTOCOL/eval_info.json. A run on GridShapes has no policy: its slot masks and latent actions "
+        "are scored against the known objects and moves.",
         (
             "playslot evaluate run=runs/mine protocol=simulation episodes=50",
             "playslot evaluate run=runs/mine protocol=imagination episodes=50 seed=3",
+            "playslot evaluate run=runs/shapes episodes=100",
         ),
     ),
     "pipeline": Command(

@@ -62,17 +62,50 @@ class GridConfig:
 
 
 @dataclass(frozen=True)
+class BlocksConfig:
+    """The blocks family, read by `env=block_push`, `block_push_easy`, `block_reach` and `block_pick` only.
+
+    Attributes:
+        task: which object: `red`, `reddest` (nearest to red by CIEDE2000), `odd` (all others share another colour) or
+            `odd_groups` (the others form groups of a colour).
+        distractors: other objects, 0 to 4.
+        distractors_to: where given, each episode draws their number from `distractors` to this.
+        colour: colour of the odd object (a name in `playslot_rl.envs.colours`); empty draws it for each episode.
+        reward: `dense` or `sparse`.
+    """
+
+    task: Literal["red", "reddest", "odd", "odd_groups"] = "odd"
+    distractors: int = 3
+    distractors_to: int | None = None
+    colour: str = ""
+    reward: Literal["dense", "sparse"] = "dense"
+
+    def __post_init__(self) -> None:
+        _check(0 <= self.distractors <= 4, "env.blocks.distractors", self.distractors, "0 to 4")
+        last = self.distractors if self.distractors_to is None else self.distractors_to
+        limits = f"{self.distractors} (env.blocks.distractors) to 4, or null"
+        _check(self.distractors <= last <= 4, "env.blocks.distractors_to", last, limits)
+        if self.colour:
+            from playslot_rl.envs.colours import COLOURS
+
+            _check(self.colour in COLOURS, "env.blocks.colour", self.colour, f"one of {', '.join(COLOURS)}")
+            odd = self.task in ("odd", "odd_groups")
+            _check(odd, "env.blocks.colour", self.colour, f"no colour with env.blocks.task={self.task}")
+
+
+@dataclass(frozen=True)
 class EnvConfig:
     """The task.
 
     Attributes:
-        name: environment name (`button_press`, `grid_shapes`).
+        name: environment name (`button_press`, `block_push`, `grid_shapes`, ...).
         image_size: side of the square frames, pixels.
         action_dim: width A of the real action.
         frame_skip: environment steps per agent step, all with the same action.
         max_steps: agent steps in an episode.
         warmup_steps: random agent steps after each reset, before the first observation.
         grid: settings of `grid_shapes`.
+        blocks: settings of the `block_*` environments.
     """
 
     name: str = "button_press"
@@ -82,6 +115,7 @@ class EnvConfig:
     max_steps: int = 20
     warmup_steps: int = 12
     grid: GridConfig = field(default_factory=GridConfig)
+    blocks: BlocksConfig = field(default_factory=BlocksConfig)
 
     def __post_init__(self) -> None:
         _check(self.image_size in (32, 64, 128), "env.image_size", self.image_size, "32, 64 or 128")
@@ -96,7 +130,7 @@ class DataConfig:
     Attributes:
         root: LeRobot v3.0 data set(s) of unlabelled videos; several are separated by commas.
         demos: data set of demonstrations; empty means `root`.
-        camera: image feature to read; empty means the only one.
+        camera: image feature(s) to read, separated by commas; empty means the only one.
         resize: resize frames of another size than `env.image_size` (area averaging) instead of refusing them.
         cache: folder of the frame and slot caches; empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
         validation: fraction of episodes held out from training.

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from playslot_rl.config import DataConfig, ExperimentConfig
-from playslot_rl.envs import PROCEDURAL
+from playslot_rl.envs import PROCEDURAL, gym_id
 from playslot_rl.recipes import evaluate, train_dynamics, train_policy, train_slots
 from playslot_rl.recipes.run import open_run, store_config
 
@@ -19,13 +19,15 @@ def main(config: ExperimentConfig) -> None:
     (GridShapes) there are neither demonstrations nor a policy, and slots and latent actions are scored instead.
     """
     began = time.monotonic()
+    behaves = config.env.name not in PROCEDURAL
+    if behaves:
+        gym_id(config.env.name)  # refused now, not after hours of training
     name = config.out or config.run or f"runs/{config.env.name}_{config.preset}"
     config = replace(config, out=name, run="")
     folder = open_run(config)
     if not (folder / "config.json").is_file():  # a stage stores it anew once it finds that it fits
         store_config(config, folder)
     config = replace(config, data=_collect(config, folder))
-    behaves = config.env.name not in PROCEDURAL
     for stage in (train_slots, train_dynamics, *([train_policy] if behaves else [])):
         since = time.monotonic()
         stage.main(config)

@@ -176,14 +176,17 @@ def open_sources(
 ) -> EpisodeFrames:
     """Open one or several data sets as one; `roots` is a list, or a string with commas.
 
-    Labels that not every data set has are dropped. The frames must have one size.
+    With several cameras (commas in `camera`) each episode comes once for each of them. Labels that not every data set
+    has are dropped. The frames must have one size.
 
     Raises:
         DataError: as `open_source`, or the frame sizes differ.
     """
     names = [name.strip() for name in roots.split(",")] if isinstance(roots, str) else list(roots)
-    names = [name for name in names if str(name)] or [""]
-    sources = [open_source(root, camera, cache, image_size=image_size, resize=resize) for root in names]
+    cameras = [name.strip() for name in camera.split(",")]
+    pairs = [(name, one) for name in ([name for name in names if str(name)] or [""]) for one in cameras]
+    names = [name for name, _ in pairs]
+    sources = [open_source(root, one, cache, image_size=image_size, resize=resize) for root, one in pairs]
     if len(sources) == 1:
         return sources[0]
     for name, source in zip(names, sources, strict=True):

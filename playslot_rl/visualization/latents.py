@@ -45,10 +45,10 @@ def data_roots(given: ReportInput) -> list[Path]:
 def read_latents(model: WorldModel, root: Path, given: ReportInput, most_episodes: int = 200) -> LatentData:
     """Latent actions of up to `most_episodes` episodes of a data set, with the probe where it has actions."""
     from playslot_rl.data.slot_cache import slot_cache
-    from playslot_rl.data.source import open_source
+    from playslot_rl.data.source import open_sources
 
     data = given.config.data
-    source = open_source(root, camera=data.camera, cache=data.cache)
+    source = open_sources([root], camera=data.camera, cache=data.cache)
     prints = str(given.metas.get("slots", {}).get("fingerprint", ""))
     slots = slot_cache(source, model.savi, prints, data.cache, module_device(model))
     starts, lengths = source.starts[:most_episodes], source.lengths[:most_episodes]
