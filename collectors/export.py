@@ -5,6 +5,7 @@ A LeRobot data set is unreadable until it is finalised, so none is ever open whi
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -24,7 +25,7 @@ from playslot_rl.errors import OutputError
 from playslot_rl.training.atomic import explain_write_errors, replace_dir, write_json
 
 META_NAME = "meta/playslot.json"
-PACKAGES = ("metaworld", "mujoco", "gymnasium", "torchrl", "lerobot", "playslot_rl")
+PACKAGES = ("metaworld", "gymnasium-robotics", "mujoco", "gymnasium", "torchrl", "lerobot", "playslot_rl")
 VIDEO_ERROR = 2.0
 """Mean difference [0, 255] that h264 in yuv444p may make."""
 FREE_BYTES = 16 * 2**20
@@ -98,7 +99,8 @@ def env_metadata(spec: CollectionSpec) -> dict[str, Any]:
     register()
     entry_point = gymnasium.spec(gym_id(spec.env.name)).entry_point
     creator: Any = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
-    metadata: dict[str, Any] = creator.metadata
+    describe = getattr(creator, "metadata_of", None)  # a family of tasks says what is to be done in each
+    metadata: dict[str, Any] = creator.metadata if describe is None else describe(spec.env)
     return metadata
 
 
@@ -120,23 +122,27 @@ def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str,
         rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=0) if video else None,
     )
     write = _write_video if video else _write_images
-    return write(dataset, spec, journal, metadata["task"])
+    try:
+        return write(dataset, spec, journal, metadata["task"])
+    except BaseException:
+        # LeRobot's destructors would finish the files later, in a folder that has been removed or made anew.
+        dataset.writer._finalized = dataset.meta._finalized = True
+        raise
 
 
 def _write_images(dataset: Any, spec: CollectionSpec, journal: Journal, task: str) -> list[dict[str, Any]]:
     """The journal's PNGs go into the data set as they are."""
-    writer = ImageSetWriter(dataset.meta, dataset.root, task)
     records = []
-    for index in range(spec.episodes):
-        episode, images = journal.read_with_images(index)
-        columns: dict[str, list[Any]] = {}
-        for row in rows(episode, task):
-            for name, value in row.items():
-                columns.setdefault(name, []).append(value)
-        del columns["task"], columns[keys.FEATURE_IMAGE]
-        writer.add({name: np.stack(values) for name, values in columns.items()}, episode.frames, images)
-        records.append(_outcome(episode))
-    writer.close()
+    with contextlib.closing(ImageSetWriter(dataset.meta, dataset.root, task)) as writer:
+        for index in range(spec.episodes):
+            episode, images = journal.read_with_images(index)
+            columns: dict[str, list[Any]] = {}
+            for row in rows(episode, task):
+                for name, value in row.items():
+                    columns.setdefault(name, []).append(value)
+            del columns["task"], columns[keys.FEATURE_IMAGE]
+            writer.add({name: np.stack(values) for name, values in columns.items()}, episode.frames, images)
+            records.append(_outcome(episode))
     dataset.finalize()
     return records
 

@@ -16,8 +16,12 @@ if TYPE_CHECKING:
 
 ENVIRONMENTS: dict[str, tuple[str, str]] = {
     "button_press": ("PlaySlot/ButtonPress-v0", "playslot_rl.envs.button_press:ButtonPressEnv"),
+    "block_push": ("PlaySlot/BlockPush-v0", "playslot_rl.envs.block_push:BlockPushEnv"),
+    "block_push_easy": ("PlaySlot/BlockPushEasy-v0", "playslot_rl.envs.block_push:BlockPushEnv"),
+    "block_reach": ("PlaySlot/BlockReach-v0", "playslot_rl.envs.block_push:BlockReachEnv"),
+    "block_pick": ("PlaySlot/BlockPick-v0", "playslot_rl.envs.block_push:BlockPickEnv"),
 }
-"""Name in the configuration -> Gymnasium id and entry point."""
+"""Name in the configuration -> Gymnasium id and entry point; `block_ids.py` has more ids of the blocks family."""
 
 PROCEDURAL = ("grid_shapes",)
 """Environments that are drawn, not simulated: they give videos, there is nothing to act on and no success."""
@@ -49,9 +53,13 @@ def register() -> None:
     from gymnasium.envs.registration import register as gym_register
     from gymnasium.envs.registration import registry
 
-    for gym_id, entry_point in ENVIRONMENTS.values():
-        if gym_id not in registry:
-            gym_register(id=gym_id, entry_point=entry_point, order_enforce=False, disable_env_checker=True)
+    from playslot_rl.envs.block_ids import family
+
+    wanted: dict[str, tuple[str, dict[str, Any]]] = {name: (entry, {}) for name, entry in ENVIRONMENTS.values()}
+    wanted.update({name: (entry, {"env": config}) for name, (entry, config) in family().items()})
+    for name, (entry, kwargs) in wanted.items():
+        if name not in registry:
+            gym_register(id=name, entry_point=entry, order_enforce=False, disable_env_checker=True, kwargs=kwargs)
 
 
 def gym_id(name: str) -> str:

@@ -45,6 +45,23 @@ class Camera:
     lookat: tuple[float, float, float]
 
 
+@dataclass(frozen=True)
+class FixedCamera:
+    """A camera of the model.
+
+    Attributes:
+        name: its name in the model.
+        position: metres.
+        euler: radians about x, y, z, each turning the next one's axes; a camera looks along its own -z.
+        fovy: vertical field of view, degrees.
+    """
+
+    name: str
+    position: tuple[float, float, float]
+    euler: tuple[float, float, float]
+    fovy: float
+
+
 def import_mujoco() -> Any:
     """Import mujoco with a GL backend that works without a display.
 
@@ -110,12 +127,24 @@ def box_mean(frame: npt.NDArray[np.uint8], factor: int) -> npt.NDArray[np.uint8]
     return mean
 
 
+def _view(mj: Any, model: mujoco.MjModel, camera: Camera | FixedCamera) -> Any:
+    view = mj.MjvCamera()
+    if isinstance(camera, FixedCamera):
+        view.type = mj.mjtCamera.mjCAMERA_FIXED
+        view.fixedcamid = model.camera(camera.name).id
+        return view
+    view.type = mj.mjtCamera.mjCAMERA_FREE
+    view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
+    view.lookat[:] = camera.lookat
+    return view
+
+
 class FrameRenderer:
     """Draws the scene of one MuJoCo model.
 
     Args:
         model: the model; its off-screen buffer size and, for `fast`, its sample count are changed.
-        camera: the viewpoint.
+        camera: the viewpoint; a fixed one must be in the model, at rest in the world.
         size: side of the frames, pixels.
         config: quality and supersampling.
 
@@ -123,7 +152,7 @@ class FrameRenderer:
         RenderError: there is no working GL backend.
     """
 
-    def __init__(self, model: mujoco.MjModel, camera: Camera, size: int, config: RenderConfig) -> None:
+    def __init__(self, model: mujoco.MjModel, camera: Camera | FixedCamera, size: int, config: RenderConfig) -> None:
         mj = import_mujoco()
         fast = config.quality == "fast"
         self.size = size
@@ -141,15 +170,12 @@ class FrameRenderer:
         if fast:
             for flag in (mj.mjtRndFlag.mjRND_SHADOW, mj.mjtRndFlag.mjRND_REFLECTION):
                 self._renderer.scene.flags[flag] = 0
-        self._camera = mj.MjvCamera()
-        self._camera.type = mj.mjtCamera.mjCAMERA_FREE
-        self._camera.distance = camera.distance
-        self._camera.azimuth = camera.azimuth
-        self._camera.elevation = camera.elevation
-        self._camera.lookat[:] = camera.lookat
+        self._camera = _view(mj, model, camera)
         self._culler: FrustumCuller | None = None
         if fast:
-            self._renderer.update_scene(mj.MjData(model), self._camera)
+            data = mj.MjData(model)
+            mj.mj_forward(model, data)
+            self._renderer.update_scene(data, self._camera)
             self._culler = FrustumCuller(model, self._renderer.scene)
 
     def __call__(self, data: mujoco.MjData) -> npt.NDArray[np.uint8]:

@@ -121,6 +121,8 @@ class EnvConfig:
         _check(self.image_size in (32, 64, 128), "env.image_size", self.image_size, "32, 64 or 128")
         _check(self.frame_skip >= 1, "env.frame_skip", self.frame_skip, "at least 1")
         _check(self.max_steps >= 2, "env.max_steps", self.max_steps, "at least 2")
+        used = self.name.startswith("block_") or self.blocks == BlocksConfig()
+        _check(used, "env.blocks", self.blocks, f"no changes with env.name={self.name}, which has no blocks")
 
 
 @dataclass(frozen=True)

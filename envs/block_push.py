@@ -1,0 +1,229 @@
+"""The blocks family: a Fetch arm that reaches for spheres, pushes cubes or picks them up.
+
+`BlockPush` is Push with the task `odd` and three distractors. Written anew after the multi-object-fetch tasks, on
+gymnasium-robotics' `MujocoFetchEnv`; see docs/environments.md.
+
+Shapes: A = 4, S = 4, H = W = `EnvConfig.image_size`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Final, cast
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
+from playslot_rl.envs.block_experts import EXPERTS, Scene
+from playslot_rl.envs.block_ids import block_config
+from playslot_rl.envs.block_layout import Layout, Variant, draw_layout
+from playslot_rl.envs.block_scene import CAMERA
+from playslot_rl.envs.rendering import FrameRenderer, import_mujoco
+from playslot_rl.errors import ConfigError
+
+ACTION_DIM: Final = 4
+STATE_DIM: Final = 4
+SUCCESS: Final = 0.05
+"""Distance in metres, in space, under which the task is solved."""
+SENTENCES: Final[dict[Variant, str]] = {
+    "push": "Push the {} cube onto the red sphere.",
+    "reach": "Reach for the {} sphere.",
+    "pick": "Lift the {} cube to the red sphere.",
+}
+WHICH: Final = {"red": "red", "reddest": "reddest", "odd": "odd", "odd_groups": "odd"}
+
+Observation = dict[str, npt.NDArray[Any]]
+
+
+class BlockEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
+    """One task of the blocks family; `BlockPushEnv`, `BlockReachEnv` and `BlockPickEnv` say what is to be done.
+
+    Observations are `pixels`, uint8 [0, 255] (H, W, 3), and `state`, float32 (4,): grip xyz and the gripper's opening,
+    in metres. Actions are float32 (4,) in [-1, 1]: grip displacement xyz in units of 0.05 m, and (Pick only) gripper
+    effort, negative closes. One agent step is `frame_skip` environment steps (25 Hz) of the same action; its reward is
+    their mean, and `info["success"]` says whether any of them solved the task. Success does not terminate: clips have a
+    fixed length, `max_steps`.
+
+    Dense reward of an environment step, in (0, 1], with the distance d from the object to its goal and the distance g
+    from the grip to the object: 0.9 exp(-20 d) + 0.1 exp(-10 g); for Reach, where the grip itself is the object,
+    0.9 exp(-20 d) + 0.1 exp(-10 d). Sparse: 0 if solved, else -1.
+
+    An episode is a function of its seed alone: layout and `warmup_steps` random agent steps before the first
+    observation come from two independent streams of that seed.
+
+    Args:
+        env: the task; None means three distractors, `odd`, 25 agent steps of two environment steps.
+        render: how frames are drawn; None means the defaults.
+        render_mode: `rgb_array` or None.
+
+    Attributes:
+        draw_steps: False makes `step` return the last frame that was drawn instead of a new one, for controllers that
+            do not look at it. `reset` always draws, unless `draw_resets` is False.
+        layout: the present episode's layout.
+
+    Raises:
+        ConfigError: `env.action_dim` is not 4.
+        RenderError: there is no working GL backend.
+    """
+
+    variant: ClassVar[Variant]
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it so)
+        "render_modes": ["rgb_array"],
+        "render_fps": 12,
+        "control_hz": 25,
+        "task": "",
+    }
+    """`control_hz` counts environment steps: an agent step of `frame_skip` of them takes `frame_skip / 25` seconds."""
+
+    layout: Layout
+
+    @classmethod
+    def metadata_of(cls, config: EnvConfig) -> dict[str, Any]:
+        """Gymnasium's metadata with the sentence that says what is to be done."""
+        return {**cls.metadata, "task": SENTENCES[cls.variant].format(WHICH[config.blocks.task])}
+
+    def __init__(
+        self,
+        env: EnvConfig | None = None,
+        render: RenderConfig | None = None,
+        render_mode: str | None = "rgb_array",
+    ) -> None:
+        self.config = env or block_config(f"block_{self.variant}", BlocksConfig())
+        if self.config.action_dim != ACTION_DIM:
+            raise ConfigError(f"env.action_dim: got {self.config.action_dim}, expected {ACTION_DIM} for the blocks")
+        self.metadata = self.metadata_of(self.config)
+        import_mujoco()
+        from playslot_rl.envs.block_simulation import BlockSimulation
+
+        blocks = self.config.blocks
+        most = blocks.distractors if blocks.distractors_to is None else blocks.distractors_to
+        self._simulation = BlockSimulation(self.variant, 1 + most)
+        size = self.config.image_size
+        self._renderer = FrameRenderer(self._simulation.model, CAMERA, size, render or RenderConfig())
+        self.render_mode = render_mode
+        space = gym.spaces.Dict(
+            {
+                "pixels": gym.spaces.Box(0, 255, (size, size, 3), np.uint8),
+                "state": gym.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32),
+            }
+        )
+        self.observation_space = cast(gym.Space[Observation], space)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+        self._frame: npt.NDArray[np.uint8] | None = None
+        self._steps = 0
+        self.draw_steps = self.draw_resets = True
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: the episode's seed; None draws the next one from the environment's generator.
+            options: unused.
+
+        Returns:
+            The first observation and `{"success": bool}`: True for an episode that starts solved, which only random
+            warm-up steps can make.
+        """
+        del options
+        super().reset(seed=seed)
+        episode = int(self.np_random.integers(2**31)) if seed is None else seed
+        layout, warmup = (np.random.default_rng(s) for s in np.random.SeedSequence(episode).spawn(2))
+        self.layout = draw_layout(layout, self.variant, self.config.blocks, self._simulation.start_grip)
+        self._simulation.place(self.layout)
+        for _ in range(self.config.warmup_steps):
+            self._simulate(warmup.uniform(-1.0, 1.0, ACTION_DIM).astype(np.float32))
+        self._steps = 0
+        return self._observe(self.draw_resets), {"success": self.distance < SUCCESS}
+
+    def _simulate(self, action: npt.NDArray[np.float32]) -> tuple[float, bool]:
+        reward, success = 0.0, False
+        for _ in range(self.config.frame_skip):
+            self._simulation.advance(action)
+            reward += self._reward()
+            success |= self.distance < SUCCESS
+        return reward / self.config.frame_skip, success
+
+    def _reward(self) -> float:
+        d = self.distance
+        if self.config.blocks.reward == "sparse":
+            return 0.0 if d < SUCCESS else -1.0
+        scene = self.scene
+        g = float(np.linalg.norm(scene.object - scene.grip))
+        return float(0.9 * np.exp(-20.0 * d) + 0.1 * np.exp(-10.0 * g))
+
+    @property
+    def distance(self) -> float:
+        """Metres from the object (Reach: the grip) to the goal, in space."""
+        scene = self.scene
+        moved = scene.grip if self.variant == "reach" else scene.object
+        return float(np.linalg.norm(moved - scene.goal))
+
+    @property
+    def scene(self) -> Scene:
+        """Where things are now."""
+        simulation, layout = self._simulation, self.layout
+        places = layout.places if self.variant == "reach" else simulation.cubes(len(layout.places))
+        return Scene(simulation.grip, simulation.opening, places, layout.target, layout.goal)
+
+    def step(self, action: npt.NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One agent step.
+
+        Args:
+            action: float (4,), clipped to [-1, 1].
+
+        Raises:
+            ValueError: an action of another shape, or not finite.
+        """
+        action = np.asarray(action, np.float32)
+        if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
+            raise ValueError(f"action: got {action!r}, expected {ACTION_DIM} finite numbers in [-1, 1]")
+        reward, success = self._simulate(np.clip(action, -1.0, 1.0))
+        self._steps += 1
+        return self._observe(self.draw_steps), reward, False, self._steps >= self.config.max_steps, {"success": success}
+
+    def expert_action(self) -> npt.NDArray[np.float32]:
+        """Action of the scripted expert for the present state: float32 (4,) in [-1, 1]."""
+        return EXPERTS[self.variant](self.scene)
+
+    def _observe(self, draw: bool = True) -> Observation:
+        if draw or self._frame is None:
+            self._frame = self.draw()
+        state = np.array([*self._simulation.grip, self._simulation.opening], np.float32)
+        return {"pixels": self._frame, "state": state}
+
+    def draw(self) -> npt.NDArray[np.uint8]:
+        """Draw the present state anew: uint8 (H, W, 3). `render` returns the frame that was last observed."""
+        return self._renderer(self._simulation.data)
+
+    def render(self) -> npt.NDArray[np.uint8] | None:
+        """The present frame, uint8 (H, W, 3); None without a render mode or before the first reset."""
+        if self.render_mode is None or self._frame is None:
+            return None
+        return self._frame.copy()
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self._renderer.close()
+        self._simulation.close()
+
+
+class BlockPushEnv(BlockEnv):
+    """Push the cube that the task means onto the red sphere. The gripper is closed and locked."""
+
+    variant = "push"
+
+
+class BlockReachEnv(BlockEnv):
+    """Move the gripper to the sphere that the task means. The gripper is closed and locked."""
+
+    variant = "reach"
+
+
+class BlockPickEnv(BlockEnv):
+    """Lift the cube that the task means to the red sphere in the air."""
+
+    variant = "pick"
