@@ -74,10 +74,12 @@ class ImageSetWriter:
 
     def close(self) -> None:
         """Write what is left; the data set is readable once LeRobot has finalised its metadata too."""
-        self._flush()
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        try:
+            self._flush()
+        finally:
+            file, self._file = self._file, None
+            if file is not None:
+                file.close()
 
     def _next_file(self) -> None:
         from lerobot.datasets.utils import update_chunk_file_indices

@@ -88,7 +88,7 @@ class RayWorkers:
             if "ModuleNotFoundError" in text or "creation task" in text:
                 return Report(slot, error=PlaySlotError(_cannot_start(text)))
             self.kill(slot)
-            return Report(slot, reason="on Ray died")
+            return Report(slot, dead="on Ray died")
         except ray.exceptions.RayTaskError as error:
             cause = error.cause
             if isinstance(cause, PlaySlotError):
@@ -96,7 +96,7 @@ class RayWorkers:
             return Report(slot, error=RuntimeError(f"{type(cause).__name__}: {cause}"))
         except ray.exceptions.RayError as error:
             self.kill(slot)
-            return Report(slot, reason=f"on Ray was lost ({type(error).__name__})")
+            return Report(slot, dead=f"on Ray was lost ({type(error).__name__})")
         self.journal.add_encoded(index, content)
         return Report(slot, index=index)
 

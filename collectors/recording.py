@@ -18,6 +18,8 @@ from playslot_rl.errors import PlaySlotError
 AHEAD = 2
 """Episodes in a worker's hands: while it records one, the next is there already."""
 POLL_S = 1.0
+START_S = 300.0
+"""What a worker is given to import everything, beyond `collector.timeout_s`."""
 
 
 def record_into(
@@ -85,6 +87,7 @@ class _Dispatch:
         self.waiting = deque(sorted(set(indices)))
         self.in_hand: list[list[int]] = [[] for _ in range(workers)]
         self.silent_s = [0.0] * workers
+        self.started = [False] * workers
         self.replaced = 0
 
     def run(self) -> Iterator[int]:
@@ -116,18 +119,19 @@ class _Dispatch:
 
     def _take(self, report: Report) -> int | None:
         """A report's episode, if it stored one."""
-        self.silent_s[report.slot] = 0.0
+        self.silent_s[report.slot], self.started[report.slot] = 0.0, True
         if report.error is not None:
             raise report.error
+        if report.dead:
+            self._replace(report.slot, report.dead)
         if report.index is None:
-            self._replace(report.slot, report.reason)
             return None
         self.in_hand[report.slot].remove(report.index)
         return report.index
 
     def _replace_silent(self) -> None:
         for slot, silent in enumerate(self.silent_s):
-            if silent >= self.settings.timeout_s:
+            if silent >= self.settings.timeout_s + (0.0 if self.started[slot] else START_S):
                 self.pool.kill(slot)
                 self._replace(slot, f"gave no episode for {self.settings.timeout_s:g} s")
 
@@ -135,7 +139,7 @@ class _Dispatch:
         """Start another worker in a dead one's place; its episodes wait again."""
         lost = sorted(self.in_hand[slot])
         self.waiting.extendleft(reversed(lost))
-        self.in_hand[slot], self.silent_s[slot] = [], 0.0
+        self.in_hand[slot], self.silent_s[slot], self.started[slot] = [], 0.0, False
         if self.replaced >= self.settings.restarts:
             raise PlaySlotError(
                 f"a collector worker {reason}, after {self.replaced} were replaced: got more than collector.restarts="

@@ -27,12 +27,15 @@ PR_SET_PDEATHSIG = 1
 
 
 class Report(NamedTuple):
-    """What a worker said: `index` is stored; or an `error` of its own; or, with neither, that it died (`reason`)."""
+    """News of a worker: it stored episode `index`; or ended with an `error`; or died, and of what (`dead`).
+
+    With none of them, it is ready.
+    """
 
     slot: int
     index: int | None = None
     error: Exception | None = None
-    reason: str = ""
+    dead: str = ""
 
 
 class Workers(Protocol):
@@ -71,6 +74,7 @@ def serve(pipe: Connection[Any, Any], spec: CollectionSpec, folder: Path) -> Non
     start_worker()
     try:
         collector = EpisodeCollector.make(spec)
+        pipe.send(None)  # ready
         while True:
             job: Job = pipe.recv()
             store(folder, collector.record(job))
@@ -136,7 +140,7 @@ class LocalWorkers:
             process.join(1.0)
             code = process.exitcode
             self.kill(slot)
-            yield Report(slot, reason=f"ended with {_exit_text(code)}")
+            yield Report(slot, dead=f"ended with {_exit_text(code)}")
 
     def kill(self, slot: int) -> None:
         """See `Workers`."""
