@@ -65,7 +65,7 @@ def of_frames(frames: Sequence[npt.NDArray[np.uint8]]) -> dict[str, Array]:
 
 def _summary(rows: Array, count: int) -> dict[str, Array]:
     stats = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
-    quantiles = np.quantile(rows, list(QUANTILES.values()), axis=0)
+    quantiles = np.quantile(rows, list(QUANTILES.values()), axis=0, method="inverted_cdf")  # no interpolation: theirs
     return {**stats, "count": np.array([count]), **dict(zip(QUANTILES, quantiles, strict=True))}
 
 

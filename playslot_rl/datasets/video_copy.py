@@ -59,6 +59,7 @@ class VideoCopier:
     files: int = DEFAULT_FILES
     _number: int = -1
     _frames: int = 0
+    _bytes: int = 0
     _out: Any = None
     _stream: Any = None
     _codec: tuple[Any, ...] = ()
@@ -124,8 +125,7 @@ class VideoCopier:
         source = self._open(path)
         stream = source.stream
         codec = _codec(stream)
-        full = self._out is not None and self._path().stat().st_size >= self.limit
-        if self._out is None or full or codec != self._codec:
+        if self._out is None or self._bytes >= self.limit or codec != self._codec:
             self._next(stream, codec)
         start = self._frames / self.fps
         base = float(stream.time_base)
@@ -135,6 +135,7 @@ class VideoCopier:
             packet.dts = min(packet.pts, max(self._last_dts + 1, packet.dts + shift))
             self._last_dts = packet.dts
             packet.stream = self._stream
+            self._bytes += packet.size  # the file itself lags behind: the muxer buffers
             self._out.mux_one(packet)
         self._frames += length
         return self._place(start, length)
@@ -163,7 +164,7 @@ class VideoCopier:
         if self._out is not None:
             self._out.close()
         self._number += 1
-        self._frames, self._codec, self._last_dts = 0, codec, -(2**62)
+        self._frames, self._bytes, self._codec, self._last_dts = 0, 0, codec, -(2**62)
         target = self._path()
         target.parent.mkdir(parents=True, exist_ok=True)
         self._out = av.open(str(target), "w", format="mp4")
