@@ -19,13 +19,15 @@ MARK = "<!-- made by `playslot dataset push`; remove this line to keep your own 
 META_NAME = "meta/playslot.json"
 """Settings and outcome of a recorded data set; written by the collectors."""
 
+TASKS_SHOWN = 8
+
 
 @dataclass(frozen=True)
 class CardFacts:
     """What a card says.
 
     Attributes:
-        task: in words; empty if not known.
+        tasks: in words.
         cameras: name, height and width of each.
         fps: stored frames a second.
         control_hz: environment steps a second; None if not recorded.
@@ -33,7 +35,7 @@ class CardFacts:
         made: how it was recorded, name to text; empty if not by our collectors.
     """
 
-    task: str
+    tasks: tuple[str, ...]
     cameras: tuple[tuple[str, int, int], ...]
     fps: float
     control_hz: float | None
@@ -60,13 +62,17 @@ def facts_of(files: LeRobotFiles) -> CardFacts:
     skip = env.get("frame_skip")
     success = note.get("success_rate")
     return CardFacts(
-        task=files.task,
+        tasks=_tasks(files),
         cameras=cameras,
         fps=files.fps,
         control_hz=files.fps * skip if skip else None,
         success=float(success) if success is not None else _success(files),
         made=_made(spec, env, note.get("versions") or {}),
     )
+
+
+def _tasks(files: LeRobotFiles) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(str(task) for row in files.episodes for task in row.get("tasks") or () if str(task)))
 
 
 def _size(feature: dict[str, Any]) -> tuple[int, int]:
@@ -140,7 +146,7 @@ def make_card(files: LeRobotFiles, repo_id: str, record: HubRecord) -> str:
 
 
 def _summary(files: LeRobotFiles, facts: CardFacts) -> str:
-    task = f" of the task “{facts.task}”" if facts.task else ""
+    task = f" of the task “{facts.tasks[0]}”" if len(facts.tasks) == 1 else ""
     return f"{len(files.episodes)} episodes{task}, {files.frames} frames, in LeRobot's format {_version(files)}."
 
 
@@ -150,9 +156,10 @@ def _version(files: LeRobotFiles) -> str:
 
 def _description(files: LeRobotFiles, facts: CardFacts, record: HubRecord) -> dict[str, str]:
     features = files.info["features"]
+    more = f"; and {len(facts.tasks) - TASKS_SHOWN} more" if len(facts.tasks) > TASKS_SHOWN else ""
     action = features.get(keys.FEATURE_ACTION, {}).get("shape") or []
     rows = {
-        "task": facts.task or "not named",
+        "task": "; ".join(facts.tasks[:TASKS_SHOWN]) + more if facts.tasks else "not named",
         "camera": ", ".join(f"`{name}` {height} x {width}" for name, height, width in facts.cameras) or "none",
         "frames a second": f"{facts.fps:g}",
         "control rate": f"{facts.control_hz:g} Hz" if facts.control_hz else "not recorded",

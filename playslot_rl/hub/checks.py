@@ -2,33 +2,55 @@
 
 from __future__ import annotations
 
-import hashlib
+from dataclasses import dataclass
 from pathlib import Path
 
-from playslot_rl.data.lerobot_files import LeRobotFiles, open_files
-from playslot_rl.hub.layout import LOCAL_RECORD, REMOTE_RECORD, is_data
+from playslot_rl.datasets.contents import read_contents
+from playslot_rl.datasets.fingerprint import fingerprint_of
+from playslot_rl.datasets.frames import scan_frames
+from playslot_rl.datasets.problems import Problems
+from playslot_rl.datasets.rows import check_rows
+from playslot_rl.datasets.verify import verify
+from playslot_rl.errors import DataError
 
-_PIECE = 8 << 20
+
+@dataclass(frozen=True)
+class Content:
+    """What a sound data set holds.
+
+    Attributes:
+        episodes, frames: counts.
+        fingerprint: of the content, as `playslot dataset verify` prints it.
+    """
+
+    episodes: int
+    frames: int
+    fingerprint: str
 
 
-def check_data_set(root: Path) -> LeRobotFiles:
-    """Open a data set and compare its counts with its metadata.
+def check_before_push(root: Path) -> Content:
+    """Everything `playslot dataset verify` checks: others will build on it.
 
     Raises:
-        DataError: missing, of another format version, unfinalised, or with more or fewer rows than its metadata says.
+        DataError: it is not sound.
     """
-    return open_files(root)
+    result = verify(root)
+    if not result.ok:
+        more = f" (and {len(result.errors) - 1} more)" if len(result.errors) > 1 else ""
+        raise DataError(f"{result.errors[0]}{more}; run `playslot dataset verify {root}` for all of it, then `repair`")
+    return Content(result.episodes, result.frames, result.fingerprint)
 
 
-def fingerprint(root: Path) -> str:
-    """Content hash of every file of a data set except the Hub's records: 16 hex digits."""
-    digest = hashlib.sha256()
-    for file in sorted(root.rglob("*")):
-        path = file.relative_to(root).as_posix()
-        if not is_data(path) or path in (LOCAL_RECORD, REMOTE_RECORD) or not file.is_file():
-            continue
-        digest.update(f"{path}\0{file.stat().st_size}\0".encode())
-        with file.open("rb") as stream:
-            while piece := stream.read(_PIECE):
-                digest.update(piece)
-    return digest.hexdigest()[:16]
+def check_after_pull(root: Path) -> Content:
+    """Counts, indices and every frame. Statistics are not compared: others' may be made in another way.
+
+    Raises:
+        DataError: rows and metadata disagree, or frames cannot be decoded; the message is the first fault.
+    """
+    problems = Problems()
+    contents = read_contents(root, problems)
+    check_rows(contents, problems)
+    scans = scan_frames(contents, problems)
+    if problems.errors:
+        raise DataError(problems.errors[0])
+    return Content(len(contents.spans), contents.rows, fingerprint_of(contents, scans).value)

@@ -129,8 +129,8 @@ def _http(error: BaseException, place: Place) -> HubError:
         )
     if status >= 500:
         return HubError(
-            f"{place.repo_id}: got {status}, the Hub has an error of its own, also after retries: run the same command "
-            "again later, it carries on"
+            f"{place.repo_id}: got {status}, an error of the Hub's own, also after retries; expected an answer: run "
+            "the same command again later, it carries on"
         )
     said = " ".join(str(getattr(error, "server_message", None) or error).split())[:300]
     return HubError(f"{place.repo_id}: got {status} from the Hub ({said}), expected the request to be taken")

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from playslot_rl.errors import DataError, HubError, OutputError
-from playslot_rl.hub.checks import check_data_set, fingerprint
+from playslot_rl.hub.checks import Content, check_after_pull
 from playslot_rl.hub.layout import FORMAT_TAG, RemoteFile, is_pulled, same_content
 from playslot_rl.hub.record import SCHEME, read_origin, read_record, write_origin
 from playslot_rl.hub.session import Repository, open_repository
@@ -187,12 +187,15 @@ def _finish(
     """Check counts and fingerprint, note the origin, and put the folder in its place."""
     shutil.rmtree(partial / ".cache", ignore_errors=True)
     try:
-        episodes, frames, found, compared = _check_content(hub, partial, commit)
+        found, compared = _check_content(hub, partial, commit)
     except (DataError, HubError):
         shutil.rmtree(partial, ignore_errors=True)  # whole and wrong: fetching it again would not help
         raise
     size = sum(file.size for file in wanted.values())
-    result = PullResult(hub.name, str(root), name, why, commit, episodes, frames, len(wanted), size, found, compared)
+    result = PullResult(
+        hub.name, str(root), name, why, commit, found.episodes, found.frames, len(wanted), size, found.fingerprint,
+        compared,
+    )  # fmt: skip
     endpoint = {"endpoint": hub.place.endpoint, "pulled": datetime.now(UTC).isoformat(timespec="seconds")}
     write_origin(
         partial, {key: value for key, value in asdict(result).items() if key not in ("root", "why")} | endpoint
@@ -205,24 +208,24 @@ def _finish(
     return result
 
 
-def _check_content(hub: Repository, partial: Path, commit: str) -> tuple[int, int, str, bool]:
-    """Counts and fingerprint; and whether there was a fingerprint to compare."""
+def _check_content(hub: Repository, partial: Path, commit: str) -> tuple[Content, bool]:
+    """What has arrived; and whether the Hub named a fingerprint to compare it with."""
     try:
-        files = check_data_set(partial)
+        found = check_after_pull(partial)
     except DataError as error:
-        said = str(error).replace(str(partial), hub.name).partition(";")[0]
+        first = str(error).replace(f"{partial}/", "").partition(";")[0]
         raise DataError(
-            f"{said} at commit {commit[:12]}: files of an earlier push may have stayed on the Hub; expected rows that "
-            "agree with the metadata: ask its owner to push it again, by `playslot dataset push`"
+            f"{hub.name}: got a data set at commit {commit[:12]} whose files disagree ({first}), expected a sound one: "
+            "an earlier push may have left files behind; ask its owner to push it by `playslot dataset push`"
         ) from error
-    found, record = fingerprint(partial), read_record(partial)
+    record = read_record(partial)
     if record is None or record.scheme != SCHEME:
-        return len(files.episodes), files.frames, found, False
-    expected = (record.episodes, record.frames, record.fingerprint)
-    if (len(files.episodes), files.frames, found) != expected:
+        return found, False
+    expected = Content(record.episodes, record.frames, record.fingerprint)
+    if found != expected:
         raise HubError(
-            f"{hub.name}: got {len(files.episodes)} episodes, {files.frames} frames, fingerprint {found}, expected "
-            f"{record.episodes}, {record.frames}, {record.fingerprint} as pushed: the data set was changed on the Hub "
-            "by something else; ask its owner to push it again"
+            f"{hub.name}: got {found.episodes} episodes, {found.frames} frames, fingerprint {found.fingerprint}, "
+            f"expected {expected.episodes}, {expected.frames}, {expected.fingerprint} as pushed: the data set was "
+            "changed on the Hub by something else; ask its owner to push it again"
         )
-    return len(files.episodes), files.frames, found, True
+    return found, True

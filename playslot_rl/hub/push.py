@@ -7,9 +7,10 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from playslot_rl.data.lerobot_files import open_files
 from playslot_rl.errors import HubError
 from playslot_rl.hub.card import is_ours, make_card
-from playslot_rl.hub.checks import check_data_set
+from playslot_rl.hub.checks import check_before_push
 from playslot_rl.hub.layout import CARD_NAME, REMOTE_RECORD, RemoteFile, is_data, local_files, same_content
 from playslot_rl.hub.record import HubRecord
 from playslot_rl.hub.session import Repository, open_repository
@@ -98,12 +99,13 @@ def push(
         HubError: bad names, no or bad token, offline, no network, an error of the Hub, or a tag that is taken.
     """
     root = Path(root).expanduser()
-    files = check_data_set(root)
+    checked = check_before_push(root)
+    files = open_files(root)
     target = branch or MAIN
     _check_names(target, tag, str(files.info["codebase_version"]))
     with open_repository(repo_id, root, token=token, writing=True, revision=target) as hub:
         hub.check_token()
-        record = HubRecord.of(files)
+        record = HubRecord.of(checked)
         is_private = hub.create(private)
         branches, tags = hub.refs()
         if target not in branches:

@@ -7,14 +7,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from playslot_rl.data.lerobot_files import LeRobotFiles
 from playslot_rl.errors import HubError
-from playslot_rl.hub.checks import fingerprint
+from playslot_rl.hub.checks import Content
 from playslot_rl.hub.layout import LOCAL_RECORD, REMOTE_RECORD
 from playslot_rl.training.atomic import write_json
 
 SCHEME = 1
-"""Version of the way fingerprints are made; those of another version are not compared."""
+"""Version of `datasets/fingerprint.py`, to be raised when that changes: those of another version are not compared."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +21,7 @@ class HubRecord:
     """What was pushed.
 
     Attributes:
-        fingerprint: content hash of the data set, as `playslot dataset info` prints it.
+        fingerprint: content hash of the data set, as `playslot dataset verify` prints it.
         episodes, frames: counts.
         scheme: how the fingerprint is made.
         playslot_rl: version that pushed.
@@ -35,11 +34,11 @@ class HubRecord:
     playslot_rl: str
 
     @classmethod
-    def of(cls, files: LeRobotFiles) -> HubRecord:
+    def of(cls, content: Content) -> HubRecord:
         """The record of a checked data set."""
         from playslot_rl import __version__
 
-        return cls(fingerprint(files.root), len(files.episodes), files.frames, SCHEME, __version__)
+        return cls(content.fingerprint, content.episodes, content.frames, SCHEME, __version__)
 
     def to_bytes(self) -> bytes:
         """As a file."""

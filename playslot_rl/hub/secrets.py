@@ -12,7 +12,7 @@ from typing import Any
 from playslot_rl.errors import HubError
 
 MASK = "<token>"
-_SHAPED = re.compile(r"\bhf_[A-Za-z0-9_]{8,}")
+_SHAPED = re.compile(r"\bhf_[A-Za-z0-9]{16,}\b")
 _BEARER = re.compile(r"(?i)\b(bearer|basic)(\s+|%20)[^\s'\",;]+")
 _IN_ADDRESS = re.compile(r"(?<=://)[^/\s@'\"]+@")
 _CHARACTERS = re.compile(r"[A-Za-z0-9._~+/=-]+")

@@ -5,12 +5,17 @@ Reads one JSON request a line, answers with one line. Sleeps are noted, not slep
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import errno
 import json
 import logging
+import os
+import shutil
 import sys
 import time
 import traceback
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,28 +37,31 @@ def _chain(error: BaseException | None) -> list[str]:
         if link is None or id(link) in seen:
             continue
         seen.add(id(link))
-        texts += [str(link), repr(link), repr(vars(link)), *getattr(link, "__notes__", ())]
+        texts += [str(link), repr(link), *getattr(link, "__notes__", ())]
+        texts += [value for value in vars(link).values() if isinstance(value, str)]
         waiting += [link.__cause__, link.__context__]
     return texts
 
 
-def _patch(name: str, value: Any) -> None:
+@contextlib.contextmanager
+def _faults(patches: dict[str, Any]) -> Iterator[None]:
     """Named faults of this side."""
-    if name == "full_disk":
-        import huggingface_hub.file_download as module
+    import huggingface_hub.file_download as module
 
-        def full(*_: Any, **__: Any) -> None:
-            raise OSError(28, "No space left on device")
+    http_get, disk_usage = module.http_get, shutil.disk_usage
 
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    if "full_disk" in patches:
         module.http_get = full
-    elif name == "free":
-        import collections
-        import shutil
-
-        usage = collections.namedtuple("usage", "total used free")
-        shutil.disk_usage = lambda _: usage(10**9, 10**9 - value, value)  # type: ignore[assignment]
-    else:
-        raise ValueError(name)
+    if "free" in patches:
+        usage = disk_usage(".")
+        shutil.disk_usage = lambda _: usage._replace(free=patches["free"])  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        module.http_get, shutil.disk_usage = http_get, disk_usage
 
 
 def _run(request: dict[str, Any]) -> dict[str, Any]:
@@ -80,9 +88,8 @@ def main() -> None:
         SLEPT.clear()
         answer: dict[str, Any]
         try:
-            for name, value in request.get("patches", {}).items():
-                _patch(name, value)
-            answer = _run(request)
+            with _faults(request["patches"]):
+                answer = _run(request)
         except Exception as error:  # noqa: BLE001 - everything is reported to the test
             answer = {"error": str(error), "type": type(error).__name__, "chain": _chain(error),
                       "traceback": traceback.format_exc()}  # fmt: skip

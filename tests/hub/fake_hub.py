@@ -21,7 +21,8 @@ from urllib.parse import parse_qs, unquote, urlsplit
 LARGE = (".parquet", ".mp4")
 WRITE_TOKEN = "hf_MARKERofTheOwner0123456789abcdef"
 READ_TOKEN = "hf_MARKERofAReader0123456789abcdef"
-TOKENS = {WRITE_TOKEN: "owner", READ_TOKEN: "reader"}
+PLAIN_TOKEN = "no.shape-that-tells-MARKER_it"
+TOKENS = {WRITE_TOKEN: "owner", READ_TOKEN: "reader", PLAIN_TOKEN: "owner"}
 
 
 @dataclass
@@ -56,7 +57,7 @@ class Repository:
 
 @dataclass
 class Fault:
-    """Answers requests in place of the Hub.
+    """Something that goes wrong when the Hub answers.
 
     Attributes:
         method, pattern: which requests; the pattern is searched in the path.
@@ -65,6 +66,8 @@ class Fault:
         corrupt: flip the last byte of the body.
         times: how often; -1 means always.
         echo: repeat the request's token in the error, as no Hub should.
+        code: the Hub's name of the error.
+        stall: wait until the Hub is told to go on, before answering.
     """
 
     method: str
@@ -75,6 +78,7 @@ class Fault:
     times: int = 1
     echo: bool = False
     code: str = ""
+    stall: bool = False
 
 
 class FakeHub:
@@ -86,6 +90,8 @@ class FakeHub:
         self.faults: list[Fault] = []
         self.requests: list[tuple[str, str, dict[str, str], bytes]] = []
         self.lock = threading.RLock()
+        self.stalled = threading.Event()
+        self.go_on = threading.Event()
         hub = self
 
         class Handler(_Handler):
@@ -180,9 +186,13 @@ class _Handler(BaseHTTPRequestHandler):
         if "chunked" in self.headers.get("Transfer-Encoding", ""):
             self.body = self._chunks()
         with hub.lock:
-            hub.requests.append((self.command, path, dict(self.headers), self.body))
+            headers = {name.lower(): value for name, value in self.headers.items()}
+            hub.requests.append((self.command, path, headers, self.body))
         self.failure = hub.fault(self.command, path)
         try:
+            if self.failure and self.failure.stall:
+                hub.stalled.set()
+                hub.go_on.wait(60)
             if self.failure and self.failure.status:
                 raise RefusedError(self.failure.status, "made to fail", self.failure.code)
             raw = urlsplit(self.path).path  # matched before it is unquoted: a branch's slash arrives as %2F

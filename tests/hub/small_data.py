@@ -10,6 +10,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from playslot_rl.datasets.statistics import of_numbers
+
 FPS = 10
 NOTE = {
     "spec": {
@@ -79,6 +81,7 @@ def write_small(
         "meta/episodes/file_index": [0] * len(lengths),
     }
     _write(root / "meta/episodes/chunk-000/file-000.parquet", pa.table(episodes))
+    _write_statistics(root, features)
     tasks = pa.table({"task_index": [0], "__index_level_0__": ["press | the “button”"]})
     _write(root / "meta/tasks.parquet", tasks)
     info = {
@@ -88,10 +91,20 @@ def write_small(
         "features": features,
     }  # fmt: skip
     (root / "meta/info.json").write_text(json.dumps(info))
-    (root / "meta/stats.json").write_text("{}")
     if ours:
-        (root / "meta/playslot.json").write_text(json.dumps(NOTE))
+        (root / "meta/playslot.json").write_text(json.dumps(NOTE | {"episodes": [{"seed": None}] * len(lengths)}))
     return root
+
+
+def _write_statistics(root: Path, features: dict[str, Any]) -> None:
+    """Of all rows; those of each episode may be missing."""
+    tables = [pq.read_table(path) for path in sorted((root / "data").rglob("*.parquet"))]
+    stats = {}
+    for name, feature in features.items():
+        if feature["dtype"] != "string":
+            values = np.concatenate([np.asarray(table.column(name).to_pylist()) for table in tables])
+            stats[name] = {key: value.tolist() for key, value in of_numbers(values).items()}
+    (root / "meta/stats.json").write_text(json.dumps(stats))
 
 
 def _write(path: Path, table: pa.Table) -> None:
