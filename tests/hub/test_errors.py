@@ -120,6 +120,16 @@ def test_an_error_of_the_hub_that_stays_ends_the_push_and_the_same_command_carri
     assert "error" not in push(client, data)
 
 
+def test_large_files_that_arrived_before_a_failure_are_not_sent_again(hub: FakeHub, client: Client, data: Path) -> None:
+    hub.faults.append(Fault("POST", "/commit/", status=500, times=-1))
+    failed(push(client, data))
+    assert hub.asked("PUT", "/large/")
+    hub.faults.clear()
+    hub.requests.clear()
+    assert "error" not in push(client, data)
+    assert not hub.asked("PUT", "/large/")
+
+
 def test_a_push_that_died_before_the_tag_sets_it_the_next_time(hub: FakeHub, client: Client, data: Path) -> None:
     hub.faults.append(Fault("POST", "/tag/", status=500, times=-1))
     failed(push(client, data))
