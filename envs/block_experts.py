@@ -36,6 +36,16 @@ REST: Final = 0.02
 """A cube that is being pushed is left at this distance from the goal."""
 NEAR: Final = 0.045
 """Any other cube that is this near is left alone: the task is solved under 0.05."""
+PICK_TRAVEL_Z: Final = 0.52
+"""Height at which the open gripper passes over the small cubes."""
+AROUND: Final = 0.02
+"""How near the grip is to the centre of a cube that its fingers can close on."""
+OVER: Final = 0.012
+"""How far aside the open gripper may come down."""
+GRASP: Final = 0.064
+"""The fingers rest on a small cube at an opening of less than this."""
+OPEN: Final = 1.0
+CLOSE: Final = -1.0
 FALLEN_Z: Final = 0.38
 """A cube under it has fallen off the table."""
 
@@ -100,8 +110,16 @@ def push(scene: Scene) -> Action:
 
 
 def pick(scene: Scene) -> Action:
-    """Open over the cube, come down, close, and carry it to the goal."""
-    return towards(scene, scene.goal)
+    """Open over the cube, come down round it, close, carry it to the goal, and hold it there."""
+    cube, grip = scene.object, scene.grip
+    aside, above = float(np.linalg.norm(grip[:2] - cube[:2])), abs(float(grip[2] - cube[2]))
+    if aside < AROUND and above < AROUND:
+        if scene.opening < GRASP:
+            return towards(scene, grip + scene.goal - cube, CLOSE)
+        return towards(scene, cube, CLOSE)
+    if aside < OVER:
+        return towards(scene, cube, OPEN)
+    return towards(scene, np.array([*cube[:2], max(PICK_TRAVEL_Z, grip[2] - 0.02)]), OPEN)
 
 
 EXPERTS: Final[dict[Variant, Callable[[Scene], Action]]] = {"push": push, "reach": reach, "pick": pick}

@@ -101,7 +101,7 @@ def draw_colours(rng: np.random.Generator, config: BlocksConfig, count: int) -> 
     """Colours of `count` objects and the index of the one the task is about.
 
     `red`: it is red, no other is. `reddest`: all colours differ, it is the nearest to red by CIEDE2000. `odd`: all
-    others share one colour. `odd_groups`: it alone has its colour; the others form groups of two or three of one colour.
+    others share one colour. `odd_groups`: it alone has its colour, the others form groups of two or three.
     `config.colour` fixes the colour of the odd one. With one distractor nobody can see which of two is the odd one.
     """
     names = list(COLOURS)

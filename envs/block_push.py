@@ -18,7 +18,8 @@ from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
 from playslot_rl.envs.block_experts import EXPERTS, Scene
 from playslot_rl.envs.block_ids import block_config
 from playslot_rl.envs.block_layout import Layout, Variant, draw_layout
-from playslot_rl.envs.block_scene import CAMERA
+from playslot_rl.envs.block_scene import CAMERA, SCREEN, STILL, lighten
+from playslot_rl.envs.facets import Still
 from playslot_rl.envs.rendering import FrameRenderer, import_mujoco
 from playslot_rl.errors import ConfigError
 
@@ -101,7 +102,11 @@ class BlockEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         most = blocks.distractors if blocks.distractors_to is None else blocks.distractors_to
         self._simulation = BlockSimulation(self.variant, 1 + most)
         size = self.config.image_size
-        self._renderer = FrameRenderer(self._simulation.model, CAMERA, size, render or RenderConfig())
+        render = render or RenderConfig()
+        if render.quality == "fast":
+            lighten(self._simulation.model)
+        still = Still(self._simulation.data, STILL, SCREEN)
+        self._renderer = FrameRenderer(self._simulation.model, CAMERA, size, render, still)
         self.render_mode = render_mode
         space = gym.spaces.Dict(
             {

@@ -8,6 +8,7 @@ about 3 ms a 64x64 frame instead of 46 to 80.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import os
 import sys
 import warnings
@@ -20,6 +21,7 @@ import numpy.typing as npt
 
 from playslot_rl.config import RenderConfig
 from playslot_rl.envs.culling import FrustumCuller
+from playslot_rl.envs.facets import Still, only_in_sight
 from playslot_rl.errors import RenderError
 
 if TYPE_CHECKING:
@@ -147,12 +149,20 @@ class FrameRenderer:
         camera: the viewpoint; a fixed one must be in the model, at rest in the world.
         size: side of the frames, pixels.
         config: quality and supersampling.
+        still: parts that never move, of which `fast` draws only what a fixed camera can see.
 
     Raises:
         RenderError: there is no working GL backend.
     """
 
-    def __init__(self, model: mujoco.MjModel, camera: Camera | FixedCamera, size: int, config: RenderConfig) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        camera: Camera | FixedCamera,
+        size: int,
+        config: RenderConfig,
+        still: Still | None = None,
+    ) -> None:
         mj = import_mujoco()
         fast = config.quality == "fast"
         self.size = size
@@ -161,7 +171,10 @@ class FrameRenderer:
         model.vis.global_.offwidth = model.vis.global_.offheight = side
         if fast:
             model.vis.quality.offsamples = 0
-        self._renderer = _make_renderer(mj, model, side)
+        with contextlib.ExitStack() as stack:
+            if fast and still is not None and isinstance(camera, FixedCamera):
+                stack.enter_context(only_in_sight(model, still, np.array(camera.position)))
+            self._renderer = _make_renderer(mj, model, side)
         self._finalizer = weakref.finalize(self, _close, self._renderer)
         # Handlers at exit run last in, first out: ours must precede EGL's own, registered with its first context, or
         # closing prints tracebacks. `finalize` may have registered its handler before both.

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from statistics import median
+from typing import TYPE_CHECKING
 
 from playslot_rl.benchmark.spec import Sizes
-from playslot_rl.config import EnvConfig, RenderConfig
+from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
+
+if TYPE_CHECKING:
+    from playslot_rl.envs.block_push import BlockEnv
+    from playslot_rl.envs.button_press import ButtonPressEnv
 
 
 def render_seconds(sizes: Sizes) -> dict[str, float]:
-    """Median seconds a frame: `fast` and `full`; the repeats take turns.
+    """ButtonPress: median seconds a frame, `fast` and `full`; the repeats take turns.
 
     Raises:
         RenderError: there is no working GL backend.
@@ -18,9 +25,26 @@ def render_seconds(sizes: Sizes) -> dict[str, float]:
     from playslot_rl.envs.button_press import ButtonPressEnv
 
     config = EnvConfig(image_size=sizes.image_size, warmup_steps=1)
+    return _race(sizes, lambda render: ButtonPressEnv(config, render))
+
+
+def render_block_push_seconds(sizes: Sizes) -> dict[str, float]:
+    """BlockPush: median seconds a frame, `fast` and `full`; the repeats take turns.
+
+    Raises:
+        RenderError: there is no working GL backend.
+    """
+    from playslot_rl.envs.block_ids import block_config
+    from playslot_rl.envs.block_push import BlockPushEnv
+
+    config = replace(block_config("block_push", BlocksConfig()), image_size=sizes.image_size)
+    return _race(sizes, lambda render: BlockPushEnv(config, render))
+
+
+def _race(sizes: Sizes, make: Callable[[RenderConfig], BlockEnv | ButtonPressEnv]) -> dict[str, float]:
     scenes = {
-        "full": (ButtonPressEnv(config, RenderConfig(quality="full")), sizes.full_frames),
-        "fast": (ButtonPressEnv(config, RenderConfig(quality="fast")), sizes.fast_frames),
+        "full": (make(RenderConfig(quality="full")), sizes.full_frames),
+        "fast": (make(RenderConfig(quality="fast")), sizes.fast_frames),
     }
     seconds: dict[str, list[float]] = {name: [] for name in scenes}
     try:

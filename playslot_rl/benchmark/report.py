@@ -16,6 +16,7 @@ TARGETS: Final = {
     "rollout_cache": 3.0,
     "window_sampling": 20.0,
     "render": 12.0,
+    "render_block_push": 5.0,
 }
 """Ratios that the project asks of itself (on two CPU cores)."""
 
@@ -40,7 +41,7 @@ def measure(
         PlaySlotError: a child died. RenderError: no GL backend.
     """
     from playslot_rl.allocator import tune_allocator
-    from playslot_rl.benchmark.drawing import render_seconds
+    from playslot_rl.benchmark.drawing import render_block_push_seconds, render_seconds
     from playslot_rl.benchmark.race import race
     from playslot_rl.benchmark.sampling import sampling_rates
 
@@ -55,12 +56,14 @@ def measure(
     rates = sampling_rates(sizes)
     say("rendering, fast against default")
     render = render_seconds(sizes)
+    blocks = render_block_push_seconds(sizes)
     return {
         "savi_step": _entry(savi, "plain_fp32_glibc", "collapsed_bf16_allocator"),
         "dynamics_step": _entry(dynamics, "plain_fp32_glibc", "fast"),
         "rollout_cache": _entry(rollout, "full", "cached"),
         "window_sampling": {"ratio": rates["cache"] / rates["lerobot"], "unit": "frames/s", **rates},
         "render": _entry(render, "full", "fast"),
+        "render_block_push": _entry(blocks, "full", "fast"),
         "machine": {**machine(), "threads": threads, "repeats": sizes.repeats, "quick": quick},
     }
 

@@ -32,7 +32,7 @@ def test_geoms_behind_and_beside_the_camera_are_unseen_and_one_across_the_edge_i
     try:
         culler = renderer._culler
         assert culler is not None
-        unseen = dict(zip(NAMES, culler.unseen(data.geom_xpos), strict=True))
+        unseen = dict(zip(NAMES, culler.unseen(data), strict=True))
         before = model.geom_group.copy()
         renderer(data)
     finally:
@@ -51,7 +51,7 @@ def test_frames_of_button_press_are_the_same_with_and_without_culling(monkeypatc
                 culled = env.step(action)[0]["pixels"]
                 culler = env._renderer._culler
                 assert culler is not None
-                hidden.append(culler.unseen(env._env.data.geom_xpos).sum())
+                hidden.append(culler.unseen(env._env.data).sum())
                 with monkeypatch.context() as patch:
                     patch.setattr(FrustumCuller, "hide", lambda self, data: None)
                     np.testing.assert_array_equal(env.draw(), culled)
