@@ -28,6 +28,8 @@ META_NAME = "meta/playslot.json"
 PACKAGES = ("metaworld", "gymnasium-robotics", "mujoco", "gymnasium", "torchrl", "lerobot", "playslot_rl")
 VIDEO_ERROR = 2.0
 """Mean difference [0, 255] that h264 in yuv444p may make."""
+METADATA_ROWS = 200
+"""Episodes in a row group of the episodes' metadata."""
 FREE_BYTES = 16 * 2**20
 """Less free space than this after a failed export is reported as a full disk."""
 
@@ -120,6 +122,8 @@ def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str,
         use_videos=video,
         video_backend="pyav",
         rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=0) if video else None,
+        # LeRobot's 10 makes a row group of some 150 columns every ten episodes, all in memory and in the footer.
+        metadata_buffer_size=METADATA_ROWS,
     )
     write = _write_video if video else _write_images
     try:

@@ -1,9 +1,8 @@
 """LeRobot v3.0 data sets with stored images, written from PNGs that are there already.
 
 LeRobot's own `add_frame` and `save_episode` write each image to a file of its own, read it again for the statistics and
-a third time for the parquet file, and build a `datasets.Dataset` an episode: 77 ms for 21 frames, where recording them
-takes 90. This writer makes the same files with LeRobot's own schema, metadata and statistics in a tenth of that; a test
-holds it to LeRobot's output.
+a third time for the parquet file, and build a `datasets.Dataset` an episode, which takes about as long as recording it.
+This writer makes the same files with LeRobot's own schema, metadata and statistics; a test holds it to LeRobot's output.
 """
 
 from __future__ import annotations

@@ -41,6 +41,7 @@ COMMANDS: Final[dict[str, Command]] = {
         (
             "playslot collect policy=random episodes=400 out=data/random",
             "playslot collect policy=expert episodes=150 seed=5 workers=2 out=data/expert",
+            "playslot collect policy=random episodes=400 collector.backend=ray workers=2 out=data/random",
             "playslot collect env=grid_shapes episodes=1000 out=data/shapes",
         ),
     ),

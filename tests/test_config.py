@@ -156,6 +156,13 @@ def test_a_run_without_a_usable_config_is_refused(tmp_path: Path, content: str |
         compose([f"run={tmp_path}"], "evaluate")
 
 
+def test_a_config_stored_before_the_collector_had_settings_loads(tmp_path: Path) -> None:
+    stored = to_dict(ExperimentConfig())
+    del stored["collector"]
+    (tmp_path / "config.json").write_text(json.dumps(stored))
+    assert compose([f"run={tmp_path}"], "evaluate").collector == ExperimentConfig().collector
+
+
 def test_equal_configs_have_equal_fingerprints() -> None:
     assert fingerprint(compose(["preset=smoke"])) == fingerprint(compose(["preset=smoke"]))
     assert fingerprint(compose(["preset=smoke"])) != fingerprint(compose(["preset=smoke", "seed=1"]))
