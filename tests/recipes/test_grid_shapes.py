@@ -1,0 +1,86 @@
+"""GridShapes end to end: collected, trained without a policy, scored against what is known, and streamed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import ONE_CORE, playslot, refused
+
+from playslot_rl.config import EnvConfig
+from playslot_rl.data.source import open_source
+from playslot_rl.envs.grid_shapes import generate, moves_of
+
+
+@pytest.fixture(scope="module")
+def shapes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished smoke run."""
+    run = tmp_path_factory.mktemp("shapes") / "run"
+    done = playslot("pipeline", "env=grid_shapes", "preset=smoke", f"out={run}", "episodes=4", *ONE_CORE)
+    assert done.code == 0, done.err
+    return run
+
+
+def test_the_pipeline_scores_slots_and_latents_and_trains_no_policy(shapes: Path) -> None:
+    result = json.loads((shapes / "evaluation" / "objects" / "eval_info.json").read_text())
+    assert -1 <= result["foreground_ari"] <= 1
+    assert set(result["probes"]) == {"prototype", "latent"}
+    assert result["probes"]["prototype"]["chance"] == 0.2
+    assert np.sum(result["codes"]) == 4 * 6 * 2, "each object's slot has one code a step"
+    assert not (shapes / "policy").exists()
+    assert sorted(path.name for path in (shapes / "data").iterdir()) == ["random"]
+
+
+def test_its_report_has_the_scores_and_misses_nothing(shapes: Path) -> None:
+    text = (shapes / "report.md").read_text()
+    for part in ("FG-ARI", "from the slot's prototype", "| up |", "most frequent move", "Prediction"):
+        assert part in text
+    assert "To make it" not in text
+    assert {"prediction.png", "slots.png", "prototypes.png", "losses.png"} <= {
+        path.name for path in (shapes / "figures").iterdir()
+    }
+
+
+def test_the_same_command_again_skips_everything(shapes: Path) -> None:
+    done = playslot("pipeline", "env=grid_shapes", "preset=smoke", f"out={shapes}", "episodes=4", *ONE_CORE)
+    assert done.code == 0
+    assert done.out.count("skipped") == 3
+
+
+def test_evaluate_says_that_there_is_nothing_to_act_on(shapes: Path) -> None:
+    done = playslot("evaluate", f"run={shapes}", "protocol=imagination", "episodes=2", "seed=1", *ONE_CORE)
+    assert done.code == 0
+    assert "nothing to act on" in done.out
+    refused("evaluate", f"run={shapes}", "episodes=1", message="episodes: got 1, expected at least 2")
+
+
+def test_a_policy_and_a_demo_are_refused(shapes: Path, tmp_path: Path) -> None:
+    refused("train-policy", f"run={shapes}", message="variant: got multi, expected single")
+    refused("demo", "env=grid_shapes", f"out={tmp_path / 'x'}", message="policy: got expert .*expected random")
+    refused("pipeline", "env=sketchy", f"out={tmp_path / 'y'}", message="env=sketchy: got an environment without a sim")
+    assert not list(tmp_path.iterdir())
+
+
+def test_collected_clips_are_those_of_their_seeds(tmp_path: Path) -> None:
+    wanted = ("env=grid_shapes", "env.grid.objects=3", "env.action_dim=6", "episodes=3", "collect.random_steps=5")
+    done = playslot("collect", *wanted, "seed=2", f"out={tmp_path / 'set'}", *ONE_CORE)
+    assert done.code == 0, done.err
+    source = open_source(tmp_path / "set", cache=tmp_path / "cache")
+    assert source.seeds is not None
+    assert source.actions is not None
+    assert source.seeds.tolist() == [2_000_000, 2_000_001, 2_000_002]
+    env = EnvConfig(name="grid_shapes", action_dim=6)
+    clips = generate(source.seeds.tolist(), 5, type(env)(**{**vars(env), "grid": type(env.grid)(objects=3)}))
+    for episode in range(3):
+        rows = source.episode_rows(episode)
+        np.testing.assert_array_equal(source.frames[rows], clips.frames[episode])
+        np.testing.assert_array_equal(moves_of(source.actions[rows[:-1]]), clips.moves[episode])
+
+
+def test_an_expert_and_a_wrong_action_width_are_refused(tmp_path: Path) -> None:
+    out = f"out={tmp_path / 'set'}"
+    refused("collect", "env=grid_shapes", "policy=expert", out, message="policy: got expert .*move by themselves")
+    refused("collect", "env=grid_shapes", "env.grid.objects=5", out, message="expected 10, .*model.savi.n_slots=6")
+    assert not list(tmp_path.iterdir())
