@@ -43,9 +43,13 @@ def is_data(path: str) -> bool:
     return PurePosixPath(path).suffix in _SUFFIXES.get(parts[0], set())
 
 
+def _is_licence(path: str) -> bool:
+    return path.startswith("LICENSE") and "/" not in path
+
+
 def is_pulled(path: str) -> bool:
     """Whether a pull fetches this path: the data set, its card and its licence, no more."""
-    return (is_data(path) and path != LOCAL_RECORD) or path == CARD_NAME or path.startswith("LICENSE")
+    return (is_data(path) and path != LOCAL_RECORD) or path == CARD_NAME or _is_licence(path)
 
 
 def local_files(root: Path) -> tuple[dict[str, int], list[str]]:
@@ -63,7 +67,7 @@ def local_files(root: Path) -> tuple[dict[str, int], list[str]]:
         if not file.is_file():
             continue
         path = file.relative_to(root).as_posix()
-        if (is_data(path) and path not in _GENERATED) or ("/" not in path and path.startswith("LICENSE")):
+        if (is_data(path) and path not in _GENERATED) or _is_licence(path):
             sizes[path] = file.stat().st_size
         elif path != CARD_NAME and path not in _GENERATED:
             left.append(path)

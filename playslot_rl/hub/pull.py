@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -203,8 +204,9 @@ def _finish(
     if root.is_dir():
         root.rmdir()  # empty, or it would have been refused
     replace_dir(partial, root)
-    for old in root.parent.glob(f".{root.name}.pull-*"):
-        shutil.rmtree(old, ignore_errors=True)  # of a commit that has been superseded
+    for old in root.parent.iterdir():  # of commits that have been superseded
+        if re.fullmatch(re.escape(f".{root.name}.pull-") + "[0-9a-f]{16}", old.name):
+            shutil.rmtree(old, ignore_errors=True)
     return result
 
 

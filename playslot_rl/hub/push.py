@@ -6,6 +6,7 @@ import re
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final, Literal
 
 from playslot_rl.data.lerobot_files import open_files
 from playslot_rl.errors import HubError
@@ -16,6 +17,7 @@ from playslot_rl.hub.record import HubRecord
 from playslot_rl.hub.session import Repository, open_repository
 
 MAIN = "main"
+KEPT: Final = "kept"
 _VERSION = re.compile(r"v?\d+(\.\d+)*")
 
 
@@ -115,22 +117,20 @@ def push(
         sizes, left = local_files(root)
         content: dict[str, Path | bytes] = {path: root / path for path in sizes}
         content[REMOTE_RECORD] = record.to_bytes()
-        card = _card(hub, root, head, remote)
-        if card is None:
-            content[CARD_NAME] = make_card(files, hub.name, record).encode()
-        elif CARD_NAME not in remote or isinstance(card, Path):
-            content[CARD_NAME] = card
+        card = _own_card(hub, root, head, remote)
+        if card != KEPT:
+            content[CARD_NAME] = card or make_card(files, hub.name, record).encode()
+        expected = {path: sizes.get(path, _size(item)) for path, item in content.items()}
         stale = tuple(sorted(path for path in remote if is_data(path) and path not in content))
         _check_tag(hub, tag, tags, content)
         message = f"{record.episodes} episodes, {record.frames} frames, fingerprint {record.fingerprint}"
         commit = hub.commit(content, stale, message, target, head)
-        expected = {path: _size(item) for path, item in content.items()}
         _check_remote(hub, commit, expected)
         version = str(files.info["codebase_version"]) if target == MAIN else None
         set_tags = _set_tags(hub, commit, version, tag, tags)
     return PushResult(
         hub.name, hub.address, target, commit, commit != head, is_private, set_tags, record, len(expected),
-        sum(expected.values()), stale, tuple(left), "made" if card is None else "kept",
+        sum(expected.values()), stale, tuple(left), "kept" if card else "made",
     )  # fmt: skip
 
 
@@ -167,16 +167,16 @@ def _check_tag(hub: Repository, tag: str | None, tags: dict[str, str], content: 
         )
 
 
-def _card(hub: Repository, root: Path, head: str, remote: dict[str, RemoteFile]) -> Path | bytes | None:
-    """A card written by hand, in the folder or else on the Hub; None if there is none."""
+def _own_card(hub: Repository, root: Path, head: str, remote: dict[str, RemoteFile]) -> Path | Literal["", "kept"]:
+    """A card written by hand: the one in the folder, else `KEPT` for the one on the Hub; empty if there is none."""
     local = root / CARD_NAME
     if local.is_file() and not is_ours(local.read_text(errors="replace")):
         return local
     if CARD_NAME not in remote:
-        return None
+        return ""
     with tempfile.TemporaryDirectory(prefix="playslot-card-") as folder:
-        there = hub.read(CARD_NAME, head, Path(folder))
-    return None if is_ours(there.decode(errors="replace")) else there
+        there = hub.read(CARD_NAME, head, Path(folder)).decode(errors="replace")
+    return "" if is_ours(there) else KEPT
 
 
 def _check_remote(hub: Repository, commit: str, expected: dict[str, int]) -> None:

@@ -53,22 +53,37 @@ def write_small(
     if wide:
         features["noise"] = {"dtype": "string", "shape": [1], "names": None}
     for file in range(shards):
-        rows: dict[str, list[Any]] = {name: [] for name in features}
-        for episode in np.flatnonzero(files == file):
-            for t in range(lengths[episode]):
-                rows["action"].append(generator.normal(size=2).astype(np.float32).tolist())
-                rows["next.success"].append(bool(episode > 0 and t == lengths[episode] - 1))
-                rows["timestamp"].append(t / FPS)
-                rows["frame_index"].append(t)
-                rows["episode_index"].append(int(episode))
-                rows["index"].append(int(starts[episode]) + t)
-                rows["task_index"].append(0)
-                if wide:
-                    size = wide if file == shards - 1 and not rows["noise"] else 0
-                    rows["noise"].append(generator.bytes(size // 2).hex())
+        here = np.flatnonzero(files == file)
+        rows = _rows(here, lengths, starts, generator)
+        if wide:
+            rows["noise"] = [generator.bytes(wide // 2).hex() if file == shards - 1 else ""]
+            rows["noise"] += [""] * (len(rows["index"]) - 1)
         types = {"action": pa.list_(pa.float32(), 2), "timestamp": pa.float32()}
         table = pa.table({name: pa.array(values, types.get(name)) for name, values in rows.items()})
         _write(root / f"data/chunk-000/file-{file:03d}.parquet", table)
+    _write_metadata(root, features, lengths, starts, files, version)
+    if ours:
+        (root / "meta/playslot.json").write_text(json.dumps(NOTE | {"episodes": [{"seed": None}] * len(lengths)}))
+    return root
+
+
+def _rows(here: Any, lengths: tuple[int, ...], starts: Any, generator: np.random.Generator) -> dict[str, list[Any]]:
+    """Rows of some episodes; all but the first are solved at their end."""
+    steps = [(int(episode), t) for episode in here for t in range(lengths[episode])]
+    return {
+        "action": generator.normal(size=(len(steps), 2)).astype(np.float32).tolist(),
+        "next.success": [episode > 0 and t == lengths[episode] - 1 for episode, t in steps],
+        "timestamp": [t / FPS for _, t in steps],
+        "frame_index": [t for _, t in steps],
+        "episode_index": [episode for episode, _ in steps],
+        "index": [int(starts[episode]) + t for episode, t in steps],
+        "task_index": [0] * len(steps),
+    }
+
+
+def _write_metadata(
+    root: Path, features: dict[str, Any], lengths: tuple[int, ...], starts: Any, files: Any, version: str
+) -> None:
     episodes = {
         "episode_index": list(range(len(lengths))),
         "tasks": [["press | the “button”"]] * len(lengths),
@@ -91,9 +106,6 @@ def write_small(
         "features": features,
     }  # fmt: skip
     (root / "meta/info.json").write_text(json.dumps(info))
-    if ours:
-        (root / "meta/playslot.json").write_text(json.dumps(NOTE | {"episodes": [{"seed": None}] * len(lengths)}))
-    return root
 
 
 def _write_statistics(root: Path, features: dict[str, Any]) -> None:
