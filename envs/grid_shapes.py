@@ -81,7 +81,8 @@ class Clips:
 def moves_of(actions: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
     """Labels (..., O), index into `MOVES`, of the actions (..., 2 O) of a recorded data set."""
     pairs = np.rint(np.asarray(actions)).astype(np.int64).reshape(*np.shape(actions)[:-1], -1, 2)
-    return np.abs(pairs[..., None, :] - DISPLACEMENTS).sum(-1).argmin(-1)
+    labels: npt.NDArray[np.int64] = np.abs(pairs[..., None, :] - DISPLACEMENTS).sum(-1).argmin(-1)
+    return labels
 
 
 def generate(seeds: Iterable[int], steps: int, env: EnvConfig) -> Clips:

@@ -41,7 +41,8 @@ def overlaps(truth: Labels, predicted: Labels, objects: int, slots: int) -> npt.
     pairs = np.bincount(truth.ravel().astype(np.int64) * slots + predicted.ravel(), minlength=(objects + 1) * slots)
     both = pairs.reshape(objects + 1, slots).astype(np.float64)
     either = both.sum(1, keepdims=True) + both.sum(0, keepdims=True) - both
-    return both / np.maximum(either, 1.0)
+    found: npt.NDArray[np.float64] = both / np.maximum(either, 1.0)
+    return found
 
 
 def match_slots(truth: Labels, predicted: Labels, objects: int, slots: int) -> npt.NDArray[np.int64]:
