@@ -68,10 +68,9 @@ def gym_id(name: str) -> str:
     Raises:
         ConfigError: there is no such environment.
     """
-    if name in PROCEDURAL:
-        raise ConfigError(
-            f"env={name}: got videos without a simulator, expected one of {', '.join(sorted(ENVIRONMENTS))}"
-        )
+    if name in (*PROCEDURAL, *RECORDED):
+        known = ", ".join(sorted(ENVIRONMENTS))
+        raise ConfigError(f"env={name}: got an environment without a simulator, expected one of {known}")
     if name not in ENVIRONMENTS:
         near = difflib.get_close_matches(name, ENVIRONMENTS, n=1)
         hint = f"; did you mean env={near[0]}?" if near else "; choose one of these"
