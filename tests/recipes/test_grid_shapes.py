@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from commands import ONE_CORE, playslot, refused
 
-from playslot_rl.config import EnvConfig
+from playslot_rl.collectors.spec import CollectionSpec
+from playslot_rl.compose import compose
+from playslot_rl.config import EnvConfig, GridConfig
 from playslot_rl.data.source import open_source
 from playslot_rl.envs.grid_shapes import generate, moves_of
 
@@ -71,8 +73,7 @@ def test_collected_clips_are_those_of_their_seeds(tmp_path: Path) -> None:
     assert source.seeds is not None
     assert source.actions is not None
     assert source.seeds.tolist() == [2_000_000, 2_000_001, 2_000_002]
-    env = EnvConfig(name="grid_shapes", action_dim=6)
-    clips = generate(source.seeds.tolist(), 5, type(env)(**{**vars(env), "grid": type(env.grid)(objects=3)}))
+    clips = generate(source.seeds.tolist(), 5, EnvConfig(name="grid_shapes", action_dim=6, grid=GridConfig(objects=3)))
     for episode in range(3):
         rows = source.episode_rows(episode)
         np.testing.assert_array_equal(source.frames[rows], clips.frames[episode])
@@ -84,3 +85,10 @@ def test_an_expert_and_a_wrong_action_width_are_refused(tmp_path: Path) -> None:
     refused("collect", "env=grid_shapes", "policy=expert", out, message="policy: got expert .*move by themselves")
     refused("collect", "env=grid_shapes", "env.grid.objects=5", out, message="expected 10, .*model.savi.n_slots=6")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_record_without_the_groups_of_other_tasks_is_the_same_collection() -> None:
+    plain = CollectionSpec.make(compose(["preset=smoke"]), "random", 2, 3, 0).to_dict()
+    assert not [value for value in plain["env"].values() if isinstance(value, dict)], "as it was before there were any"
+    shapes = ["preset=smoke", "env=grid_shapes", "env.grid.speed=3"]
+    assert CollectionSpec.make(compose(shapes), "random", 2, 3, 0).to_dict()["env"]["grid"]["speed"] == 3
