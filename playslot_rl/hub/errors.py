@@ -125,7 +125,7 @@ def _http(error: BaseException, place: Place) -> HubError:
         )
     if status == 429:
         return HubError(
-            f"{place.repo_id}: got 429, too many requests: wait some minutes and run the same command again"
+            f"{place.repo_id}: got 429, too many requests, expected fewer: run the same command again in some minutes"
         )
     if status >= 500:
         return HubError(

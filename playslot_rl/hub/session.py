@@ -137,7 +137,7 @@ class Repository:
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
         def send() -> str:
-            operations = [CommitOperationDelete(path, is_folder=False) for path in stale]
+            operations: list[Any] = [CommitOperationDelete(path, is_folder=False) for path in stale]
             operations += [CommitOperationAdd(path, content) for path, content in files.items()]
             info = self.api.create_commit(repo_id=self.name, repo_type=KIND, operations=operations, revision=branch,
                                           commit_message=message, parent_commit=head)  # fmt: skip

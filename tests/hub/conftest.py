@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import subprocess
@@ -97,9 +98,21 @@ def data(tmp_path: Path) -> Path:
     return write_small(tmp_path / "data")
 
 
-@pytest.fixture
-def pushed(hub: FakeHub, client: Client, data: Path) -> Repository:
-    """The data set on the Hub, public."""
-    answer = client("push", root=data, repo_id="owner/press", private=False)
+@pytest.fixture(scope="session")
+def first_push(
+    running_hub: FakeHub, client: Client, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Repository, dict[str, bytes]]:
+    """What a push of the data set of `data` leaves on the Hub; made once, it is the same each time."""
+    root = write_small(tmp_path_factory.mktemp("first") / "data")
+    answer = client("push", root=root, repo_id="owner/press", private=False)
     assert "error" not in answer, answer
+    return copy.deepcopy(running_hub.repositories["owner/press"]), dict(running_hub.large)
+
+
+@pytest.fixture
+def pushed(first_push: tuple[Repository, dict[str, bytes]], hub: FakeHub) -> Repository:
+    """The data set of `data` on the Hub, public."""
+    repository, large = first_push
+    hub.large.update(large)
+    hub.repositories["owner/press"] = copy.deepcopy(repository)
     return hub.repositories["owner/press"]
