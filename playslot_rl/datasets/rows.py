@@ -153,8 +153,8 @@ def _check_episode(contents: Contents, episode: Episode, span: Span, problems: P
         )
     try:
         if contents.data_file(episode.row) != contents.data_files[span.file]:
-            got, named = contents.data_files[span.file], contents.data_file(episode.row)
-            problems.error("wrong file", f"episode {span.index}: got rows in {got}, expected them in {named} as stated")
+            there, named = contents.data_files[span.file], contents.data_file(episode.row)
+            problems.error("wrong file", f"episode {span.index}: got rows in {there}, expected them in {named}")
     except (KeyError, ValueError, TypeError):
         return  # noted with the files
     for camera in contents.videos:

@@ -58,9 +58,20 @@ def of_numbers(values: Array) -> dict[str, Array]:
 
 def of_frames(frames: Sequence[npt.NDArray[np.uint8]]) -> dict[str, Array]:
     """Statistics of one episode's sampled frames (H, W, C): float64 (C, 1, 1), in [0, 1]."""
-    pixels = np.stack(frames).reshape(-1, frames[0].shape[-1]) / 255.0
-    stats = _summary(pixels, len(frames))
-    return {name: value if name == "count" else value.reshape(-1, 1, 1) for name, value in stats.items()}
+    channels = np.stack(frames).reshape(-1, frames[0].shape[-1]).T
+    # From the counts of the 256 levels: exact, and many times faster than sorting pixels for the quantiles.
+    levels = [_of_levels(np.bincount(channel, minlength=256)) for channel in channels]
+    stats = {name: np.array([level[name] for level in levels]).reshape(-1, 1, 1) for name in levels[0]}
+    return {**stats, "count": np.array([len(frames)])}
+
+
+def _of_levels(counts: Array) -> dict[str, float]:
+    values, total, below = np.arange(256) / 255.0, int(counts.sum()), np.cumsum(counts)
+    mean = float(counts @ values) / total
+    present = np.flatnonzero(counts)
+    stats = {"min": values[present[0]], "max": values[present[-1]], "mean": mean}
+    stats["std"] = float(np.sqrt(counts @ (values - mean) ** 2 / total))
+    return {**stats, **{name: values[np.searchsorted(below, share * total)] for name, share in QUANTILES.items()}}
 
 
 def _summary(rows: Array, count: int) -> dict[str, Array]:

@@ -89,7 +89,7 @@ BREAKS: dict[str, tuple[Break, str]] = {
     "rate": (info(fps=20), "got timestamp 0.1 at frame 1|got timestamp .* expected"),
     "rows cut off": (lambda root: keep_rows(root, ROWS, 13), "episode 2: got 5 rows, expected 7"),
     "an episode's rows gone": (lambda root: keep_rows(root, ROWS, 8), "episode 2: got no rows, expected 7"),
-    "an episode's metadata gone": (lambda root: keep_rows(root, EPISODES, 2), "episode 2: got rows, but no row in meta"),
+    "an episode's metadata gone": (lambda root: keep_rows(root, EPISODES, 2), "episode 2: got rows, but no row in"),
     "shifted index": (column(ROWS, "index", 4, 5), r"row 4: got index 5, expected 4 \(and 0 more"),
     "shifted frame_index": (column(ROWS, "frame_index", 6, 2), "episode 1: got frame_index"),
     "shifted episode_index": (column(ROWS, "episode_index", 4, 1), "episode 0: got 4 rows, expected 5"),
@@ -128,7 +128,7 @@ def test_damage_is_noticed(damage: str, broken: Path) -> None:
     assert not result.ok
     assert result.fingerprint == ""
     assert any(re.search(message, line) for line in result.errors), result.errors
-    assert all(("\n" not in line and "expected" in line) or "more of this kind" in line or "but" in line for line in result.errors)  # fmt: skip
+    assert all("\n" not in line for line in result.errors)
 
 
 VIDEO_BREAKS: dict[str, tuple[Break, str]] = {
@@ -139,7 +139,7 @@ VIDEO_BREAKS: dict[str, tuple[Break, str]] = {
     "from_timestamp": (column(EPISODES, f"videos/{CAMERA}/from_timestamp", 1, 0.9), "episode 1: got .* from 0.9 to"),
     "to_timestamp": (column(EPISODES, f"videos/{CAMERA}/to_timestamp", 2, 9.0), "to 9.0 s, expected 7 frames"),
     "stated size": (lambda root: edit_json(root, "meta/info.json",
-                    lambda content: content["features"][CAMERA].update(shape=[32, 32, 3])), r"got frames of \(64, 64\)"),
+                    lambda info: info["features"][CAMERA].update(shape=[32, 32, 3])), r"got frames of \(64, 64\)"),
     "camera's mean": (stats(CAMERA, "mean", [[[0.9]]] * 3), f"stats.json: got mean of {CAMERA}"),
 }  # fmt: skip
 
