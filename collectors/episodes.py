@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -29,7 +29,8 @@ REDRAWN = "redrawn"
 MAX_REDRAWS = 20
 
 
-class Job(NamedTuple):
+@dataclass(frozen=True)
+class Job:
     """An episode to record: its place in the collection and its seed."""
 
     index: int

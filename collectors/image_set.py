@@ -2,7 +2,7 @@
 
 LeRobot's own `add_frame` and `save_episode` write each image to a file of its own, read it again for the statistics and
 a third time for the parquet file, and build a `datasets.Dataset` an episode, which takes about as long as recording it.
-This writer makes the same files with LeRobot's own schema, metadata and statistics; a test holds it to LeRobot's output.
+This writer makes the same files with LeRobot's own schema, metadata and statistics; a test compares the two.
 """
 
 from __future__ import annotations

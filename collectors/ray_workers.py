@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import os
+import socket
 import warnings
 from typing import Any
 
@@ -18,6 +19,8 @@ from playslot_rl.collectors.journal import Journal
 from playslot_rl.collectors.policies import make_policy
 from playslot_rl.collectors.workers import Report
 from playslot_rl.errors import ConfigError, PlaySlotError
+
+CONNECT_S = 10.0
 
 
 class RemoteEpisodeCollector(EpisodeCollector):
@@ -120,11 +123,13 @@ class RayWorkers:
 def _connect(journal: Journal, count: int, address: str) -> Any:
     """TorchRL's Ray collector, without actors yet."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray announces a change of its own
+    where = address or os.environ.get("RAY_ADDRESS", "")
+    alone = not where
+    _check_reachable(where)
     from torchrl.collectors.distributed import RayCollector
 
-    alone = not (address or os.environ.get("RAY_ADDRESS"))
     init: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "logging_level": "error"}
-    init |= {"address": "local", "num_cpus": count} if alone else {"address": address or None}
+    init |= {"address": "local", "num_cpus": count} if alone else {"address": where}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of weight updates: these policies have no weights
@@ -139,11 +144,30 @@ def _connect(journal: Journal, count: int, address: str) -> Any:
                 weight_sync_schemes={},
             )
     except (ConnectionError, RuntimeError, ValueError) as error:
-        text, where = " ".join(str(error).split()), address or os.environ.get("RAY_ADDRESS", "")
-        raise PlaySlotError(
-            f"collector.backend=ray: got {text}, expected a cluster at {where!r}; "
-            "check collector.ray_address, or leave it out to use this machine alone"
-        ) from error
+        raise PlaySlotError(_no_cluster(where, error)) from error
+
+
+def _check_reachable(where: str) -> None:
+    """Look whether anybody listens at HOST:PORT; Ray itself would try for minutes.
+
+    Raises:
+        PlaySlotError: nobody does.
+    """
+    host, colon, port = where.removeprefix("ray://").rpartition(":")
+    if not colon or not port.isdigit():
+        return  # "auto" and the like are Ray's to judge
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        raise PlaySlotError(_no_cluster(where, error)) from error
+
+
+def _no_cluster(where: str, error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return (
+        f"collector.backend=ray: got {text}, expected a cluster at {where!r}; "
+        "check collector.ray_address, or leave it out to use this machine alone"
+    )
 
 
 def _resources() -> dict[str, Any]:

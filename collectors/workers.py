@@ -13,10 +13,11 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from playslot_rl.collectors.episodes import EpisodeCollector, Job
 from playslot_rl.collectors.journal import Journal, store
@@ -26,7 +27,8 @@ from playslot_rl.errors import PlaySlotError
 PR_SET_PDEATHSIG = 1
 
 
-class Report(NamedTuple):
+@dataclass(frozen=True)
+class Report:
     """News of a worker: it stored episode `index`; or ended with an `error`; or died, and of what (`dead`).
 
     With none of them, it is ready.

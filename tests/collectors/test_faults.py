@@ -366,7 +366,7 @@ def stored(out: Path) -> int:
     return len(list(journal_path(out).glob("episode_*.npz")))
 
 
-def wait_for(happened: Any, process: subprocess.Popen[bytes] | None = None, timeout: float = 240.0) -> None:
+def wait_for(happened: Any, process: subprocess.Popen[bytes] | None = None, timeout: float = 400.0) -> None:
     deadline = time.monotonic() + timeout
     while not happened():
         assert process is None or process.poll() is None, process.communicate()[1].decode()
@@ -407,6 +407,7 @@ def assert_no_orphans(pid: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_workers_killed_and_stopped_are_replaced(
     reference: list[Any], tmp_path: Path, started: list[subprocess.Popen[bytes]]
 ) -> None:
@@ -417,7 +418,7 @@ def test_workers_killed_and_stopped_are_replaced(
     killed, stopped = workers_of(process.pid)
     os.kill(killed, signal.SIGKILL)
     os.kill(stopped, signal.SIGSTOP)
-    errors = process.communicate(timeout=280)[1].decode()
+    errors = process.communicate(timeout=800)[1].decode()
     assert process.returncode == 0, errors
     assert "ended with SIGKILL: another takes its place" in errors
     assert "gave no episode for 8 s: another takes its place" in errors
@@ -428,6 +429,7 @@ def test_workers_killed_and_stopped_are_replaced(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_death_beyond_the_limit_ends_in_one_line_and_the_same_command_carries_on(
     reference: list[Any], tmp_path: Path, started: list[subprocess.Popen[bytes]]
 ) -> None:

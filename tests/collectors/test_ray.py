@@ -96,7 +96,6 @@ def test_two_ray_workers_record_the_local_episodes_and_a_killed_one_is_replaced(
             np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
 
 
-@pytest.mark.slow
 def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     settings = CollectorConfig(backend="ray", ray_address="127.0.0.1:1")
     with pytest.raises(PlaySlotError, match=r"127\.0\.0\.1:1.*check collector\.ray_address"):
