@@ -125,7 +125,7 @@ def _image_rows(
 
 def decode_image(root: Path, cell: dict[str, Any] | None) -> Array | str:
     """Pixels of a stored image, (H, W, 3) uint8 for colours, or why it cannot be decoded."""
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     try:
         if cell is None:
@@ -134,6 +134,8 @@ def decode_image(root: Path, cell: dict[str, Any] | None) -> Array | str:
         with Image.open(io.BytesIO(content)) as image:
             depth = image.mode.startswith(("I", "F"))
             return np.asarray(image if depth else image.convert("RGB"))
+    except UnidentifiedImageError:
+        return "not an image"
     except (OSError, ValueError, SyntaxError, KeyError, TypeError, AttributeError) as error:
         return " ".join(str(error).split())[:80] or type(error).__name__
 
