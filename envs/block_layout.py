@@ -26,6 +26,8 @@ GOAL_APART: Final = 0.104
 episode starts solved."""
 LIFT: Final = (0.10, 0.20)
 """How far Pick's goal is above a cube on the table."""
+TRIES: Final = 256
+"""Layouts drawn at once; the first that fits is taken. One in some hundred does with four distractors."""
 REACH_Z: Final = (TABLE_TOP + 0.045, TABLE_TOP + 0.245)
 """Heights of Reach's spheres."""
 
@@ -82,11 +84,13 @@ def _scatter(rng: np.random.Generator, start: Vector, count: int, with_goal: boo
     least = np.full((total, total), APART)
     if with_goal:
         least[:, -1] = GOAL_APART
-    pairs = np.triu_indices(total, 1)
+    first, second = np.triu_indices(total, 1)
     while True:
-        xy = start[:2] + rng.uniform(-SPREAD, SPREAD, (total, 2))
-        if (np.linalg.norm(xy[:, None] - xy[None], axis=-1) >= least)[pairs].all():
-            return np.concatenate([xy, np.zeros((total, 1))], axis=1)
+        xy = start[:2] + rng.uniform(-SPREAD, SPREAD, (TRIES, total, 2))
+        gaps = np.linalg.norm(xy[:, first] - xy[:, second], axis=-1)
+        fits = (gaps >= least[first, second]).all(axis=1)
+        if fits.any():
+            return np.concatenate([xy[fits.argmax()], np.zeros((total, 1))], axis=1)
 
 
 def _reach_places(rng: np.random.Generator, start: Vector, count: int, target: int) -> Vector:

@@ -140,6 +140,7 @@ def test_the_command_writes_every_key_with_its_ratio_and_medians(
         "dynamics_step": ("plain_fp32_glibc", "fast"),
         "rollout_cache": ("full", "cached"),
         "render": ("full", "fast"),
+        "render_block_push": ("full", "fast"),
     }
     for key, (slow, fast) in pairs.items():
         assert figures[key]["ratio"] == pytest.approx(figures[key][slow] / figures[key][fast])

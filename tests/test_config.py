@@ -13,7 +13,7 @@ from playslot_rl.config import ExperimentConfig, ModelConfig, SAViConfig, finger
 from playslot_rl.errors import ConfigError
 
 PRESETS = ["compact", "paper", "smoke"]
-ENVS = ["button_press", "grid_shapes"]
+ENVS = ["block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "grid_shapes", "sketchy"]
 
 
 def store(config: ExperimentConfig, run: Path) -> Path:
