@@ -138,7 +138,8 @@ def _pieces(choice: Choice) -> Iterator[Any]:
 
     contents = choice.contents
     starts = np.cumsum([0, *contents.file_rows])
-    number, table = -1, None
+    number = -1
+    table: Any = None
     for span in choice.spans:
         if span.file != number:
             number, table = span.file, pq.ParquetFile(contents.data_files[span.file]).read()
