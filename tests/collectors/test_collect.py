@@ -230,20 +230,18 @@ def test_full_disk_is_one_line_and_loses_nothing(made: Path, tmp_path: Path, mon
     assert len(load(out)) == 2 * (STEPS + 1)
 
 
-def test_image_that_lerobot_failed_to_write_is_noticed(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from lerobot.datasets import dataset_writer
+def test_frame_that_was_stored_wrongly_is_noticed(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from playslot_rl.collectors.image_set import ImageSetWriter
 
-    original = dataset_writer.write_image
+    original = ImageSetWriter.add
 
-    def lossy(image: Any, path: Path, **options: Any) -> None:
-        original(image // 2 if path.stem.endswith("2") else image, path, **options)
+    def swapped(self: Any, values: Any, frames: Any, images: list[bytes]) -> None:
+        original(self, values, frames, [images[0], images[2], images[1], *images[3:]])
 
     out = tmp_path / "data"
     restore(made, out)
-    monkeypatch.setattr(dataset_writer, "write_image", lossy)
-    with pytest.raises(OutputError, match="frames of episode 0 that differ"):
+    monkeypatch.setattr(ImageSetWriter, "add", swapped)
+    with pytest.raises(OutputError, match="got another row 1 of episode 0 than was recorded"):
         small(out)
     assert not out.exists()
 
