@@ -23,7 +23,7 @@ Vector = npt.NDArray[np.float64]
 MujocoFetchEnv: Any = import_fetch().MujocoFetchEnv
 
 
-class BlockSimulation(MujocoFetchEnv):  # type: ignore[misc]
+class BlockSimulation(MujocoFetchEnv):
     """Arm, table and objects; `place` starts an episode, `advance` runs one environment step.
 
     Args:
@@ -62,6 +62,8 @@ class BlockSimulation(MujocoFetchEnv):  # type: ignore[misc]
         self._grip_site = self.model.site("robot0:grip").id
         self._fingers = [self.model.joint(f"robot0:{side}_gripper_finger_joint").qposadr[0] for side in "lr"]
         self.start_grip = self.grip
+
+    initial_qpos: Any  # joint values by name, and, once the robot has settled, those of all joints
 
     def _initialize_simulation(self) -> None:
         """As in the base class, with our scene in place of a file."""

@@ -72,7 +72,8 @@ def in_sight(model: mujoco.MjModel, still: Still, name: str, camera: Vector) -> 
     faces = model.mesh_face[first : first + facets]
     box_axes, box_place = data.geom_xmat[box].reshape(3, 3), data.geom_xpos[box]
     hidden = screened((vertices - box_place) @ box_axes, (camera - box_place) @ box_axes, model.geom_size[box] - SHRINK)
-    return facing(vertices[faces], camera) & ~hidden[faces].all(axis=1)
+    seen: npt.NDArray[np.bool_] = facing(vertices[faces], camera) & ~hidden[faces].all(axis=1)
+    return seen
 
 
 @contextlib.contextmanager
