@@ -21,6 +21,8 @@ from playslot_rl.collectors.workers import Report
 from playslot_rl.errors import ConfigError, PlaySlotError
 
 CONNECT_S = 10.0
+STARTS = 3
+"""Attempts to start Ray on this machine: it gives its own processes 30 seconds, too few where all cores are busy."""
 
 
 class RemoteEpisodeCollector(EpisodeCollector):
@@ -130,21 +132,27 @@ def _connect(journal: Journal, count: int, address: str) -> Any:
 
     init: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "logging_level": "error"}
     init |= {"address": "local", "num_cpus": count} if alone else {"address": where}
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of weight updates: these policies have no weights
-            return RayCollector(
-                [],
-                make_policy(journal.spec.policy, journal.spec.noise),
-                collector_class=RemoteEpisodeCollector,
-                frames_per_batch=journal.spec.steps,
-                collector_kwargs=[],
-                remote_configs=[],
-                ray_init_config=init,
-                weight_sync_schemes={},
-            )
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        raise PlaySlotError(_no_cluster(where, error)) from error
+    for attempt in range(STARTS if alone else 1):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of weight updates: these policies have no weights
+                return RayCollector(
+                    [],
+                    make_policy(journal.spec.policy, journal.spec.noise),
+                    collector_class=RemoteEpisodeCollector,
+                    frames_per_batch=journal.spec.steps,
+                    collector_kwargs=[],
+                    remote_configs=[],
+                    ray_init_config=init,
+                    weight_sync_schemes={},
+                )
+        except Exception as error:  # a node that does not start in time is a plain Exception
+            import ray
+
+            ray.shutdown()
+            if not alone or attempt == STARTS - 1:
+                raise PlaySlotError(_no_cluster(where, error)) from error
+    raise AssertionError("unreachable")
 
 
 def _check_reachable(where: str) -> None:
@@ -164,6 +172,8 @@ def _check_reachable(where: str) -> None:
 
 def _no_cluster(where: str, error: Exception) -> str:
     text = " ".join(str(error).split())
+    if not where:
+        return f"collector.backend=ray: got {text}, expected Ray to start on this machine; use collector.backend=local"
     return (
         f"collector.backend=ray: got {text}, expected a cluster at {where!r}; "
         "check collector.ray_address, or leave it out to use this machine alone"

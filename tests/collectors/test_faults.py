@@ -412,7 +412,7 @@ def test_workers_killed_and_stopped_are_replaced(
     reference: list[Any], tmp_path: Path, started: list[subprocess.Popen[bytes]]
 ) -> None:
     out = tmp_path / "data"
-    process = start(started, tmp_path, out, episodes=200, timeout_s=8)
+    process = start(started, tmp_path, out, episodes=80, timeout_s=8)
     wait_for(lambda: stored(out) >= 3, process)
     wait_for(lambda: len(workers_of(process.pid)) == 2, process)
     killed, stopped = workers_of(process.pid)
@@ -425,7 +425,7 @@ def test_workers_killed_and_stopped_are_replaced(
     assert not alive(killed)
     assert not alive(stopped)
     assert_no_orphans(process.pid)
-    assert_whole(out, 200, reference)
+    assert_whole(out, 80, reference)
 
 
 @pytest.mark.slow
@@ -434,7 +434,7 @@ def test_death_beyond_the_limit_ends_in_one_line_and_the_same_command_carries_on
     reference: list[Any], tmp_path: Path, started: list[subprocess.Popen[bytes]]
 ) -> None:
     out = tmp_path / "data"
-    process = start(started, tmp_path, out, episodes=400, restarts=0)
+    process = start(started, tmp_path, out, episodes=150, restarts=0)
     wait_for(lambda: stored(out) >= 3, process)
     os.kill(workers_of(process.pid)[0], signal.SIGKILL)
     errors = process.communicate(timeout=60)[1].decode()
@@ -443,9 +443,9 @@ def test_death_beyond_the_limit_ends_in_one_line_and_the_same_command_carries_on
     assert "Traceback" not in errors
     assert_no_orphans(process.pid)
     kept = {p.name: p.stat().st_mtime_ns for p in journal_path(out).glob("episode_*.npz")}
-    assert 3 <= len(kept) < 400
+    assert 3 <= len(kept) < 150
 
-    process = start(started, tmp_path, out, episodes=400)
+    process = start(started, tmp_path, out, episodes=150)
     wait_for(lambda: stored(out) > len(kept), process)
     now = {p.name: p.stat().st_mtime_ns for p in journal_path(out).glob("episode_*.npz")}
     assert kept.items() <= now.items()  # none was recorded again
@@ -454,5 +454,5 @@ def test_death_beyond_the_limit_ends_in_one_line_and_the_same_command_carries_on
     process.wait()
     wait_for(lambda: not any(alive(child) for child in children), timeout=20.0)
     assert_no_orphans(process.pid)
-    small(out, 400)
-    assert_whole(out, 400, reference)
+    small(out, 150)
+    assert_whole(out, 150, reference)
