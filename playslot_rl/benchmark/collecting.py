@@ -86,7 +86,7 @@ def measure(
 
     total = max(workers) * WARM_UP + episodes + 2 * max(workers)
     spec = CollectionSpec.make(config, policy, total, steps, 0)
-    with tempfile.TemporaryDirectory(prefix="playslot-bench-", dir=Path.cwd()) as folder:
+    with tempfile.TemporaryDirectory(prefix="playslot-bench-") as folder:
         say("where an episode's time goes, in one process")
         parts, sizes = episode_parts(spec, min(episodes, 20), Path(folder))
         rates: dict[int, list[float]] = {count: [] for count in workers}

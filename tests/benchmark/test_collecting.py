@@ -22,7 +22,7 @@ def test_a_stopwatch_gives_inner_time_to_the_inner_block() -> None:
 
 
 def test_every_part_is_measured_and_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     small = {"env": {"image_size": 32, "warmup_steps": 1}, "render": {"supersample": 1}}
     figures = measure(from_dict(ExperimentConfig, small), "random", 2, [1], episodes=2, target=1000)
     assert list(figures["episode_ms"]) == [
