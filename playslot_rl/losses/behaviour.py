@@ -95,7 +95,7 @@ class BehaviourLoss(_CloningLoss):
     Reads SLOTS (..., N, D) and LATENT_ACTION (..., Z), targets inferred by InvDyn from unlabelled videos; SLOTS may be
     parsed or predicted ones. Writes `loss_policy`. For the oracle, `set_keys(action=keys.ACTION)`.
 
-    Note: equal to TorchRL's `BCLoss` with the same `loss_function` (a test holds it to that), which we do not use because
+    Note: equal to TorchRL's `BCLoss` with the same `loss_function` (a test holds it to that), not used because
     its functional conversion hides the network from `.train()`, `.eval()` and the checkpoints.
 
     Args:
