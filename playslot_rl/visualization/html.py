@@ -95,6 +95,6 @@ def _picture(picture: Picture) -> str:
         sources += f'<source media="(prefers-color-scheme: dark)" srcset="{data_uri(picture.dark)}">'
     image = f'<img src="{data_uri(picture.light)}" alt="{escape(picture.alt)}">'
     return (
-        '<figure><div class="scroll" tabindex="0"><picture>{sources}{image}</picture></div>\n'
+        f'<figure><div class="scroll" tabindex="0"><picture>{sources}{image}</picture></div>\n'
         f"<figcaption>{_inline(picture.caption)}</figcaption></figure>"
     )
