@@ -428,9 +428,8 @@ class BehaviourStageConfig(StageConfig):
     Attributes:
         labelled_demos: demonstrations whose real actions the action decoder may see.
         imagined: also clone from slots that cOCVP predicts along each demonstration.
-        on_policy_rounds: rounds in which the policy unfolds in imagination from each demonstration's first frame, and
-            then clones that demonstration's latents from the slots it reached itself too (0 in the paper).
-        on_policy_steps: optimiser steps of each round.
+        loss: `l2` (paper) or `l1`, of policy, oracle and decoder. Where an expert switches at once between opposite
+            actions, the mean that `l2` finds is neither, and the policy dithers; the median is one of them.
         slot_noise: standard deviation of Gaussian noise added to the slots that policy and oracle clone from (0 in the
             paper); slots have a standard deviation of about 0.7, and a prediction is about 0.03 off.
         decoder_inputs: `inverse_dynamics` (InvDyn's latents; paper), `policy` (the policy's outputs) or `both`.
@@ -441,8 +440,7 @@ class BehaviourStageConfig(StageConfig):
 
     labelled_demos: int = 50
     imagined: bool = True
-    on_policy_rounds: int = 0
-    on_policy_steps: int = 500
+    loss: Literal["l2", "l1"] = "l2"
     slot_noise: float = 0.0
     decoder_inputs: Literal["inverse_dynamics", "policy", "both"] = "inverse_dynamics"
     decoder_steps: int = 2000

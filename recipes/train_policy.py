@@ -31,7 +31,7 @@ def main(config: ExperimentConfig) -> None:
     """
     import torch
 
-    from playslot_rl.data.demonstrations import label_demonstrations, unfold_policy
+    from playslot_rl.data.demonstrations import label_demonstrations
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.training.checkpoints import (
         checkpoint_folder,
@@ -100,14 +100,6 @@ def main(config: ExperimentConfig) -> None:
 
     cloned = train(clone, "policy", config.behaviour.steps, lr)
     agent.eval()
-    seconds = cloned.seconds
-    for number in range(1, config.behaviour.on_policy_rounds + 1):
-        demos = unfold_policy(agent, demos)
-        again = CloneStage(agent.policy, None, demos, config.behaviour)
-        seconds += train(again, f"round{number}", config.behaviour.on_policy_steps, lr).seconds
-        agent.eval()
-    if config.behaviour.on_policy_rounds:
-        demos = unfold_policy(agent, demos)
     decode = DecoderStage(agent.action_decoder, agent.policy, demos, config.behaviour)
     decoded = train(decode, "decoder", config.behaviour.decoder_steps, config.behaviour.decoder_lr)
     save_stage(
@@ -119,7 +111,7 @@ def main(config: ExperimentConfig) -> None:
         parents=prints,
         metrics={**cloned.metrics, **{f"decoder_{key}": value for key, value in decoded.metrics.items()}},
         steps=cloned.step,
-        seconds=seconds + decoded.seconds,
+        seconds=cloned.seconds + decoded.seconds,
         extra={
             "demos": len(demos.lengths),
             "labelled_demos": config.behaviour.labelled_demos,

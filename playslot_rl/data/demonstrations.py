@@ -5,7 +5,7 @@ Shapes: M transitions of all demonstrations in a row, N slots, D slot width, Z l
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.errors import DataError
-from playslot_rl.world_model import Agent, WorldModel
+from playslot_rl.world_model import WorldModel
 
 BATCH = 64
 
@@ -30,9 +30,7 @@ class Demonstrations:
         latents: inferred latent actions (M, Z).
         actions: real actions (M, A) in [-1, 1], or None.
         episode: number of the demonstration of each transition, int64 (M,).
-        first: parsed slots of each demonstration's first frame (E, N, D).
         lengths: transitions of each demonstration, int64 (E,).
-        unfolded: slots that the policy itself reaches in imagination at the same step (M, N, D), or None.
     """
 
     slots: Tensor
@@ -40,9 +38,7 @@ class Demonstrations:
     latents: Tensor
     actions: Tensor | None
     episode: Tensor
-    first: Tensor
     lengths: Tensor
-    unfolded: Tensor | None = None
 
     def labelled(self, demos: int) -> Tensor:
         """Rows (int64) of the first `demos` demonstrations, the only ones whose actions the action decoder sees.
@@ -102,21 +98,5 @@ def label_demonstrations(
         latents=torch.cat([parts[e][2] for e in order]),
         actions=None if labels is None else labels.clamp(-1, 1),
         episode=torch.repeat_interleave(torch.arange(len(order)), steps).to(device),
-        first=torch.stack([parts[e][0][0] for e in order]),
         lengths=steps,
     )
-
-
-@torch.no_grad()
-def unfold_policy(agent: Agent, demos: Demonstrations) -> Demonstrations:
-    """The demonstrations with `unfolded` made by this agent's policy: DAgger's states, in imagination.
-
-    The demonstration's latent of the same step is the target there: no expert is asked, and no simulator.
-    """
-    from playslot_rl.evaluation.controllers import unfold
-
-    longest = int(demos.lengths.max())
-    parts = [unfold(agent, first, longest).slots for first in demos.first.split(BATCH)]
-    slots = torch.cat(parts)
-    rows = [slots[i, : int(length)] for i, length in enumerate(demos.lengths)]
-    return replace(demos, unfolded=torch.cat(rows))

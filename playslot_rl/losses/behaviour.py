@@ -2,6 +2,8 @@
 
     L_pi = mean (f_pi(S_t) - z_t)^2,   L_a = mean (D_a(z_t) - a_t)^2
 
+or, with `loss_function="l1"`, the means of the absolute differences.
+
 Shapes: N slots, D slot width, Z latent-action width, A action width; "..." is any batch.
 """
 
@@ -20,7 +22,7 @@ from playslot_rl import keys
 
 
 class _CloningLoss(LossModule):
-    """Mean squared error of a network's output to an action; the two losses below name the keys."""
+    """Mean squared (or absolute) error of a network's output to an action; the two losses below name the keys."""
 
     @dataclass
     class _AcceptedKeys:
@@ -40,9 +42,12 @@ class _CloningLoss(LossModule):
     default_keys: ClassVar[type[Any]] = _AcceptedKeys
     out_name = "loss_cloning"
 
-    def __init__(self, network: nn.Module) -> None:
+    def __init__(self, network: nn.Module, loss_function: str = "l2") -> None:
         super().__init__()
+        if loss_function not in ("l1", "l2"):
+            raise ValueError(f"loss_function: got {loss_function!r}, expected l1 or l2")
         self.network = network
+        self.loss_function = loss_function
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -74,11 +79,14 @@ class _CloningLoss(LossModule):
             raise ValueError(f"{self.tensor_keys.action}: got shape {got}, expected {expected} (the network's output)")
         mask: Tensor | None = tensordict.get(self.tensor_keys.mask, None)
         if mask is None:
-            return TensorDict({self.out_name: (predicted - target).square().mean()}, [])
+            return TensorDict({self.out_name: self._distance(predicted - target).mean()}, [])
         mask = mask.reshape(target.shape[:-1])
         # The target is replaced, not the error multiplied: it may be NaN, and 0 * NaN is NaN in the gradient.
-        error = (predicted - torch.where(mask[..., None], target, predicted.detach())).square().mean(-1)
+        error = self._distance(predicted - torch.where(mask[..., None], target, predicted.detach())).mean(-1)
         return TensorDict({self.out_name: error.sum() / mask.sum().clamp(min=1)}, [])
+
+    def _distance(self, difference: Tensor) -> Tensor:
+        return difference.abs() if self.loss_function == "l1" else difference.square()
 
 
 class BehaviourLoss(_CloningLoss):
@@ -87,11 +95,15 @@ class BehaviourLoss(_CloningLoss):
     Reads SLOTS (..., N, D) and LATENT_ACTION (..., Z), targets inferred by InvDyn from unlabelled videos; SLOTS may be
     parsed or predicted ones. Writes `loss_policy`. For the oracle, `set_keys(action=keys.ACTION)`.
 
-    Note: equal to TorchRL's `BCLoss(loss_function="l2")` (a test holds it to that), which we do not use because its
-    functional conversion hides the network from `.train()`, `.eval()` and the checkpoints.
+    Note: equal to TorchRL's `BCLoss` with the same `loss_function` (a test holds it to that), not used because
+    its functional conversion hides the network from `.train()`, `.eval()` and the checkpoints.
 
     Args:
         policy: the network that is trained, (..., N, D) to (..., Z).
+        loss_function: `l2` (paper) or `l1`.
+
+    Raises:
+        ValueError: another loss function.
 
     Examples:
         >>> import torch
@@ -104,8 +116,8 @@ class BehaviourLoss(_CloningLoss):
 
     out_name = "loss_policy"
 
-    def __init__(self, policy: nn.Module) -> None:
-        super().__init__(policy)
+    def __init__(self, policy: nn.Module, loss_function: str = "l2") -> None:
+        super().__init__(policy, loss_function)
 
 
 class ActionDecoderLoss(_CloningLoss):
@@ -115,6 +127,10 @@ class ActionDecoderLoss(_CloningLoss):
 
     Args:
         action_decoder: the network that is trained, (..., Z) to (..., A).
+        loss_function: `l2` (paper) or `l1`.
+
+    Raises:
+        ValueError: another loss function.
 
     Examples:
         >>> import torch
@@ -142,5 +158,5 @@ class ActionDecoderLoss(_CloningLoss):
     default_keys = _AcceptedKeys
     out_name = "loss_action"
 
-    def __init__(self, action_decoder: nn.Module) -> None:
-        super().__init__(action_decoder)
+    def __init__(self, action_decoder: nn.Module, loss_function: str = "l2") -> None:
+        super().__init__(action_decoder, loss_function)

@@ -27,9 +27,8 @@ def _draw(count: int, batch: int, generators: StepGenerators, stream: str, devic
 
 
 def _inputs(demos: Demonstrations, config: BehaviourStageConfig) -> list[Tensor]:
-    """What the policy clones from, each (M, N, D): parsed slots, imagined ones, and those it reached itself."""
-    imagined = [demos.imagined] if config.imagined else []
-    return [demos.slots, *imagined, *([] if demos.unfolded is None else [demos.unfolded])]
+    """What the policy clones from, each (M, N, D): parsed slots, and imagined ones."""
+    return [demos.slots, demos.imagined] if config.imagined else [demos.slots]
 
 
 class CloneStage:
@@ -38,6 +37,8 @@ class CloneStage:
     Note: the paper clones from parsed slots only. Imagination then feeds the policy slots it never saw; with the
     predicted slots of the same demonstrations among its inputs (still without any action label) it has. Noise on the
     slots (`config.slot_noise`) makes both networks smooth over errors of about that size: 150 demonstrations are few.
+    With `config.loss=l1` they learn medians: the scripted experts switch between full speed back and ahead, and a mean
+    of both stands still.
 
     Args:
         policy: trained in place.
@@ -58,10 +59,10 @@ class CloneStage:
                 "set behaviour.oracle=false"
             )
         self.policy, self.oracle, self.demos, self.config = policy, oracle, demos, config
-        self.criterion = BehaviourLoss(policy)
+        self.criterion = BehaviourLoss(policy, config.loss)
         self.oracle_criterion: BehaviourLoss | None = None
         if oracle is not None:
-            self.oracle_criterion = BehaviourLoss(oracle)
+            self.oracle_criterion = BehaviourLoss(oracle, config.loss)
             self.oracle_criterion.set_keys(action=keys.ACTION)
         self.inputs = torch.cat(_inputs(demos, config))
 
@@ -125,7 +126,7 @@ class DecoderStage:
         if demos.actions is None:
             raise DataError("action decoder: got demonstrations without actions, expected the feature `action`")
         self.decoder, self.config = decoder, config
-        self.criterion = ActionDecoderLoss(decoder)
+        self.criterion = ActionDecoderLoss(decoder, config.loss)
         rows = demos.labelled(config.labelled_demos)
         inputs = [] if config.decoder_inputs == "policy" else [demos.latents[rows]]
         if config.decoder_inputs != "inverse_dynamics":

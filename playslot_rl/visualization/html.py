@@ -28,8 +28,7 @@ caption { caption-side: bottom; text-align: left; color: var(--soft); font-size:
 th, td { text-align: left; padding: .35rem 1.2rem .35rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
 thead th { color: var(--soft); font-weight: 600; font-size: .9rem; }
 tbody th { font-weight: 600; }
-figure img { display: block; max-width: none; height: auto; }
-figure.fit img { max-width: 100%; }
+figure img { display: block; max-width: 100%; height: auto; }
 figcaption { color: var(--soft); font-size: .9rem; margin-top: .4rem; }
 code { font: .9em ui-monospace, Consolas, monospace; overflow-wrap: anywhere; }
 .missing { background: var(--note); border-left: 4px solid #e69f00; padding: .6rem .9rem; }
@@ -95,8 +94,7 @@ def _picture(picture: Picture) -> str:
     if picture.dark is not None:
         sources += f'<source media="(prefers-color-scheme: dark)" srcset="{data_uri(picture.dark)}">'
     image = f'<img src="{data_uri(picture.light)}" alt="{escape(picture.alt)}">'
-    fit = ' class="fit"' if picture.dark is not None else ""
     return (
-        f'<figure{fit}><div class="scroll" tabindex="0"><picture>{sources}{image}</picture></div>\n'
+        f'<figure><div class="scroll" tabindex="0"><picture>{sources}{image}</picture></div>\n'
         f"<figcaption>{_inline(picture.caption)}</figcaption></figure>"
     )

@@ -26,12 +26,13 @@ def demos() -> TensorDict:
 
 
 @pytest.mark.filterwarnings("ignore:The name target_actor_network_params")
-def test_it_equals_torchrls_behaviour_cloning_loss_and_its_gradient() -> None:
+@pytest.mark.parametrize("loss_function", ["l2", "l1"])
+def test_it_equals_torchrls_behaviour_cloning_loss_and_its_gradient(loss_function: str) -> None:
     policy = tiny_agent().policy
     twin = copy.deepcopy(policy)
-    ours = BehaviourLoss(policy)(demos())["loss_policy"]
+    ours = BehaviourLoss(policy, loss_function)(demos())["loss_policy"]
     ours.backward()
-    reference = BCLoss(latent_policy_module(twin), loss_function="l2")
+    reference = BCLoss(latent_policy_module(twin), loss_function=loss_function)
     reference.set_keys(action=keys.LATENT_ACTION)
     theirs = reference(demos())["loss_bc"]
     theirs.backward()
@@ -39,6 +40,27 @@ def test_it_equals_torchrls_behaviour_cloning_loss_and_its_gradient() -> None:
     gradients = {name: p.grad for name, p in reference.actor_network_params.flatten_keys(".").items()}
     for name, parameter in policy.named_parameters():
         torch.testing.assert_close(parameter.grad, gradients[f"module.{name}"])
+
+
+def test_between_opposite_targets_l2_finds_the_mean_and_l1_stays_with_the_more_frequent_one() -> None:
+    target = torch.tensor([[1.0], [1.0], [1.0], [-1.0], [-1.0]])
+    batch = TensorDict({keys.SLOTS: torch.zeros(5, 1), keys.LATENT_ACTION: target}, [5])
+    found = {}
+    for loss_function in ("l2", "l1"):
+        network = torch.nn.Linear(1, 1)
+        optimizer = torch.optim.SGD(network.parameters(), lr=0.05)
+        for _ in range(400):
+            optimizer.zero_grad()
+            BehaviourLoss(network, loss_function)(batch)["loss_policy"].backward()
+            optimizer.step()
+        found[loss_function] = float(network.bias.detach())
+    assert found["l2"] == pytest.approx(0.2, abs=0.01)
+    assert found["l1"] == pytest.approx(1.0, abs=0.06)
+
+
+def test_an_unknown_loss_function_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected l1 or l2"):
+        BehaviourLoss(torch.nn.Linear(1, 1), "l3")
 
 
 def test_the_slot_oracle_is_the_same_loss_on_real_actions() -> None:

@@ -115,6 +115,7 @@ def test_report_of_a_whole_run_is_self_contained(tmp_path: Path, monkeypatch: py
     assert "Stage dynamics is not finished" in text
     named = re.findall(r"\]\((figures/[a-z_]+\.png)\)", text)
     assert len(named) == 7
+    assert len(re.findall(r'<img src="data:image/png;base64,[A-Za-z0-9+/=]{500,}" alt="[^"]', html)) == len(named)
     assert all((run / name).stat().st_size > 500 for name in named)
     assert str(tmp_path) not in html + text  # no path of this machine
 
