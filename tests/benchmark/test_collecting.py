@@ -44,4 +44,4 @@ def test_every_part_is_measured_and_printed(tmp_path: Path, monkeypatch: pytest.
     text = table(figures)
     assert all(f"| {name} |" in text for name in figures["episode_ms"])
     assert "1000 episodes with 1 workers" in text
-    assert not list(tmp_path.iterdir())
+    assert not list(tmp_path.glob("playslot*"))
