@@ -35,4 +35,4 @@ class RenderError(PlaySlotError, RuntimeError):
 
 
 class HubError(PlaySlotError, RuntimeError):
-    """A push or pull failed: no token, bad token, no network, no repository, no revision, offline, or a server error."""
+    """A push or pull failed: no or a bad token, no network, repository or revision, offline, or a server error."""

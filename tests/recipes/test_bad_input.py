@@ -22,7 +22,10 @@ from playslot_rl.training.tensors import load_tensors, save_tensors
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ("env=button_pres", "unknown env 'button_pres': expected one of .*button_press.*; did you mean env=button_press"),
+        (
+            "env=button_pres",
+            "unknown env 'button_pres': expected one of .*button_press.*; did you mean env=button_press",
+        ),
         ("preset=smok", "unknown preset 'smok': expected one of .*; did you mean preset=smoke"),
         ("slots.optim.l=1", r"unknown key slots\.optim\.l: expected one of .*; did you mean slots\.optim\.lr"),
         ("episods=3", "unknown key episods: .*; did you mean episodes"),
