@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -204,3 +207,37 @@ def test_shares_that_make_no_sense_are_refused(
     with pytest.raises(DataError, match=message):
         split(images, tmp_path / "parts", fractions)
     assert not list(tmp_path.iterdir())
+
+
+KILLED = """
+import sys, time
+from pathlib import Path
+from playslot_rl.datasets import merge as merging
+
+def stop(*_):
+    print("written", flush=True)
+    time.sleep(600)
+
+merging.require_verified = stop  # everything is written, nothing is named yet
+merging.merge([Path(a) for a in sys.argv[2:]], Path(sys.argv[1]))
+"""
+
+
+def test_a_merge_killed_before_it_gets_its_name_leaves_the_sources_and_the_same_command_does_it(
+    images: Path, tmp_path: Path
+) -> None:
+    parts = [shutil.copytree(images, tmp_path / name) for name in ("a", "b")]
+    before = [content_fingerprint(part).value for part in parts]
+    out = tmp_path / "all"
+    arguments = [sys.executable, "-c", KILLED, str(out), *map(str, parts)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "written\n"
+        assert any(path.name.endswith(".parquet") for path in (tmp_path / ".all.new").rglob("*"))
+        process.send_signal(signal.SIGKILL)
+    assert not out.exists()
+    assert [content_fingerprint(part).value for part in parts] == before
+    result = merge(parts, out)
+    assert (result.verification.ok, result.verification.episodes, result.verification.frames) == (True, 6, 30)
+    assert content_fingerprint(out).episodes == content_fingerprint(images).episodes * 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "all", "b"]
