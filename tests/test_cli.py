@@ -18,6 +18,7 @@ from playslot_rl.errors import ConfigError, DataError, OutputError
 
 COMMANDS = [
     "collect",
+    "convert",
     "train-slots",
     "train-dynamics",
     "train-policy",
@@ -54,6 +55,7 @@ def raising(error: BaseException) -> Recipe:
 
 def test_the_commands_are_the_promised_ones() -> None:
     assert list(cli.COMMANDS) == COMMANDS
+    assert list(cli.GROUPS) == ["dataset"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -12,6 +12,7 @@ import pytest
 
 from playslot_rl import cli
 from playslot_rl.compose import compose
+from playslot_rl.datasets.command import parser as dataset_parser
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -48,6 +49,9 @@ def test_a_documented_command_is_accepted(page: str, command: str) -> None:
         assert program == "playslot"
     elif program == "playslot":
         name = rest[0]
+        if name in cli.GROUPS:
+            assert dataset_parser().parse_args(rest[1:])
+            return
         assert name in cli.COMMANDS, f"{page}: no such command"
         typed = [word for word in rest[1:] if not word.startswith("--") and "=" in word]
         assert len(typed) == len([word for word in rest[1:] if "=" in word])
@@ -56,7 +60,7 @@ def test_a_documented_command_is_accepted(page: str, command: str) -> None:
         # A page names runs that are not here: composed as by a command that reads no run.
         assert compose(typed, "collect")
     else:
-        assert program in {"cd", "cp", "git", "python", "pip", "tensorboard"}, f"{page}: unknown program"
+        assert program in {"cd", "cp", "git", "hf", "python", "pip", "tensorboard"}, f"{page}: unknown program"
 
 
 def test_the_cheap_commands_run() -> None:
