@@ -10,6 +10,8 @@ import pytest
 from playslot_rl.benchmark.collecting import Stopwatch, measure, table
 from playslot_rl.config import ExperimentConfig, from_dict
 
+pytestmark = pytest.mark.slow  # together they take a minute; make test-all runs them
+
 
 def test_a_stopwatch_gives_inner_time_to_the_inner_block() -> None:
     watch = Stopwatch()

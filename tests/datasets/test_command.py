@@ -20,6 +20,8 @@ from playslot_rl.datasets.contents import read_contents
 from playslot_rl.datasets.problems import Problems
 from playslot_rl.datasets.viz import episode_frames, spread
 
+pytestmark = pytest.mark.slow  # together they take a minute; make test-all runs them
+
 ACTIONS = ["info", "verify", "repair", "merge", "split", "viz", "push", "pull"]
 
 

@@ -30,6 +30,8 @@ from playslot_rl.datasets.repair import repair
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, OutputError
 
+pytestmark = pytest.mark.slow  # together they take a minute; make test-all runs them
+
 
 def create(root: Path, dtype: str = "image", shard_mb: float = 100, size: int = 32) -> Any:
     from lerobot.configs.video import RGBEncoderConfig

@@ -11,6 +11,8 @@ import pytest
 from fake_hub import PLAIN_TOKEN, READ_TOKEN, FakeHub, Fault, Repository
 from small_data import contents
 
+pytestmark = pytest.mark.slow  # together they take a minute; make test-all runs them
+
 Client = Callable[..., dict[str, Any]]
 
 

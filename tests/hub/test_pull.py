@@ -11,6 +11,8 @@ import pytest
 from fake_hub import FakeHub, Fault, Repository
 from small_data import contents, write_small
 
+pytestmark = pytest.mark.slow  # together they take a minute; make test-all runs them
+
 Client = Callable[..., dict[str, Any]]
 RECORDS = {"README.md", "meta/playslot_hub.json", "meta/playslot_pull.json"}
 

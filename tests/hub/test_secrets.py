@@ -20,6 +20,8 @@ from fake_hub import PLAIN_TOKEN, WRITE_TOKEN, FakeHub, Fault, Repository
 from playslot_rl.errors import HubError
 from playslot_rl.hub.secrets import MASK, Redactor, checked_token
 
+pytestmark = pytest.mark.slow  # together they take a minute; make test-all runs them
+
 Client = Callable[..., dict[str, Any]]
 
 
