@@ -13,6 +13,7 @@ UV_VERSION := 0.13.8
 STAMP := $(VENV)/.setup-done
 LOCK := requirements.lock
 ARGS ?=
+PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 PYTHON ?=
 
 export UV_PYTHON := $(BIN)/python
@@ -69,10 +70,11 @@ demo: $(STAMP)
 	@$(BIN)/playslot demo $(ARGS)
 
 test: $(STAMP)
-	@$(BIN)/python -m pytest -m "not slow" $(ARGS)
+	@$(BIN)/python -m pytest -m "not slow" $(PARALLEL) $(ARGS)
 
-test-all: $(STAMP)
-	@$(BIN)/python -m pytest $(ARGS)
+# The slow ones kill processes and count on time: one after the other.
+test-all: test
+	@$(BIN)/python -m pytest -m slow $(ARGS)
 
 lint: $(STAMP) typing
 	@$(BIN)/ruff check .

@@ -11,6 +11,16 @@ import typing
 from typing import Any, Literal, Union, get_args, get_origin
 
 
+def check(ok: bool, what: str, got: object, expected: str) -> None:
+    """Refuse a value out of range.
+
+    Raises:
+        ValueError: not `ok`; one line that says what was got and what was expected.
+    """
+    if not ok:
+        raise ValueError(f"{what}: got {got!r}, expected {expected}")
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """Nested plain dict of a config (tuples become lists, as in JSON)."""
     plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))

@@ -203,7 +203,7 @@ def _write(root: Path, episodes: Sequence[SketchyEpisode], cameras: Sequence[str
         for row in read_steps(episode, cameras, size):
             dataset.add_frame(row)
             lengths[-1] += 1
-        dataset.save_episode()
+        dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
     again = LeRobotDataset(f"playslot_rl/sketchy_{root.name}", root=root, video_backend="pyav")
     if (again.num_episodes, len(again)) != (len(episodes), sum(lengths)):

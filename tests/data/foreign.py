@@ -41,7 +41,7 @@ def write_foreign(
         for t, frame in enumerate(episode):
             row: dict[str, Any] = {f"observation.images.{name}": frame for name in cameras}
             dataset.add_frame(row | {"action": np.array([t, -t], np.float32), "task": "push"})
-        dataset.save_episode()
+        dataset.save_episode(parallel_encoding=False)  # its processes would each import LeRobot again
     if die:
         os._exit(0)  # as a kill would: no destructor finalises
     dataset.finalize()
