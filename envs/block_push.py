@@ -8,9 +8,8 @@ Shapes: A = 4, S = 4, H = W = `EnvConfig.image_size`.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Final, cast
+from typing import Any, ClassVar, Final
 
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
@@ -20,11 +19,9 @@ from playslot_rl.envs.block_ids import block_config
 from playslot_rl.envs.block_layout import Layout, Variant, draw_layout
 from playslot_rl.envs.block_scene import CAMERA, SCREEN, STILL, lighten
 from playslot_rl.envs.facets import Still
+from playslot_rl.envs.pixel_task import Action, Frame, PixelTask
 from playslot_rl.envs.rendering import FrameRenderer, import_mujoco
-from playslot_rl.errors import ConfigError
 
-ACTION_DIM: Final = 4
-STATE_DIM: Final = 4
 SUCCESS: Final = 0.05
 """Distance in metres, in space, under which the task is solved."""
 SENTENCES: Final[dict[Variant, str]] = {
@@ -34,10 +31,8 @@ SENTENCES: Final[dict[Variant, str]] = {
 }
 WHICH: Final = {"red": "red", "reddest": "reddest", "odd": "odd", "odd_groups": "odd"}
 
-Observation = dict[str, npt.NDArray[Any]]
 
-
-class BlockEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
+class BlockEnv(PixelTask):
     """One task of the blocks family; `BlockPushEnv`, `BlockReachEnv` and `BlockPickEnv` say what is to be done.
 
     Observations are `pixels`, uint8 [0, 255] (H, W, 3), and `state`, float32 (4,): grip xyz and the gripper's opening,
@@ -59,8 +54,6 @@ class BlockEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         render_mode: `rgb_array` or None.
 
     Attributes:
-        draw_steps: False makes `step` return the last frame that was drawn instead of a new one, for controllers that
-            do not look at it. `reset` always draws, unless `draw_resets` is False.
         layout: the present episode's layout.
 
     Raises:
@@ -91,9 +84,7 @@ class BlockEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         render: RenderConfig | None = None,
         render_mode: str | None = "rgb_array",
     ) -> None:
-        self.config = env or block_config(f"block_{self.variant}", BlocksConfig())
-        if self.config.action_dim != ACTION_DIM:
-            raise ConfigError(f"env.action_dim: got {self.config.action_dim}, expected {ACTION_DIM} for the blocks")
+        super().__init__(env or block_config(f"block_{self.variant}", BlocksConfig()), render_mode)
         self.metadata = self.metadata_of(self.config)
         import_mujoco()
         from playslot_rl.envs.block_simulation import BlockSimulation
@@ -101,50 +92,17 @@ class BlockEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         blocks = self.config.blocks
         most = blocks.distractors if blocks.distractors_to is None else blocks.distractors_to
         self._simulation = BlockSimulation(self.variant, 1 + most)
-        size = self.config.image_size
         render = render or RenderConfig()
         if render.quality == "fast":
             lighten(self._simulation.model)
         still = Still(self._simulation.data, STILL, SCREEN)
-        self._renderer = FrameRenderer(self._simulation.model, CAMERA, size, render, still)
-        self.render_mode = render_mode
-        space = gym.spaces.Dict(
-            {
-                "pixels": gym.spaces.Box(0, 255, (size, size, 3), np.uint8),
-                "state": gym.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32),
-            }
-        )
-        self.observation_space = cast(gym.Space[Observation], space)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
-        self._frame: npt.NDArray[np.uint8] | None = None
-        self._steps = 0
-        self.draw_steps = self.draw_resets = True
+        self._renderer = FrameRenderer(self._simulation.model, CAMERA, self.config.image_size, render, still)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode.
-
-        Args:
-            seed: the episode's seed; None draws the next one from the environment's generator.
-            options: unused.
-
-        Returns:
-            The first observation and `{"success": bool}`: True for an episode that starts solved, which only random
-            warm-up steps can make.
-        """
-        del options
-        super().reset(seed=seed)
-        episode = int(self.np_random.integers(2**31)) if seed is None else seed
-        layout, warmup = (np.random.default_rng(s) for s in np.random.SeedSequence(episode).spawn(2))
-        self.layout = draw_layout(layout, self.variant, self.config.blocks, self._simulation.start_grip)
+    def _begin(self, rng: np.random.Generator) -> None:
+        self.layout = draw_layout(rng, self.variant, self.config.blocks, self._simulation.start_grip)
         self._simulation.place(self.layout)
-        for _ in range(self.config.warmup_steps):
-            self._simulate(warmup.uniform(-1.0, 1.0, ACTION_DIM).astype(np.float32))
-        self._steps = 0
-        return self._observe(self.draw_resets), {"success": self.distance < SUCCESS}
 
-    def _simulate(self, action: npt.NDArray[np.float32]) -> tuple[float, bool]:
+    def _simulate(self, action: Action) -> tuple[float, bool]:
         reward, success = 0.0, False
         for _ in range(self.config.frame_skip):
             self._simulation.advance(action)
@@ -174,41 +132,19 @@ class BlockEnv(gym.Env[Observation, npt.NDArray[np.float32]]):
         places = layout.places if self.variant == "reach" else simulation.cubes(len(layout.places))
         return Scene(simulation.grip, simulation.opening, places, layout.target, layout.goal)
 
-    def step(self, action: npt.NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One agent step.
+    def _solved(self) -> bool:
+        return self.distance < SUCCESS
 
-        Args:
-            action: float (4,), clipped to [-1, 1].
+    def _state(self) -> npt.NDArray[np.float32]:
+        return np.array([*self._simulation.grip, self._simulation.opening], np.float32)
 
-        Raises:
-            ValueError: an action of another shape, or not finite.
-        """
-        action = np.asarray(action, np.float32)
-        if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
-            raise ValueError(f"action: got {action!r}, expected {ACTION_DIM} finite numbers in [-1, 1]")
-        reward, success = self._simulate(np.clip(action, -1.0, 1.0))
-        self._steps += 1
-        return self._observe(self.draw_steps), reward, False, self._steps >= self.config.max_steps, {"success": success}
-
-    def expert_action(self) -> npt.NDArray[np.float32]:
+    def expert_action(self) -> Action:
         """Action of the scripted expert for the present state: float32 (4,) in [-1, 1]."""
         return EXPERTS[self.variant](self.scene)
 
-    def _observe(self, draw: bool = True) -> Observation:
-        if draw or self._frame is None:
-            self._frame = self.draw()
-        state = np.array([*self._simulation.grip, self._simulation.opening], np.float32)
-        return {"pixels": self._frame, "state": state}
-
-    def draw(self) -> npt.NDArray[np.uint8]:
+    def draw(self) -> Frame:
         """Draw the present state anew: uint8 (H, W, 3). `render` returns the frame that was last observed."""
         return self._renderer(self._simulation.data)
-
-    def render(self) -> npt.NDArray[np.uint8] | None:
-        """The present frame, uint8 (H, W, 3); None without a render mode or before the first reset."""
-        if self.render_mode is None or self._frame is None:
-            return None
-        return self._frame.copy()
 
     def close(self) -> None:
         """Free the GL context."""

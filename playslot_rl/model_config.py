@@ -24,12 +24,16 @@ class SAViConfig:
         token_dim: width of the encoder tokens' MLP and of q, k, v.
         decoder: `broadcast` (full-resolution spatial broadcast; paper) or `pixel_shuffle` (from 8x8 upwards).
         decoder_channels: channels of the decoder.
+        decoder_position: `linear` (a linear map of the coordinates; paper) or, for `pixel_shuffle`, `learned` (a free
+            8x8 map is added, so that a still background does not have to be made out of ramps).
         collapse: use the collapsed first layer of the broadcast decoder (exact; `false` computes it plainly).
         first_iterations: Slot Attention iterations on an episode's first frame.
         iterations: iterations on every later frame.
         corrector_mlp: hidden width of the corrector's residual MLP.
         transition_heads: heads of the transition block, of width D / heads.
         transition_mlp: hidden width of the transition block's MLP.
+        transition_start: how the transition's weights start: `xavier` (as all others) or `identity` (it starts by
+            handing slots on as they are, so that no two of them learn to change places at every frame).
     """
 
     n_slots: int = 4
@@ -41,12 +45,14 @@ class SAViConfig:
     token_dim: int = 128
     decoder: Literal["broadcast", "pixel_shuffle"] = "broadcast"
     decoder_channels: tuple[int, ...] = (64, 64, 64, 64)
+    decoder_position: Literal["linear", "learned"] = "linear"
     collapse: bool = True
     first_iterations: int = 3
     iterations: int = 1
     corrector_mlp: int = 256
     transition_heads: int = 4
     transition_mlp: int = 512
+    transition_start: Literal["xavier", "identity"] = "xavier"
 
     def __post_init__(self) -> None:
         check(self.n_slots >= 1, "model.savi.n_slots", self.n_slots, "at least 1")
@@ -55,6 +61,12 @@ class SAViConfig:
             "model.savi.encoder_strides",
             self.encoder_strides,
             f"one stride for each of the {len(self.encoder_channels)} encoder channels",
+        )
+        check(
+            self.decoder_position == "linear" or self.decoder == "pixel_shuffle",
+            "model.savi.decoder_position",
+            self.decoder_position,
+            f"linear with model.savi.decoder={self.decoder}",
         )
         check(
             self.slot_dim % self.transition_heads == 0,

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from playslot_rl.evaluation.hold_out import hold_out
+
 HELD_OUT = 0.3
 
 
@@ -40,16 +42,11 @@ def probe_moves(
     """
     if not len(features) == len(moves) == len(clips):
         raise ValueError(f"probe_moves: got {len(features)}, {len(moves)} and {len(clips)} rows, expected as many each")
-    names = np.unique(clips)
-    if len(names) < 2:
-        raise ValueError(f"probe_moves: got {len(names)} clip, expected at least 2 to hold some out")
+    test, test_clips = hold_out(clips, held_out, seed, "probe_moves: clip")
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
 
-    shuffled = np.random.default_rng(seed).permutation(names)
-    held = shuffled[: min(len(names) - 1, max(1, round(held_out * len(names))))]
-    test = np.isin(clips, held)
     common = int(np.bincount(moves[~test], minlength=classes).argmax())
     if len(np.unique(moves[~test])) > 1:
         probe = make_pipeline(StandardScaler(), LogisticRegression(C=10.0, max_iter=500))
@@ -62,5 +59,5 @@ def probe_moves(
         "chance": 1.0 / classes,
         "train": int((~test).sum()),
         "test": int(test.sum()),
-        "test_clips": len(held),
+        "test_clips": test_clips,
     }

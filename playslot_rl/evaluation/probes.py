@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from playslot_rl.evaluation.hold_out import hold_out
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 
 Floats = npt.NDArray[np.float32]
@@ -81,13 +82,8 @@ def probe_actions(
     """
     if not len(z) == len(actions) == len(episodes):
         raise ValueError(f"probe_actions: got {len(z)}, {len(actions)} and {len(episodes)} rows, expected as many each")
-    names = np.unique(episodes)
-    if len(names) < 2:
-        raise ValueError(f"probe_actions: got {len(names)} episode, expected at least 2 to hold some out")
-    shuffled = np.random.default_rng(seed).permutation(names)
-    held = shuffled[: min(len(names) - 1, max(1, round(held_out * len(names))))]
-    test = np.isin(episodes, held)
-    result: dict[str, Any] = {"train": int((~test).sum()), "test": int(test.sum()), "test_episodes": len(held)}
+    test, test_episodes = hold_out(episodes, held_out, seed, "probe_actions: episode")
+    result: dict[str, Any] = {"train": int((~test).sum()), "test": int(test.sum()), "test_episodes": test_episodes}
     for name in ("linear", "mlp"):
         result[name] = _score(name, z[~test], actions[~test], z[test], actions[test], seed)
     if codes is not None and codes.size and codes.min() >= 0:

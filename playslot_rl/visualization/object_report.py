@@ -16,7 +16,6 @@ from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.evaluation.episodes import TaskPool
 from playslot_rl.evaluation.objects import RESULT, parse_clips, seed_frames
 from playslot_rl.evaluation.seeds import first_seed
-from playslot_rl.evaluation.success import hardware
 from playslot_rl.visualization.document import Block, Document, Missing, Picture, Section, Table, Text
 from playslot_rl.visualization.frames import to_uint8
 from playslot_rl.visualization.grid import image_grid
@@ -29,6 +28,7 @@ from playslot_rl.visualization.sections import (
     slots_section,
     training_section,
 )
+from playslot_rl.visualization.setting_rows import machine_row, model_rows
 from playslot_rl.world_model import WorldModel
 
 WORLD_MODEL_STAGES = ("slots", "dynamics")
@@ -142,26 +142,16 @@ def code_section(result: dict[str, Any] | None) -> Section:
 
 def settings_section(given: ReportInput, result: dict[str, Any] | None) -> Section:
     """Settings and sizes."""
-    env, model, machine = given.config.env, given.world_model, hardware()
+    env = given.config.env
     grid = env.grid
     rows = [
         ["frames", f"{env.image_size} x {env.image_size} pixels, drawn from seeds"],
         ["objects", f"{grid.objects} of {grid.size} pixels, {grid.speed} pixels a step"],
         ["new direction", f"with probability {grid.change} at each step"],
     ]
-    if model is not None:
-        c = model.config
-        rows += [
-            ["slots", f"{c.savi.n_slots} of width {c.savi.slot_dim}"],
-            [
-                "latent actions",
-                f"{c.inverse_dynamics.mode}, {c.inverse_dynamics.variant}, {c.inverse_dynamics.latent_dim} wide",
-            ],
-            ["prototypes", str(model.inverse_dynamics.n_prototypes)],
-        ]
+    rows += model_rows(given.world_model)
     if result is not None:
         seeds, took = result["seeds"], seconds(result.get("wall_seconds"))
         rows.append(["scored", f"{len(seeds)} clips, seeds {min(seeds)} to {max(seeds)}, {took}"])
-    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
-    rows.append(["report made on", f"{machine['machine']}, {machine['cores']} cores{gpu}, torch {machine['torch']}"])
+    rows.append(machine_row())
     return Section("Settings", [Table(["setting", "value"], rows)])

@@ -13,7 +13,6 @@ from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.episodes import TaskPool
-from playslot_rl.evaluation.success import hardware
 from playslot_rl.training.atomic import write_bytes, write_text
 from playslot_rl.training.checkpoints import checkpoint_folder, world_model_folder
 from playslot_rl.visualization.document import Block, Document, Picture, Section, Table, Text
@@ -32,6 +31,7 @@ from playslot_rl.visualization.sections import (
     success_section,
     training_section,
 )
+from playslot_rl.visualization.setting_rows import machine_row, model_rows
 from playslot_rl.world_model import Agent, WorldModel
 
 
@@ -173,23 +173,14 @@ def settings_section(given: ReportInput) -> Section:
         ["agent step", f"{env.frame_skip} environment steps; at most {env.max_steps} agent steps an episode"],
         ["warm-up", f"{env.warmup_steps} random agent steps after each reset"],
     ]
+    rows += model_rows(model)
     if model is not None:
-        c = model.config
-        rows += [
-            ["slots", f"{c.savi.n_slots} of width {c.savi.slot_dim}"],
-            [
-                "latent actions",
-                f"{c.inverse_dynamics.mode}, {c.inverse_dynamics.variant}, width {model.latent_shape[-1]}",
-            ],
-            ["parameters", ", ".join(f"{name} {count(module):,}" for name, module in _parts(given).items())],
-        ]
+        rows.append(["parameters", ", ".join(f"{name} {count(module):,}" for name, module in _parts(given).items())])
     for protocol, result in read_evaluations(given.run).items():
         seeds = result["seeds"]
         what = f"{len(seeds)} seeds from {min(seeds)} to {max(seeds)}, {seconds(result.get('wall_seconds'))}"
         rows.append([f"evaluation, {protocol}", f"{what}, {result.get('redrawn', 0)} redrawn"])
-    machine = hardware()
-    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
-    rows.append(["report made on", f"{machine['machine']}, {machine['cores']} cores{gpu}, torch {machine['torch']}"])
+    rows.append(machine_row())
     blocks: list[Block] = [Table(["setting", "value"], rows), *(Text(note) for note in notes(given))]
     return Section("Settings and notes", blocks)
 

@@ -131,3 +131,31 @@ def test_gradients_reach_every_parameter() -> None:
     (savi.decode(slots).frames - frames).square().mean().backward()
     silent = {n for n, p in savi.named_parameters() if p.grad is None or not p.grad.any()}
     assert silent == set()
+
+
+def test_a_transition_that_starts_as_identity_hands_the_slots_on_and_can_learn() -> None:
+    savi = small(transition_start="identity")
+    slots, state = savi(torch.rand(2, 3, 3, 32, 32))
+    torch.testing.assert_close(state, slots[:, -1], rtol=0, atol=0)
+    state.square().sum().backward()
+    for weight in (savi.transition.block.to_v.weight, savi.transition.block.mlp[-1].weight):  # type: ignore[index]
+        assert weight.grad is not None
+        assert weight.grad.abs().sum() > 0
+
+
+def test_the_learned_position_map_starts_at_zero_and_tells_places_apart() -> None:
+    plain, free = small(), small(decoder_position="learned")
+    slots = torch.rand(1, 3, 16)
+    free.load_state_dict(plain.state_dict(), strict=False)
+    torch.testing.assert_close(free.decode(slots).frames, plain.decode(slots).frames)
+    with torch.no_grad():
+        free.decoder.position_map[0, :, 2, 5] += 1.0  # type: ignore[index]
+    changed = (free.decode(slots).rgb - plain.decode(slots).rgb).abs().amax(dim=(0, 1, 2))
+    rows, columns = changed.nonzero(as_tuple=True)
+    assert 0 < len(rows) < changed.numel()
+    assert rows.float().mean() < columns.float().mean()  # cell (2, 5) of 8 x 8
+
+
+def test_only_the_pixel_shuffle_decoder_has_a_learned_position_map() -> None:
+    with pytest.raises(ValueError, match="decoder_position"):
+        small(decoder="broadcast", decoder_position="learned")

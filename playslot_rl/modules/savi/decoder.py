@@ -85,9 +85,12 @@ class PixelShuffleDecoder(nn.Module):
         image_size: side of the frames, 8 times a power of two.
         slot_dim: D.
         channels: channels at 8x8, 16x16, ... : one for each doubling.
+        learned_position: add a free map to the linear position embedding; it starts at zero.
     """
 
-    def __init__(self, image_size: int, slot_dim: int, channels: tuple[int, ...]) -> None:
+    def __init__(
+        self, image_size: int, slot_dim: int, channels: tuple[int, ...], learned_position: bool = False
+    ) -> None:
         super().__init__()
         doublings = int(math.log2(image_size // BASE))
         if len(channels) != doublings:
@@ -97,12 +100,14 @@ class PixelShuffleDecoder(nn.Module):
             )
         self.project = nn.Linear(slot_dim, channels[0])
         self.position = SoftPositionEmbedding(BASE, channels[0])
+        self.position_map = nn.Parameter(torch.zeros(1, channels[0], BASE, BASE)) if learned_position else None
         outs = (*channels[1:], 4)
         self.convs = nn.ModuleList(nn.Conv2d(a, 4 * b, 3, padding=1) for a, b in zip(channels, outs, strict=True))
 
     def forward(self, slots: Tensor) -> Tensor:
         """Slots (M, D) to RGB and mask logit (M, 4, H, W)."""
-        x = F.relu(self.project(slots)[:, :, None, None] + self.position())
+        position = self.position() if self.position_map is None else self.position() + self.position_map
+        x = F.relu(self.project(slots)[:, :, None, None] + position)
         x = x.contiguous(memory_format=torch.channels_last)
         for i, conv in enumerate(self.convs):
             x = F.pixel_shuffle(conv(x), 2)

@@ -56,9 +56,11 @@ class SAVi(nn.Module):
         self.decoder: nn.Module = (
             BroadcastDecoder(image_size, c.slot_dim, c.decoder_channels, c.collapse)
             if c.decoder == "broadcast"
-            else PixelShuffleDecoder(image_size, c.slot_dim, c.decoder_channels)
+            else PixelShuffleDecoder(image_size, c.slot_dim, c.decoder_channels, c.decoder_position == "learned")
         )
         self.apply(_initialise)
+        if c.transition_start == "identity":
+            self.transition.start_as_identity()
 
     def forward(
         self, frames: Tensor, state: Tensor | None = None, generator: torch.Generator | None = None

@@ -23,6 +23,13 @@ class SlotTransition(nn.Module):
         super().__init__()
         self.block = TransformerBlock(slot_dim, heads, slot_dim // heads, mlp_dim, project_out=False)
 
+    def start_as_identity(self) -> None:
+        """Silence what the block adds: its values and the last layer of its MLP start at zero."""
+        last = self.block.mlp[-1]
+        assert isinstance(last, nn.Linear)
+        for weight in (self.block.to_v.weight, last.weight, last.bias):
+            nn.init.zeros_(weight)
+
     def forward(self, slots: Tensor) -> Tensor:
         """Slots (B, N, D) to slots (B, N, D)."""
         out: Tensor = self.block(slots)[0]

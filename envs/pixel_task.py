@@ -1,0 +1,134 @@
+"""What our simulated tasks share: spaces, seeding, warm-up, agent steps and frames that are drawn only when wanted.
+
+Shapes: A = 4, S = 4, H = W = `EnvConfig.image_size`.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, Final, cast
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.config import EnvConfig
+from playslot_rl.errors import ConfigError
+
+ACTION_DIM: Final = 4
+STATE_DIM: Final = 4
+
+Action = npt.NDArray[np.float32]
+Frame = npt.NDArray[np.uint8]
+Observation = dict[str, npt.NDArray[Any]]
+
+
+class PixelTask(gym.Env[Observation, Action]):
+    """A task seen by one camera.
+
+    An episode is a function of its seed alone: the task and the `warmup_steps` random agent steps before the first
+    observation come from two independent streams of that seed. One agent step is `frame_skip` environment steps of the
+    same action. Success does not terminate: clips have a fixed length, `max_steps`.
+
+    Args:
+        config: the task.
+        render_mode: `rgb_array` or None.
+
+    Attributes:
+        draw_steps: False makes `step` return the last frame that was drawn instead of a new one, for controllers that
+            do not look at it: rendering is most of a step's time. `reset` always draws, unless `draw_resets` is False.
+
+    Raises:
+        ConfigError: `env.action_dim` is not 4.
+    """
+
+    def __init__(self, config: EnvConfig, render_mode: str | None) -> None:
+        if config.action_dim != ACTION_DIM:
+            raise ConfigError(f"env.action_dim: got {config.action_dim}, expected {ACTION_DIM} for {config.name}")
+        self.config, self.render_mode = config, render_mode
+        size = config.image_size
+        space = gym.spaces.Dict(
+            {
+                "pixels": gym.spaces.Box(0, 255, (size, size, 3), np.uint8),
+                "state": gym.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32),
+            }
+        )
+        self.observation_space = cast(gym.Space[Observation], space)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+        self._frame: Frame | None = None
+        self._steps = 0
+        self.draw_steps = self.draw_resets = True
+
+    @abstractmethod
+    def _begin(self, rng: np.random.Generator) -> None:
+        """Put the simulation into a new episode, drawn from `rng`."""
+
+    @abstractmethod
+    def _simulate(self, action: Action) -> tuple[float, bool]:
+        """One agent step: its mean reward, and whether any of its environment steps solved the task."""
+
+    @abstractmethod
+    def _solved(self) -> bool:
+        """Whether the task is solved in the present state."""
+
+    @abstractmethod
+    def _state(self) -> npt.NDArray[np.float32]:
+        """Proprioception, float32 (4,)."""
+
+    @abstractmethod
+    def expert_action(self) -> Action:
+        """Action of the scripted expert for the present state: float32 (4,) in [-1, 1]."""
+
+    @abstractmethod
+    def draw(self) -> Frame:
+        """Draw the present state anew: uint8 (H, W, 3). `render` returns the frame that was last observed."""
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: the episode's seed; None draws the next one from the environment's generator.
+            options: unused.
+
+        Returns:
+            The first observation and `{"success": bool}`: True for an episode that starts solved, which only random
+            warm-up steps can make.
+        """
+        del options
+        super().reset(seed=seed)
+        episode = int(self.np_random.integers(2**31)) if seed is None else seed
+        task, warmup = (np.random.default_rng(s) for s in np.random.SeedSequence(episode).spawn(2))
+        self._begin(task)
+        for _ in range(self.config.warmup_steps):
+            self._simulate(warmup.uniform(-1.0, 1.0, ACTION_DIM).astype(np.float32))
+        self._steps = 0
+        return self._observe(self.draw_resets), {"success": self._solved()}
+
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One agent step.
+
+        Args:
+            action: float (4,), clipped to [-1, 1].
+
+        Raises:
+            ValueError: an action of another shape, or not finite.
+        """
+        action = np.asarray(action, np.float32)
+        if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
+            raise ValueError(f"action: got {action!r}, expected {ACTION_DIM} finite numbers in [-1, 1]")
+        reward, success = self._simulate(np.clip(action, -1.0, 1.0))
+        self._steps += 1
+        return self._observe(self.draw_steps), reward, False, self._steps >= self.config.max_steps, {"success": success}
+
+    def _observe(self, draw: bool) -> Observation:
+        if draw or self._frame is None:
+            self._frame = self.draw()
+        return {"pixels": self._frame, "state": self._state()}
+
+    def render(self) -> Frame | None:
+        """The present frame, uint8 (H, W, 3); None without a render mode or before the first reset."""
+        if self.render_mode is None or self._frame is None:
+            return None
+        return self._frame.copy()
