@@ -5,10 +5,8 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -16,85 +14,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as parquet
 import pytest
+from small_sets import assert_whole, begin, small, spec_of
 
-from playslot_rl.collectors import collect, recording
-from playslot_rl.collectors.episodes import Job, record
-from playslot_rl.collectors.journal import Journal, journal_path
+from playslot_rl.collectors import recording
+from playslot_rl.collectors.episodes import Job
+from playslot_rl.collectors.journal import Journal
 from playslot_rl.collectors.recording import record_into
-from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.collectors.workers import Report
-from playslot_rl.config import CollectorConfig, ExperimentConfig, from_dict
+from playslot_rl.config import CollectorConfig
 from playslot_rl.errors import ConfigError, OutputError, PlaySlotError
-
-STEPS = 3
-SMALL: dict[str, Any] = {
-    "env": {"image_size": 32, "warmup_steps": 1},
-    "render": {"supersample": 1},
-    "logging": {"progress": False},
-}
-
-
-def config(**changes: Any) -> ExperimentConfig:
-    return from_dict(ExperimentConfig, {**SMALL, **changes})
-
-
-def spec_of(episodes: int) -> CollectionSpec:
-    return CollectionSpec.make(config(), "random", episodes, STEPS, 0)
-
-
-def small(out: Path, episodes: int) -> Path:
-    return collect(config(), "random", episodes, STEPS, out, seed=0, workers=1)
-
-
-def assert_whole(out: Path, episodes: int, reference: list[Any] | None = None) -> None:
-    """Every seed once and in order, every row there, frames as an undisturbed process records them; nothing beside."""
-    columns = ["index", "episode_index", "frame_index", "seed", "observation.images.front"]
-    rows = [
-        row
-        for file in sorted((out / "data").rglob("*.parquet"))
-        for row in parquet.read_table(file, columns=columns).to_pylist()
-    ]
-    each = STEPS + 1
-    assert [row["index"] for row in rows] == list(range(episodes * each))
-    assert [row["seed"] for row in rows] == [i for i in range(episodes) for _ in range(each)]
-    assert [row["episode_index"] for row in rows] == [i for i in range(episodes) for _ in range(each)]
-    assert [row["frame_index"] for row in rows] == list(range(each)) * episodes
-    record_file = json.loads((out / "meta" / "playslot.json").read_text())
-    assert [e["seed"] for e in record_file["episodes"]] == list(range(episodes))
-    assert json.loads((out / "meta" / "info.json").read_text())["total_episodes"] == episodes
-    assert not journal_path(out).exists()
-    assert not out.with_name(f".{out.name}.export").exists()
-    for index, images in enumerate(reference or []):
-        assert [row["observation.images.front"]["bytes"] for row in rows[index * each : (index + 1) * each]] == images
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A journal of three episodes, recorded in this process without faults."""
-    folder = tmp_path_factory.mktemp("recorded") / "data.journal"
-    journal = Journal(folder, spec_of(3))
-    for episode in record(journal.spec, range(3)):
-        journal.add(episode)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def reference(recorded: Path) -> list[Any]:
-    """PNGs of the first three episodes."""
-    journal = Journal(recorded, spec_of(3))
-    return [journal.read_with_images(index)[1] for index in range(3)]
-
-
-def begin(recorded: Path, out: Path, without: int | None = None) -> Journal:
-    """A journal of three episodes for `out`, one of them missing."""
-    shutil.copytree(recorded, journal_path(out))
-    journal = Journal(journal_path(out), spec_of(3))
-    if without is not None:
-        journal.path(without).unlink()
-    return journal
-
 
 # --- handing out, with workers that are not processes ----------------------------------------------------------------
 
@@ -320,139 +249,3 @@ def test_write_that_fails_leaves_no_half_file(
         small(tmp_path / "data", 3)
     assert journal.missing() == [1]
     assert not list(journal.folder.glob(".*tmp*"))
-
-
-# --- really killing processes ----------------------------------------------------------------------------------------
-
-PROGRAM = """
-import json, sys
-from pathlib import Path
-from playslot_rl.collectors import collect
-from playslot_rl.config import ExperimentConfig, from_dict
-from playslot_rl.errors import PlaySlotError
-if __name__ == "__main__":
-    settings, episodes, workers, out = json.loads(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
-    try:
-        collect(from_dict(ExperimentConfig, settings), "random", episodes, 3, out, seed=0, workers=workers)
-    except PlaySlotError as error:
-        sys.exit(f"one line: {error}")
-"""
-
-
-@pytest.fixture
-def started() -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Processes of a test; whatever happens, none of them and of their children outlives it."""
-    processes: list[subprocess.Popen[bytes]] = []
-    yield processes
-    for process in processes:
-        for pid in [process.pid, *session_of(process.pid)]:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-        process.communicate()
-
-
-def start(
-    started: list[subprocess.Popen[bytes]], tmp_path: Path, out: Path, episodes: int, **collector: Any
-) -> subprocess.Popen[bytes]:
-    program = tmp_path / "program.py"
-    program.write_text(PROGRAM)
-    settings = json.dumps({**SMALL, "collector": collector})
-    command = [sys.executable, str(program), settings, str(episodes), "2", str(out)]
-    started.append(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True))
-    return started[-1]
-
-
-def stored(out: Path) -> int:
-    return len(list(journal_path(out).glob("episode_*.npz")))
-
-
-def wait_for(happened: Any, process: subprocess.Popen[bytes] | None = None, timeout: float = 400.0) -> None:
-    deadline = time.monotonic() + timeout
-    while not happened():
-        assert process is None or process.poll() is None, process.communicate()[1].decode()
-        assert time.monotonic() < deadline, "timed out"
-        time.sleep(0.005)
-
-
-def alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except OSError:
-        return False
-
-
-def session_of(pid: int) -> list[int]:
-    """Processes of the session that `pid` leads, itself left out: orphans stay in it."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            fields = path.read_text().rsplit(")", 1)[1].split()
-            if int(fields[3]) == pid and fields[0] != "Z" and int(path.parent.name) != pid:
-                found.append(int(path.parent.name))
-    return found
-
-
-def workers_of(pid: int) -> list[int]:
-    """Collector processes of a parent (not multiprocessing's resource tracker)."""
-    found = []
-    for child in session_of(pid):
-        with contextlib.suppress(OSError):
-            if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
-                found.append(child)
-    return found
-
-
-def assert_no_orphans(pid: int) -> None:
-    wait_for(lambda: not session_of(pid), timeout=20.0)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_workers_killed_and_stopped_are_replaced(
-    reference: list[Any], tmp_path: Path, started: list[subprocess.Popen[bytes]]
-) -> None:
-    out = tmp_path / "data"
-    process = start(started, tmp_path, out, episodes=80, timeout_s=8)
-    wait_for(lambda: stored(out) >= 3, process)
-    wait_for(lambda: len(workers_of(process.pid)) == 2, process)
-    killed, stopped = workers_of(process.pid)
-    os.kill(killed, signal.SIGKILL)
-    os.kill(stopped, signal.SIGSTOP)
-    errors = process.communicate(timeout=800)[1].decode()
-    assert process.returncode == 0, errors
-    assert "ended with SIGKILL: another takes its place" in errors
-    assert "gave no episode for 8 s: another takes its place" in errors
-    assert not alive(killed)
-    assert not alive(stopped)
-    assert_no_orphans(process.pid)
-    assert_whole(out, 80, reference)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_death_beyond_the_limit_ends_in_one_line_and_the_same_command_carries_on(
-    reference: list[Any], tmp_path: Path, started: list[subprocess.Popen[bytes]]
-) -> None:
-    out = tmp_path / "data"
-    process = start(started, tmp_path, out, episodes=150, restarts=0)
-    wait_for(lambda: stored(out) >= 3, process)
-    os.kill(workers_of(process.pid)[0], signal.SIGKILL)
-    errors = process.communicate(timeout=60)[1].decode()
-    assert process.returncode == 1
-    assert errors.startswith("one line: a collector worker ended with SIGKILL")
-    assert "Traceback" not in errors
-    assert_no_orphans(process.pid)
-    kept = {p.name: p.stat().st_mtime_ns for p in journal_path(out).glob("episode_*.npz")}
-    assert 3 <= len(kept) < 150
-
-    process = start(started, tmp_path, out, episodes=150)
-    wait_for(lambda: stored(out) > len(kept), process)
-    now = {p.name: p.stat().st_mtime_ns for p in journal_path(out).glob("episode_*.npz")}
-    assert kept.items() <= now.items()  # none was recorded again
-    children = session_of(process.pid)
-    process.kill()  # and now the parent
-    process.wait()
-    wait_for(lambda: not any(alive(child) for child in children), timeout=20.0)
-    assert_no_orphans(process.pid)
-    small(out, 150)
-    assert_whole(out, 150, reference)
