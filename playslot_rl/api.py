@@ -37,7 +37,8 @@ def load(run: str | Path = "pretrained", device: str = "", seed: int = 0) -> Pla
     """Load a run folder, or the world model that ships with the package.
 
     Args:
-        run: folder of a run, or `pretrained`. Without a finished `train-policy` the model cannot `act`.
+        run: folder of a run, or `pretrained/ENV` (`pretrained` is ButtonPress's). Without a finished `train-policy` the
+            model cannot `act`.
         device: torch device; empty means a GPU if there is one.
         seed: of sampled initial slots (only models with `initial: gaussian` draw any).
 

@@ -24,12 +24,17 @@ GROUPS: Final = ("env", "preset")
 CONTINUES: Final = frozenset({"evaluate", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
 SHIPPED: Final = "pretrained"
-"""`run=pretrained` names the shipped world model, which is not a run folder."""
+"""`run=pretrained` names the task's shipped world model, `run=pretrained/ENV` one of them: no run folders."""
 
 _FOLDERS: Final = frozenset({"out", "run", "data.root", "data.demos", "data.cache"})
 
 # These say what one invocation does, on which machine; a stored run does not hand them on.
 _OF_THE_CALL: Final = ("out", "run", "episodes", "policy", "protocol", "workers", "collector", "device")
+
+
+def shipped(run: str) -> bool:
+    """Whether `run` names a shipped world model instead of a folder."""
+    return run.partition("/")[0] == SHIPPED
 
 
 def choices(group: str) -> list[str]:
@@ -58,7 +63,7 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
             _check_choice(group, pairs[group])
     try:
         run = _expand_home(_unquote(pairs.get("run", "")))
-        continues = command in CONTINUES and run not in ("", SHIPPED)
+        continues = command in CONTINUES and run != "" and not shipped(run)
         config = _from_run(Path(run), pairs) if continues else _from_preset(pairs)
     except ConfigError:
         raise

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.recipes import evaluate, train_policy
-from playslot_rl.recipes.run import open_run, store_config
+from playslot_rl.recipes.run import open_run, parent_run, store_config
 
 FIRST_SEED = 7
 """Added to `seed`: the shipped model was trained on videos of the base seeds 0 and 1, and the demo sees new ones."""
@@ -25,7 +25,7 @@ def main(config: ExperimentConfig) -> None:
     name = config.out or "runs/demo"
     config = replace(config, out=name, run="pretrained", seed=FIRST_SEED + config.seed)
     folder = open_run(config)
-    world_model_checkpoints("pretrained")  # a missing or damaged one is refused before anything is recorded
+    world_model_checkpoints(parent_run(config, folder))  # a missing one is refused before anything is recorded
     if not (folder / "config.json").is_file():
         store_config(config, folder)
     demos = Path(config.data.demos or folder / "data" / "expert")

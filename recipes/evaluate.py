@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from playslot_rl.compose import shipped
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
@@ -97,8 +98,8 @@ def check_run(config: ExperimentConfig) -> Path:
     """
     if not config.run:
         raise ConfigError("run: got nothing, expected the folder of a run with a trained policy, such as run=runs/demo")
-    if config.run == "pretrained":
-        raise CheckpointError("run=pretrained is a world model without a policy; train one by `playslot train-policy`")
+    if shipped(config.run):
+        raise CheckpointError(f"run={config.run} is a world model without a policy; run `playslot train-policy`")
     run = Path(config.run)
     if not run.is_dir():
         raise CheckpointError(f"run={config.run}: no such folder, expected a run; make one by `playslot demo`")

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from playslot_rl.compose import SHIPPED, shipped
 from playslot_rl.config import ExperimentConfig, StageConfig, to_dict
 from playslot_rl.errors import ConfigError, DataError, OutputError
 
@@ -26,7 +27,7 @@ def open_run(config: ExperimentConfig) -> Path:
         OutputError: the folder holds something else.
     """
     folder = Path(config.out or config.run)
-    if str(folder) in (".", "pretrained"):
+    if str(folder) == "." or shipped(str(folder)):
         raise ConfigError("out: got nothing, expected the run folder to write, such as out=runs/first")
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"out={folder}: got a file, expected a folder: choose another out=")
@@ -102,8 +103,8 @@ def demo_root(config: ExperimentConfig) -> str:
 
 
 def parent_run(config: ExperimentConfig, folder: Path) -> str:
-    """Where a stage finds its parents: `run` if given (a folder or `pretrained`), else the folder it writes."""
-    return config.run or str(folder)
+    """Where a stage finds its parents: `run` if given (`pretrained` is the task's own), else the folder it writes."""
+    return f"{SHIPPED}/{config.env.name}" if config.run == SHIPPED else config.run or str(folder)
 
 
 def finished(

@@ -1,6 +1,6 @@
 """`playslot train-policy run=RUN data.root=DEMOS`: stage 3, latent policy, slot oracle and action decoder.
 
-`run=pretrained out=RUN` builds on the shipped world model.
+`run=pretrained out=RUN` builds on the world model that ships for the task.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from playslot_rl.compose import shipped
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
     demo_root,
@@ -65,7 +66,7 @@ def main(config: ExperimentConfig) -> None:
     def ready() -> None:
         home = world_model_folder(parent)
         if Path(parent).resolve() != run.resolve() and home.resolve() != run.resolve():
-            link_world_model(run, parent if parent == "pretrained" else home)
+            link_world_model(run, parent if shipped(parent) else home)
         store_config(config, run)
 
     device = open_device(config)

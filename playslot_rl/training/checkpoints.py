@@ -6,8 +6,8 @@ The layout of a run (`RUN`), and of the shipped models, is the same:
     RUN/dynamics/checkpoint    modules `inverse_dynamics`, `predictor`; parent: slots
     RUN/policy/checkpoint      modules `policy`, `action_decoder`, `oracle` (if trained); parents: slots, dynamics
 
-A run whose world model lives elsewhere has `RUN/world_model.json`, `{"source": "pretrained"}` or a path relative to
-RUN. A child names its parents by the fingerprints of their weights and refuses any other.
+A run whose world model lives elsewhere has `RUN/world_model.json`: `{"source": "pretrained/ENV"}`, or a path relative
+to RUN. A child names its parents by the fingerprints of their weights and refuses any other.
 """
 
 from __future__ import annotations
@@ -257,13 +257,20 @@ def pretrained_folder(env: str = "button_press") -> Path:
     return root / env
 
 
-def run_folder(run: Path | str, env: str = "button_press") -> Path:
-    """`pretrained` or a path to the folder that it names.
+def shipped_env(run: Path | str) -> str | None:
+    """Environment of the shipped world model that `pretrained/ENV` or `pretrained` (ButtonPress) names, else None."""
+    name, _, env = str(run).partition("/")
+    return (env or "button_press") if name == PRETRAINED else None
+
+
+def run_folder(run: Path | str) -> Path:
+    """`pretrained`, `pretrained/ENV` or a path to the folder that it names.
 
     Raises:
         CheckpointError: there is no such folder.
     """
-    if str(run) == PRETRAINED:
+    env = shipped_env(run)
+    if env is not None:
         return pretrained_folder(env)
     folder = Path(run)
     if not str(run) or not folder.is_dir():
@@ -312,12 +319,13 @@ def require_adoptable(checkpoint: StageCheckpoint, run: Path) -> None:
 
 
 def link_world_model(run: Path, source: Path | str) -> None:
-    """Say that the world model of `run` is the one of another run, or `pretrained`.
+    """Say that the world model of `run` is the one of another run, or a shipped one (`pretrained/ENV`).
 
     Raises:
         OutputError: full disk.
     """
-    text = PRETRAINED if str(source) == PRETRAINED else os.path.relpath(source, run)
+    env = shipped_env(source)
+    text = os.path.relpath(source, run) if env is None else f"{PRETRAINED}/{env}"
     write_json(run / "world_model.json", {"source": text})
 
 
@@ -333,8 +341,8 @@ def world_model_folder(run: Path | str) -> Path:
         return folder
     source = _read_json(link).get("source")
     if not isinstance(source, str):
-        raise CheckpointError(f'{link}: got no "source", expected "{PRETRAINED}" or a path: delete it and train again')
-    return run_folder(PRETRAINED if source == PRETRAINED else folder / source)
+        raise CheckpointError(f'{link}: got no "source", expected "{PRETRAINED}/ENV" or a path: train again')
+    return run_folder(folder / source if shipped_env(source) is None else source)
 
 
 def world_model_checkpoints(run: Path | str) -> dict[str, StageCheckpoint]:
