@@ -26,7 +26,7 @@ CONTINUES: Final = frozenset({"evaluate", "train-dynamics", "train-policy"})
 SHIPPED: Final = "pretrained"
 """`run=pretrained` names the task's shipped world model, `run=pretrained/ENV` one of them: no run folders."""
 
-_FOLDERS: Final = frozenset({"out", "run", "data.root", "data.demos", "data.cache"})
+_FOLDERS: Final = frozenset({"out", "run", "data.root", "data.demos", "data.cache", "slots.start_from"})
 
 # These say what one invocation does, on which machine; a stored run does not hand them on.
 _OF_THE_CALL: Final = ("out", "run", "episodes", "policy", "protocol", "workers", "collector", "device")

@@ -82,9 +82,11 @@ class SlotsStageConfig(StageConfig):
 
     Attributes:
         clip_frames: frames per clip.
+        start_from: run (or `pretrained/ENV`) whose SAVi this one starts from; empty starts from scratch (paper).
     """
 
     clip_frames: int = 8
+    start_from: str = ""
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,11 @@ def main(config: ExperimentConfig) -> None:
     import torch
 
     from playslot_rl.modules.savi import SAVi
-    from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
+    from playslot_rl.training.checkpoints import checkpoint_folder, load_savi, save_stage, slots_fingerprint
     from playslot_rl.training.fit import fit
     from playslot_rl.training.seeding import derived_seed
     from playslot_rl.training.stage_slots import SlotsStage
+    from playslot_rl.training.warm_start import warm_start
 
     run = open_run(config)
     wanted = {"env": {"image_size": config.env.image_size}, "model": {"savi": to_dict(config.model.savi)}}
@@ -29,8 +30,12 @@ def main(config: ExperimentConfig) -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derived_seed(config.seed, 0, "slots"))
         savi = SAVi(config.model.savi, config.env.image_size).to(device)
+    started: dict[str, str] = {}
+    if config.slots.start_from:
+        warm_start(savi, load_savi(config.slots.start_from, device), config.slots.start_from)
+        started = {"started_from": slots_fingerprint(config.slots.start_from)}
     stage = SlotsStage(savi, source, config.slots, validation=config.data.validation, seed=config.seed, device=device)
-    identity = {**wanted, "data": source.fingerprint, "data.validation": config.data.validation}
+    identity = {**wanted, "data": source.fingerprint, "data.validation": config.data.validation, **started}
     result = fit(
         stage,
         config.slots,
@@ -52,6 +57,6 @@ def main(config: ExperimentConfig) -> None:
         metrics=result.metrics,
         steps=result.step,
         seconds=result.seconds,
-        extra={"episodes": source.episodes, "seed": config.seed},
+        extra={"episodes": source.episodes, "seed": config.seed, **started},
     )
     print(f"slots: {result.metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {run / 'slots'}", flush=True)

@@ -377,6 +377,15 @@ def _frozen(module: nn.Module, device: torch.device | str) -> None:
     module.to(device).eval().requires_grad_(False)
 
 
+def slots_fingerprint(run: Path | str) -> str:
+    """Fingerprint of a run's SAVi.
+
+    Raises:
+        CheckpointError: it has none.
+    """
+    return read_stage(checkpoint_folder(world_model_folder(run), "slots"), "slots").fingerprint
+
+
 def load_savi(run: Path | str, device: torch.device | str = "cpu") -> SAVi:
     """SAVi of a run (or `pretrained`), in eval mode, without gradients for its weights.
 

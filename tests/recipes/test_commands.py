@@ -86,6 +86,22 @@ def test_stages_one_by_one_equal_the_pipeline(shared_run: Path, videos: Path, de
         assert weights(run, stage) == weights(shared_run, stage)
 
 
+def test_slots_may_start_from_another_runs(shared_run: Path, videos: Path, tmp_path: Path) -> None:
+    arguments = (f"data.root={videos}", f"slots.start_from={shared_run}", "seed=1")
+    smoke("train-slots", f"out={tmp_path / 'warm'}", *arguments, "slots.optim.lr=0")
+    assert weights(tmp_path / "warm", "slots") == weights(shared_run, "slots")
+    meta = json.loads((tmp_path / "warm" / "slots" / "checkpoint" / "meta.json").read_text())
+    assert meta["started_from"] == meta["fingerprint"]
+    refused(
+        "train-slots",
+        f"out={tmp_path / 'other'}",
+        *arguments,
+        "model.savi.slot_dim=48",
+        message=r"slots\.start_from=\S+: got \S+ of .* expected .*: give model\.savi",
+    )
+    assert not (tmp_path / "other").exists()
+
+
 def test_stages_with_nothing_but_out_equal_the_pipeline(
     shared_run: Path, videos: Path, demos: Path, tmp_path: Path
 ) -> None:
