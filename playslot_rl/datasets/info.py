@@ -55,25 +55,30 @@ class DatasetSummary:
         """One JSON object."""
         return json.dumps(asdict(self), indent=2)
 
-    def lines(self) -> list[str]:
-        """For people."""
+    def facts(self) -> list[tuple[str, str]]:
+        """Names and values for people."""
         shortest, mean, longest = self.lengths
         length = f"{shortest}" if shortest == longest else f"{shortest} to {longest}, mean {mean:.1f}"
         seconds = self.frames / self.fps
         sizes = ", ".join(f"{name} {size / MEBIBYTE:.1f} MiB" for name, size in self.bytes.items() if size)
         found = [
-            f"{self.root}: LeRobot {self.format}, robot {self.robot or 'not stated'}",
-            f"episodes  {self.episodes}, {length} frames each",
-            f"frames    {self.frames} at {self.fps:g} fps ({seconds:.0f} s)",
-            *(f"task      {words!r} ({count} episodes)" for words, count in self.tasks.items()),
-            f"size      {sizes}",
+            ("episodes", f"{self.episodes}, {length} frames each"),
+            ("frames", f"{self.frames} at {self.fps:g} fps ({seconds:.0f} s)"),
+            *(("task", f"{words!r} ({count} episodes)") for words, count in self.tasks.items()),
+            ("size", sizes),
         ]
         if self.success_rate is not None:
-            found.append(f"success   {100 * self.success_rate:.1f} % of the episodes")
+            found.append(("success", f"{100 * self.success_rate:.1f} % of the episodes"))
         if self.seeds is not None:
-            found.append(f"seeds     {self.seeds[0]} to {self.seeds[1]}")
+            found.append(("seeds", f"{self.seeds[0]} to {self.seeds[1]}"))
         if self.source is not None:
-            found.append("made by   " + ", ".join(f"{name} {value}" for name, value in self.source.items()))
+            found.append(("made by", ", ".join(f"{name} {value}" for name, value in self.source.items())))
+        return found
+
+    def lines(self) -> list[str]:
+        """For people."""
+        head = f"{self.root}: LeRobot {self.format}, robot {self.robot or 'not stated'}"
+        found = [head, *(f"{name:<8}  {value}" for name, value in self.facts())]
         width = max(map(len, self.features))
         return [*found, "features", *(f"  {name:<{width}}  {kind}" for name, kind in self.features.items())]
 

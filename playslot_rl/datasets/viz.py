@@ -61,7 +61,7 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
         OutputError: the file cannot be written.
     """
     from playslot_rl.training.atomic import write_text
-    from playslot_rl.visualization.document import Document, Section, Text
+    from playslot_rl.visualization.document import Document, Section, Table
     from playslot_rl.visualization.html import to_html
 
     contents = require_sound(root)
@@ -70,8 +70,8 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
         raise ConfigError(f"--out: got {target} inside the data set, expected a file outside: a push would upload it")
     chosen = spread(len(contents.spans), episodes)
     summary = info(root)
-    about = [Text(line) for line in summary.lines()[1:] if not line.startswith(("features", "  "))]
-    sections = [Section("Data set", [*about, _feature_table(summary.features)])]
+    about = Table(["fact", "value"], summary.facts())
+    sections = [Section("Data set", [about, _feature_table(summary.features)])]
     sections += [_episode_section(contents, clip) for clip in _clips(contents, chosen)]
     lead = f"{summary.episodes} episodes, {summary.frames} frames at {summary.fps:g} fps; shown: {_names(chosen)}."
     write_text(target, to_html(Document(f"Data set {contents.root.absolute().name}", lead, sections)))
@@ -190,7 +190,10 @@ def _episode_section(contents: Contents, clip: Clip) -> Any:
 
 def _caption(contents: Contents, clip: Clip) -> str:
     rows = slice(clip.span.start, clip.span.stop)
-    parts = [f"{clip.span.length} frames, {clip.span.length / contents.fps:.1f} s", *clip.episode.tasks]
+    parts = [
+        f"{clip.span.length} frames, {clip.span.length / contents.fps:.1f} s",
+        *(task.rstrip(".") for task in clip.episode.tasks),
+    ]
     seeds, solved = contents.columns.get(keys.FEATURE_SEED), contents.columns.get(keys.FEATURE_SUCCESS)
     if seeds is not None:
         parts.append(f"seed {int(seeds[clip.span.start])}")
