@@ -1,4 +1,4 @@
-"""The shipped world model: there, small, documented, loadable, and good enough that a broken one is noticed.
+"""The shipped world models: there, small, documented, loadable, and good enough that a broken one is noticed.
 
 The policy in `tests/assets/button_press_policy/policy/checkpoint` was trained on it by `playslot train-policy`; with
 another world model it is refused, so that whoever renews the model renews the policy too.
@@ -17,19 +17,19 @@ from playslot_rl.compose import compose
 from playslot_rl.training.atomic import write_json
 from playslot_rl.training.checkpoints import load_agent, load_world_model, pretrained_folder, read_stage
 
-ENV = "button_press"
-ASSET = Path(__file__).parent / "assets" / f"{ENV}_policy"
+ENVS = ("button_press", "block_push_easy")
+ASSET = Path(__file__).parent / "assets" / "button_press_policy"
 LIMIT = 8 * 1000**2
 
 
-@pytest.fixture(scope="module")
-def shipped() -> Path:
+@pytest.fixture(scope="module", params=ENVS)
+def shipped(request: pytest.FixtureRequest) -> Path:
     """Its folder. A missing model is a failure, never a skip."""
-    return pretrained_folder(ENV)
+    return pretrained_folder(request.param)
 
 
 @pytest.fixture
-def run(shipped: Path, tmp_path: Path) -> Path:
+def run(tmp_path: Path) -> Path:
     """A run that uses the shipped world model with the stored policy."""
     assert (ASSET / "policy" / "checkpoint" / "meta.json").is_file(), f"no stored policy at {ASSET}/policy/checkpoint"
     shutil.copytree(ASSET / "policy" / "checkpoint", tmp_path / "policy" / "checkpoint")
@@ -60,9 +60,16 @@ def test_its_meta_says_how_it_was_made(shipped: Path, stage: str) -> None:
     assert "/tmp/" not in json.dumps(meta)
 
 
-def test_it_loads_and_has_the_sizes_of_the_compact_preset() -> None:
-    world = load_world_model("pretrained")
-    config = compose(["preset=compact"])
+def test_no_other_model_ships() -> None:
+    assert {path.name for path in pretrained_folder("button_press").parent.iterdir() if path.is_dir()} - {
+        "__pycache__"
+    } == set(ENVS)
+
+
+@pytest.mark.parametrize("env", ENVS)
+def test_it_loads_and_has_the_sizes_of_the_compact_preset(env: str) -> None:
+    world = load_world_model(f"pretrained/{env}")
+    config = compose(["preset=compact", f"env={env}"])
     assert world.config.savi == config.model.savi
     assert world.config.inverse_dynamics == config.model.inverse_dynamics
     assert world.config.predictor == config.model.predictor
