@@ -84,10 +84,10 @@ def test_the_actor_that_is_loaded_plays_and_repeats(trained: Path) -> None:
     original = controller.act
 
     def noted(moment: object) -> np.ndarray:
-        chosen.append(original(moment))  # type: ignore[arg-type]
+        chosen.append(original(moment))
         return chosen[-1]
 
-    controller.act = noted  # type: ignore[method-assign, assignment]
+    controller.act = noted
     with TaskPool(config.env, config.render) as pool:
         for _ in range(2):
             run_episodes(pool, controller, [7, 8])
@@ -110,9 +110,9 @@ def test_an_interrupted_run_ends_with_the_same_weights(
     config, original = _config(world, tmp_path / "run"), SOLDLearner.update
 
     def stopped(self: SOLDLearner, batch: object, generators: object) -> object:
-        if generators.step == 5:  # type: ignore[attr-defined]
+        if generators.step == 5:
             raise KeyboardInterrupt
-        return original(self, batch, generators)  # type: ignore[arg-type]
+        return original(self, batch, generators)
 
     with monkeypatch.context() as patch:
         patch.setattr(SOLDLearner, "update", stopped)
@@ -129,11 +129,11 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_checkpoint(
     original = SOLDLearner.update
 
     def broken(self: SOLDLearner, batch: object, generators: object) -> object:
-        values = dict(original(self, batch, generators))  # type: ignore[arg-type]
-        return values | {"slot_mse": torch.tensor(float("nan"))} if generators.step == 5 else values  # type: ignore[attr-defined]
+        values = dict(original(self, batch, generators))
+        return values | {"slot_mse": torch.tensor(float("nan"))} if generators.step == 5 else values
 
     monkeypatch.setattr(SOLDLearner, "update", broken)
-    with pytest.raises(TrainingError, match="sold: slot_mse is nan .* the last good checkpoint is .*step_00000024"):
+    with pytest.raises(TrainingError, match=r"sold: slot_mse is nan .* the last good checkpoint is .*step_00000024"):
         sold.main(_config(world, tmp_path / "run"))
 
 
@@ -155,7 +155,7 @@ def test_a_world_without_slots_is_refused_before_anything_is_written(tmp_path: P
 
 
 def test_another_frame_size_than_savis_is_refused(world: Path, tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="env.image_size: got 32, expected 64"):
+    with pytest.raises(CheckpointError, match=r"env\.image_size: got 32, expected 64"):
         sold.main(_config(world, tmp_path / "run", "env.image_size=32"))
 
 

@@ -85,7 +85,10 @@ class SlotAggregation(nn.Module):
         x = torch.cat((self.embed(slots), output), dim=2).flatten(1, 2)
         bias = alibi_bias(self.slopes, s, first, n + 1).to(x.dtype)
         kept: list[KeysValues] = []
+        last = len(self.blocks) - 1
         for i, block in enumerate(self.blocks):
-            x, keys_values = block(x, bias, None if past is None else past[i])
+            # Only the output tokens of the last layer are read.
+            wanted = slice(n, None, n + 1) if i == last else slice(None)
+            x, keys_values = block(x, bias, None if past is None else past[i], wanted)
             kept.append(keys_values)
-        return self.norm(x.view(b, s, n + 1, -1)[:, :, n]), kept
+        return self.norm(x), kept

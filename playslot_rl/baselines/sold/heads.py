@@ -1,5 +1,5 @@
-"""SOLD's reward, value and actor: a slot-aggregation transformer each, and a linear layer (Mosbach et al., 2025, section
-3.3).
+"""SOLD's reward, value and actor: a slot-aggregation transformer each, and a linear layer
+(Mosbach et al., 2025, section 3.3).
 
 Shapes: slots (B, S, N, D), A action width. All take the past that they returned for the earlier steps, so a step of
 imagination costs one step.

@@ -126,15 +126,14 @@ class SOLDLearner:
         actor = losses.actor_loss(
             imagined, returns, values[:, :-1], self.returns.scale(), weights, config.entropy, config.actor_gradient
         )
-        norms = {"actor_grad_norm": self._step("actor", actor)}
-
-        # The slots as constants: the critic judges what was imagined, it does not reach back into it.
-        fixed = imagined.slots.detach()[:, :-1]
         with torch.no_grad():
-            slow = self.slow_critic.decode(self.slow_critic(fixed)[:, frames - 1 :])
-        logits = networks.critic(fixed)[:, frames - 1 :]
-        value = losses.value_loss(networks.critic, logits, returns.detach(), slow, weights)
-        norms["critic_grad_norm"] = self._step("critic", value)
+            slow = self.slow_critic.decode(self.slow_critic(imagined.slots[:, :-1])[:, frames - 1 :])
+        value = losses.value_loss(networks.critic, logits[:, :-1], returns, slow, weights)
+        # Actor and critic share the critic's forward pass, so it is kept until both gradients are taken.
+        norms = {
+            "actor_grad_norm": self._step("actor", actor, keep=True),
+            "critic_grad_norm": self._step("critic", value),
+        }
         self._follow()
         return norms | {
             "loss_actor": actor.detach(),
@@ -167,10 +166,11 @@ class SOLDLearner:
 
     # --- optimisers -----------------------------------------------------------------------------------------------
 
-    def _step(self, name: str, loss: Tensor) -> Tensor:
-        """Move one network by a loss; its gradient's norm before clipping."""
+    def _step(self, name: str, loss: Tensor, keep: bool = False) -> Tensor:
+        """Move one network by a loss; its gradient's norm before clipping. `keep` leaves the graph for another loss."""
         parameters = list(self.networks.parts[name].parameters())
-        for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
+        gradients = torch.autograd.grad(loss, parameters, retain_graph=keep)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         norm: Tensor = nn.utils.clip_grad_norm_(parameters, self.config.grad_clip)
         # A step along a gradient that is not finite would spoil every weight; the loop stops at the number.

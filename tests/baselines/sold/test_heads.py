@@ -45,7 +45,7 @@ def test_cross_entropy_is_least_at_the_target() -> None:
         optimizer.zero_grad()
         two_hot.cross_entropy(logits, target).backward()
         optimizer.step()
-    assert float(two_hot.decode(logits)) == pytest.approx(5.0, abs=0.1)
+    assert two_hot.decode(logits).item() == pytest.approx(5.0, abs=0.1)
 
 
 def test_the_decoded_value_has_gradients_of_its_own_size() -> None:

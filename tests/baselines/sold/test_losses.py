@@ -70,9 +70,7 @@ def test_reinforce_raises_the_probability_of_better_than_expected_actions_only()
     log_probs = torch.zeros(1, 2, requires_grad=True)
     returns = torch.tensor([[3.0, 1.0]], requires_grad=True)
     imagined = _imagined(1, 2)._replace(log_probs=log_probs)
-    loss = losses.actor_loss(
-        imagined, returns, torch.full((1, 2), 2.0), torch.ones(1), torch.ones(2), 0.0, "reinforce"
-    )
+    loss = losses.actor_loss(imagined, returns, torch.full((1, 2), 2.0), torch.ones(1), torch.ones(2), 0.0, "reinforce")
     by_probability, by_returns = torch.autograd.grad(loss, (log_probs, returns), allow_unused=True)
     assert by_probability.tolist() == [[-0.5, 0.5]]
     assert by_returns is None
