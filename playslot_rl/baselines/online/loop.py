@@ -39,6 +39,11 @@ if TYPE_CHECKING:
 FREE_KEYS: Final = ("minutes", "checkpoint_every", "evaluate_every", "log_every", "replay_on_disk")
 
 
+def fixed_keys(online: OnlineConfig) -> dict[str, Any]:
+    """A method's config without what a resumed or finished run may change."""
+    return {key: value for key, value in to_dict(online).items() if key not in FREE_KEYS}
+
+
 @dataclass(frozen=True)
 class OnlineResult:
     """What `train_online` did.
@@ -133,7 +138,7 @@ class _Run:
         self.learner, self.online, self.config, self.folder = learner, online, config, folder
         self.name, self.title, self.device, self.prior_steps = name, title, device, prior_steps
         self.replay = Replay(online, config.env.max_steps + 1)
-        fixed = {key: value for key, value in to_dict(online).items() if key not in FREE_KEYS}
+        fixed = fixed_keys(online)
         env = {"env": to_dict(config.env), "render": to_dict(config.render)}
         self.checkpoints = OnlineCheckpoints(folder, {name: fixed, "seed": config.seed, **env, **identity})
         self.history = History(folder / "metrics.jsonl")
