@@ -20,7 +20,7 @@ from tensordict import TensorDictBase
 from playslot_rl.baselines.online.acting import Episodes, play
 from playslot_rl.baselines.online.checkpoints import OnlineCheckpoints, OnlineState
 from playslot_rl.baselines.online.config import OnlineConfig
-from playslot_rl.baselines.online.curve import curve_point, write_curve
+from playslot_rl.baselines.online.curve import curve_point, draw_curve, write_curve
 from playslot_rl.baselines.online.learner import Learner
 from playslot_rl.baselines.online.replay import Replay
 from playslot_rl.baselines.online.seeds import development_seeds, training_seed
@@ -115,6 +115,7 @@ def train_online(
         finally:
             logger.close()
     run.write_curve()
+    draw_curve(folder, title, run.state.curve, run.state.random)
     return OnlineResult(run.state, start, run.state.random)
 
 
@@ -243,11 +244,9 @@ class _Run:
         self.write_curve()
 
     def write_curve(self) -> None:
-        """Renew `curve.json` and its pictures."""
+        """Renew `curve.json`."""
         seeds = development_seeds(self.online.evaluation_episodes)
-        if self.state.curve:
-            env = self.config.env.name
-            write_curve(self.folder, self.title, env, seeds, self.state.curve, self.state.random)
+        write_curve(self.folder, self.title, self.config.env.name, seeds, self.state.curve, self.state.random)
 
     def _save(self) -> None:
         for key, value in module_tensors(self.learner.modules).items():
