@@ -16,13 +16,19 @@ def main(config: ExperimentConfig) -> None:
 
     Raises:
         CheckpointError: no finished slots in `run`, or `out` was begun otherwise.
-        ConfigError: settings that do not fit each other.
+        ConfigError: an environment without a simulator or a dense reward, or settings that do not fit.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
+    from playslot_rl.baselines.online.requirements import require_online
+
+    own = config.baselines.sold
+    require_online(config, own, "sold")  # before anything is written or computed
+    run = open_run(config)
+
     import torch
 
-    from playslot_rl.baselines.online.loop import FREE_KEYS, train_online
-    from playslot_rl.baselines.online.seeds import check_seeds
+    from playslot_rl.baselines.methods import METHODS
+    from playslot_rl.baselines.online.loop import fixed_keys, train_online
     from playslot_rl.baselines.sold.learner import SOLDLearner
     from playslot_rl.baselines.sold.load import NAME, build_networks, prior_steps, slots_checkpoint
     from playslot_rl.training.checkpoints import (
@@ -37,16 +43,14 @@ def main(config: ExperimentConfig) -> None:
     )
     from playslot_rl.training.seeding import derived_seed
 
-    run, own = open_run(config), config.baselines.sold
     parent = parent_run(config, run)
     run_folder(parent, config.env.name)
     slots = slots_checkpoint(parent)
     require_adoptable(slots, run)
     require_config(slots, {"env": {"image_size": config.env.image_size}})
-    fixed = {key: value for key, value in to_dict(own).items() if key not in FREE_KEYS}
-    if finished(config, run, NAME, {"env": to_dict(config.env), NAME: fixed}, {"slots": slots}, ""):
+    trained_as = {"env": to_dict(config.env), NAME: fixed_keys(own)}
+    if finished(config, run, NAME, trained_as, {"slots": slots}, ""):
         return
-    check_seeds(config, own.steps // config.env.max_steps + own.envs)
     before = prior_steps(own, slots)
 
     def ready() -> None:
@@ -66,7 +70,7 @@ def main(config: ExperimentConfig) -> None:
         config,
         run / NAME,
         name=NAME,
-        title="SOLD",
+        title=METHODS[NAME].title,
         device=device,
         identity={"slots": slots.fingerprint},
         ready=ready,
@@ -88,12 +92,14 @@ def main(config: ExperimentConfig) -> None:
             "savi_steps": before,
             "episodes": state.episodes,
             "seed": config.seed,
-            "random": result.random,
+            "random_policy": result.random,
+            "parameters": sum(parameter.numel() for parameter in networks.parameters()),
         },
     )
-    reached = state.metrics.get("return_mean", float("nan"))
+    random, last = result.random, state.curve[-1]
     print(
-        f"{NAME}: return {reached:.1f} (random {result.random['return_mean']:.1f}) after {state.step} agent steps, "
-        f"{run / NAME}",
+        f"{NAME}: {state.step} agent steps and {before} of SAVi's data, {state.updates} updates; development episodes: "
+        f"return {last['return_mean']:.2f} (random {random['return_mean']:.2f}), success "
+        f"{100 * last['success_rate']:.0f} % (random {100 * random['success_rate']:.0f} %); {run / NAME}",
         flush=True,
     )

@@ -154,6 +154,12 @@ def test_a_world_without_slots_is_refused_before_anything_is_written(tmp_path: P
     assert not (tmp_path / "run").exists()
 
 
+def test_a_task_without_a_dense_reward_is_refused_before_anything_is_written(world: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"env\.blocks\.reward: got sparse with method=sold, expected dense"):
+        sold.main(_config(world, tmp_path / "run", "env=block_reach", "env.blocks.reward=sparse"))
+    assert not (tmp_path / "run").exists()
+
+
 def test_another_frame_size_than_savis_is_refused(world: Path, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"env\.image_size: got 32, expected 64"):
         sold.main(_config(world, tmp_path / "run", "env.image_size=32"))

@@ -27,9 +27,14 @@ def curve_point(played: Episodes) -> dict[str, Any]:
 
 
 def write_curve(
-    folder: Path, method: str, env: str, seeds: Sequence[int], rows: Sequence[Mapping[str, Any]], random: Mapping[str, Any]
+    folder: Path,
+    method: str,
+    env: str,
+    seeds: Sequence[int],
+    rows: Sequence[Mapping[str, Any]],
+    random: Mapping[str, Any],
 ) -> None:
-    """Write `curve.json` and the pictures `curve_light.png` and `curve_dark.png`.
+    """Write `curve.json`.
 
     Args:
         folder: `RUN/METHOD`.
@@ -42,9 +47,6 @@ def write_curve(
     Raises:
         OutputError: full disk.
     """
-    from playslot_rl.visualization.learning import learning_chart
-    from playslot_rl.visualization.palette import DARK, LIGHT
-
     values = {
         "method": method,
         "env": env,
@@ -54,5 +56,16 @@ def write_curve(
         "rows": [dict(row) for row in rows],
     }
     write_json(folder / "curve.json", values)
+
+
+def draw_curve(folder: Path, method: str, rows: Sequence[Mapping[str, Any]], random: Mapping[str, Any]) -> None:
+    """Draw `curve_light.png` and `curve_dark.png`.
+
+    Raises:
+        OutputError: full disk.
+    """
+    from playslot_rl.visualization.learning import learning_chart
+    from playslot_rl.visualization.palette import DARK, LIGHT
+
     for theme in (LIGHT, DARK):
         write_bytes(folder / f"curve_{theme.name}.png", learning_chart({method: rows}, random, theme))

@@ -20,7 +20,7 @@ from tensordict import TensorDictBase
 from playslot_rl.baselines.online.acting import Episodes, play
 from playslot_rl.baselines.online.checkpoints import OnlineCheckpoints, OnlineState
 from playslot_rl.baselines.online.config import OnlineConfig
-from playslot_rl.baselines.online.curve import curve_point, write_curve
+from playslot_rl.baselines.online.curve import curve_point, draw_curve, write_curve
 from playslot_rl.baselines.online.learner import Learner
 from playslot_rl.baselines.online.replay import Replay
 from playslot_rl.baselines.online.seeds import development_seeds, training_seed
@@ -37,6 +37,11 @@ if TYPE_CHECKING:
 
 # How often we look, and how long, does not change what is learned on the way: these may differ on resuming.
 FREE_KEYS: Final = ("minutes", "checkpoint_every", "evaluate_every", "log_every", "replay_on_disk")
+
+
+def fixed_keys(online: OnlineConfig) -> dict[str, Any]:
+    """A method's config without what a resumed or finished run may change."""
+    return {key: value for key, value in to_dict(online).items() if key not in FREE_KEYS}
 
 
 @dataclass(frozen=True)
@@ -110,6 +115,7 @@ def train_online(
         finally:
             logger.close()
     run.write_curve()
+    draw_curve(folder, title, run.state.curve, run.state.random)
     return OnlineResult(run.state, start, run.state.random)
 
 
@@ -133,7 +139,7 @@ class _Run:
         self.learner, self.online, self.config, self.folder = learner, online, config, folder
         self.name, self.title, self.device, self.prior_steps = name, title, device, prior_steps
         self.replay = Replay(online, config.env.max_steps + 1)
-        fixed = {key: value for key, value in to_dict(online).items() if key not in FREE_KEYS}
+        fixed = fixed_keys(online)
         env = {"env": to_dict(config.env), "render": to_dict(config.render)}
         self.checkpoints = OnlineCheckpoints(folder, {name: fixed, "seed": config.seed, **env, **identity})
         self.history = History(folder / "metrics.jsonl")
@@ -238,11 +244,9 @@ class _Run:
         self.write_curve()
 
     def write_curve(self) -> None:
-        """Renew `curve.json` and its pictures."""
+        """Renew `curve.json`."""
         seeds = development_seeds(self.online.evaluation_episodes)
-        if self.state.curve:
-            env = self.config.env.name
-            write_curve(self.folder, self.title, env, seeds, self.state.curve, self.state.random)
+        write_curve(self.folder, self.title, self.config.env.name, seeds, self.state.curve, self.state.random)
 
     def _save(self) -> None:
         for key, value in module_tensors(self.learner.modules).items():

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torchrl.objectives.value.functional import vec_td_lambda_return_estimate
+from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 
 def lambda_returns(rewards: Tensor, values: Tensor, gamma: float, lmbda: float) -> Tensor:
@@ -28,5 +28,5 @@ def lambda_returns(rewards: Tensor, values: Tensor, gamma: float, lmbda: float) 
         [1.5, 1.0]
     """
     over = torch.zeros(rewards.shape, dtype=torch.bool, device=rewards.device)
-    returns: Tensor = vec_td_lambda_return_estimate(gamma, lmbda, values, rewards, done=over, terminated=over)
+    returns: Tensor = td_lambda_return_estimate(gamma, lmbda, values, rewards, done=over, terminated=over)
     return returns
