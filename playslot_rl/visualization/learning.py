@@ -11,9 +11,7 @@ from playslot_rl.visualization.charts import _figure, _png, _style
 from playslot_rl.visualization.palette import Theme
 
 
-def learning_chart(
-    curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Mapping[str, Any], theme: Theme
-) -> bytes:
+def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Mapping[str, Any], theme: Theme) -> bytes:
     """Two panels: mean return with its standard error, and success rate with its 95 % interval.
 
     Args:

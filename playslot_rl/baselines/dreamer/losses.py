@@ -90,7 +90,9 @@ def build_loss(networks: DreamerNetworks, config: DreamerConfig) -> DreamerV3Los
         entropy_bonus=config.entropy,
         use_reinforce=True,
     )
-    actor.make_value_estimator(ValueEstimators.TDLambda, gamma=config.gamma, lmbda=config.lmbda)
+    # TorchRL 0.14.1 hands its estimator a TensorDict without batch size, whose time is then taken to be the last axis,
+    # of length one: without `time_dim` the lambda returns are one-step returns.
+    actor.make_value_estimator(ValueEstimators.TDLambda, gamma=config.gamma, lmbda=config.lmbda, time_dim=-2)
     value = DreamerV3ValueLoss(
         critic, value_loss="two_hot", num_value_bins=BINS, actor_loss=actor, slow_critic_regularization=1.0
     )

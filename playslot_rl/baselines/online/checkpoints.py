@@ -8,6 +8,7 @@ Frames are most of it, so the journal is only appended to; its file is on the di
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
@@ -124,7 +125,7 @@ class ReplayJournal:
     def forget(self, before: int) -> None:
         """Remove files with none but episodes before number `before`."""
         starts = self.files()
-        for (_, path), (following, _) in zip(starts, starts[1:], strict=False):
+        for (_, path), (following, _) in itertools.pairwise(starts):
             if following <= before:
                 path.unlink()
 
@@ -140,7 +141,8 @@ class ReplayJournal:
         found = first + (len(next(iter(whole.values()))) if whole else 0)
         if found != total:
             raise CheckpointError(
-                f"{self.folder}: got episodes up to {found}, expected {total}: delete {self.folder.parent} to start anew"
+                f"{self.folder}: got episodes up to {found}, expected {total}: "
+                f"delete {self.folder.parent} to start anew"
             )
         lead = next(iter(whole.values())).shape[:2]
         return TensorDict(whole, lead)

@@ -268,4 +268,3 @@ class _Run:
     def _log(self, split: str, values: Mapping[str, float]) -> None:
         numbers = {"updates": self.state.updates, **values, "seconds": round(self._seconds(), 3)}
         self.history.append(split, self.state.step, numbers)
-

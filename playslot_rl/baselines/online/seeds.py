@@ -46,4 +46,6 @@ def check_seeds(config: ExperimentConfig, episodes: int) -> None:
     top = config.evaluation.seed_offset + limit * BLOCK
     if top > TRAINING:
         offset = config.evaluation.seed_offset
-        raise ConfigError(f"evaluation.seed_offset: got {offset}, expected at most {TRAINING - limit * BLOCK}: lower it")
+        raise ConfigError(
+            f"evaluation.seed_offset: got {offset}, expected at most {TRAINING - limit * BLOCK}: lower it"
+        )

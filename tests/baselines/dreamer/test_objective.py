@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from dreamer_parts import A, B, T, Parts, random_batch
+from dreamer_parts import A, B, Parts, T, random_batch
 from tensordict import TensorDict
 
 from playslot_rl import keys

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from online_toy import STEPS, ToyLearner, ToyPool, toy_online, train
 from tensordict import TensorDict
 from torch import Tensor
-from online_toy import STEPS, ToyLearner, ToyPool, toy_online, train
 
 from playslot_rl import keys
 from playslot_rl.baselines.online import loop
@@ -164,7 +164,9 @@ def test_a_budget_of_minutes_ends_the_run_with_a_checkpoint_and_a_point(tmp_path
 
 
 def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(tmp_path: Path) -> None:
-    with pytest.raises(TrainingError, match=r"toy: loss is nan at update 11, .* last good checkpoint is .*step_00000032"):
+    with pytest.raises(
+        TrainingError, match=r"toy: loss is nan at update 11, .* last good checkpoint is .*step_00000032"
+    ):
         train(tmp_path, ToyLearner(nan_at=10))
     assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["step_00000016", "step_00000032"]
 
