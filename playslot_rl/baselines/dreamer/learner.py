@@ -29,7 +29,7 @@ class DreamerLearner:
         loss: the objective; holds the slow critic and the scale of the returns.
     """
 
-    stored = (keys.PIXELS,)
+    stored: tuple[str, ...] = (keys.PIXELS,)
 
     def __init__(self, networks: DreamerNetworks, config: DreamerConfig) -> None:
         self.networks = networks

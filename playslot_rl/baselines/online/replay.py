@@ -5,6 +5,9 @@ Shapes: n episodes of L frames (`env.max_steps` + 1), B sequences of T frames, A
 
 from __future__ import annotations
 
+import contextlib
+import logging
+from collections.abc import Iterator
 from typing import Final
 
 import torch
@@ -79,7 +82,8 @@ class Replay:
             raise ValueError(f"replay: got episodes of {frames} frames, expected {self.episode_frames}")
         number = torch.arange(self.episodes, self.episodes + n).unsqueeze(-1).expand(n, frames)
         rows = episodes.clone(recurse=False).set(keys.EPISODE, number.contiguous())
-        self._buffer.extend(rows.set(STREAM, torch.zeros_like(number)).reshape(-1))
+        with _quiet():
+            self._buffer.extend(rows.set(STREAM, torch.zeros_like(number)).reshape(-1))
         self.episodes += n
 
     def restore(self, episodes: TensorDictBase, total: int) -> None:
@@ -106,3 +110,15 @@ class Replay:
         flat = self._buffer.sample().exclude("index", STREAM)
         batch: TensorDict = flat.reshape(self.batch_size, self.sequence)
         return batch
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without TorchRL's line on standard error that a storage was made."""
+    logger = logging.getLogger("torchrl")
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
