@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from playslot_rl.baselines.config import BaselinesConfig as BaselinesConfig
+from playslot_rl.baselines.methods import MethodName as MethodName
 from playslot_rl.data_config import CollectConfig as CollectConfig
 from playslot_rl.data_config import CollectorConfig as CollectorConfig
 from playslot_rl.data_config import DataConfig as DataConfig
@@ -181,6 +183,8 @@ class ExperimentConfig:
         protocol: evaluation protocol.
         device: torch device; empty means a GPU if there is one.
         threads: torch threads; 0 leaves torch's choice.
+        method: what `train-baseline` trains (a name of `playslot_rl.baselines.methods`).
+        demos: demonstrations of the data set to use, the first ones; None means all.
     """
 
     preset: str = "paper"
@@ -193,6 +197,8 @@ class ExperimentConfig:
     protocol: Literal["simulation", "imagination"] = "simulation"
     device: str = ""
     threads: int = 0
+    method: MethodName = "playslot"
+    demos: int | None = None
     env: EnvConfig = field(default_factory=EnvConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     data: DataConfig = field(default_factory=DataConfig)
@@ -202,10 +208,12 @@ class ExperimentConfig:
     slots: SlotsStageConfig = field(default_factory=SlotsStageConfig)
     dynamics: DynamicsStageConfig = field(default_factory=DynamicsStageConfig)
     behaviour: BehaviourStageConfig = field(default_factory=BehaviourStageConfig)
+    baselines: BaselinesConfig = field(default_factory=BaselinesConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     logging: LoggingConfig = field(default_factory=LoggingConfig)
 
     def __post_init__(self) -> None:
         check(self.episodes is None or self.episodes >= 1, "episodes", self.episodes, "at least 1")
         check(self.seed >= 0, "seed", self.seed, "a non-negative integer")
+        check(self.demos is None or self.demos >= 1, "demos", self.demos, "at least 1")
         check(self.workers >= 0, "workers", self.workers, "0 (one per core) or more")

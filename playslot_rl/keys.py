@@ -50,6 +50,14 @@ OBJECT_MASKS: Final = "object_masks"
 """True masks, where they are known: uint8 (..., H, W), 0 the ground, o + 1 object o."""
 SUCCESS: Final = "success"
 """Whether the task has been solved: bool (..., 1)."""
+REWARD: Final = "reward"
+"""Reward received on the way to a frame: float32 (..., 1), the mean over the environment steps of an agent step."""
+IS_FIRST: Final = "is_first"
+"""True on the first frame of an episode, whose action and reward are zero: bool (..., 1)."""
+IS_LAST: Final = "is_last"
+"""True on the last frame of an episode: bool (..., 1)."""
+EPISODE: Final = "episode"
+"""Number of the episode a replayed frame belongs to: int64 (...)."""
 
 # --- LeRobot features ---------------------------------------------------------------------------------------------
 

@@ -57,6 +57,11 @@ def main(config: ExperimentConfig) -> None:
         metrics=result.metrics,
         steps=result.step,
         seconds=result.seconds,
-        extra={"episodes": source.episodes, "seed": config.seed, **started},
+        extra={
+            "episodes": source.episodes,
+            "agent_steps": int((source.lengths - 1).sum()),
+            "seed": config.seed,
+            **started,
+        },
     )
     print(f"slots: {result.metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {run / 'slots'}", flush=True)

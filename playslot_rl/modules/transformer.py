@@ -42,29 +42,39 @@ class TransformerBlock(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(dim, mlp_dim), nn.GELU(), nn.Linear(mlp_dim, dim))
 
     def forward(
-        self, x: Tensor, mask: Tensor | None = None, past: KeysValues | None = None
+        self,
+        x: Tensor,
+        mask: Tensor | None = None,
+        past: KeysValues | None = None,
+        wanted: slice = slice(None),
     ) -> tuple[Tensor, KeysValues]:
         """Transform S new tokens that attend to the past and to each other.
 
         Args:
             x: new tokens (B, S, dim).
-            mask: bool, True where attention is allowed, broadcastable to (B, heads, S, S_past + S).
+            mask: bool, True where attention is allowed, or a bias of the logits, broadcastable to
+                (B, heads, S, S_past + S).
             past: keys and values of earlier tokens.
+            wanted: the new tokens to transform; the others are only attended to. A last layer of which one token is
+                read need not compute the rest.
 
         Returns:
-            Tokens (B, S, dim), and the keys and values of past and new tokens together.
+            The wanted tokens (B, S, dim), and the keys and values of past and new tokens together.
         """
-        b, s, _ = x.shape
         normed = self.norm_attention(x)
-        q, k, v = (
-            layer(normed).view(b, s, self.heads, self.head_dim).transpose(1, 2)
-            for layer in (self.to_q, self.to_k, self.to_v)
-        )
+        q = self._heads(self.to_q(normed[:, wanted]))
+        k, v = self._heads(self.to_k(normed)), self._heads(self.to_v(normed))
         if past is not None:
             k, v = torch.cat((past[0], k), dim=2), torch.cat((past[1], v), dim=2)
+        if mask is not None and wanted != slice(None):
+            mask = mask[..., wanted, :]
         y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-        x = x + self.to_out(y.transpose(1, 2).reshape(b, s, -1))
+        x = x[:, wanted] + self.to_out(y.transpose(1, 2).flatten(2))
         return x + self.mlp(self.norm_mlp(x)), (k, v)
+
+    def _heads(self, x: Tensor) -> Tensor:
+        """(B, S, inner) to (B, heads, S, head_dim)."""
+        return x.view(*x.shape[:2], self.heads, self.head_dim).transpose(1, 2)
 
 
 def sinusoidal_code(length: int, dim: int) -> Tensor:

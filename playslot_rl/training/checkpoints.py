@@ -5,6 +5,7 @@ The layout of a run (`RUN`), and of the shipped models, is the same:
     RUN/slots/checkpoint       module `savi`
     RUN/dynamics/checkpoint    modules `inverse_dynamics`, `predictor`; parent: slots
     RUN/policy/checkpoint      modules `policy`, `action_decoder`, `oracle` (if trained); parents: slots, dynamics
+    RUN/METHOD/checkpoint      a baseline; parents: slots, where it builds on them
 
 A run whose world model lives elsewhere has `RUN/world_model.json`: `{"source": "pretrained/ENV"}`, or a path relative
 to RUN. A child names its parents by the fingerprints of their weights and refuses any other.
@@ -43,7 +44,17 @@ if TYPE_CHECKING:
 FORMAT = "playslot_rl.checkpoint/1"
 PRETRAINED = "pretrained"
 STAGES = ("slots", "dynamics", "policy")
-_COMMANDS = {"slots": "train-slots", "dynamics": "train-dynamics", "policy": "train-policy"}
+_COMMANDS = {
+    "slots": "train-slots",
+    "dynamics": "train-dynamics",
+    "policy": "train-policy",
+    "lapo_model": "train-baseline method=lapo",
+}
+
+
+def training_command(stage: str) -> str:
+    """The command that trains a stage, or a baseline of that name."""
+    return _COMMANDS.get(stage, f"train-baseline method={stage}")
 
 
 @dataclass(frozen=True)
@@ -143,7 +154,7 @@ def read_stage(path: Path, stage: str) -> StageCheckpoint:
     if not (path / "meta.json").is_file():
         raise CheckpointError(
             f"no {stage} checkpoint at {path}, expected meta.json, config.json and weights.safetensors: "
-            f"run `playslot {_COMMANDS[stage]}` first, or check run="
+            f"run `playslot {training_command(stage)}` first, or check run="
         )
     meta, config = _read_json(path / "meta.json"), _read_json(path / "config.json")
     if meta.get("format") != FORMAT:
@@ -207,7 +218,7 @@ def require_parents(child: StageCheckpoint, parents: Mapping[str, StageCheckpoin
         if parent.fingerprint != expected:
             raise CheckpointError(
                 f"{child.path} was trained on {name} {expected}, got {name} {parent.fingerprint} at {parent.path}: "
-                f"run `playslot {_COMMANDS[child.stage]}` again on these, or put its parent back"
+                f"run `playslot {training_command(child.stage)}` again on these, or put its parent back"
             )
 
 
@@ -373,7 +384,8 @@ def stage_model(checkpoint: StageCheckpoint) -> tuple[ModelConfig, EnvConfig]:
         ) from error
 
 
-def _frozen(module: nn.Module, device: torch.device | str) -> None:
+def freeze_on(module: nn.Module, device: torch.device | str) -> None:
+    """Move a module to a device, into evaluation mode, without gradients for its weights."""
     module.to(device).eval().requires_grad_(False)
 
 
@@ -399,7 +411,7 @@ def load_savi(run: Path | str, device: torch.device | str = "cpu") -> SAVi:
     with torch.random.fork_rng(devices=[]):
         savi = SAVi(model.savi, env.image_size)
     load_weights(checkpoint, {"savi": savi})
-    _frozen(savi, device)
+    freeze_on(savi, device)
     return savi
 
 
@@ -418,7 +430,7 @@ def load_world_model(run: Path | str, device: torch.device | str = "cpu") -> Wor
         world = WorldModel(model, env)
     load_weights(stages["slots"], {"savi": world.savi})
     load_weights(stages["dynamics"], {"inverse_dynamics": world.inverse_dynamics, "predictor": world.predictor})
-    _frozen(world, device)
+    freeze_on(world, device)
     return world
 
 
@@ -440,5 +452,5 @@ def load_agent(run: Path | str, device: torch.device | str = "cpu") -> Agent:
         agent = Agent.untrained(world, oracle="oracle" in policy.meta.get("modules", []))
     modules = {"policy": agent.policy, "action_decoder": agent.action_decoder, "oracle": agent.oracle}
     load_weights(policy, {name: module for name, module in modules.items() if module is not None})
-    _frozen(agent, device)
+    freeze_on(agent, device)
     return agent

@@ -1,0 +1,1 @@
+"""DreamerV3 from pixels, from TorchRL's parts."""

@@ -1,0 +1,80 @@
+"""A trained DreamerV3 as an actor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from playslot_rl import keys
+from playslot_rl.baselines.dreamer.config import DreamerConfig
+from playslot_rl.baselines.dreamer.learner import act
+from playslot_rl.baselines.dreamer.networks import DreamerNetworks
+from playslot_rl.config import EnvConfig, from_dict
+from playslot_rl.errors import CheckpointError
+from playslot_rl.training.checkpoints import checkpoint_folder, load_weights, read_stage
+
+NAME: Final = "dreamer"
+
+
+class DreamerPolicy(TensorDictModuleBase):
+    """Frame and memory to action and memory, without exploring.
+
+    Args:
+        networks: trained.
+    """
+
+    in_keys: list[str] = [keys.PIXELS, "state", "belief", keys.ACTION]  # noqa: RUF012 (tensordict declares it so)
+    out_keys: list[str] = [keys.ACTION, "state", "belief"]  # noqa: RUF012
+
+    def __init__(self, networks: DreamerNetworks) -> None:
+        super().__init__()
+        self.networks = networks
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """PIXELS uint8 (n, 3, H, W), `state`, `belief`, the last ACTION -> ACTION (n, A), `state`, `belief`."""
+        # The prior draws a sample that is not used here.
+        with torch.random.fork_rng(devices=[]):
+            out = act(self.networks, tensordict, None)
+        return tensordict.update(out.select(*self.out_keys))
+
+
+class DreamerActor:
+    """DreamerV3 as `playslot_rl.baselines.actor.Actor`.
+
+    Args:
+        networks: trained, in eval mode.
+    """
+
+    def __init__(self, networks: DreamerNetworks) -> None:
+        self.module = DreamerPolicy(networks)
+        self._networks = networks
+
+    def initial(self, seeds: Sequence[int]) -> TensorDict:
+        """Zero states; nothing is drawn."""
+        return self._networks.blank(len(seeds))
+
+
+def load_actor(run: Path, device: torch.device | str = "cpu") -> DreamerActor:
+    """The trained actor of `RUN/dreamer/checkpoint`, in eval mode.
+
+    Raises:
+        CheckpointError: no finished training there, or a damaged one.
+    """
+    checkpoint = read_stage(checkpoint_folder(run, NAME), NAME)
+    try:
+        env = from_dict(EnvConfig, checkpoint.config["env"], "env.")
+        config = from_dict(DreamerConfig, checkpoint.config[NAME], f"{NAME}.")
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{checkpoint.path}/config.json: {error}; expected the config of this version: train dreamer again"
+        ) from error
+    with torch.random.fork_rng(devices=[]):
+        networks = DreamerNetworks(config, env)
+    load_weights(checkpoint, {"networks": networks})
+    networks.to(device).eval().requires_grad_(False)
+    return DreamerActor(networks)

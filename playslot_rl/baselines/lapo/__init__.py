@@ -1,0 +1,1 @@
+"""LAPO: latent actions from pixels, holistic."""

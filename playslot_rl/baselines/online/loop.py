@@ -1,0 +1,270 @@
+"""The one loop of the methods that learn by acting: rounds of episodes, and updates from their replay.
+
+Everything that is drawn derives from (seed, round) or (seed, update). Checkpoints lie between rounds, so that no
+environment has to be stored; killed at any moment and started again, the same command ends with the same weights, bit
+for bit on a CPU (with a budget of minutes: as far as the time reaches).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import torch
+from tensordict import TensorDictBase
+
+from playslot_rl.baselines.online.acting import Episodes, play
+from playslot_rl.baselines.online.checkpoints import OnlineCheckpoints, OnlineState
+from playslot_rl.baselines.online.config import OnlineConfig
+from playslot_rl.baselines.online.curve import curve_point, draw_curve, write_curve
+from playslot_rl.baselines.online.learner import Learner
+from playslot_rl.baselines.online.replay import Replay
+from playslot_rl.baselines.online.seeds import development_seeds, training_seed
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.errors import TrainingError
+from playslot_rl.evaluation.episodes import LOCKSTEP, TaskPool
+from playslot_rl.training.logging import History, MetricLogger, open_logger
+from playslot_rl.training.progress import StageProgress
+from playslot_rl.training.seeding import StepGenerators, global_seed, step_generator
+from playslot_rl.training.tensors import module_tensors
+
+if TYPE_CHECKING:
+    from torchrl.trainers.algorithms import DreamerV3UpdateRatio
+
+# How often we look, and how long, does not change what is learned on the way: these may differ on resuming.
+FREE_KEYS: Final = ("minutes", "checkpoint_every", "evaluate_every", "log_every", "replay_on_disk")
+
+
+def fixed_keys(online: OnlineConfig) -> dict[str, Any]:
+    """A method's config without what a resumed or finished run may change."""
+    return {key: value for key, value in to_dict(online).items() if key not in FREE_KEYS}
+
+
+@dataclass(frozen=True)
+class OnlineResult:
+    """What `train_online` did.
+
+    Attributes:
+        state: where it ended.
+        resumed_from: agent steps this process started at.
+        random: the random policy's point.
+    """
+
+    state: OnlineState
+    resumed_from: int
+    random: dict[str, Any]
+
+
+def train_online(
+    learner: Learner,
+    online: OnlineConfig,
+    config: ExperimentConfig,
+    folder: Path,
+    *,
+    name: str,
+    title: str,
+    device: torch.device,
+    identity: Mapping[str, Any] | None = None,
+    ready: Callable[[], None] | None = None,
+    prior_steps: int = 0,
+) -> OnlineResult:
+    """Train until `online.steps` agent steps (or `online.minutes`), carrying on from the newest checkpoint.
+
+    Writes `folder/checkpoints`, `folder/replay`, `folder/logs`, `folder/metrics.jsonl`, `folder/curve.json` and the
+    curve's pictures, nothing else.
+
+    Args:
+        learner: its modules already on `device`.
+        online: the method's config.
+        config: task, renderer, seed, logging.
+        folder: `RUN/METHOD`.
+        name: the method, for messages and as the prefix of config keys.
+        title: as the picture names it.
+        device: the learner's.
+        identity: further plain values a resumed run must share.
+        ready: called once, before anything is played, when a run begun before was found to be the same.
+        prior_steps: agent steps behind what the learner was given (a world model's data), added to the curve's.
+
+    Raises:
+        TrainingError: a loss or weight is not finite; the last good checkpoint stays.
+        CheckpointError: the folder was begun with another config, or its checkpoint is damaged.
+        OutputError: full disk; the last good checkpoint stays.
+        KeyboardInterrupt: Ctrl-C; its message says where the same command carries on.
+    """
+    run = _Run(learner, online, config, folder, name, title, device, identity or {}, prior_steps)
+    if ready is not None:
+        ready()
+    start = run.state.step
+    run.history.rewind(start)
+    logging = config.logging
+    if not run.finished:
+        logger = open_logger(logging, folder / "logs", name, start)
+        progress = StageProgress(name, start, online.steps, logging.progress, online.evaluate_every)
+        try:
+            with progress, run.pool:
+                while not run.finished:
+                    run.advance(logger, progress)
+        except KeyboardInterrupt:
+            last = run.checkpoints.last()
+            where = f"step {int(last.name.removeprefix('step_'))} ({last})" if last else "the beginning"
+            raise KeyboardInterrupt(f"{name} interrupted; the same command carries on from {where}") from None
+        finally:
+            logger.close()
+    run.write_curve()
+    draw_curve(folder, title, run.state.curve, run.state.random)
+    return OnlineResult(run.state, start, run.state.random)
+
+
+class _Run:
+    """One process's part of a run: the pieces `train_online` moves from round to round."""
+
+    def __init__(
+        self,
+        learner: Learner,
+        online: OnlineConfig,
+        config: ExperimentConfig,
+        folder: Path,
+        name: str,
+        title: str,
+        device: torch.device,
+        identity: Mapping[str, Any],
+        prior_steps: int,
+    ) -> None:
+        from torchrl.trainers.algorithms import DreamerV3UpdateRatio
+
+        self.learner, self.online, self.config, self.folder = learner, online, config, folder
+        self.name, self.title, self.device, self.prior_steps = name, title, device, prior_steps
+        self.replay = Replay(online, config.env.max_steps + 1)
+        fixed = fixed_keys(online)
+        env = {"env": to_dict(config.env), "render": to_dict(config.render)}
+        self.checkpoints = OnlineCheckpoints(folder, {name: fixed, "seed": config.seed, **env, **identity})
+        self.history = History(folder / "metrics.jsonl")
+        self.state = self.checkpoints.resume_online(learner.modules, learner.optimizers, self.replay)
+        self.ratio: DreamerV3UpdateRatio = DreamerV3UpdateRatio(online.update_ratio)
+        self.ratio.load_state_dict({"ratio": online.update_ratio, "previous": self.state.ratio_from})
+        self.pool = TaskPool(config.env, config.render)
+        self.new: list[TensorDictBase] = []
+        self._began = time.monotonic() - self.state.seconds
+
+    @property
+    def finished(self) -> bool:
+        """Whether the steps, or the minutes, are used up."""
+        late = 0 < self.online.minutes * 60 <= self.state.seconds
+        return self.state.step >= self.online.steps or late
+
+    def advance(self, logger: MetricLogger, progress: StageProgress) -> None:
+        """One round of episodes, its updates, and whatever is due after it."""
+        before = self.state
+        if not before.random:
+            self.state = replace(before, random=self._measure(random=True))
+        self._play()
+        if self.state.step > self.online.prefill and self.replay.ready:
+            self._learn(logger)
+        self.state = replace(self.state, ratio_from=self.ratio.state_dict()["previous"], seconds=self._seconds())
+        progress.update(min(self.state.step, self.online.steps), {})
+        over = self.finished
+        if self._due(before.step, self.online.evaluate_every) or over:
+            self._evaluate(logger)
+        if self._due(before.step, self.online.checkpoint_every) or over:
+            self._save()
+
+    def _seconds(self) -> float:
+        return time.monotonic() - self._began
+
+    def _due(self, before: int, every: int) -> bool:
+        return self.state.step // every > before // every
+
+    def _mode(self, training: bool) -> None:
+        for module in self.learner.modules.values():
+            module.train(training)
+
+    def _play(self) -> None:
+        state, n = self.state, self.online.envs
+        seeds = [training_seed(self.config.seed, state.episodes + i) for i in range(n)]
+        generator = step_generator(self.config.seed, state.rounds, "act", self.device)
+        self._mode(False)
+        with global_seed(self.config.seed, state.rounds, "act"):
+            random = state.step < self.online.prefill
+            played = play(self.pool, seeds, self.learner, self.device, generator, explore=True, random=random)
+        self.replay.add(played.frames)
+        self.new.append(played.frames)
+        step = state.step + n * self.config.env.max_steps
+        self.state = replace(state, step=step, rounds=state.rounds + 1, episodes=state.episodes + n)
+        values = {"return": sum(played.returns) / n, "success": sum(played.successes) / n}
+        self._log("acting", values)
+
+    def _learn(self, logger: MetricLogger) -> None:
+        self._mode(True)
+        for _ in range(self.ratio(self.state.step)):
+            update, seed = self.state.updates, self.config.seed
+            batch = self.replay.sample(step_generator(seed, update, "replay")).to(self.device)
+            with global_seed(seed, update, "update"):
+                values = self.learner.update(batch, StepGenerators(seed, update, self.device))
+            # One transfer for all, so that a GPU is waited for once an update.
+            numbers = dict(zip(values, torch.stack([v.float() for v in values.values()]).tolist(), strict=True))
+            for key, value in numbers.items():
+                if not math.isfinite(value):
+                    raise self._not_finite(key, str(value))
+            self.state = replace(self.state, updates=update + 1)
+            if update == 0 or (update + 1) % self.online.log_every == 0:
+                self._log("train", numbers)
+                logger.log({f"{self.name}/train/{key}": value for key, value in numbers.items()}, update + 1)
+
+    def _measure(self, random: bool = False) -> dict[str, Any]:
+        """Play the development episodes without exploring."""
+        seeds, played = development_seeds(self.online.evaluation_episodes), []
+        self._mode(False)
+        with global_seed(self.config.seed, self.state.rounds, "development"):
+            for first in range(0, len(seeds), LOCKSTEP):
+                generator = step_generator(self.config.seed, first, "development", self.device)
+                learner = None if random else self.learner
+                chunk = seeds[first : first + LOCKSTEP]
+                played.append(play(self.pool, chunk, learner, self.device, generator, random=random))
+        returns = tuple(value for part in played for value in part.returns)
+        successes = tuple(value for part in played for value in part.successes)
+        return curve_point(Episodes(played[0].frames, returns, successes))
+
+    def _evaluate(self, logger: MetricLogger) -> None:
+        state = self.state
+        point = self._measure()
+        row = {
+            "env_steps": state.step + self.prior_steps,
+            "updates": state.updates,
+            "seconds": round(state.seconds, 1),
+            **point,
+        }
+        metrics = {key: value for key, value in point.items() if isinstance(value, float)}
+        self.state = replace(state, metrics=metrics, curve=[*state.curve, row], seconds=self._seconds())
+        self._log("validation", metrics)
+        logger.log({f"{self.name}/validation/{key}": value for key, value in metrics.items()}, state.step)
+        self.write_curve()
+
+    def write_curve(self) -> None:
+        """Renew `curve.json`."""
+        seeds = development_seeds(self.online.evaluation_episodes)
+        write_curve(self.folder, self.title, self.config.env.name, seeds, self.state.curve, self.state.random)
+
+    def _save(self) -> None:
+        for key, value in module_tensors(self.learner.modules).items():
+            if value.is_floating_point() and not bool(value.isfinite().all()):
+                raise self._not_finite(key, "not finite")
+        new = torch.cat(self.new) if self.new else None
+        modules, optimizers = self.learner.modules, self.learner.optimizers
+        self.checkpoints.save_online(self.state, modules, optimizers, new, self.replay.capacity)
+        self.new = []
+
+    def _not_finite(self, what: str, got: str) -> TrainingError:
+        last = self.checkpoints.last()
+        kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
+        return TrainingError(
+            f"{self.name}: {what} is {got} at update {self.state.updates + 1}, expected a finite number; {kept}; "
+            f"lower its learning rate (baselines.{self.name}.*), and use another out="
+        )
+
+    def _log(self, split: str, values: Mapping[str, float]) -> None:
+        numbers = {"updates": self.state.updates, **values, "seconds": round(self._seconds(), 3)}
+        self.history.append(split, self.state.step, numbers)

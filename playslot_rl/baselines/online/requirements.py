@@ -1,0 +1,24 @@
+"""What a task must have for a method that learns by acting: a simulator and a dense reward."""
+
+from __future__ import annotations
+
+from playslot_rl.baselines.online.config import OnlineConfig
+from playslot_rl.baselines.online.seeds import check_seeds
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.envs import gym_id
+from playslot_rl.errors import ConfigError
+
+
+def require_online(config: ExperimentConfig, online: OnlineConfig, method: str) -> None:
+    """Refuse what cannot be learned by acting, before anything is started.
+
+    Raises:
+        ConfigError: an environment without a simulator or without a dense reward, or seeds beyond their block.
+    """
+    gym_id(config.env.name)
+    if config.env.name.startswith("block_") and config.env.blocks.reward != "dense":
+        raise ConfigError(
+            f"env.blocks.reward: got {config.env.blocks.reward} with method={method}, expected dense: "
+            "methods that learn by acting need a dense reward; set env.blocks.reward=dense"
+        )
+    check_seeds(config, online.steps // config.env.max_steps + online.envs)

@@ -1,0 +1,94 @@
+"""SOLD's policy at work: frame, SAVi's state and past slots to an action.
+
+Shapes: n episodes, W frames of memory, N slots, D slot width, A action width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from playslot_rl import keys
+from playslot_rl.baselines.sold.heads import ActorHead, action_distribution, sample_action
+from playslot_rl.modules.savi import SAVi
+from playslot_rl.world_model import frame_parser_module, module_device
+
+
+class SlotActing(TensorDictModuleBase):
+    """One step of acting.
+
+    Reads PIXELS (n, 3, H, W) uint8, SLOT_STATE, SLOT_AGE, SLOT_HISTORY (n, W, N, D), right-aligned, and
+    HISTORY_LENGTH (n, 1); writes these anew but for the frame, SLOTS (n, N, D) and ACTION (n, A) in [-1, 1].
+
+    Args:
+        savi: frozen.
+        actor: the policy.
+        window: W, the last frames the actor sees. It was trained on that many; ALiBi lets it slide.
+        action_dim: A.
+    """
+
+    in_keys = (keys.PIXELS, keys.SLOT_STATE, keys.SLOT_AGE, keys.SLOT_HISTORY, keys.HISTORY_LENGTH)
+    out_keys = (keys.SLOT_STATE, keys.SLOT_AGE, keys.SLOT_HISTORY, keys.HISTORY_LENGTH, keys.SLOTS, keys.ACTION)
+
+    def __init__(self, savi: SAVi, actor: ActorHead, window: int, action_dim: int) -> None:
+        super().__init__()
+        self.savi, self.actor, self.window, self.action_dim = savi, actor, window, action_dim
+
+    def initial(self, n: int) -> TensorDict:
+        """The memory of n new episodes, batch size [n]."""
+        device, shape = module_device(self.actor), (self.savi.config.n_slots, self.savi.config.slot_dim)
+        return TensorDict(
+            {
+                keys.SLOT_STATE: torch.zeros(n, *shape, device=device),
+                keys.SLOT_AGE: torch.zeros(n, 1, dtype=torch.long, device=device),
+                keys.SLOT_HISTORY: torch.zeros(n, self.window, *shape, device=device),
+                keys.HISTORY_LENGTH: torch.zeros(n, 1, dtype=torch.long, device=device),
+                keys.ACTION: torch.zeros(n, self.action_dim, device=device),
+            },
+            batch_size=[n],
+            device=device,
+        )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The most likely action; sampled initial slots are the same in every episode."""
+        return self.act(tensordict, torch.Generator(module_device(self.actor)).manual_seed(0), explore=False)
+
+    def act(self, memory: TensorDictBase, generator: torch.Generator, explore: bool) -> TensorDictBase:
+        """Parse, remember, choose; `explore` samples the action."""
+        out = frame_parser_module(self.savi, generator)(memory.copy())
+        history = torch.cat((memory[keys.SLOT_HISTORY][:, 1:], out[keys.SLOTS].unsqueeze(1)), dim=1)
+        length = (memory[keys.HISTORY_LENGTH] + 1).clamp(max=self.window)
+        location, std = self._last(history, length.squeeze(-1))
+        action = sample_action(action_distribution(location, std), generator) if explore else location
+        return out.update({keys.SLOT_HISTORY: history, keys.HISTORY_LENGTH: length, keys.ACTION: action})
+
+    def _last(self, history: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+        """Location and deviation (n, A) at the newest frame of right-aligned histories.
+
+        They are moved to the left: the actor is causal, so what pads the right end is never looked at.
+        """
+        window = int(length.max())
+        steps = torch.arange(window, device=history.device)
+        source = (steps + self.window - length[:, None]).clamp(max=self.window - 1)
+        rows = torch.arange(len(history), device=history.device)
+        location, std, _ = self.actor(history[rows[:, None], source])
+        return location[rows, length - 1], std[rows, length - 1]
+
+
+class SOLDActor:
+    """SOLD as `playslot_rl.baselines.actor.Actor`: the most likely action.
+
+    Args:
+        module: the acting step.
+    """
+
+    def __init__(self, module: SlotActing) -> None:
+        self.module = module
+
+    def initial(self, seeds: Sequence[int]) -> TensorDict:
+        """The memory of new episodes; nothing is drawn."""
+        return self.module.initial(len(seeds))

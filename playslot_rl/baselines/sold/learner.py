@@ -1,0 +1,186 @@
+"""SOLD's update: dynamics and reward from replayed slots, actor and critic from imagination (Mosbach et al., 2025).
+
+Shapes: B sequences of T frames, C context frames, H imagined steps, R rollouts, N slots, D slot width, A action width.
+
+Each loss moves the weights of one network: gradients are asked for by name (`torch.autograd.grad`), so the actor's runs
+through dynamics, reward and critic and leaves them as they are.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from playslot_rl import keys
+from playslot_rl.baselines.online.normaliser import PercentileValueNorm
+from playslot_rl.baselines.sold import losses
+from playslot_rl.baselines.sold.acting import SlotActing
+from playslot_rl.baselines.sold.config import SOLDConfig
+from playslot_rl.baselines.sold.imagination import imagine
+from playslot_rl.baselines.sold.networks import SOLDNetworks, acting_window
+from playslot_rl.modules.savi import SAVi
+from playslot_rl.training.seeding import StepGenerators
+from playslot_rl.world_model import normalise
+
+
+class SOLDLearner:
+    """SOLD as `playslot_rl.baselines.online.learner.Learner`.
+
+    Args:
+        savi: of a finished run, frozen: evaluation mode, no weight that asks for a gradient.
+        networks: on SAVi's device.
+        config: sizes, weights and rates.
+        action_dim: A.
+    """
+
+    def __init__(self, savi: SAVi, networks: SOLDNetworks, config: SOLDConfig, action_dim: int) -> None:
+        self.savi, self.networks, self.config = savi, networks, config
+        self.slow_critic = copy.deepcopy(networks.critic).requires_grad_(False)
+        self.returns = PercentileValueNorm(rate=config.return_rate, min_scale=1.0).to(next(savi.parameters()).device)
+        self.acting = SlotActing(savi, networks.actor, acting_window(config), action_dim)
+        self.stored: tuple[str, ...] = (keys.SLOTS,) if config.image_weight == 0 else (keys.SLOTS, keys.PIXELS)
+        rates = {"actor": config.actor_lr, "critic": config.critic_lr}
+        self._adam = {
+            name: torch.optim.Adam(part.parameters(), lr=rates.get(name, config.model_lr))
+            for name, part in networks.parts.items()
+        }
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """The four networks, the critic's slow copy and the scale of the returns."""
+        return {**self.networks.parts, "slow_critic": self.slow_critic, "returns": self.returns}
+
+    @property
+    def optimizers(self) -> Mapping[str, torch.optim.Optimizer]:
+        """One Adam a network."""
+        return self._adam
+
+    def initial(self, n: int) -> TensorDict:
+        """The memory of n new episodes."""
+        return self.acting.initial(n)
+
+    def act(self, memory: TensorDictBase, generator: torch.Generator, explore: bool) -> TensorDictBase:
+        """See `Learner.act`."""
+        return self.acting.act(memory, generator, explore) if explore else self.acting(memory)
+
+    def update(self, batch: TensorDict, generators: StepGenerators) -> Mapping[str, Tensor]:
+        """See `Learner.update`."""
+        metrics = self._model(batch, generators)
+        if generators.step >= self.config.world_model_updates:
+            metrics |= self._behaviour(batch, generators)
+        return metrics
+
+    # --- dynamics and reward --------------------------------------------------------------------------------------
+
+    def _model(self, batch: TensorDict, generators: StepGenerators) -> dict[str, Tensor]:
+        """Section 3.2: the autoregressive rollout from C frames, and the reward on parsed and on predicted slots.
+
+        Note: the reward's targets are the same on both; it is asked about predicted slots in imagination.
+        """
+        c, slots, is_first = self.config.context, batch[keys.SLOTS], batch[keys.IS_FIRST].squeeze(-1)
+        valid = losses.same_episode(is_first)
+        predicted = self.networks.dynamics.rollout(slots[:, :c], batch[keys.ACTION][:, 1:])
+        slot = losses.slot_loss(predicted, slots[:, 1:], valid[:, 1:])
+        loss, metrics = self.config.slot_weight * slot, {"slot_mse": slot.detach()}
+        if self.config.image_weight > 0:
+            image = self._image_loss(predicted, batch[keys.PIXELS][:, 1:], valid[:, 1:], generators)
+            loss, metrics["image_mse"] = loss + self.config.image_weight * image, image.detach()
+        metrics["dynamics_grad_norm"] = self._step("dynamics", loss)
+
+        imagined = torch.cat((slots[:, :c], predicted[:, c - 1 :]), dim=1)
+        rewards, arrived = batch[keys.REWARD].squeeze(-1), valid & ~is_first
+        reward = losses.reward_loss(
+            self.networks.reward, torch.cat((slots, imagined)), rewards.repeat(2, 1), arrived.repeat(2, 1)
+        )
+        return metrics | {"loss_reward": reward.detach(), "reward_grad_norm": self._step("reward", reward)}
+
+    def _image_loss(self, predicted: Tensor, pixels: Tensor, valid: Tensor, generators: StepGenerators) -> Tensor:
+        """Mean squared error of decoded frames, through the frozen decoder."""
+        count, frames = self.config.decoded_frames, predicted.shape[1]
+        if 0 < count < frames:
+            picked = torch.randperm(frames, generator=generators.torch("decoded", "cpu"))[:count].to(predicted.device)
+            predicted, pixels, valid = predicted[:, picked], pixels[:, picked], valid[:, picked]
+        decoded = self.savi.decode(predicted).frames
+        return losses.masked_mean((decoded - normalise(pixels)).square().mean(dim=(-3, -2, -1)), valid)
+
+    # --- actor and critic -----------------------------------------------------------------------------------------
+
+    def _behaviour(self, batch: TensorDict, generators: StepGenerators) -> dict[str, Tensor]:
+        """Section 3.3: imagine, judge, improve."""
+        config, networks = self.config, self.networks
+        context, actions = self._starts(batch, generators)
+        frames = context.shape[1]
+        noise = generators.torch("imagination")
+        imagined = imagine(networks.dynamics, networks.actor, context, actions, config.horizon, noise)
+        logits = networks.critic(imagined.slots)[:, frames - 1 :]
+        values = networks.critic.decode(logits)
+        rewards = networks.reward.decode(networks.reward(imagined.slots)[:, frames:])
+        returns = losses.imagined_returns(rewards, values[:, 1:], config.gamma, config.lmbda)
+        self.returns.update(returns.detach().unsqueeze(-1))
+        weights = losses.discounts(config.gamma, config.horizon, returns)
+        actor = losses.actor_loss(
+            imagined, returns, values[:, :-1], self.returns.scale(), weights, config.entropy, config.actor_gradient
+        )
+        with torch.no_grad():
+            slow = self.slow_critic.decode(self.slow_critic(imagined.slots[:, :-1])[:, frames - 1 :])
+        value = losses.value_loss(networks.critic, logits[:, :-1], returns, slow, weights)
+        # Actor and critic share the critic's forward pass, so it is kept until both gradients are taken.
+        norms = {
+            "actor_grad_norm": self._step("actor", actor, keep=True),
+            "critic_grad_norm": self._step("critic", value),
+        }
+        self._follow()
+        return norms | {
+            "loss_actor": actor.detach(),
+            "loss_critic": value.detach(),
+            "imagined_reward": rewards.detach().mean(),
+            "imagined_return": returns.detach().mean(),
+            "return_scale": self.returns.scale().detach().squeeze(),
+            "entropy": imagined.entropies.detach().mean(),
+        }
+
+    def _starts(self, batch: TensorDict, generators: StepGenerators) -> tuple[Tensor, Tensor]:
+        """Windows (R, c, N, D) of one episode each, and the actions (R, c - 1, A) between their frames.
+
+        Note: c is drawn from 1 to C. The source starts from C frames always, but an episode's first decisions are made
+        from one frame and from two.
+        """
+        draw = generators.torch("starts", "cpu")
+        c = int(torch.randint(1, self.config.context + 1, (), generator=draw))
+        slots, actions = batch[keys.SLOTS], batch[keys.ACTION]
+        first = batch[keys.IS_FIRST].squeeze(-1)
+        ends = torch.ones_like(first)
+        ends[:, : c - 1] = False
+        for back in range(c - 1):  # no frame of the window but its first may start an episode
+            ends[:, back:] &= ~first[:, : first.shape[1] - back]
+        row, end = ends.nonzero(as_tuple=True)
+        picked = torch.randint(len(row), (self.config.starts,), generator=draw).to(row.device)
+        row, first_frame = row[picked, None], (end[picked] - c + 1)[:, None]
+        steps = torch.arange(c, device=row.device)
+        return slots[row, first_frame + steps], actions[row, first_frame + steps[1:]]
+
+    # --- optimisers -----------------------------------------------------------------------------------------------
+
+    def _step(self, name: str, loss: Tensor, keep: bool = False) -> Tensor:
+        """Move one network by a loss; its gradient's norm before clipping. `keep` leaves the graph for another loss."""
+        parameters = list(self.networks.parts[name].parameters())
+        gradients = torch.autograd.grad(loss, parameters, retain_graph=keep)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        norm: Tensor = nn.utils.clip_grad_norm_(parameters, self.config.grad_clip)
+        # A step along a gradient that is not finite would spoil every weight; the loop stops at the number.
+        if bool(norm.isfinite()):
+            self._adam[name].step()
+        return norm.detach()
+
+    @torch.no_grad()
+    def _follow(self) -> None:
+        """Move the slow critic towards the critic."""
+        pairs = zip(self.slow_critic.parameters(), self.networks.critic.parameters(), strict=True)
+        for slow, fast in pairs:
+            slow.lerp_(cast(Tensor, fast), 1 - self.config.critic_decay)

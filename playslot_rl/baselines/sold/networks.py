@@ -1,0 +1,46 @@
+"""SOLD's trained networks, by the sizes of its config. SAVi, which is frozen, is not among them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import nn
+
+from playslot_rl.baselines.sold.aggregation import SlotAggregation
+from playslot_rl.baselines.sold.config import SOLDConfig
+from playslot_rl.baselines.sold.dynamics import OCVPSeq
+from playslot_rl.baselines.sold.heads import ActorHead, ScalarHead
+
+
+class SOLDNetworks(nn.Module):
+    """Dynamics, reward, critic and actor.
+
+    Args:
+        config: sizes.
+        slot_dim: D.
+        action_dim: A.
+        frames: frames of the longest sequence that the dynamics learn from.
+    """
+
+    def __init__(self, config: SOLDConfig, slot_dim: int, action_dim: int, frames: int) -> None:
+        super().__init__()
+        c = config
+        context = max(frames, c.context + c.horizon)
+        self.dynamics = OCVPSeq(slot_dim, action_dim, c.dim, c.dynamics_layers, c.heads, c.mlp_dim, context)
+        self.reward = ScalarHead(self._backbone(c, slot_dim), c.dim, c.bins)
+        self.critic = ScalarHead(self._backbone(c, slot_dim), c.dim, c.bins)
+        self.actor = ActorHead(self._backbone(c, slot_dim), c.dim, action_dim)
+
+    @staticmethod
+    def _backbone(c: SOLDConfig, slot_dim: int) -> SlotAggregation:
+        return SlotAggregation(slot_dim, c.dim, c.head_layers, c.heads, c.mlp_dim)
+
+    @property
+    def parts(self) -> Mapping[str, nn.Module]:
+        """By name, as checkpoints store them."""
+        return {"dynamics": self.dynamics, "reward": self.reward, "critic": self.critic, "actor": self.actor}
+
+
+def acting_window(config: SOLDConfig) -> int:
+    """Frames the actor looks back when it acts: as many as it sees in imagination."""
+    return config.context + config.horizon

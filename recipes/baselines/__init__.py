@@ -1,0 +1,1 @@
+"""Recipes of the baselines, one module a method: `main(config)` trains it."""

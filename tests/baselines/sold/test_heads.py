@@ -1,0 +1,99 @@
+"""Two-hot symlog grids, and the distributions of actions."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from playslot_rl.baselines.sold.aggregation import SlotAggregation
+from playslot_rl.baselines.sold.heads import (
+    MAX_STD,
+    MIN_STD,
+    ActorHead,
+    ScalarHead,
+    action_distribution,
+    sample_action,
+)
+from playslot_rl.baselines.sold.two_hot import SymlogTwoHot
+
+
+def _backbone() -> SlotAggregation:
+    return SlotAggregation(slot_dim=6, dim=16, layers=1, heads=2, mlp_dim=16)
+
+
+def test_two_hot_round_trip() -> None:
+    two_hot = SymlogTwoHot(255)
+    values = torch.tensor([-1e6, -37.5, -1.0, -0.01, 0.0, 0.3, 8.25, 150.0, 1e7], dtype=torch.float64)
+    encoded = two_hot.encode(values)
+    assert ((encoded > 0).sum(dim=-1) <= 2).all()  # two neighbours
+    torch.testing.assert_close(encoded.sum(dim=-1), torch.ones_like(values))
+    torch.testing.assert_close(two_hot.decode(encoded.clamp(min=1e-300).log()), values, rtol=1e-4, atol=1e-4)
+
+
+def test_values_beyond_the_grid_land_on_its_ends() -> None:
+    encoded = SymlogTwoHot(41).encode(torch.tensor([-1e30, 1e30]))
+    assert encoded[0, 0] == 1
+    assert encoded[1, -1] == 1
+
+
+def test_cross_entropy_is_least_at_the_target() -> None:
+    two_hot = SymlogTwoHot(41)
+    target = torch.tensor(5.0)
+    logits = torch.zeros(41, requires_grad=True)
+    optimizer = torch.optim.Adam([logits], lr=0.3)
+    for _ in range(200):
+        optimizer.zero_grad()
+        two_hot.cross_entropy(logits, target).backward()
+        optimizer.step()
+    assert two_hot.decode(logits).item() == pytest.approx(5.0, abs=0.1)
+
+
+def test_the_decoded_value_has_gradients_of_its_own_size() -> None:
+    """Averaging symexp(b_k) instead would make this 1e6 and more at flat logits."""
+    logits = torch.zeros(255, requires_grad=True)
+    two_hot = SymlogTwoHot(255)
+    (gradient,) = torch.autograd.grad(two_hot.decode(logits), logits)
+    assert 0 < gradient.abs().max() < 1
+
+
+@pytest.mark.parametrize("bins", [2, 40])
+def test_grids_without_a_zero_are_refused(bins: int) -> None:
+    with pytest.raises(ValueError, match=f"bins: got {bins}, expected an odd number"):
+        SymlogTwoHot(bins)
+
+
+def test_an_untrained_scalar_head_says_zero() -> None:
+    head = ScalarHead(_backbone(), 16, 41)
+    assert head.decode(head(torch.randn(2, 3, 4, 6))).abs().max() < 1e-5
+
+
+def test_actions_are_within_bounds_and_their_mode_is_the_location() -> None:
+    torch.manual_seed(0)
+    head = ActorHead(_backbone(), 16, 3)
+    torch.nn.init.normal_(head.out.weight, std=3.0)
+    location, std, _ = head(torch.randn(50, 4, 4, 6))
+    assert std.min() >= MIN_STD
+    assert std.max() <= MAX_STD
+    distribution = action_distribution(location, std)
+    action = sample_action(distribution, torch.Generator().manual_seed(0))
+    assert action.shape == (50, 4, 3)
+    assert action.abs().max() <= 1
+    nearby = (location + 0.05 * torch.randn(location.shape)).clamp(-1, 1)
+    assert (distribution.log_prob(location) >= distribution.log_prob(nearby) - 1e-5).all()
+
+
+def test_samples_follow_the_distribution_and_repeat_with_the_generator() -> None:
+    location, std = torch.full((40_000, 1), 0.6), torch.full((40_000, 1), 0.5)
+    distribution = action_distribution(location, std)
+    drawn = sample_action(distribution, torch.Generator().manual_seed(3))
+    assert torch.equal(drawn, sample_action(distribution, torch.Generator().manual_seed(3)))
+    assert float(drawn.mean()) == pytest.approx(float(distribution.base_dist.mean[0]), abs=0.01)
+    assert float(drawn.var()) == pytest.approx(float(distribution.base_dist.variance[0]), abs=0.01)
+
+
+def test_samples_are_reparameterised() -> None:
+    location = torch.full((1000, 1), 0.2, requires_grad=True)
+    drawn = sample_action(action_distribution(location, torch.full((1000, 1), 0.3)), torch.Generator().manual_seed(0))
+    (gradient,) = torch.autograd.grad(drawn.sum(), location)
+    assert gradient.min() >= 0
+    assert gradient.mean() > 0.5

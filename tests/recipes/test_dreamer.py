@@ -1,0 +1,122 @@
+"""`train-baseline method=dreamer` at smoke size: what it leaves, what it refuses, kill -9."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import signal
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from playslot_rl.baselines.actor import ActorController
+from playslot_rl.baselines.dreamer.load import load_actor
+from playslot_rl.compose import compose
+from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.evaluation.episodes import TaskPool, run_episodes
+from playslot_rl.recipes.baselines import dreamer
+
+SMOKE = ("preset=smoke", "method=dreamer", "env=block_reach", "threads=1", "device=cpu", "env.max_steps=6")
+
+
+def train(out: Path, *overrides: str) -> None:
+    """The recipe, as the command line calls it."""
+    dreamer.main(compose([*SMOKE, f"out={out}", *overrides]))
+
+
+def weights(out: Path) -> bytes:
+    return (out / "dreamer" / "checkpoint" / "weights.safetensors").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("dreamer") / "run"
+    train(out)
+    return out
+
+
+def test_a_run_leaves_weights_a_curve_and_its_config(run: Path) -> None:
+    meta = json.loads((run / "dreamer" / "checkpoint" / "meta.json").read_text())
+    assert meta["stage"] == "dreamer"
+    assert meta["env_steps"] == 36
+    assert meta["steps"] == 1 + 12 // 4
+    assert meta["parameters"] > 0
+    curve = json.loads((run / "dreamer" / "curve.json").read_text())
+    assert [row["env_steps"] for row in curve["rows"]] == [12, 24, 36]
+    assert json.loads((run / "config.json").read_text())["method"] == "dreamer"
+    assert {path.name for path in run.iterdir()} == {"config.json", "dreamer"}
+
+
+def test_its_actor_plays_and_repeats_itself(run: Path) -> None:
+    actor = load_actor(run)
+    config = compose(list(SMOKE))
+    seeds = [1_000_000_000, 1_000_000_001]
+    shown: list[list[int]] = [[], []]
+    with TaskPool(config.env, config.render) as pool:
+        for take in shown:
+
+            def on_frame(episode: int, step: int, frame: object, take: list[int] = take) -> None:
+                take.append(hash(frame.tobytes()))  # type: ignore[attr-defined]
+
+            torch.rand(3)  # the global generator is none of its business
+            run_episodes(pool, ActorController(actor, torch.device("cpu")), seeds, on_frame, stop=False)
+    assert len(shown[0]) == 14
+    assert shown[0] == shown[1]
+
+
+def test_the_same_command_again_does_nothing(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = weights(run)
+    train(run)
+    assert "dreamer: finished before (4 steps), skipped" in capsys.readouterr().out
+    assert weights(run) == before
+
+
+def test_other_values_in_the_same_folder_are_refused(run: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"dreamer\.gamma: got 0\.5, expected 0\.99"):
+        train(run, "baselines.dreamer.gamma=0.5")
+
+
+def test_a_run_without_an_actor_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="no dreamer checkpoint"):
+        load_actor(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "override, message",
+    [
+        ("env.blocks.reward=sparse", "env.blocks.reward: got sparse with method=dreamer, expected dense"),
+        ("env=grid_shapes", "env=grid_shapes: got an environment without a simulator"),
+        ("baselines.dreamer.steps=100000000", "steps: got .* episodes, expected at most"),
+        ("seed=1000", "seed: got 1000, expected 0 to 999"),
+        ("baselines.dreamer.frame_size=24", "frame_size: got 24, expected a divisor"),
+        ("baselines.dreamer.capacity=5", "capacity: got 5 frames, expected at least"),
+    ],
+)
+def test_what_cannot_be_learned_from_is_refused_before_anything_is_written(
+    tmp_path: Path, override: str, message: str
+) -> None:
+    config = compose([*SMOKE, f"out={tmp_path / 'run'}", override])
+    with pytest.raises(ConfigError, match=message):
+        dreamer.main(config)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(run: Path, tmp_path: Path) -> None:
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["torchrl.objectives", "playslot_rl.baselines.dreamer.learner"])
+    out = tmp_path / "killed"
+    process = context.Process(target=train, args=(out,))
+    process.start()
+    limit = time.monotonic() + 200
+    while not list((out / "dreamer" / "checkpoints").glob("step_*")) and time.monotonic() < limit:
+        time.sleep(0.005)
+    process.kill()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    assert not (out / "dreamer" / "checkpoint").exists()
+    train(out)
+    assert weights(out) == weights(run)
+    assert not list(out.rglob("*.tmp-*"))

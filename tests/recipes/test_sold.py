@@ -1,0 +1,212 @@
+"""SOLD's recipe at preset smoke: trains, resumes, loads, and refuses what does not fit."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from playslot_rl.baselines.actor import ActorController
+from playslot_rl.baselines.sold.learner import SOLDLearner
+from playslot_rl.baselines.sold.load import load_actor, prior_steps, slots_checkpoint
+from playslot_rl.compose import compose
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.errors import CheckpointError, ConfigError, TrainingError
+from playslot_rl.evaluation.episodes import TaskPool, run_episodes
+from playslot_rl.modules.savi import SAVi
+from playslot_rl.recipes.baselines import sold
+from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
+
+
+def _config(world: Path, out: Path, *overrides: str) -> ExperimentConfig:
+    fixed = ("preset=smoke", "method=sold", "device=cpu", "threads=1", "logging.backend=none")
+    return compose([*fixed, f"run={world}", f"out={out}", *overrides])
+
+
+def _weights(run: Path) -> bytes:
+    return (run / "sold" / "checkpoint" / "weights.safetensors").read_bytes()
+
+
+def _write_world(run: Path, seed: int = 0) -> Path:
+    """A run with an untrained SAVi, of six episodes of five agent steps."""
+    config = compose(["preset=smoke"])
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        savi = SAVi(config.model.savi, config.env.image_size)
+    plain = {"env": to_dict(config.env), "model": to_dict(config.model), "slots": to_dict(config.slots)}
+    save_stage(
+        checkpoint_folder(run, "slots"), stage="slots", modules={"savi": savi}, config=plain, data={}, parents={},
+        metrics={}, steps=1, seconds=0.0, extra={"episodes": 6, "agent_steps": 30},
+    )  # fmt: skip
+    return run
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _write_world(tmp_path_factory.mktemp("world") / "run")
+
+
+@pytest.fixture(scope="module")
+def trained(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished smoke run of SOLD; look, do not touch."""
+    run = tmp_path_factory.mktemp("sold") / "run"
+    sold.main(_config(world, run))
+    return run
+
+
+def test_a_run_leaves_weights_parents_and_a_learning_curve(trained: Path, world: Path) -> None:
+    meta = json.loads((trained / "sold" / "checkpoint" / "meta.json").read_text())
+    assert meta["modules"] == ["actor", "critic", "dynamics", "reward"]
+    assert meta["parents"] == {"slots": slots_checkpoint(world).fingerprint}
+    assert json.loads((trained / "config.json").read_text())["method"] == "sold"
+    curve = json.loads((trained / "sold" / "curve.json").read_text())
+    # 48 agent steps of its own in two points, behind 30 of SAVi's data.
+    assert [row["env_steps"] for row in curve["rows"]] == [24 + 30, 48 + 30]
+    assert meta["env_steps"] == 78
+    assert meta["savi_steps"] == 30
+    assert curve["random"]["return_mean"] > 0
+
+
+def test_the_actor_that_is_loaded_plays_and_repeats(trained: Path) -> None:
+    actor = load_actor(trained)
+    config = compose(["preset=smoke"])
+    controller = ActorController(actor, torch.device("cpu"))
+    chosen: list[np.ndarray] = []
+    original = controller.act
+
+    def noted(moment: object) -> np.ndarray:
+        chosen.append(original(moment))
+        return chosen[-1]
+
+    controller.act = noted
+    with TaskPool(config.env, config.render) as pool:
+        for _ in range(2):
+            run_episodes(pool, controller, [7, 8])
+    assert len(chosen) == 2 * config.env.max_steps
+    for first, second in zip(chosen[: config.env.max_steps], chosen[config.env.max_steps :], strict=True):
+        assert first.shape == (2, 4)
+        np.testing.assert_array_equal(first, second)
+
+
+def test_a_finished_run_is_skipped(trained: Path, world: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = _weights(trained)
+    sold.main(_config(world, trained))
+    assert "sold: finished before" in capsys.readouterr().out
+    assert _weights(trained) == before
+
+
+def test_an_interrupted_run_ends_with_the_same_weights(
+    trained: Path, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, original = _config(world, tmp_path / "run"), SOLDLearner.update
+
+    def stopped(self: SOLDLearner, batch: object, generators: object) -> object:
+        if generators.step == 5:
+            raise KeyboardInterrupt
+        return original(self, batch, generators)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SOLDLearner, "update", stopped)
+        with pytest.raises(KeyboardInterrupt, match="sold interrupted; the same command carries on from step 24"):
+            sold.main(config)
+    assert not (tmp_path / "run" / "sold" / "checkpoint").exists()
+    sold.main(config)
+    assert _weights(tmp_path / "run") == _weights(trained)
+
+
+def test_a_loss_that_is_not_finite_stops_with_the_last_checkpoint(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = SOLDLearner.update
+
+    def broken(self: SOLDLearner, batch: object, generators: object) -> object:
+        values = dict(original(self, batch, generators))
+        return values | {"slot_mse": torch.tensor(float("nan"))} if generators.step == 5 else values
+
+    monkeypatch.setattr(SOLDLearner, "update", broken)
+    with pytest.raises(TrainingError, match=r"sold: slot_mse is nan .* the last good checkpoint is .*step_00000024"):
+        sold.main(_config(world, tmp_path / "run"))
+
+
+def test_another_savi_than_it_was_trained_on_is_refused(trained: Path, tmp_path: Path) -> None:
+    other = _write_world(tmp_path / "other", seed=1)
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    (run / "world_model.json").write_text(json.dumps({"source": "../other"}))
+    with pytest.raises((CheckpointError, KeyError)):
+        load_actor(run)
+    with pytest.raises((CheckpointError, KeyError)):
+        sold.main(_config(other, run))
+
+
+def test_a_world_without_slots_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CheckpointError, match="no slots checkpoint"):
+        sold.main(_config(tmp_path / "empty", tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_task_without_a_dense_reward_is_refused_before_anything_is_written(world: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"env\.blocks\.reward: got sparse with method=sold, expected dense"):
+        sold.main(_config(world, tmp_path / "run", "env=block_reach", "env.blocks.reward=sparse"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_another_frame_size_than_savis_is_refused(world: Path, tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"env\.image_size: got 32, expected 64"):
+        sold.main(_config(world, tmp_path / "run", "env.image_size=32"))
+
+
+def test_savis_data_are_counted_from_the_config_the_checkpoint_or_its_episodes(world: Path) -> None:
+    own, slots = compose(["preset=smoke"]).baselines.sold, slots_checkpoint(world)
+    assert prior_steps(own, slots) == 30
+    assert prior_steps(compose(["preset=smoke", "baselines.sold.savi_steps=5"]).baselines.sold, slots) == 5
+    del slots.meta["agent_steps"]
+    assert prior_steps(own, slots) == 6 * 6  # episodes times env.max_steps of preset smoke
+    del slots.meta["episodes"]
+    with pytest.raises(ConfigError, match=r"baselines.sold.savi_steps: got nothing"):
+        prior_steps(own, slots)
+
+
+@pytest.mark.parametrize(
+    "override, message",
+    [
+        ("heads=3", "heads: got 3, expected a divisor"),
+        ("bins=40", "bins: got 40, expected an odd number"),
+        ("sequence=2", "sequence: got 2, expected 0, or more than"),
+        ("gamma=1.5", r"gamma: got 1.5, expected a number in \[0, 1\]"),
+        ("horizon=0", "horizon: got 0, expected at least 1"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        compose(["preset=smoke", f"baselines.sold.{override}"])
+
+
+@pytest.mark.slow
+def test_a_killed_run_ends_with_the_same_weights(trained: Path, world: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    code = (
+        "import sys; from playslot_rl.compose import compose; from playslot_rl.recipes.baselines import sold; "
+        "sold.main(compose(sys.argv[1:]))"
+    )
+    fixed = ("preset=smoke", "method=sold", "device=cpu", "threads=1", "logging.backend=none")
+    command = [sys.executable, "-c", code, *fixed, f"run={world}", f"out={run}"]
+    process = subprocess.Popen(command, env=os.environ)
+    deadline = time.monotonic() + 120
+    while not list((run / "sold" / "checkpoints").glob("step_*")) and time.monotonic() < deadline:
+        assert process.poll() is None, "finished before it could be killed"
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait(timeout=30)
+    assert not (run / "sold" / "checkpoint").exists()
+    subprocess.run(command, check=True, env=os.environ, timeout=200)
+    assert _weights(run) == _weights(trained)
