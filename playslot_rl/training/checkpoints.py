@@ -5,6 +5,7 @@ The layout of a run (`RUN`), and of the shipped models, is the same:
     RUN/slots/checkpoint       module `savi`
     RUN/dynamics/checkpoint    modules `inverse_dynamics`, `predictor`; parent: slots
     RUN/policy/checkpoint      modules `policy`, `action_decoder`, `oracle` (if trained); parents: slots, dynamics
+    RUN/METHOD/checkpoint      a baseline; parents: slots, where it builds on them
 
 A run whose world model lives elsewhere has `RUN/world_model.json`, `{"source": "pretrained"}` or a path relative to
 RUN. A child names its parents by the fingerprints of their weights and refuses any other.
@@ -44,6 +45,11 @@ FORMAT = "playslot_rl.checkpoint/1"
 PRETRAINED = "pretrained"
 STAGES = ("slots", "dynamics", "policy")
 _COMMANDS = {"slots": "train-slots", "dynamics": "train-dynamics", "policy": "train-policy"}
+
+
+def training_command(stage: str) -> str:
+    """The command that trains a stage, or a baseline of that name."""
+    return _COMMANDS.get(stage, f"train-baseline method={stage}")
 
 
 @dataclass(frozen=True)
@@ -143,7 +149,7 @@ def read_stage(path: Path, stage: str) -> StageCheckpoint:
     if not (path / "meta.json").is_file():
         raise CheckpointError(
             f"no {stage} checkpoint at {path}, expected meta.json, config.json and weights.safetensors: "
-            f"run `playslot {_COMMANDS[stage]}` first, or check run="
+            f"run `playslot {training_command(stage)}` first, or check run="
         )
     meta, config = _read_json(path / "meta.json"), _read_json(path / "config.json")
     if meta.get("format") != FORMAT:
@@ -207,7 +213,7 @@ def require_parents(child: StageCheckpoint, parents: Mapping[str, StageCheckpoin
         if parent.fingerprint != expected:
             raise CheckpointError(
                 f"{child.path} was trained on {name} {expected}, got {name} {parent.fingerprint} at {parent.path}: "
-                f"run `playslot {_COMMANDS[child.stage]}` again on these, or put its parent back"
+                f"run `playslot {training_command(child.stage)}` again on these, or put its parent back"
             )
 
 
