@@ -44,7 +44,12 @@ if TYPE_CHECKING:
 FORMAT = "playslot_rl.checkpoint/1"
 PRETRAINED = "pretrained"
 STAGES = ("slots", "dynamics", "policy")
-_COMMANDS = {"slots": "train-slots", "dynamics": "train-dynamics", "policy": "train-policy"}
+_COMMANDS = {
+    "slots": "train-slots",
+    "dynamics": "train-dynamics",
+    "policy": "train-policy",
+    "lapo_model": "train-baseline method=lapo",
+}
 
 
 def training_command(stage: str) -> str:
@@ -371,7 +376,8 @@ def stage_model(checkpoint: StageCheckpoint) -> tuple[ModelConfig, EnvConfig]:
         ) from error
 
 
-def _frozen(module: nn.Module, device: torch.device | str) -> None:
+def freeze_on(module: nn.Module, device: torch.device | str) -> None:
+    """Move a module to a device, into evaluation mode, without gradients for its weights."""
     module.to(device).eval().requires_grad_(False)
 
 
@@ -388,7 +394,7 @@ def load_savi(run: Path | str, device: torch.device | str = "cpu") -> SAVi:
     with torch.random.fork_rng(devices=[]):
         savi = SAVi(model.savi, env.image_size)
     load_weights(checkpoint, {"savi": savi})
-    _frozen(savi, device)
+    freeze_on(savi, device)
     return savi
 
 
@@ -407,7 +413,7 @@ def load_world_model(run: Path | str, device: torch.device | str = "cpu") -> Wor
         world = WorldModel(model, env)
     load_weights(stages["slots"], {"savi": world.savi})
     load_weights(stages["dynamics"], {"inverse_dynamics": world.inverse_dynamics, "predictor": world.predictor})
-    _frozen(world, device)
+    freeze_on(world, device)
     return world
 
 
@@ -429,5 +435,5 @@ def load_agent(run: Path | str, device: torch.device | str = "cpu") -> Agent:
         agent = Agent.untrained(world, oracle="oracle" in policy.meta.get("modules", []))
     modules = {"policy": agent.policy, "action_decoder": agent.action_decoder, "oracle": agent.oracle}
     load_weights(policy, {name: module for name, module in modules.items() if module is not None})
-    _frozen(agent, device)
+    freeze_on(agent, device)
     return agent

@@ -14,6 +14,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from playslot_rl.config import Precision
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.training.seeding import StepGenerators
 
@@ -70,6 +71,7 @@ class RegressionStage:
         batch_size: b.
         validated: at most so many rows, evenly spread, are looked at in a validation; 0 takes all.
         stream: name of the generator that draws the rows; `name` if empty.
+        precision: `bf16` trains the network under autocast; it is validated in fp32.
 
     Raises:
         ValueError: numbers of inputs and targets differ.
@@ -85,11 +87,13 @@ class RegressionStage:
         *,
         validated: int = 0,
         stream: str = "",
+        precision: Precision = "fp32",
     ) -> None:
         if len(inputs) != len(targets):
             raise ValueError(f"{name}: got {len(targets)} targets, expected one for each of {len(inputs)} inputs")
         self.name, self.criterion, self.stream = name, criterion, stream or name
         self.inputs, self.targets, self.batch_size, self.validated = inputs, targets, batch_size, validated
+        self.precision = precision
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -101,7 +105,9 @@ class RegressionStage:
         rows = draw_rows(len(self.targets), self.batch_size, generators, self.stream, self.targets.device)
         names = self.criterion.tensor_keys
         batch = {names.observation: self.inputs.draw(rows, generators), names.action: self.targets[rows]}
-        return {"loss": self.criterion(TensorDict(batch, [len(rows)]))[self.criterion.out_name]}
+        with torch.autocast(self.targets.device.type, torch.bfloat16, enabled=self.precision == "bf16"):
+            losses = self.criterion(TensorDict(batch, [len(rows)]))
+        return {"loss": losses[self.criterion.out_name]}
 
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
         """Unexplained fraction of the targets' variance on the training data."""
