@@ -11,6 +11,7 @@ from typing import Literal
 
 from playslot_rl.baselines.config import BaselinesConfig as BaselinesConfig
 from playslot_rl.baselines.methods import MethodName as MethodName
+from playslot_rl.comparison.config import CompareConfig as CompareConfig
 from playslot_rl.data_config import CollectConfig as CollectConfig
 from playslot_rl.data_config import CollectorConfig as CollectorConfig
 from playslot_rl.data_config import DataConfig as DataConfig
@@ -32,6 +33,7 @@ from playslot_rl.plain import to_dict as to_dict
 from playslot_rl.stage_config import OptimConfig as OptimConfig
 from playslot_rl.stage_config import Precision as Precision
 from playslot_rl.stage_config import StageConfig as StageConfig
+
 
 @dataclass(frozen=True)
 class SlotsStageConfig(StageConfig):
@@ -162,6 +164,7 @@ class ExperimentConfig:
     dynamics: DynamicsStageConfig = field(default_factory=DynamicsStageConfig)
     behaviour: BehaviourStageConfig = field(default_factory=BehaviourStageConfig)
     baselines: BaselinesConfig = field(default_factory=BaselinesConfig)
+    compare: CompareConfig = field(default_factory=CompareConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     logging: LoggingConfig = field(default_factory=LoggingConfig)
 

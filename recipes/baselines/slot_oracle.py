@@ -1,4 +1,4 @@
-"""`playslot train-baseline method=slot_oracle run=WORLD data.demos=DEMOS demos=N out=DIR`: clone real actions from slots.
+"""`playslot train-baseline method=slot_oracle run=WORLD data.demos=DEMOS out=DIR`: clone real actions from slots.
 
 Sizes are `model.policy`, the schedule is `behaviour`, as for PlaySlot's policy.
 """

@@ -78,7 +78,7 @@ class LAPOBehaviour:
         )
 
     def decoder_stage(self) -> RegressionStage:
-        """Real actions of the labelled demonstrations, from the inverse model's latents, the trained policy's, or both."""
+        """Real actions of the labelled demonstrations, from inferred latents, the policy's, or both."""
         behaviour = self.config.behaviour
         chosen = np.flatnonzero(self.moves.episode < behaviour.labelled_demos)
         rows = torch.from_numpy(chosen).to(self.device)

@@ -63,9 +63,7 @@ class EncoderMLP(nn.Module):
         out_dim: width of the output.
     """
 
-    def __init__(
-        self, in_channels: int, channels: tuple[int, ...], image_size: int, hidden: int, out_dim: int
-    ) -> None:
+    def __init__(self, in_channels: int, channels: tuple[int, ...], image_size: int, hidden: int, out_dim: int) -> None:
         super().__init__()
         self.encoder = ConvEncoder(in_channels, channels)
         side = image_size // 2 ** len(channels)

@@ -5,8 +5,8 @@
 R is torchvision's ResNet-18 without pooling and classifier: its last feature map, read as h w tokens of 512, takes the
 place of the slots in the policy's network f; P is a learned position of each token. All of it is trained.
 
-Note: the paper does not say where in ResNet-18 the features are taken, nor whether it stays frozen. Frames are 64x64, so
-the last feature map is 2x2: as many tokens as ButtonPress has slots.
+Note: the paper does not say where in ResNet-18 the features are taken, nor whether it stays frozen. Frames are 64x64,
+so the last feature map is 2x2: as many tokens as ButtonPress has slots.
 
 Shapes: B batch, H W image height and width, h w those of the feature map (H / 32, W / 32), A action dim.
 """
