@@ -74,7 +74,9 @@ def _footnotes(result: Result) -> list[str]:
         for row in ({"title": t, "labels": _labels(done, t)} for t in _titles(done) if _labels(done, t))
     ]
     notes += _one_each(
-        done, "env_steps", "Environment steps: {title} {value}, those of the data it builds on included."
+        done,
+        "env_steps",
+        "Environment steps (agent steps) of {title}: {value}, those of the videos its slots were trained on included.",
     )
     notes += _one_each(done, "pretraining", "{title} starts from {value} weights.")
     notes += _one_each(done, "parameters", "Parameters, those of the models it builds on included: {title} {value}.")

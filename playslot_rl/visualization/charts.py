@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of a size in inches."""
+def _figure(width: float, height: float) -> Figure:
     # Figure without pyplot: no global state, no display needed.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -26,8 +25,7 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def style_axes(axes: Axes, theme: Theme) -> None:
-    """Give axes the page's colours and a quiet grid."""
+def _style(axes: Axes, theme: Theme) -> None:
     axes.set_facecolor("none")
     axes.tick_params(colors=theme.text, labelsize=9, length=3)
     axes.xaxis.label.set_color(theme.text)
@@ -56,7 +54,7 @@ def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], bool]], 
     Returns:
         PNG.
     """
-    figure = new_figure(6.4, 0.6 + 0.42 * len(rows))
+    figure = _figure(6.4, 0.6 + 0.42 * len(rows))
     axes = figure.add_subplot()
     for y, (_, rate, (low, high), own) in enumerate(rows):
         colour = theme.series[0] if own else theme.series[7]
@@ -71,7 +69,7 @@ def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], bool]], 
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlim(-3, 103)
     axes.set_xlabel("success rate, % (bar: 95 % Wilson interval)")
-    style_axes(axes, theme)
+    _style(axes, theme)
     axes.grid(False, axis="y")
     return _png(figure, theme)
 
@@ -95,7 +93,7 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
         raise ValueError("loss_chart: got no loss in the histories, expected at least one")
     columns = min(columns, len(panels))
     height = -(-len(panels) // columns)
-    figure = new_figure(3.1 * columns, 2.3 * height)
+    figure = _figure(3.1 * columns, 2.3 * height)
     handles: dict[str, Any] = {}
     for index, (stage, name) in enumerate(panels):
         axes = figure.add_subplot(height, columns, index + 1)
@@ -109,7 +107,7 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
                 axes.set_yscale("log")
         axes.set_title(f"{stage}: {name.replace('_', ' ')}", fontsize=10)
         axes.set_xlabel("optimiser step", fontsize=9)
-        style_axes(axes, theme)
+        _style(axes, theme)
         axes.tick_params(axis="y", which="minor", labelsize=7, colors=theme.text)
         handles |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
     figure.legend(
@@ -133,7 +131,7 @@ def curve_chart(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[A
     """
     if not panels:
         raise ValueError("curve_chart: got no feature, expected at least one")
-    figure = new_figure(3.1 * len(panels), 2.2)
+    figure = _figure(3.1 * len(panels), 2.2)
     for index, (name, lines) in enumerate(panels.items()):
         axes = figure.add_subplot(1, len(panels), index + 1)
         for number, (label, values) in enumerate(lines.items()):
@@ -141,7 +139,7 @@ def curve_chart(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[A
             axes.plot(np.arange(len(values)), values, color=colour, linewidth=1.3, label=label)
         axes.set_title(name, fontsize=10)
         axes.set_xlabel("frame", fontsize=9)
-        style_axes(axes, theme)
+        _style(axes, theme)
         if 1 < len(lines) <= len(theme.series):
             axes.legend(frameon=False, labelcolor=theme.text, fontsize=7, ncols=2)
     return _png(figure, theme)
@@ -165,7 +163,7 @@ def usage_chart(counts: Mapping[str, Sequence[int]], theme: Theme) -> bytes:
     Returns:
         PNG.
     """
-    figure = new_figure(6.4, 2.4)
+    figure = _figure(6.4, 2.4)
     axes = figure.add_subplot()
     k = max(len(c) for c in counts.values())
     width = 0.8 / len(counts)
@@ -181,7 +179,7 @@ def usage_chart(counts: Mapping[str, Sequence[int]], theme: Theme) -> bytes:
     axes.set_xticks(range(k))
     axes.set_xlabel("code")
     axes.set_ylabel("transitions, %")
-    style_axes(axes, theme)
+    _style(axes, theme)
     axes.grid(False, axis="x")
     if len(counts) > 1:
         figure.legend(loc="outside upper right", ncols=4, frameon=False, labelcolor=theme.text, fontsize=9)

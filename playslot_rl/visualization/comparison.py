@@ -6,7 +6,7 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from playslot_rl.visualization.charts import new_figure, style_axes
+from playslot_rl.visualization.charts import _figure, _style
 from playslot_rl.visualization.palette import METHOD_STYLES, Theme
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def comparison_figure(result: Result, theme: Theme) -> Figure:
     curves = [row for row in result["rows"] if row["curve"]]
     final = [row for row in result["summary"] if row["demos"] is None]
     online = bool(curves or final)
-    figure = new_figure(9.6 if offline and online else 6.4, 3.9)
+    figure = _figure(9.6 if offline and online else 6.4, 3.9)
     panels = int(bool(offline)) + int(online) or 1
     handles: dict[str, Any] = {}
     if offline or not online:
@@ -125,4 +125,4 @@ def _finish(axes: Axes, result: Result, theme: Theme) -> None:
             axes.axhline(100 * rate, color=theme.series[7], linestyle=line, linewidth=1.2, label=f"{name} actions")
     axes.set_ylim(-3, 103)
     axes.set_ylabel("success rate, %")
-    style_axes(axes, theme)
+    _style(axes, theme)

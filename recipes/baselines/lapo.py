@@ -16,8 +16,6 @@ from playslot_rl.recipes.run import demo_root, finished, fixed_keys, open_device
 if TYPE_CHECKING:
     from playslot_rl.training.checkpoints import StageCheckpoint
 
-SIZES = ("channels", "hidden", "groups", "code_dim", "codes", "decay", "dead_threshold", "commitment")
-
 
 def main(config: ExperimentConfig) -> None:
     """Train LAPO into `OUT/lapo_model` and `OUT/lapo`; killed, the same command carries on; finished, it says so.
@@ -27,7 +25,7 @@ def main(config: ExperimentConfig) -> None:
         DataError: no videos, too few demonstrations, or none with actions.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.baselines.lapo.load import MODEL, NAME
+    from playslot_rl.baselines.lapo.load import MODEL, NAME, given_model
     from playslot_rl.data.demonstrations import first_demonstrations, require_labelled
     from playslot_rl.training.checkpoints import adopt_stage
 
@@ -35,7 +33,7 @@ def main(config: ExperimentConfig) -> None:
     source = first_demonstrations(open_videos(config, demos, "train-baseline"), config.demos)
     source.require_actions(config.env.action_dim)
     require_labelled(config.behaviour.labelled_demos, source.episodes)  # before anything is computed
-    model = _given_model(config, run) if own.world else train_model(config, run)
+    model = given_model(own, config.env.image_size, run) if own.world else train_model(config, run)
     wanted = {
         "model": {"action_decoder": to_dict(config.model.action_decoder)},
         "behaviour": {key: to_dict(config.behaviour)[key] for key in ("labelled_demos", "decoder_inputs")},
@@ -58,7 +56,7 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
     """
     import torch
 
-    from playslot_rl.baselines.lapo.load import MODEL, NAME
+    from playslot_rl.baselines.lapo.load import MODEL, NAME, sizes_of
     from playslot_rl.baselines.lapo.model import ForwardModel, InverseModel
     from playslot_rl.baselines.lapo.stage import LAPOModelStage
     from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, save_stage
@@ -66,7 +64,7 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
     from playslot_rl.training.seeding import derived_seed
 
     own = config.baselines.lapo
-    sizes = {NAME: {key: to_dict(own)[key] for key in SIZES}}
+    sizes = {NAME: sizes_of(own)}
     trained_as = {NAME: {**sizes[NAME], "model": fixed_keys(own.model)}}
     if finished(config, run, MODEL, trained_as, {}, config.data.root):
         return read_stage(checkpoint_folder(run, MODEL), MODEL)
@@ -107,29 +105,10 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
     )
 
 
-def _given_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
-    from playslot_rl.baselines.lapo.load import MODEL, NAME
-    from playslot_rl.training.checkpoints import (
-        checkpoint_folder,
-        read_stage,
-        require_adoptable,
-        require_config,
-        require_whole,
-        run_folder,
-    )
-
-    own = config.baselines.lapo
-    model = read_stage(checkpoint_folder(run_folder(own.world), MODEL), MODEL)
-    require_whole(model)
-    require_adoptable(model, run)
-    require_config(model, {"env": {"image_size": config.env.image_size}, NAME: {k: to_dict(own)[k] for k in SIZES}})
-    return model
-
-
 def _train_policy(config: ExperimentConfig, run: Path, model: StageCheckpoint) -> None:
     """Latent policy, then action decoder."""
     from playslot_rl.baselines.lapo.behaviour import LAPOBehaviour
-    from playslot_rl.baselines.lapo.load import MODEL, NAME
+    from playslot_rl.baselines.lapo.load import MODEL, NAME, sizes_of
     from playslot_rl.data.demonstrations import first_demonstrations
     from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
     from playslot_rl.training.fit import fit
@@ -137,7 +116,7 @@ def _train_policy(config: ExperimentConfig, run: Path, model: StageCheckpoint) -
     own, device = config.baselines.lapo, open_device(config)
     source = first_demonstrations(open_videos(config, demo_root(config), "train-baseline"), config.demos)
     behaviour = LAPOBehaviour(config, model, source, device)
-    sizes = {"action_decoder": to_dict(config.model.action_decoder), NAME: {key: to_dict(own)[key] for key in SIZES}}
+    sizes = {"action_decoder": to_dict(config.model.action_decoder), NAME: sizes_of(own)}
     labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
     identity = {**sizes, "data": source.fingerprint, MODEL: model.fingerprint, "loss": own.loss, "shift": own.shift}
     common = {"seed": config.seed, "device": device, "logging": config.logging}

@@ -6,7 +6,7 @@ Shapes: B batch, H W image height and width, Z latent-action width, A action dim
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -17,7 +17,11 @@ from playslot_rl.baselines.actor import Actor
 from playslot_rl.baselines.lapo.config import LAPOConfig
 from playslot_rl.baselines.lapo.encoder import EncoderMLP
 from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.plain import to_dict
 from playslot_rl.world_model import action_decoder_module, normalise
+
+if TYPE_CHECKING:
+    from playslot_rl.training.checkpoints import StageCheckpoint
 
 NAME: Final = "lapo"
 MODEL: Final = "lapo_model"
@@ -65,6 +69,35 @@ def stored_config(config: dict[str, Any], where: Path) -> LAPOConfig:
         raise CheckpointError(
             f"{where}/config.json: {error}; expected LAPO's config of this version of playslot_rl: train it again"
         ) from error
+
+
+def sizes_of(config: LAPOConfig) -> dict[str, Any]:
+    """The part of the config that inverse and forward model are built from."""
+    names = ("channels", "hidden", "groups", "code_dim", "codes", "decay", "dead_threshold", "commitment")
+    values = to_dict(config)
+    return {name: values[name] for name in names}
+
+
+def given_model(config: LAPOConfig, image_size: int, run: Path) -> StageCheckpoint:
+    """The inverse and forward model of the run `config.world`, after checking that `run` can build on it.
+
+    Raises:
+        CheckpointError: it is missing or damaged, of other sizes, or `run` has another one of its own.
+    """
+    from playslot_rl.training.checkpoints import (
+        checkpoint_folder,
+        read_stage,
+        require_adoptable,
+        require_config,
+        require_whole,
+        run_folder,
+    )
+
+    model = read_stage(checkpoint_folder(run_folder(config.world), MODEL), MODEL)
+    require_whole(model)
+    require_adoptable(model, run)
+    require_config(model, {"env": {"image_size": image_size}, NAME: sizes_of(config)})
+    return model
 
 
 def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
