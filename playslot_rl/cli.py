@@ -7,7 +7,6 @@ Exit codes: 0 done, 1 an error of the run, 2 bad arguments, 130 interrupted.
 from __future__ import annotations
 
 import argparse
-import errno
 import importlib
 import os
 import sys
@@ -18,10 +17,7 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from playslot_rl import __version__
-from playslot_rl.errors import ConfigError, PlaySlotError
-
-DEBUG: Final = "PLAYSLOT_DEBUG"
-"""Set to 1: errors show their traceback."""
+from playslot_rl.errors import DEBUG, ConfigError, explain
 
 
 @dataclass(frozen=True)
@@ -76,6 +72,18 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot train-policy run=pretrained data.demos=data/expert behaviour.labelled_demos=20 out=runs/few",
         ),
     ),
+    "train-baseline": Command(
+        "one of the methods PlaySlot is compared with, as a run of its own",
+        "Trains method=slot_oracle, resnet_oracle, lapo, dreamer or sold (docs/baselines.md) into out=; `playslot "
+        "evaluate run=OUT` then measures it as it does PlaySlot. run= is the world model whose slots slot_oracle and "
+        "sold build on; settings come from env= and preset=, not from that run. demos=N takes the first N "
+        "demonstrations.",
+        (
+            "playslot train-baseline method=slot_oracle run=pretrained data.demos=data/expert demos=50 out=runs/oracle",
+            "playslot train-baseline method=lapo data.root=data/random data.demos=data/expert out=runs/lapo",
+            "playslot train-baseline method=dreamer env=block_reach out=runs/dreamer",
+        ),
+    ),
     "evaluate": Command(
         "success rate in simulation (closed loop) or in imagination (open loop)",
         "Evaluates a fixed list of held-out seeds, one episode each, and writes "
@@ -93,6 +101,20 @@ COMMANDS: Final[dict[str, Command]] = {
         (
             "playslot pipeline preset=compact env=button_press out=runs/mine",
             "playslot pipeline preset=smoke out=runs/smoke",
+        ),
+    ),
+    "compare": Command(
+        "methods side by side: success against demonstrations, table and plot",
+        "Trains and evaluates every method with every number of demonstrations and every seed, on the same held-out "
+        "episodes, and writes OUT/comparison.json, .md, .png and .svg. What is done is reused, so the same command "
+        "carries on after a stop and tries what failed again. Here demos=, seeds= and methods= are lists. The world "
+        "model is run=, or trained once into OUT/world_model; data are data.root and data.demos, or recorded once "
+        "into OUT/data. Jobs run one after the other, or by a Hydra launcher: hydra.launcher=joblib, submitit_local, "
+        "submitit_slurm or ray, with its own keys as hydra.launcher.KEY=VALUE.",
+        (
+            "playslot compare run=pretrained demos=10,50,100,150 seeds=0,1,2 out=runs/comparison",
+            "playslot compare env=block_push_easy methods=playslot,slot_oracle demos=100,600 seeds=0 out=runs/blocks",
+            "playslot compare run=pretrained hydra.launcher=joblib hydra.launcher.n_jobs=2 out=runs/comparison",
         ),
     ),
     "demo": Command(
@@ -127,6 +149,7 @@ KEYS_HELP: Final = """common keys (any key of playslot_rl/config.py works, with 
   out=DIR               folder to write
   data.root=DIR[,DIR]   LeRobot v3.0 data set(s) of videos; data.demos=DIR for demonstrations
   run=DIR               run folder to go on from, with its stored config; `pretrained` is the shipped model
+  demos=N               train-policy, train-baseline: the first N demonstrations; compare: a list of numbers
   protocol=simulation   evaluation protocol: simulation or imagination
 
 environment variables: PLAYSLOT_DEBUG=1 shows tracebacks, PLAYSLOT_CACHE=DIR moves the caches,
@@ -236,22 +259,7 @@ def _guarded(name: str, run: Callable[[], int]) -> int:
     except Exception as error:
         if _debugging():
             raise
-        return _fail(name, _explain(error), 1)
-
-
-def _explain(error: BaseException) -> str:
-    """One line about an error, the full disk first: libraries wrap it in errors of their own."""
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(error, PlaySlotError):
-        if (isinstance(cause, OSError) and cause.errno == errno.ENOSPC) or os.strerror(errno.ENOSPC) in str(cause):
-            where = getattr(cause, "filename", None)
-            place = f" for {where}" if where else ""
-            return f"got a full disk{place}, expected free space: free some and run the same command again"
-        cause = cause.__cause__ or cause.__context__
-    text = " ".join(str(error).split()) or "no message"
-    if isinstance(error, PlaySlotError):
-        return text
-    return f"{type(error).__name__}: {text} (unexpected; {DEBUG}=1 shows where)"
+        return _fail(name, explain(error), 1)
 
 
 def _debugging() -> bool:

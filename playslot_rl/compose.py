@@ -23,6 +23,8 @@ CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
 CONTINUES: Final = frozenset({"evaluate", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
+COMPARE: Final = "compare"
+"""The command whose `methods=`, `demos=` and `seeds=` are lists, and which takes `hydra.` keys."""
 SHIPPED: Final = "pretrained"
 """`run=pretrained` names the task's shipped world model, `run=pretrained/ENV` one of them: no run folders."""
 
@@ -57,7 +59,7 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         ConfigError: an argument that is not `key=value`, an unknown environment, preset or key, a value outside its
             range, or a run folder without a usable `config.json`.
     """
-    pairs = _parse(overrides)
+    pairs = _parse(_compare_keys(overrides) if command == COMPARE else overrides)
     for group in GROUPS:
         if group in pairs:
             _check_choice(group, pairs[group])
@@ -91,6 +93,35 @@ def _parse(overrides: Sequence[str]) -> dict[str, str]:
         pairs.pop(key, None)  # the order of the arguments is kept: a later one wins
         pairs[key] = _unquote(value) if key in GROUPS else value
     return pairs
+
+
+def _compare_keys(overrides: Sequence[str]) -> list[str]:
+    """The short keys of `playslot compare` as those of the config's group `compare`.
+
+    `demos=10,50` (or `demos=[10,50]`) becomes `compare.demos=[10,50]`, `hydra.launcher=joblib` becomes
+    `compare.launcher=joblib`, and other `hydra.` keys are gathered, as they are, in `compare.hydra`.
+    """
+    kept, hydra = [], []
+    for argument in overrides:
+        key, equals, value = argument.partition("=")
+        name = key.strip().lstrip("+")
+        if equals and name in ("methods", "demos", "seeds"):
+            inside = _unquote(value.strip()).removeprefix("[").removesuffix("]")
+            kept.append(f"compare.{name}=[{inside}]")
+        elif equals and name == "hydra.launcher":
+            kept.append(f"compare.launcher={value}")
+        elif equals and name.startswith("hydra."):
+            hydra.append(argument.strip())
+        else:
+            kept.append(argument)
+    quoted = ",".join(_quote(argument) for argument in hydra)
+    return [*kept, f"compare.hydra=[{quoted}]"] if hydra else kept
+
+
+def _quote(text: str) -> str:
+    """Text as Hydra reads it back unchanged."""
+    text = text.replace("\\", "\\\\").replace("'", "\\'")
+    return "'" + text.replace("${", "\\${") + "'"
 
 
 def _hint(key: str) -> Any:
@@ -160,8 +191,7 @@ def _assignments(pairs: Mapping[str, str]) -> list[str]:
             continue
         if _hint(key) is str and value != "null":
             text = _expand_home(_unquote(value)) if key in _FOLDERS else _unquote(value)
-            text = text.replace("\\", "\\\\").replace("'", "\\'")
-            value = "'" + text.replace("${", "\\${") + "'"
+            value = _quote(text)
         assignments.append(f"++{key}={value}")
     return assignments
 

@@ -11,6 +11,7 @@ from typing import Literal
 
 from playslot_rl.baselines.config import BaselinesConfig as BaselinesConfig
 from playslot_rl.baselines.methods import MethodName as MethodName
+from playslot_rl.comparison.config import CompareConfig as CompareConfig
 from playslot_rl.data_config import CollectConfig as CollectConfig
 from playslot_rl.data_config import CollectorConfig as CollectorConfig
 from playslot_rl.data_config import DataConfig as DataConfig
@@ -29,53 +30,9 @@ from playslot_rl.plain import check
 from playslot_rl.plain import fingerprint as fingerprint
 from playslot_rl.plain import from_dict as from_dict
 from playslot_rl.plain import to_dict as to_dict
-
-Precision = Literal["fp32", "bf16"]
-
-
-@dataclass(frozen=True)
-class OptimConfig:
-    """Adam and its schedule.
-
-    Attributes:
-        lr: base learning rate.
-        warmup_steps: linear warm-up.
-        schedule: `cosine` to zero over the stage's steps after warm-up, or `constant`.
-        grad_clip: maximum gradient norm; 0 switches clipping off.
-    """
-
-    lr: float = 1e-4
-    warmup_steps: int = 0
-    schedule: Literal["cosine", "constant"] = "cosine"
-    grad_clip: float = 0.05
-
-
-@dataclass(frozen=True)
-class StageConfig:
-    """What every training stage has.
-
-    Attributes:
-        steps: optimiser steps.
-        batch_size: windows per step.
-        optim: optimiser.
-        precision: `bf16` autocasts the convolutions.
-        checkpoint_every: steps between checkpoints.
-        validate_every: steps between validations.
-        log_every: steps between log lines.
-    """
-
-    steps: int = 200_000
-    batch_size: int = 64
-    optim: OptimConfig = field(default_factory=OptimConfig)
-    precision: Precision = "fp32"
-    checkpoint_every: int = 1000
-    validate_every: int = 1000
-    log_every: int = 50
-
-    def __post_init__(self) -> None:
-        check(self.steps >= 1, "steps", self.steps, "at least 1")
-        check(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
-        check(self.checkpoint_every >= 1, "checkpoint_every", self.checkpoint_every, "at least 1")
+from playslot_rl.stage_config import OptimConfig as OptimConfig
+from playslot_rl.stage_config import Precision as Precision
+from playslot_rl.stage_config import StageConfig as StageConfig
 
 
 @dataclass(frozen=True)
@@ -209,6 +166,7 @@ class ExperimentConfig:
     dynamics: DynamicsStageConfig = field(default_factory=DynamicsStageConfig)
     behaviour: BehaviourStageConfig = field(default_factory=BehaviourStageConfig)
     baselines: BaselinesConfig = field(default_factory=BaselinesConfig)
+    compare: CompareConfig = field(default_factory=CompareConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     logging: LoggingConfig = field(default_factory=LoggingConfig)
 

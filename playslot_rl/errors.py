@@ -5,6 +5,13 @@ Every message is one line: what was got, what was expected, what to do. The comm
 
 from __future__ import annotations
 
+import errno
+import os
+from typing import Final
+
+DEBUG: Final = "PLAYSLOT_DEBUG"
+"""Environment variable; set to 1: errors show their traceback."""
+
 
 class PlaySlotError(Exception):
     """Base of the errors that the command line shows without a traceback."""
@@ -36,3 +43,18 @@ class RenderError(PlaySlotError, RuntimeError):
 
 class HubError(PlaySlotError, RuntimeError):
     """A push or pull failed: no or a bad token, no network, repository or revision, offline, or a server error."""
+
+
+def explain(error: BaseException) -> str:
+    """One line about an error, the full disk first: libraries wrap it in errors of their own."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(error, PlaySlotError):
+        if (isinstance(cause, OSError) and cause.errno == errno.ENOSPC) or os.strerror(errno.ENOSPC) in str(cause):
+            where = getattr(cause, "filename", None)
+            place = f" for {where}" if where else ""
+            return f"got a full disk{place}, expected free space: free some and run the same command again"
+        cause = cause.__cause__ or cause.__context__
+    text = " ".join(str(error).split()) or "no message"
+    if isinstance(error, PlaySlotError):
+        return text
+    return f"{type(error).__name__}: {text} (unexpected; {DEBUG}=1 shows where)"

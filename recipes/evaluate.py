@@ -10,11 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from playslot_rl.baselines.methods import METHODS
 from playslot_rl.compose import shipped
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.recipes import objects
+from playslot_rl.recipes import baselines, objects
 
 PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")
 
@@ -22,7 +23,8 @@ PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulatio
 def main(config: ExperimentConfig, report: bool = True) -> None:
     """Evaluate the policy of `config.run` under `config.protocol` and print the result.
 
-    Where there is no simulator (GridShapes) its slots and latent actions are scored instead: see `recipes.objects`.
+    A baseline's run (`method` in its config) is evaluated in simulation: see `recipes.baselines`. Where there is no
+    simulator (GridShapes) its slots and latent actions are scored instead: see `recipes.objects`.
 
     Args:
         config: `run`, `protocol`, `episodes` (50 if None), `seed`, `device`, `env`, `render`, `evaluation`.
@@ -34,6 +36,9 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
         OutputError: the result cannot be written.
     """
     run = check_run(config)
+    if config.method != "playslot":
+        baselines.evaluate(config, run)
+        return
     if config.env.name in PROCEDURAL:
         objects.main(config, run)
         return
@@ -68,7 +73,7 @@ def main_if_needed(config: ExperimentConfig) -> None:
         "seed": config.seed,
         "fingerprints": run_facts(run).fingerprints,
     }
-    due = [protocol for protocol in PROTOCOLS if not _measured(run, protocol, facts)]
+    due = [protocol for protocol in PROTOCOLS if not measured(run, protocol, facts)]
     for protocol in due:
         main(replace(config, protocol=protocol), report=False)
     if due or not (run / "report.html").is_file():
@@ -79,8 +84,8 @@ def main_if_needed(config: ExperimentConfig) -> None:
         print(f"report: {write_report(run, agent=load_agent(run, open_device(config)))}", flush=True)
 
 
-def _measured(run: Path, protocol: str, facts: dict[str, Any]) -> bool:
-    """Whether this policy was measured so before; if so, say it."""
+def measured(run: Path, protocol: str, facts: dict[str, Any]) -> bool:
+    """Whether the run was measured under a protocol with the same `facts` (parts of its result); if so, say it."""
     path = run / "evaluation" / protocol / "eval_info.json"
     stored = json.loads(path.read_text()) if path.is_file() else {}
     if {key: stored.get(key) for key in facts} != facts:
@@ -126,7 +131,8 @@ def check_environment(config: ExperimentConfig, image_size: int, action_dim: int
 
 def describe(result: dict[str, Any], run: Path) -> str:
     """The result in a few lines."""
-    rows = [(f"PlaySlot, {result['protocol']}", result)]
+    title = METHODS[result["method"]].title
+    rows = [(f"{title}, {result['protocol']}", result)]
     rows += [(name.replace("_", " "), reference) for name, reference in result["references"].items()]
     lines = []
     for name, row in rows:

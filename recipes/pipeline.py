@@ -40,18 +40,31 @@ def _collect(config: ExperimentConfig, folder: Path) -> DataConfig:
     """Record what is missing; returns where the data are."""
     from playslot_rl.collectors import collect
 
-    given, want = config.data, config.collect
-    random = folder / "data" / "random"
     if config.env.name in PROCEDURAL:
-        if given.root:
-            return given
+        if config.data.root:
+            return config.data
+        random, want = folder / "data" / "random", config.collect
         collect(config, "random", want.random_episodes, want.random_steps, random, config.seed, config.workers)
-        return replace(given, root=str(random))
-    demos = given.demos or str(folder / "data" / "expert")
-    if not given.demos:
+        return replace(config.data, root=str(random))
+    config = replace(config, data=collect_demos(config, folder))
+    return config.data if config.data.root else collect_videos(config, folder)
+
+
+def collect_demos(config: ExperimentConfig, folder: Path) -> DataConfig:
+    """Record demonstrations into `FOLDER/data/expert` unless `data.demos` names some; returns where the data are."""
+    from playslot_rl.collectors import collect
+
+    demos, want = config.data.demos or str(folder / "data" / "expert"), config.collect
+    if not config.data.demos:
         collect(config, "expert", want.expert_episodes, want.expert_steps, Path(demos), config.seed, config.workers)
-    if given.root:
-        return replace(given, demos=demos)
+    return replace(config.data, demos=demos)
+
+
+def collect_videos(config: ExperimentConfig, folder: Path) -> DataConfig:
+    """Record the world model's videos below `FOLDER/data`; `data.demos` are among them where the preset wants it."""
+    from playslot_rl.collectors import collect
+
+    random, want = folder / "data" / "random", config.collect
     collect(config, "random", want.random_episodes, want.random_steps, random, config.seed, config.workers)
     roots = [str(random)]
     if want.noisy_episodes:
@@ -62,6 +75,6 @@ def _collect(config: ExperimentConfig, folder: Path) -> DataConfig:
         # The next base seed: no episode of the demonstrations comes twice.
         collect(noise, "expert", want.noisy_episodes, want.expert_steps, noisy, config.seed + 1, config.workers)
         roots.append(str(noisy))
-    if want.learn_from_demos:
-        roots.append(demos)
-    return replace(given, root=",".join(roots), demos=demos)
+    if want.learn_from_demos and config.data.demos:
+        roots.append(config.data.demos)
+    return replace(config.data, root=",".join(roots))

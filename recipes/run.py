@@ -114,6 +114,7 @@ def finished(
     wanted: Mapping[str, Any],
     parents: Mapping[str, Any],
     roots: str,
+    demos: int | None = None,
 ) -> bool:
     """Whether a stage of a run is finished; if so, say that it is skipped.
 
@@ -121,10 +122,12 @@ def finished(
         wanted: parts of the config that the checkpoint must have been trained with.
         parents: checkpoints it must have been trained on, by stage.
         roots: data sets it must have been trained on; empty if the command names none.
+        demos: first episodes of them that it must have been trained on; None means all.
 
     Raises:
         CheckpointError: it was trained otherwise.
     """
+    from playslot_rl.data.demonstrations import first_demonstrations
     from playslot_rl.errors import CheckpointError
     from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, require_parents
 
@@ -137,7 +140,8 @@ def finished(
     facts: list[tuple[str, object, object]] = [("seed", config.seed, done.meta.get("seed", config.seed))]
     if roots:
         data = next(iter(done.meta["data"].values()), "none")
-        facts.append(("data", open_videos(config, roots, stage).fingerprint, data))
+        source = first_demonstrations(open_videos(config, roots, stage), demos)
+        facts.append(("data", source.fingerprint, data))
     for name, got, old in facts:
         if got != old:
             raise CheckpointError(f"{name}: got {got}, expected {old} as {path} was trained with: use another out=")

@@ -1,6 +1,6 @@
 """`playslot train-policy run=RUN data.root=DEMOS`: stage 3, latent policy, slot oracle and action decoder.
 
-`run=pretrained out=RUN` builds on the world model that ships for the task.
+`run=pretrained out=RUN` builds on the world model that ships for the task; `demos=N` takes the first N demonstrations.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ def main(config: ExperimentConfig) -> None:
 
     Raises:
         CheckpointError: no finished world model, or the run was begun otherwise.
-        DataError: no demonstrations, none with actions, or fewer than `behaviour.labelled_demos`.
+        DataError: no demonstrations, none with actions, or fewer than `demos` or `behaviour.labelled_demos`.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
     import torch
 
-    from playslot_rl.data.demonstrations import label_demonstrations
+    from playslot_rl.data.demonstrations import first_demonstrations, label_demonstrations, require_labelled
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.training.checkpoints import (
         checkpoint_folder,
@@ -60,7 +60,7 @@ def main(config: ExperimentConfig) -> None:
         "model": {"policy": to_dict(model.policy), "action_decoder": to_dict(model.action_decoder)},
         "policy": fixed_keys(config.behaviour),
     }
-    if finished(config, run, "policy", trained_as, parents, demo_root(config)):
+    if finished(config, run, "policy", trained_as, parents, demo_root(config), config.demos):
         return
 
     def ready() -> None:
@@ -72,14 +72,15 @@ def main(config: ExperimentConfig) -> None:
     device = open_device(config)
     world = load_world_model(parent, device)
     world.config = replace(world.config, policy=config.model.policy, action_decoder=config.model.action_decoder)
-    source = open_videos(config, demo_root(config), "train-policy")
+    videos = open_videos(config, demo_root(config), "train-policy")
+    source = first_demonstrations(videos, config.demos)
+    require_labelled(config.behaviour.labelled_demos, source.episodes)  # before anything is computed
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derived_seed(config.seed, 0, "policy"))
         agent = Agent.untrained(world, oracle=config.behaviour.oracle).to(device)
     prints = {name: checkpoint.fingerprint for name, checkpoint in parents.items()}
-    cached = slot_cache(source, world.savi, prints["slots"], config.data.cache, device, config.logging.progress)
+    cached = slot_cache(videos, world.savi, prints["slots"], config.data.cache, device, config.logging.progress)
     demos = label_demonstrations(world, source, cached, device)
-    demos.labelled(config.behaviour.labelled_demos)  # too few are refused before anything is trained
     lr = config.behaviour.optim.lr
     clone = CloneStage(agent.policy, agent.oracle, demos, config.behaviour)
     sizes = to_dict(world.config)

@@ -5,7 +5,8 @@ Shapes: M transitions of all demonstrations in a row, N slots, D slot width, Z l
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -46,12 +47,83 @@ class Demonstrations:
         Raises:
             DataError: there are fewer demonstrations.
         """
-        if demos > len(self.lengths):
-            raise DataError(
-                f"behaviour.labelled_demos: got {demos}, expected at most the {len(self.lengths)} demonstrations "
-                "there are: lower it or collect more"
-            )
+        require_labelled(demos, len(self.lengths))
         return torch.nonzero(self.episode < demos)[:, 0]
+
+
+def require_labelled(labelled: int, demos: int) -> None:
+    """Refuse more labelled demonstrations than there are.
+
+    Raises:
+        DataError: there are fewer.
+    """
+    if labelled > demos:
+        raise DataError(
+            f"behaviour.labelled_demos: got {labelled}, expected at most the {demos} demonstrations "
+            "there are: lower it or collect more"
+        )
+
+
+def first_demonstrations(source: EpisodeFrames, demos: int | None) -> EpisodeFrames:
+    """The first `demos` episodes of a data set; None, or as many as there are, gives the data set itself.
+
+    Row numbers stay those of the whole data set, so its slot cache serves every number of demonstrations.
+
+    Raises:
+        DataError: there are fewer episodes.
+    """
+    if demos is None or demos == source.episodes:
+        return source
+    if demos > source.episodes:
+        raise DataError(
+            f"demos: got {demos}, expected at most the {source.episodes} demonstrations there are: "
+            "lower it or collect more"
+        )
+    return replace(
+        source,
+        starts=source.starts[:demos],
+        lengths=source.lengths[:demos],
+        seeds=None if source.seeds is None else source.seeds[:demos],
+        fingerprint=hashlib.sha256(f"{source.fingerprint}/first {demos}".encode()).hexdigest()[:16],
+    )
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """Row numbers of the transitions of some episodes, in order.
+
+    Attributes:
+        rows: frame a transition starts from, int64 (M,); row + 1 is the frame after it.
+        episode: number of its episode among those with a transition, int64 (M,).
+        lengths: transitions of each of those episodes, int64 (E,).
+    """
+
+    rows: npt.NDArray[np.int64]
+    episode: npt.NDArray[np.int64]
+    lengths: npt.NDArray[np.int64]
+
+
+def transitions(source: EpisodeFrames) -> Transitions:
+    """All transitions of a data set; episodes of one frame have none and are left out.
+
+    Raises:
+        DataError: no episode has two frames.
+    """
+    kept = np.nonzero(source.lengths >= 2)[0]
+    if not len(kept):
+        raise DataError("demonstrations: got no episode of two frames or more, expected videos: collect again")
+    steps = source.lengths[kept] - 1
+    rows = np.concatenate([source.starts[e] + np.arange(n) for e, n in zip(kept, steps, strict=True)])
+    return Transitions(rows, np.repeat(np.arange(len(kept)), steps), steps)
+
+
+def real_actions(source: EpisodeFrames, rows: npt.NDArray[np.int64], width: int) -> Tensor:
+    """Real actions (M, A) in [-1, 1] of transitions.
+
+    Raises:
+        DataError: the data set has none, or of another width.
+    """
+    return torch.from_numpy(np.array(source.require_actions(width)[rows])).clamp(-1, 1)
 
 
 @torch.no_grad()
@@ -69,11 +141,9 @@ def label_demonstrations(
     Raises:
         DataError: no episode has two frames, mode `ground_truth` without actions, or actions of another width.
     """
+    moves = transitions(source)
     kept = np.nonzero(source.lengths >= 2)[0]
-    if not len(kept):
-        raise DataError("demonstrations: got no episode of two frames or more, expected videos: collect again")
-    if source.actions is not None:
-        source.require_actions(model.env.action_dim)
+    labels = None if source.actions is None else real_actions(source, moves.rows, model.env.action_dim).to(device)
     parts: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
     for length in np.unique(source.lengths[kept]):
         same = kept[source.lengths[kept] == length]
@@ -89,14 +159,11 @@ def label_demonstrations(
             for i, episode in enumerate(chosen):
                 parts[int(episode)] = (parsed[i, :-1], imagined[i], latent.mean[i])
     order = [int(e) for e in kept]
-    steps = torch.tensor([int(source.lengths[e]) - 1 for e in order])
-    rows_of_steps = np.concatenate([source.starts[e] + np.arange(source.lengths[e] - 1) for e in order])
-    labels = None if source.actions is None else torch.from_numpy(np.array(source.actions[rows_of_steps])).to(device)
     return Demonstrations(
         slots=torch.cat([parts[e][0] for e in order]),
         imagined=torch.cat([parts[e][1] for e in order]),
         latents=torch.cat([parts[e][2] for e in order]),
-        actions=None if labels is None else labels.clamp(-1, 1),
-        episode=torch.repeat_interleave(torch.arange(len(order)), steps).to(device),
-        lengths=steps,
+        actions=labels,
+        episode=torch.from_numpy(moves.episode).to(device),
+        lengths=torch.from_numpy(moves.lengths),
     )

@@ -12,11 +12,9 @@ from typing import Any
 import numpy as np
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.evaluation.controllers import ClosedLoop
 from playslot_rl.evaluation.episodes import Actions, Controller, Episode, Moment, TaskPool, run_episodes
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.training.atomic import write_json
-from playslot_rl.world_model import Agent
 
 
 class RandomController:
@@ -62,7 +60,7 @@ def summary(episodes: Sequence[Episode]) -> dict[str, Any]:
 
 
 def run_references(
-    agent: Agent,
+    oracle: Controller | None,
     config: ExperimentConfig,
     seeds: Sequence[int],
     pool: TaskPool,
@@ -72,7 +70,7 @@ def run_references(
     """Results of `random`, `expert` and `slot_oracle`, always closed-loop.
 
     Args:
-        agent: its oracle is run; an agent without one gets null values.
+        oracle: the slot oracle beside the agent; None gives null values.
         config: environment and renderer.
         seeds: evaluation seeds.
         pool: environments.
@@ -83,8 +81,8 @@ def run_references(
         "random": RandomController(config.env.action_dim),
         "expert": ExpertController(),
     }
-    if agent.oracle is not None:
-        controllers["slot_oracle"] = ClosedLoop(agent, oracle=True)
+    if oracle is not None:
+        controllers["slot_oracle"] = oracle
     stored = _read_cache(cache)
     results: dict[str, dict[str, Any]] = {}
     for name, controller in controllers.items():
@@ -93,7 +91,7 @@ def run_references(
         if not weights or key not in stored:
             stored[key] = summary(run_episodes(pool, controller, seeds))
         results[name] = stored[key]
-    if agent.oracle is None:
+    if oracle is None:
         results["slot_oracle"] = {"success_rate": None, "ci95": None, "mean_steps_to_success": None}
     if cache is not None:
         kept = {k: v for k, v in stored.items() if oracle_fingerprint or not k.startswith("slot_oracle")}

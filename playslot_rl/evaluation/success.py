@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from playslot_rl.baselines.actor import Actor, ActorController
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.controllers import ClosedLoop, OpenLoop
@@ -37,36 +38,44 @@ class RunFacts:
         labelled_demos: those of them whose real actions were used; None if the run does not say.
         fingerprints: weights of each stage.
         commit: commit the policy was trained from.
+        method: a name of `playslot_rl.baselines.methods`.
+        extra: what the method's checkpoint says of its own (`pretraining`, `env_steps`).
     """
 
     demos: int | None = None
     labelled_demos: int | None = None
     fingerprints: dict[str, str] = field(default_factory=dict)
     commit: str = ""
+    method: str = "playslot"
+    extra: dict[str, Any] = field(default_factory=dict)
 
 
-def run_facts(run: Path) -> RunFacts:
-    """Read `RUN/policy/checkpoint/meta.json`.
+_EXTRA = ("pretraining", "env_steps")
+
+
+def run_facts(run: Path, stage: str = "policy") -> RunFacts:
+    """Read `RUN/STAGE/checkpoint/meta.json`; a baseline's stage has its method's name.
 
     Raises:
         CheckpointError: the run has no trained policy, or its meta file cannot be read.
     """
-    path = run / "policy" / "checkpoint" / "meta.json"
+    path = run / stage / "checkpoint" / "meta.json"
     if not path.is_file():
-        raise CheckpointError(
-            f"{run}: got no policy/checkpoint, expected a trained policy; run `playslot train-policy run={run}`"
-        )
+        command = f"train-policy run={run}" if stage == "policy" else f"train-baseline method={stage} out={run}"
+        raise CheckpointError(f"{run}: got no {stage}/checkpoint, expected a trained policy; run `playslot {command}`")
     try:
         meta: dict[str, Any] = json.loads(path.read_text())
     except json.JSONDecodeError as error:
         raise CheckpointError(f"{path}: got {error}, expected JSON; train the policy again") from error
     prints = {str(k): str(v) for k, v in meta.get("parents", {}).items()}
-    prints["policy"] = str(meta.get("fingerprint", ""))
+    prints[stage] = str(meta.get("fingerprint", ""))
     return RunFacts(
         demos=_count(meta.get("demos")),
         labelled_demos=_count(meta.get("labelled_demos")),
         fingerprints=prints,
         commit=str(meta.get("commit", "")),
+        method="playslot" if stage == "policy" else stage,
+        extra={name: meta[name] for name in _EXTRA if name in meta},
     )
 
 
@@ -116,35 +125,62 @@ def evaluate(
         ConfigError: unknown protocol, or a seed that a training data set holds.
     """
     check_protocol(protocol)
-    facts = facts or RunFacts()
+    agent.eval()
+    controller: Controller = ClosedLoop(agent) if protocol == "simulation" else OpenLoop(agent, config.env.max_steps)
+    oracle = None if agent.oracle is None else ClosedLoop(agent, oracle=True)
+    return measure(
+        controller, config, protocol, episodes, seed, facts=facts or RunFacts(), run=run, pool=pool, oracle=oracle
+    )
+
+
+def measure(
+    controller: Controller,
+    config: ExperimentConfig,
+    protocol: str,
+    episodes: int,
+    seed: int,
+    *,
+    facts: RunFacts,
+    run: Path | None = None,
+    pool: TaskPool | None = None,
+    oracle: Controller | None = None,
+) -> dict[str, Any]:
+    """Measure any controller; see `evaluate`.
+
+    Args:
+        controller: chooses the actions.
+        config, protocol, episodes, seed, facts, run, pool: as for `evaluate`.
+        oracle: the slot oracle among the references; None gives null values for it.
+
+    Raises:
+        ConfigError: a seed that a training data set holds.
+    """
     start = first_seed(config, seed)
     seeds = list(range(start, start + episodes))
     training = training_seeds(config, run)
     check_disjoint(seeds, training)
-    agent.eval()
     own = TaskPool(config.env, config.render) if pool is None else None
     used = pool or own
     assert used is not None
     begin = time.perf_counter()
     try:
-        controller: Controller = (
-            ClosedLoop(agent) if protocol == "simulation" else OpenLoop(agent, config.env.max_steps)
-        )
         outcome = run_episodes(used, controller, seeds)
         wall = time.perf_counter() - begin
-        references = _references(agent, config, seeds, used, facts, run)
+        references = _references(oracle, config, seeds, used, facts, run)
     finally:
         if own is not None:
             own.close()
     played = [e.seed for e in outcome]
     check_disjoint(played, training)  # a redrawn episode has another seed
     return {
+        "method": facts.method,
         "protocol": protocol,
         "episodes": episodes,
         "seeds": played,
         **summary(outcome),
         "labelled_demos": facts.labelled_demos,
         "demos": facts.demos,
+        **facts.extra,
         "references": references,
         "references_protocol": "simulation (closed loop), on the same seeds",
         "max_steps": config.env.max_steps,
@@ -160,13 +196,18 @@ def evaluate(
 
 
 def _references(
-    agent: Agent, config: ExperimentConfig, seeds: list[int], pool: TaskPool, facts: RunFacts, run: Path | None
+    oracle: Controller | None,
+    config: ExperimentConfig,
+    seeds: list[int],
+    pool: TaskPool,
+    facts: RunFacts,
+    run: Path | None,
 ) -> dict[str, dict[str, Any]]:
     if not config.evaluation.references:
         return {n: {"success_rate": None, "ci95": None} for n in ("random", "expert", "slot_oracle")}
     cache = None if run is None else run / "evaluation" / "references.json"
     weights = "-".join(facts.fingerprints[k] for k in ("slots", "policy") if facts.fingerprints.get(k))
-    return run_references(agent, config, seeds, pool, weights if "policy" in facts.fingerprints else "", cache)
+    return run_references(oracle, config, seeds, pool, weights if "policy" in facts.fingerprints else "", cache)
 
 
 def evaluate_run(
@@ -180,7 +221,42 @@ def evaluate_run(
     """
     episodes = config.episodes or DEFAULT_EPISODES
     result = evaluate(agent, config, protocol, episodes, config.seed, facts=run_facts(run), run=run, pool=pool)
-    folder = run / "evaluation" / protocol
+    return _stored(run, result)
+
+
+def evaluate_actor(
+    run: Path, actor: Actor, config: ExperimentConfig, device: torch.device, pool: TaskPool | None = None
+) -> dict[str, Any]:
+    """Evaluate a baseline's actor in closed loop, as `evaluate_run` does an agent; the same file, the same keys.
+
+    Raises:
+        ConfigError: protocol `imagination`, which only PlaySlot has.
+        CheckpointError: the run has no trained policy of `config.method`.
+        OutputError: the file cannot be written.
+    """
+    check_baseline_protocol(config)
+    facts, episodes = run_facts(run, config.method), config.episodes or DEFAULT_EPISODES
+    controller = ActorController(actor, device)
+    return _stored(
+        run, measure(controller, config, "simulation", episodes, config.seed, facts=facts, run=run, pool=pool)
+    )
+
+
+def check_baseline_protocol(config: ExperimentConfig) -> None:
+    """Refuse to evaluate a baseline in imagination.
+
+    Raises:
+        ConfigError: it was asked for.
+    """
+    if config.protocol != "simulation":
+        raise ConfigError(
+            f"protocol: got {config.protocol} for method={config.method}, expected simulation: "
+            "only PlaySlot acts in imagination"
+        )
+
+
+def _stored(run: Path, result: dict[str, Any]) -> dict[str, Any]:
+    folder = run / "evaluation" / str(result["protocol"])
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "eval_info.json", result)
     return result

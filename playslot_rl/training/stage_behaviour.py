@@ -19,11 +19,7 @@ from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.training.seeding import StepGenerators
-
-
-def _draw(count: int, batch: int, generators: StepGenerators, stream: str, device: torch.device) -> Tensor:
-    drawn = torch.randint(count, (batch,), generator=generators.torch(stream, "cpu"))
-    return drawn.to(device)
+from playslot_rl.training.stage_regression import RegressionStage, TensorInputs, draw_rows, unexplained
 
 
 def _inputs(demos: Demonstrations, config: BehaviourStageConfig) -> list[Tensor]:
@@ -60,40 +56,28 @@ class CloneStage:
             )
         self.policy, self.oracle, self.demos, self.config = policy, oracle, demos, config
         self.criterion = BehaviourLoss(policy, config.loss)
-        self.oracle_criterion: BehaviourLoss | None = None
-        if oracle is not None:
-            self.oracle_criterion = BehaviourLoss(oracle, config.loss)
-            self.oracle_criterion.set_keys(action=keys.ACTION)
-        self.inputs = torch.cat(_inputs(demos, config))
+        self.oracle_stage: RegressionStage | None = None
+        if oracle is not None and demos.actions is not None:
+            self.oracle_stage = oracle_stage(oracle, demos.slots, demos.actions, config)
+        self.inputs = TensorInputs(torch.cat(_inputs(demos, config)), config.slot_noise, "policy_noise")
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
         """Policy, and oracle if there is one."""
         return {"policy": self.policy} | ({"oracle": self.oracle} if self.oracle is not None else {})
 
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         """Cloning error of one batch; the networks share no weights, so the sum trains each as alone."""
-        demos, device = self.demos, self.inputs.device
-        rows = _draw(len(self.inputs), self.config.batch_size, generators, "policy", device)
+        demos = self.demos
+        rows = draw_rows(len(self.inputs), self.config.batch_size, generators, "policy", demos.slots.device)
         batch = {
-            keys.SLOTS: self._noisy(self.inputs[rows], generators, "policy_noise"),
+            keys.SLOTS: self.inputs.draw(rows, generators),
             keys.LATENT_ACTION: demos.latents[rows % len(demos.latents)],
         }
         losses = {"policy": self.criterion(TensorDict(batch, [len(rows)]))["loss_policy"]}
-        if self.oracle_criterion is not None and demos.actions is not None:
-            rows = _draw(len(demos.slots), self.config.batch_size, generators, "oracle", device)
-            batch = {
-                keys.SLOTS: self._noisy(demos.slots[rows], generators, "oracle_noise"),
-                keys.ACTION: demos.actions[rows],
-            }
-            losses["oracle"] = self.oracle_criterion(TensorDict(batch, [len(rows)]))["loss_policy"]
+        if self.oracle_stage is not None:
+            losses["oracle"] = self.oracle_stage.loss(step, generators)["loss"]
         return {"loss": torch.stack(list(losses.values())).sum(), **losses}
-
-    def _noisy(self, slots: Tensor, generators: StepGenerators, stream: str) -> Tensor:
-        if self.config.slot_noise == 0:
-            return slots
-        generator = generators.torch(stream, slots.device)
-        return slots + self.config.slot_noise * torch.randn(slots.shape, generator=generator, device=slots.device)
 
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
         """Unexplained fraction of the latents' variance on the demonstrations, from parsed and from imagined slots."""
@@ -103,7 +87,7 @@ class CloneStage:
         }
 
 
-class DecoderStage:
+class DecoderStage(RegressionStage):
     """Regress real actions of the labelled demonstrations.
 
     Note: with `config.decoder_inputs=policy` the inputs are the trained policy's outputs, on parsed slots and (with
@@ -125,36 +109,29 @@ class DecoderStage:
     ) -> None:
         if demos.actions is None:
             raise DataError("action decoder: got demonstrations without actions, expected the feature `action`")
-        self.decoder, self.config = decoder, config
-        self.criterion = ActionDecoderLoss(decoder, config.loss)
         rows = demos.labelled(config.labelled_demos)
         inputs = [] if config.decoder_inputs == "policy" else [demos.latents[rows]]
         if config.decoder_inputs != "inverse_dynamics":
             inputs += [_apply(policy, slots[rows]) for slots in _inputs(demos, config)]
-        self.inputs = torch.cat(inputs)
-        decoder.standardise(self.inputs)
-        self.targets = demos.actions[rows].repeat(len(inputs), 1)
-
-    @property
-    def modules(self) -> Mapping[str, nn.Module]:
-        """The action decoder."""
-        return {"action_decoder": self.decoder}
-
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """Regression error of one batch."""
-        rows = _draw(len(self.inputs), self.config.batch_size, generators, "decoder", self.inputs.device)
-        batch = TensorDict({keys.LATENT_ACTION: self.inputs[rows], keys.ACTION: self.targets[rows]}, [len(rows)])
-        return {"loss": self.criterion(batch)["loss_action"]}
-
-    def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
-        """Unexplained fraction of the actions' variance on the labelled demonstrations."""
-        return {"unexplained": unexplained(self.decoder(self.inputs), self.targets)}
+        latents = torch.cat(inputs)
+        decoder.standardise(latents)
+        super().__init__(
+            "action_decoder",
+            ActionDecoderLoss(decoder, config.loss),
+            TensorInputs(latents),
+            demos.actions[rows].repeat(len(inputs), 1),
+            config.batch_size,
+            stream="decoder",
+        )
 
 
-def unexplained(predicted: Tensor, target: Tensor) -> float:
-    """Fraction of the targets' variance that predictions leave unexplained (1 - R^2, pooled over dimensions)."""
-    spread = (target - target.mean(dim=0)).square().sum().clamp(min=1e-12)
-    return float((predicted - target).square().sum() / spread)
+def oracle_stage(oracle: LatentPolicy, slots: Tensor, actions: Tensor, config: BehaviourStageConfig) -> RegressionStage:
+    """The slot oracle's training: real actions (M, A) from parsed slots (M, N, D) of all demonstrations."""
+    criterion = BehaviourLoss(oracle, config.loss)
+    criterion.set_keys(action=keys.ACTION)
+    return RegressionStage(
+        "oracle", criterion, TensorInputs(slots, config.slot_noise, "oracle_noise"), actions, config.batch_size
+    )
 
 
 @torch.no_grad()

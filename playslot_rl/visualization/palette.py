@@ -31,6 +31,24 @@ DARK: Final = Theme(
 )
 
 
+@dataclass(frozen=True)
+class MethodStyle:
+    """How a method looks in every plot: index into a theme's series, and a matplotlib marker."""
+
+    colour: int
+    marker: str
+
+
+METHOD_STYLES: Final = {
+    "playslot": MethodStyle(0, "o"),
+    "lapo": MethodStyle(5, "s"),
+    "slot_oracle": MethodStyle(2, "^"),
+    "resnet_oracle": MethodStyle(1, "v"),
+    "dreamer": MethodStyle(3, "D"),
+    "sold": MethodStyle(4, "P"),
+}
+
+
 def rgb(colour: str) -> tuple[int, int, int]:
     """Red, green and blue in [0, 255] of `#rrggbb`."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

@@ -1,0 +1,1 @@
+../../playslot_rl/stage_config.py

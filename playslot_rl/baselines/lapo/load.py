@@ -1,0 +1,127 @@
+"""A trained LAPO run as an actor: frame to latent action by the latent policy, to a real action by the decoder.
+
+Shapes: B batch, H W image height and width, Z latent-action width, A action dim.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+
+from playslot_rl import keys
+from playslot_rl.baselines.actor import Actor
+from playslot_rl.baselines.lapo.config import LAPOConfig
+from playslot_rl.baselines.lapo.encoder import EncoderMLP
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.plain import to_dict
+from playslot_rl.world_model import action_decoder_module, normalise
+
+if TYPE_CHECKING:
+    from playslot_rl.training.checkpoints import StageCheckpoint
+
+NAME: Final = "lapo"
+MODEL: Final = "lapo_model"
+"""Stage of the inverse and forward model, the parent of the policy and the decoder."""
+
+
+class FramePolicy(nn.Module):
+    """LAPO's latent policy: one frame to a latent action.
+
+    Args:
+        config: sizes.
+        image_size: H = W.
+    """
+
+    def __init__(self, config: LAPOConfig, image_size: int) -> None:
+        super().__init__()
+        self.network = EncoderMLP(3, config.channels, image_size, config.hidden, config.latent_dim)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Frames (B, 3, H, W), uint8 or float [0, 1], to latent actions (B, Z)."""
+        z: Tensor = self.network(normalise(pixels))
+        return z
+
+
+def lapo_actor(policy: FramePolicy, decoder: ActionDecoder) -> Actor:
+    """The actor of networks in evaluation mode."""
+    from playslot_rl.baselines.slot_actor import ReactiveActor
+
+    choose = TensorDictModule(policy, in_keys=[keys.PIXELS], out_keys=[keys.LATENT_ACTION])
+    return ReactiveActor(TensorDictSequential(choose, action_decoder_module(decoder)))
+
+
+def stored_config(config: dict[str, Any], where: Path) -> LAPOConfig:
+    """LAPO's part of a checkpoint's config.
+
+    Raises:
+        CheckpointError: it is not one of this version.
+    """
+    from playslot_rl.config import from_dict
+    from playslot_rl.errors import CheckpointError
+
+    try:
+        return from_dict(LAPOConfig, config[NAME], f"{NAME}.")
+    except (KeyError, ValueError) as error:
+        raise CheckpointError(
+            f"{where}/config.json: {error}; expected LAPO's config of this version of playslot_rl: train it again"
+        ) from error
+
+
+def sizes_of(config: LAPOConfig) -> dict[str, Any]:
+    """The part of the config that inverse and forward model are built from."""
+    names = ("channels", "hidden", "groups", "code_dim", "codes", "decay", "dead_threshold", "commitment")
+    values = to_dict(config)
+    return {name: values[name] for name in names}
+
+
+def given_model(config: LAPOConfig, image_size: int, run: Path) -> StageCheckpoint:
+    """The inverse and forward model of the run `config.world`, after checking that `run` can build on it.
+
+    Raises:
+        CheckpointError: it is missing or damaged, of other sizes, or `run` has another one of its own.
+    """
+    from playslot_rl.training.checkpoints import (
+        checkpoint_folder,
+        read_stage,
+        require_adoptable,
+        require_config,
+        require_whole,
+        run_folder,
+    )
+
+    model = read_stage(checkpoint_folder(run_folder(config.world), MODEL), MODEL)
+    require_whole(model)
+    require_adoptable(model, run)
+    require_config(model, {"env": {"image_size": image_size}, NAME: sizes_of(config)})
+    return model
+
+
+def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
+    """The actor of a finished run.
+
+    Raises:
+        CheckpointError: it is missing or damaged, or was trained on another inverse model.
+    """
+    from playslot_rl.training.checkpoints import (
+        checkpoint_folder,
+        freeze_on,
+        load_weights,
+        read_stage,
+        require_parents,
+        stage_model,
+    )
+
+    done = read_stage(checkpoint_folder(run, NAME), NAME)
+    require_parents(done, {MODEL: read_stage(checkpoint_folder(run, MODEL), MODEL)})
+    config, (model, env) = stored_config(done.config, done.path), stage_model(done)
+    with torch.random.fork_rng(devices=[]):
+        policy = FramePolicy(config, env.image_size)
+        decoder = ActionDecoder(model.action_decoder, config.latent_dim, env.action_dim)
+    load_weights(done, {"policy": policy, "action_decoder": decoder})
+    freeze_on(policy, device)
+    freeze_on(decoder, device)
+    return lapo_actor(policy, decoder)

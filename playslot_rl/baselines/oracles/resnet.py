@@ -1,0 +1,172 @@
+"""The ResNet Oracle: the policy's head on ResNet-18 features of the frame, cloning real actions (paper, section 4).
+
+    a_t = clamp(f(R(o_t) + P), -1, 1)
+
+R is torchvision's ResNet-18 without pooling and classifier: its last feature map, read as h w tokens of 512, takes the
+place of the slots in the policy's network f; P is a learned position of each token. All of it is trained.
+
+Note: the paper does not say where in ResNet-18 the features are taken, nor whether it stays frozen. Frames are 64x64,
+so the last feature map is 2x2: as many tokens as ButtonPress has slots.
+
+Shapes: B batch, H W image height and width, h w those of the feature map (H / 32, W / 32), A action dim.
+"""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Literal
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from playslot_rl import keys
+from playslot_rl.baselines.actor import Actor
+from playslot_rl.baselines.slot_actor import ReactiveActor
+from playslot_rl.config import PolicyConfig
+from playslot_rl.errors import CheckpointError
+from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.world_model import normalise
+
+NAME = "resnet_oracle"
+WIDTH = 512
+Pretraining = Literal["imagenet", "scratch"]
+
+# Statistics of ImageNet, with which torchvision's weights were trained.
+_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+class ResNetPolicy(nn.Module):
+    """Real action from one frame.
+
+    Args:
+        config: sizes of the head.
+        image_size: H = W, a multiple of 32.
+        out_dim: A.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, config: PolicyConfig, image_size: int, out_dim: int) -> None:
+        from torchvision.models import resnet18
+
+        super().__init__()
+        trunk = resnet18(weights=None)
+        trunk.avgpool, trunk.fc = nn.Identity(), nn.Identity()
+        self.trunk = trunk
+        self.position = nn.Parameter(torch.randn((image_size // 32) ** 2, WIDTH) * 0.02)
+        self.head = LatentPolicy(config, WIDTH, out_dim)
+        self.register_buffer("mean", torch.tensor(_MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(_STD).view(3, 1, 1), persistent=False)
+
+    def features(self, pixels: Tensor) -> Tensor:
+        """Frames (B, 3, H, W), uint8 or float [0, 1], to tokens (B, h w, 512)."""
+        flat: Tensor = self.trunk((normalise(pixels) - self.mean) / self.std)
+        return flat.view(len(flat), WIDTH, -1).transpose(1, 2)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Frames (B, 3, H, W), uint8 or float [0, 1], to actions (B, A), not clamped."""
+        actions: Tensor = self.head(self.features(pixels) + self.position)
+        return actions
+
+
+def load_pretrained(policy: ResNetPolicy, weights: str) -> Pretraining:
+    """Give the trunk its starting weights.
+
+    Args:
+        policy: changed in place.
+        weights: `auto`, `scratch`, `download` or a path, see `ResNetOracleConfig`.
+
+    Returns:
+        Which they are.
+
+    Raises:
+        CheckpointError: the file is missing, damaged or not ResNet-18's, or cannot be fetched.
+    """
+    if weights == "scratch":
+        return "scratch"
+    path = cached_weights() if weights in ("auto", "download") else Path(weights)
+    if weights == "auto" and not path.is_file():
+        return "scratch"
+    if weights == "download" and not path.is_file():
+        _download(path)
+    state = {name: value for name, value in _read(path).items() if not name.startswith("fc.")}
+    own = policy.trunk.state_dict()
+    wrong = sorted(name for name in own if name not in state or state[name].shape != own[name].shape)
+    if wrong:
+        raise CheckpointError(
+            f"baselines.resnet_oracle.weights={path}: got no tensor {wrong[0]} of its shape, expected the weights of "
+            "torchvision's ResNet-18: give another file, or set it to scratch"
+        )
+    policy.trunk.load_state_dict({name: state[name] for name in own})
+    return "imagenet"
+
+
+def cached_weights() -> Path:
+    """Where torchvision keeps ResNet-18's ImageNet weights, there or not."""
+    from torchvision.models import ResNet18_Weights
+
+    return Path(torch.hub.get_dir()) / "checkpoints" / Path(ResNet18_Weights.IMAGENET1K_V1.url).name
+
+
+def _download(path: Path) -> None:
+    from torchvision.models import ResNet18_Weights
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        torch.hub.download_url_to_file(ResNet18_Weights.IMAGENET1K_V1.url, str(path), progress=False)
+    except OSError as error:
+        raise CheckpointError(
+            f"baselines.resnet_oracle.weights=download: got {error}, expected a network: put the file at {path}, "
+            "or set it to scratch"
+        ) from error
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    if path.suffix == ".safetensors":
+        from playslot_rl.training.tensors import load_tensors
+
+        return load_tensors(path)
+    try:
+        # Published as a pickle; read as tensors only.
+        state: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
+        raise CheckpointError(
+            f"baselines.resnet_oracle.weights={path}: got {str(error).splitlines()[0]}, expected a file of ResNet-18's "
+            "weights: check the path, or set it to scratch"
+        ) from error
+    return state
+
+
+class _Clamped(nn.Module):
+    def __init__(self, policy: ResNetPolicy) -> None:
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        actions: Tensor = self.policy(pixels)
+        return actions.clamp(-1, 1)
+
+
+def resnet_actor(policy: ResNetPolicy) -> Actor:
+    """The actor of a policy in evaluation mode; actions clamped to [-1, 1]."""
+    return ReactiveActor(TensorDictModule(_Clamped(policy), in_keys=[keys.PIXELS], out_keys=[keys.ACTION]))
+
+
+def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
+    """The actor of a finished run.
+
+    Raises:
+        CheckpointError: it is missing or damaged.
+    """
+    from playslot_rl.training.checkpoints import checkpoint_folder, freeze_on, load_weights, read_stage, stage_model
+
+    done = read_stage(checkpoint_folder(run, NAME), NAME)
+    model, env = stage_model(done)
+    with torch.random.fork_rng(devices=[]):
+        policy = ResNetPolicy(model.policy, env.image_size, env.action_dim)
+    load_weights(done, {"policy": policy})
+    freeze_on(policy, device)
+    return resnet_actor(policy)

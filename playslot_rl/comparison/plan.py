@@ -1,0 +1,193 @@
+"""Which jobs a comparison has: one for each method, number of demonstrations and training seed.
+
+A job is a file, `OUT/jobs/NAME.json`, that says everything; `python -m playslot_rl.recipes.compare_job FILE` runs it,
+on any machine that sees the folder, and running it again carries on or does nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from playslot_rl.baselines.methods import METHODS, MethodName
+from playslot_rl.comparison.config import LAUNCHERS
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.envs import gym_id
+from playslot_rl.errors import CheckpointError, ConfigError
+
+_OF_THE_MACHINE = ("device", "threads", "workers", "logging", "collector", "compare", "preset")
+"""Config that says where and how loudly a job runs, not what comes out."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training and its evaluation.
+
+    Attributes:
+        method: what is trained.
+        demos: demonstrations it learns from; None for a method that acts.
+        seed: of the training.
+        out: folder of the comparison.
+    """
+
+    method: MethodName
+    demos: int | None
+    seed: int
+    out: Path
+
+    @property
+    def name(self) -> str:
+        """Such as `lapo-d50-s0`, or `dreamer-s0`."""
+        demos = "" if self.demos is None else f"-d{self.demos}"
+        return f"{self.method}{demos}-s{self.seed}"
+
+    @property
+    def file(self) -> Path:
+        """What it is told."""
+        return self.out / "jobs" / f"{self.name}.json"
+
+    @property
+    def run(self) -> Path:
+        """The run folder it writes."""
+        return self.out / "runs" / self.name
+
+    @property
+    def stage(self) -> str:
+        """Stage of the run whose checkpoint is the method's."""
+        return "policy" if self.method == "playslot" else self.method
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """How it is evaluated."""
+        return ("simulation", "imagination") if self.method == "playslot" else ("simulation",)
+
+
+def jobs(config: ExperimentConfig, out: Path) -> list[Job]:
+    """All jobs, in the order in which they run: few demonstrations first, the methods side by side."""
+    wanted = config.compare
+    offline = [m for m in wanted.methods if not METHODS[m].online]
+    online = [m for m in wanted.methods if METHODS[m].online]
+    return [
+        *(Job(m, n, s, out) for s in wanted.seeds for n in sorted(wanted.demos) for m in offline),
+        *(Job(m, None, s, out) for s in wanted.seeds for m in online),
+    ]
+
+
+def uses_demos(config: ExperimentConfig) -> bool:
+    """Whether a method learns from demonstrations."""
+    return any(not METHODS[m].online for m in config.compare.methods)
+
+
+def uses_slots(config: ExperimentConfig) -> bool:
+    """Whether a method builds on a world model."""
+    return any(METHODS[m].slots for m in config.compare.methods)
+
+
+def check_comparison(config: ExperimentConfig) -> None:
+    """Refuse what cannot be compared, before anything is computed.
+
+    Raises:
+        ConfigError: an environment without simulator, or without dense reward for a method that acts; a launcher that
+            is not installed; the shipped world model of another task.
+        CheckpointError: `run` is no finished world model.
+    """
+    env, wanted = config.env, config.compare
+    gym_id(env.name)
+    online = [m for m in wanted.methods if METHODS[m].online]
+    if online and env.blocks.reward == "sparse" and env.name.startswith("block_"):
+        raise ConfigError(
+            f"env.blocks.reward: got sparse with {', '.join(online)}, expected dense: a method that learns by acting "
+            "needs a dense reward; set env.blocks.reward=dense or leave it out of methods="
+        )
+    if wanted.launcher and importlib.util.find_spec(LAUNCHERS[wanted.launcher].split(".")[0]) is None:
+        raise _no_launcher(wanted.launcher)
+    if wanted.launcher and importlib.util.find_spec(LAUNCHERS[wanted.launcher]) is None:
+        raise _no_launcher(wanted.launcher)
+    if uses_slots(config) and config.run:
+        from playslot_rl.training.checkpoints import require_config, world_model_checkpoints
+
+        for checkpoint in world_model_checkpoints(config.run).values():
+            require_config(checkpoint, {"env": {"image_size": env.image_size, "action_dim": env.action_dim}})
+            trained_on = checkpoint.config.get("env", {}).get("name")
+            if trained_on != env.name:
+                raise CheckpointError(
+                    f"run={config.run}: got a world model of env={trained_on}, expected env={env.name}: leave run= "
+                    "out to train one"
+                )
+
+
+def _no_launcher(name: str) -> ConfigError:
+    return ConfigError(
+        f"hydra.launcher: got {name}, expected an installed launcher: install it by `uv pip install -e '.[launchers]'`"
+    )
+
+
+def check_demos(config: ExperimentConfig, episodes: int, where: str) -> None:
+    """Refuse more demonstrations than there are.
+
+    Raises:
+        ConfigError: there are fewer.
+    """
+    most = max(config.compare.demos)
+    if most > episodes:
+        raise ConfigError(
+            f"demos: got {most}, expected at most the {episodes} demonstrations of {where}: lower it or collect more"
+        )
+
+
+def job_config(config: ExperimentConfig, job: Job, world: str, lapo_world: str) -> ExperimentConfig:
+    """What a job trains with.
+
+    Labels are `behaviour.labelled_demos` or, with fewer demonstrations than that, all of them. PlaySlot's own oracle
+    and the references of each evaluation are left out: the slot oracle is a method, and the references run once.
+
+    Args:
+        config: of the comparison, with `data` complete.
+        job: which one.
+        world: run folder of the world model, or `pretrained`.
+        lapo_world: run folder of LAPO's inverse and forward model.
+    """
+    labelled = min(config.behaviour.labelled_demos, job.demos or config.behaviour.labelled_demos)
+    lapo = replace(config.baselines.lapo, world=lapo_world)
+    return replace(
+        config,
+        method=job.method,
+        demos=job.demos,
+        seed=job.seed,
+        out=str(job.run),
+        run=world if METHODS[job.method].slots else "",
+        protocol="simulation",
+        behaviour=replace(config.behaviour, labelled_demos=labelled, oracle=False),
+        baselines=replace(config.baselines, lapo=lapo),
+        evaluation=replace(config.evaluation, references=False),
+        logging=replace(config.logging, progress=False),
+    )
+
+
+def job_record(job: Job, config: ExperimentConfig, parents: Mapping[str, str]) -> dict[str, Any]:
+    """What the job's file says.
+
+    Args:
+        job: which one.
+        config: its own (`job_config`).
+        parents: fingerprints of the weights it builds on, by stage.
+    """
+    values = to_dict(config)
+    result = {key: value for key, value in values.items() if key not in _OF_THE_MACHINE}
+    identity = json.dumps([result, config.compare.evaluation_seed, dict(parents)], sort_keys=True)
+    return {
+        "name": job.name,
+        "method": job.method,
+        "demos": job.demos,
+        "seed": job.seed,
+        "evaluation_seed": config.compare.evaluation_seed,
+        "protocols": list(job.protocols),
+        "stage": job.stage,
+        "fingerprint": hashlib.sha256(identity.encode()).hexdigest()[:16],
+        "config": values,
+    }

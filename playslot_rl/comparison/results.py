@@ -1,0 +1,129 @@
+"""What came out of a comparison: one row a job and protocol, and their summary over training seeds."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from playslot_rl.baselines.methods import METHODS
+from playslot_rl.comparison.plan import Job
+from playslot_rl.comparison.status import read_status
+from playslot_rl.evaluation.intervals import wilson
+
+
+def job_rows(job: Job) -> list[dict[str, Any]]:
+    """One row for each protocol of a job, finished or not.
+
+    Keys: `name`, `method`, `title`, `protocol`, `demos`, `seed`, `status`, `error`, `labelled_demos`, `env_steps`,
+    `success_rate`, `successes`, `episodes`, `ci95` (Wilson), `mean_steps_to_success`, `train_seconds`,
+    `evaluation_seconds`, `parameters`, `pretraining` (null where there is nothing to say), `curve` (rows of an online
+    method's learning curve).
+    """
+    status = read_status(job.file)
+    meta = _read(job.run / job.stage / "checkpoint" / "meta.json") if status.status == "done" else {}
+    rows = []
+    for protocol in job.protocols:
+        info = _read(job.run / "evaluation" / protocol / "eval_info.json") if status.status == "done" else {}
+        episodes, rate = info.get("episodes"), info.get("success_rate")
+        rows.append(
+            {
+                "name": job.name,
+                "method": job.method,
+                "title": METHODS[job.method].title,
+                "protocol": protocol,
+                "demos": job.demos,
+                "seed": job.seed,
+                "status": status.status,
+                "error": status.error or None,
+                "labelled_demos": None if METHODS[job.method].online else meta.get("labelled_demos"),
+                "env_steps": meta.get("env_steps"),
+                "success_rate": rate,
+                "successes": None if rate is None else round(rate * info["episodes"]),
+                "episodes": episodes,
+                "ci95": info.get("ci95"),
+                "mean_steps_to_success": info.get("mean_steps_to_success"),
+                "train_seconds": meta.get("seconds"),
+                "evaluation_seconds": info.get("wall_seconds"),
+                "parameters": count_parameters(job.run, job.stage) if meta else None,
+                "pretraining": meta.get("pretraining"),
+                "curve": learning_curve(job) if METHODS[job.method].online else None,
+            }
+        )
+    return rows
+
+
+def learning_curve(job: Job) -> list[dict[str, Any]] | None:
+    """Rows of `RUN/METHOD/curve.json`, there before the job is done too; None without one."""
+    values: Any = _read(job.run / job.stage / "curve.json")
+    rows = values.get("rows") if isinstance(values, dict) else values
+    return rows or None
+
+
+def count_parameters(run: Path, stage: str) -> int:
+    """Floating-point numbers in a run's checkpoint and in those of its parents (weights, and a few buffers)."""
+    from playslot_rl.training.checkpoints import checkpoint_folder, world_model_folder
+
+    parents = _read(checkpoint_folder(run, stage) / "meta.json").get("parents", {})
+    folders = [checkpoint_folder(run, stage)]
+    for name in parents:
+        own = checkpoint_folder(run, name)
+        folders.append(own if own.is_dir() else checkpoint_folder(world_model_folder(run), name))
+    return sum(_numbers(folder / "weights.safetensors") for folder in folders)
+
+
+def _numbers(path: Path) -> int:
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as file:
+        slices = [file.get_slice(key) for key in file.keys()]  # noqa: SIM118  no mapping
+        return sum(math.prod(part.get_shape()) for part in slices if part.get_dtype().startswith(("F", "BF")))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A JSON file, or nothing where it is missing or damaged: a row then has nulls."""
+    try:
+        values: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return values
+
+
+def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of finished jobs, pooled over training seeds.
+
+    Keys: `method`, `title`, `protocol`, `demos`, `env_steps`, `seeds`, `success_rate` (mean over the seeds), `ci95`
+    (Wilson, all episodes of all seeds pooled), `lowest` and `highest` (of a seed), `episodes`, `labelled_demos`.
+    """
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        if row["success_rate"] is not None:
+            groups.setdefault((row["method"], row["protocol"], row["demos"]), []).append(row)
+    summary = []
+    for (method, protocol, demos), group in groups.items():
+        successes, episodes = sum(r["successes"] for r in group), sum(r["episodes"] for r in group)
+        rates = [r["success_rate"] for r in group]
+        summary.append(
+            {
+                "method": method,
+                "title": METHODS[method].title,
+                "protocol": protocol,
+                "demos": demos,
+                "env_steps": group[0]["env_steps"],
+                "seeds": sorted(r["seed"] for r in group),
+                "success_rate": sum(rates) / len(rates),
+                "ci95": list(wilson(successes, episodes)),
+                "lowest": min(rates),
+                "highest": max(rates),
+                "episodes": episodes,
+                "labelled_demos": group[0]["labelled_demos"],
+            }
+        )
+    return summary
+
+
+def failures(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """One row for each job that is not done."""
+    return list({row["name"]: row for row in rows if row["status"] != "done"}.values())

@@ -1,0 +1,66 @@
+"""How a job stands: `OUT/jobs/NAME.status.json`, and the lock that lets one process at a time work on it."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from playslot_rl.plain import from_dict
+from playslot_rl.training.atomic import write_json
+
+
+@dataclass(frozen=True)
+class Status:
+    """How a job stands.
+
+    Attributes:
+        status: `waiting`, `running`, `done` or `failed`.
+        fingerprint: of the job as it was when this was written.
+        error: one line, of a failed job.
+        seconds: wall-clock seconds of the process that wrote this.
+    """
+
+    status: Literal["waiting", "running", "done", "failed"] = "waiting"
+    fingerprint: str = ""
+    error: str = ""
+    seconds: float = 0.0
+
+
+def status_file(job_file: Path) -> Path:
+    """`NAME.status.json` beside `NAME.json`."""
+    return job_file.with_suffix(".status.json")
+
+
+def log_file(job_file: Path) -> Path:
+    """`NAME.log` beside `NAME.json`: what the job printed."""
+    return job_file.with_suffix(".log")
+
+
+def read_status(job_file: Path) -> Status:
+    """The stored status; `waiting` where there is none, or no readable one."""
+    try:
+        return from_dict(Status, json.loads(status_file(job_file).read_text()))
+    except (OSError, ValueError):
+        return Status()
+
+
+def write_status(job_file: Path, status: Status) -> None:
+    """Store a status.
+
+    Raises:
+        OutputError: full disk.
+    """
+    write_json(status_file(job_file), asdict(status))
+
+
+@contextlib.contextmanager
+def job_lock(job_file: Path) -> Iterator[None]:
+    """Wait until no other process works on the job. The lock ends with its process, however that ends."""
+    with job_file.with_suffix(".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield

@@ -1,0 +1,174 @@
+"""`comparison.md`: the table, the plot and the footnotes of a comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from playslot_rl.comparison.results import failures
+
+Result = Mapping[str, Any]
+
+
+def comparison_page(result: Result) -> str:
+    """The page, Markdown.
+
+    Args:
+        result: what `comparison.json` holds.
+    """
+    lead = (
+        f"Preset `{result['preset']}`, training seeds {_list(result['seeds'])}, {result['episodes']} held-out episodes "
+        f"(block {result['evaluation_seed']} of the evaluation seeds, the same for every method and seed), at most "
+        f"{result['max_steps']} agent steps. Success is the mean over the training seeds; in brackets the 95 % Wilson "
+        "interval of all their episodes together, which share their starts, and after it the lowest and the highest "
+        "seed."
+    )
+    parts = [
+        f"# {result['env']}: success against demonstrations",
+        lead,
+        "![Success rate](comparison.png)",
+        *_offline(result["summary"]),
+        *_online(result["summary"]),
+        "## Footnotes",
+        "\n".join(f"- {note}" for note in _footnotes(result)),
+        "## Every job",
+        _jobs(result["rows"]),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _offline(summary: Sequence[Result]) -> list[str]:
+    rows = [row for row in summary if row["demos"] is not None]
+    if not rows:
+        return []
+    numbers = sorted({row["demos"] for row in rows})
+    series = list(dict.fromkeys((row["title"], row["protocol"]) for row in rows))
+    cells = {(row["title"], row["protocol"], row["demos"]): cell(row) for row in rows}
+    body = [[f"{t}, {p}", *(cells.get((t, p, n), "–") for n in numbers)] for t, p in series]
+    return ["## By demonstrations", table(["", *(f"{n} demonstrations" for n in numbers)], body)]
+
+
+def _online(summary: Sequence[Result]) -> list[str]:
+    rows = [row for row in summary if row["demos"] is None]
+    if not rows:
+        return []
+    body = [[row["title"], _number(row["env_steps"]), cell(row)] for row in rows]
+    return ["## By acting", table(["", "environment steps", "success"], body)]
+
+
+def cell(row: Result) -> str:
+    """Rate, interval and range of the seeds: `97 % (93 to 99; seeds 96 to 98)`."""
+    low, high = (100 * end for end in row["ci95"])
+    text = f"{100 * row['success_rate']:.0f} % ({low:.0f} to {high:.0f}"
+    if len(row["seeds"]) > 1:
+        text += f"; seeds {100 * row['lowest']:.0f} to {100 * row['highest']:.0f}"
+    return f"{text})"
+
+
+def _footnotes(result: Result) -> list[str]:
+    rows: Sequence[Result] = result["rows"]
+    done = [row for row in rows if row["status"] == "done"]
+    notes = [f"{name}: {_reference(value)}, on the same episodes." for name, value in result["references"].items()]
+    notes += [
+        f"Labels: {row['title']} saw the real actions of {row['labels']}."
+        for row in ({"title": t, "labels": _labels(done, t)} for t in _titles(done) if _labels(done, t))
+    ]
+    notes += _one_each(
+        done,
+        "env_steps",
+        "Environment steps (agent steps) of {title}: {value}, those of the videos its slots were trained on included.",
+    )
+    notes += _one_each(done, "pretraining", "{title} starts from {value} weights.")
+    notes += _one_each(done, "parameters", "Parameters, those of the models it builds on included: {title} {value}.")
+    notes.append(_times(done, result))
+    world = result.get("world_model")
+    if world:
+        notes.append(
+            f"The world model ({world['source']}; slots {world['fingerprints']['slots']}, "
+            f"{world['seconds']:.0f} s of training) is the same for all methods, demonstrations and seeds."
+        )
+    missing = failures(rows)
+    notes += [f"**{row['name']}: {row['status']}.** {row['error'] or ''}".rstrip() for row in missing]
+    notes.append("Failures: none." if not missing else f"Failures: {len(missing)} of {result['jobs']} jobs, see above.")
+    notes.append(f"Made by `{result['command']}` at commit {result['commit'] or 'unknown'}; {_machine(result)}.")
+    return notes
+
+
+def _titles(rows: Sequence[Result]) -> list[str]:
+    return list(dict.fromkeys(row["title"] for row in rows))
+
+
+def _labels(rows: Sequence[Result], title: str) -> str:
+    pairs = {row["demos"]: row["labelled_demos"] for row in rows if row["title"] == title}
+    pairs = {demos: labels for demos, labels in pairs.items() if labels is not None}
+    return _list(f"{labels} of {demos}" for demos, labels in sorted(pairs.items())) + (
+        " demonstrations" if pairs else ""
+    )
+
+
+def _one_each(rows: Sequence[Result], key: str, text: str) -> list[str]:
+    notes = []
+    for title in _titles(rows):
+        values = sorted({row[key] for row in rows if row["title"] == title and row[key] is not None})
+        if values:
+            notes.append(text.format(title=title, value=_list(map(_number, values))))
+    return notes
+
+
+def _times(rows: Sequence[Result], result: Result) -> str:
+    parts = []
+    for title in _titles(rows):
+        unique = {row["name"]: row for row in rows if row["title"] == title}
+        trained = [row["train_seconds"] or 0.0 for row in unique.values()]
+        played = sum(row["evaluation_seconds"] or 0.0 for row in rows if row["title"] == title)
+        mean = sum(trained) / len(trained)
+        parts.append(f"{title} {mean:.0f} s a training, {played / len(unique):.0f} s its evaluation")
+    whole = f"{result['seconds']:.0f} s of wall time for the whole, data and world model included where they were made"
+    return f"Time: {'; '.join([*parts, whole])}."
+
+
+def _reference(value: Result) -> str:
+    if value["success_rate"] is None:
+        return "not run"
+    low, high = value["ci95"]
+    return f"{100 * value['success_rate']:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
+
+
+def _machine(result: Result) -> str:
+    at = result["hardware"]
+    return f"{at['machine']}, {at['cores']} cores, {at['gpu'] or 'no GPU'}"
+
+
+def _jobs(rows: Sequence[Result]) -> str:
+    headers = ["job", "protocol", "status", "success", "labels", "environment steps", "training", "evaluation"]
+    body = [
+        [
+            row["name"],
+            row["protocol"],
+            row["status"],
+            "–" if row["success_rate"] is None else f"{row['successes']} of {row['episodes']}",
+            _number(row["labelled_demos"]),
+            _number(row["env_steps"]),
+            "–" if row["train_seconds"] is None else f"{row['train_seconds']:.0f} s",
+            "–" if row["evaluation_seconds"] is None else f"{row['evaluation_seconds']:.0f} s",
+        ]
+        for row in rows
+    ]
+    return table(headers, body)
+
+
+def table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = ["| " + " | ".join(headers) + " |", "|" + " --- |" * len(headers)]
+    lines += ["| " + " | ".join(value.replace("|", "\\|") for value in row) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def _number(value: object) -> str:
+    if value is None:
+        return "–"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def _list(values: Iterable[object]) -> str:
+    return ", ".join(map(str, values))

@@ -1,0 +1,134 @@
+"""Supervised regression as a stage of `fit`: one network, inputs by row, targets by row.
+
+The oracles, the action decoders and LAPO's latent policy are all trained by it.
+
+Shapes: M rows of training data, b rows of a batch; inputs and targets have any shape after their first dimension.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from playslot_rl.config import Precision
+from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
+from playslot_rl.training.seeding import StepGenerators
+
+
+class Inputs(Protocol):
+    """What a network regresses from, by row."""
+
+    def __len__(self) -> int:
+        """M."""
+
+    def draw(self, rows: Tensor, generators: StepGenerators) -> Tensor:
+        """Inputs (b, ...) of rows int64 (b,) for training, with noise or augmentation drawn from `generators`."""
+
+    def plain(self, rows: Tensor) -> Tensor:
+        """Inputs (b, ...) of rows, as they are."""
+
+
+class TensorInputs:
+    """Rows of a tensor (M, ...), with Gaussian noise in training.
+
+    Args:
+        values: on the device that computes.
+        noise: standard deviation; 0 adds none.
+        stream: name of the noise's generator.
+    """
+
+    def __init__(self, values: Tensor, noise: float = 0.0, stream: str = "noise") -> None:
+        self.values, self.noise, self.stream = values, noise, stream
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def draw(self, rows: Tensor, generators: StepGenerators) -> Tensor:
+        """Rows, with noise."""
+        values = self.values[rows]
+        if self.noise == 0:
+            return values
+        generator = generators.torch(self.stream, values.device)
+        return values + self.noise * torch.randn(values.shape, generator=generator, device=values.device)
+
+    def plain(self, rows: Tensor) -> Tensor:
+        """Rows, without noise."""
+        return self.values[rows]
+
+
+class RegressionStage:
+    """Regress targets (M, ...) from inputs, rows drawn uniformly with replacement.
+
+    Args:
+        name: of the network in checkpoints, and of the generator that draws the rows.
+        criterion: compares `criterion.network`'s outputs, trained in place, with the targets.
+        inputs: M of them.
+        targets: (M, ...), on the device that computes.
+        batch_size: b.
+        validated: at most so many rows, evenly spread, are looked at in a validation; 0 takes all.
+        stream: name of the generator that draws the rows; `name` if empty.
+        precision: `bf16` trains the network under autocast; it is validated in fp32.
+
+    Raises:
+        ValueError: numbers of inputs and targets differ.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        criterion: BehaviourLoss | ActionDecoderLoss,
+        inputs: Inputs,
+        targets: Tensor,
+        batch_size: int,
+        *,
+        validated: int = 0,
+        stream: str = "",
+        precision: Precision = "fp32",
+    ) -> None:
+        if len(inputs) != len(targets):
+            raise ValueError(f"{name}: got {len(targets)} targets, expected one for each of {len(inputs)} inputs")
+        self.name, self.criterion, self.stream = name, criterion, stream or name
+        self.inputs, self.targets, self.batch_size, self.validated = inputs, targets, batch_size, validated
+        self.precision = precision
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """The network."""
+        return {self.name: self.criterion.network}
+
+    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        """Error of one batch."""
+        rows = draw_rows(len(self.targets), self.batch_size, generators, self.stream, self.targets.device)
+        names = self.criterion.tensor_keys
+        batch = {names.observation: self.inputs.draw(rows, generators), names.action: self.targets[rows]}
+        with torch.autocast(self.targets.device.type, torch.bfloat16, enabled=self.precision == "bf16"):
+            losses = self.criterion(TensorDict(batch, [len(rows)]))
+        return {"loss": losses[self.criterion.out_name]}
+
+    def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
+        """Unexplained fraction of the targets' variance on the training data."""
+        count = min(self.validated or len(self.targets), len(self.targets))
+        rows = torch.linspace(0, len(self.targets) - 1, count, device=self.targets.device).long()
+        return {"unexplained": unexplained(apply_rows(self.criterion.network, self.inputs, rows), self.targets[rows])}
+
+
+def draw_rows(count: int, batch: int, generators: StepGenerators, stream: str, device: torch.device) -> Tensor:
+    """Row numbers (batch,) in [0, count), int64."""
+    drawn = torch.randint(count, (batch,), generator=generators.torch(stream, "cpu"))
+    return drawn.to(device)
+
+
+@torch.no_grad()
+def apply_rows(network: nn.Module, inputs: Inputs, rows: Tensor, batch: int = 1024) -> Tensor:
+    """A network's outputs (b, ...) on rows of its inputs, in the mode it is in."""
+    return torch.cat([network(inputs.plain(part)) for part in rows.split(batch)])
+
+
+def unexplained(predicted: Tensor, target: Tensor) -> float:
+    """Fraction of the targets' variance that predictions leave unexplained (1 - R^2, pooled over dimensions)."""
+    spread = (target - target.mean(dim=0)).square().sum().clamp(min=1e-12)
+    return float((predicted - target).square().sum() / spread)

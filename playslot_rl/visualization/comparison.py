@@ -1,0 +1,128 @@
+"""The plot of a comparison: success against demonstrations, and against environment steps for methods that act."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from playslot_rl.visualization.charts import _figure, _style
+from playslot_rl.visualization.palette import METHOD_STYLES, Theme
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Result = Mapping[str, Any]
+
+
+def comparison_figure(result: Result, theme: Theme) -> Figure:
+    """Draw a comparison.
+
+    A method has its colour and marker everywhere; imagination is dashed. Bars are 95 % Wilson intervals over the
+    episodes of all seeds, small dots are single seeds, the grey lines the references.
+
+    Args:
+        result: what `comparison.json` holds.
+        theme: page.
+    """
+    offline = [row for row in result["summary"] if row["demos"] is not None]
+    curves = [row for row in result["rows"] if row["curve"]]
+    final = [row for row in result["summary"] if row["demos"] is None]
+    online = bool(curves or final)
+    figure = _figure(9.6 if offline and online else 6.4, 3.9)
+    panels = int(bool(offline)) + int(online) or 1
+    handles: dict[str, Any] = {}
+    if offline or not online:
+        axes = figure.add_subplot(1, panels, 1)
+        _demonstrations(axes, offline, result["rows"], theme)
+        _finish(axes, result, theme)
+        handles |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    if online:
+        axes = figure.add_subplot(1, panels, panels)
+        _steps(axes, curves, final, theme)
+        _finish(axes, result, theme)
+        handles |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    if handles:
+        figure.legend(
+            handles.values(),
+            handles.keys(),
+            loc="outside lower center",
+            ncols=3,
+            frameon=False,
+            labelcolor=theme.text,
+            fontsize=9,
+        )
+    return figure
+
+
+def figure_bytes(figure: Figure, theme: Theme, kind: str) -> bytes:
+    """A figure as `png` or `svg`, the same bytes for the same figure."""
+    import matplotlib as mpl
+
+    buffer = io.BytesIO()
+    metadata = {"Date": None} if kind == "svg" else {}
+    with mpl.rc_context({"svg.hashsalt": "playslot_rl", "svg.fonttype": "none"}):
+        figure.savefig(buffer, format=kind, dpi=144, facecolor=theme.ground, metadata=metadata)
+    return buffer.getvalue()
+
+
+def _demonstrations(axes: Axes, summary: Sequence[Result], rows: Sequence[Result], theme: Theme) -> None:
+    series = list(dict.fromkeys((row["method"], row["protocol"], row["title"]) for row in summary))
+    numbers = sorted({row["demos"] for row in summary})
+    for index, (method, protocol, title) in enumerate(series):
+        style, own = METHOD_STYLES[method], [r for r in summary if (r["method"], r["protocol"]) == (method, protocol)]
+        own.sort(key=lambda row: row["demos"])
+        # Side by side, so that equal rates do not hide each other; by a factor, since the axis is logarithmic.
+        aside = 1.035 ** (index - (len(series) - 1) / 2)
+        x, y = [row["demos"] * aside for row in own], [100 * row["success_rate"] for row in own]
+        below = [max(0.0, 100 * (row["success_rate"] - row["ci95"][0])) for row in own]
+        above = [max(0.0, 100 * (row["ci95"][1] - row["success_rate"])) for row in own]
+        dream = protocol == "imagination"
+        colour = theme.series[style.colour]
+        axes.errorbar(
+            x, y, [below, above], color=colour, marker=style.marker, markersize=6, linewidth=1.6,
+            linestyle="--" if dream else "-", markerfacecolor=theme.ground if dream else colour, capsize=2,
+            elinewidth=1.2, label=f"{title}, imagination" if dream else title,
+        )  # fmt: skip
+        single = [
+            r for r in rows if (r["method"], r["protocol"]) == (method, protocol) and r["success_rate"] is not None
+        ]
+        if len({row["seed"] for row in single}) > 1:
+            dots = [row["demos"] * aside for row in single]
+            axes.plot(dots, [100 * row["success_rate"] for row in single], ".", color=colour, markersize=4, alpha=0.5)
+    axes.set_xscale("log")
+    axes.set_xticks(numbers, [str(n) for n in numbers])
+    axes.minorticks_off()
+    axes.set_xlabel("demonstrations")
+
+
+def _steps(axes: Axes, curves: Sequence[Result], final: Sequence[Result], theme: Theme) -> None:
+    for method in dict.fromkeys(row["method"] for row in [*curves, *final]):
+        style = METHOD_STYLES[method]
+        colour = theme.series[style.colour]
+        own = [row for row in curves if row["method"] == method]
+        for row in own:
+            points = [p for p in row["curve"] if p.get("success_rate") is not None and p.get("env_steps") is not None]
+            x = [p["env_steps"] for p in points]
+            axes.plot(x, [100 * p["success_rate"] for p in points], color=colour, linewidth=1.2, alpha=0.6)
+        for end in (row for row in final if row["method"] == method and row["env_steps"] is not None):
+            low, high = end["ci95"]
+            error = [[100 * (end["success_rate"] - low)], [100 * (high - end["success_rate"])]]
+            axes.errorbar(
+                [end["env_steps"]], [100 * end["success_rate"]], error, color=colour, marker=style.marker,
+                markersize=7, linestyle="none", capsize=2, label=end["title"],
+            )  # fmt: skip
+        if not any(row["method"] == method and row["env_steps"] is not None for row in final):
+            axes.plot([], [], color=colour, marker=style.marker, label=(own or list(final))[0]["title"])
+    axes.set_xlabel("environment steps (lines: development episodes)")
+
+
+def _finish(axes: Axes, result: Result, theme: Theme) -> None:
+    for name, line in (("expert", ":"), ("random", (0, (1, 3)))):
+        rate = result["references"].get(name, {}).get("success_rate")
+        if rate is not None:
+            axes.axhline(100 * rate, color=theme.series[7], linestyle=line, linewidth=1.2, label=f"{name} actions")
+    axes.set_ylim(-3, 103)
+    axes.set_ylabel("success rate, %")
+    _style(axes, theme)

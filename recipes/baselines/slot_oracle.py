@@ -1,0 +1,103 @@
+"""`playslot train-baseline method=slot_oracle run=WORLD data.demos=DEMOS out=DIR`: clone real actions from slots.
+
+Sizes are `model.policy`, the schedule is `behaviour`, as for PlaySlot's policy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.recipes.run import (
+    demo_root,
+    finished,
+    fixed_keys,
+    open_device,
+    open_run,
+    open_videos,
+    parent_run,
+    store_config,
+)
+
+
+def main(config: ExperimentConfig) -> None:
+    """Train the oracle into `OUT/slot_oracle`; killed, the same command carries on; finished, it says so.
+
+    Raises:
+        CheckpointError: no finished slots in `run`, or `out` was begun otherwise.
+        DataError: fewer than `demos` demonstrations, or none with actions.
+        OutputError, TrainingError: see `playslot_rl.errors`.
+    """
+    import torch
+
+    from playslot_rl.baselines.oracles.slot import NAME
+    from playslot_rl.data.demonstrations import first_demonstrations, real_actions, transitions
+    from playslot_rl.data.slot_cache import slot_cache
+    from playslot_rl.modules.policy import LatentPolicy
+    from playslot_rl.training.checkpoints import (
+        checkpoint_folder,
+        link_world_model,
+        load_savi,
+        read_stage,
+        require_adoptable,
+        require_config,
+        save_stage,
+        stage_model,
+        world_model_folder,
+    )
+    from playslot_rl.training.fit import fit
+    from playslot_rl.training.seeding import derived_seed
+    from playslot_rl.training.stage_behaviour import oracle_stage
+
+    run = open_run(config)
+    parent = parent_run(config, run)
+    home = world_model_folder(parent)
+    slots = read_stage(checkpoint_folder(home, "slots"), "slots")
+    require_adoptable(slots, run)
+    require_config(slots, {"env": {"image_size": config.env.image_size}})
+    policy = {"policy": to_dict(config.model.policy)}
+    parents, demos = {"slots": slots}, demo_root(config)
+    if finished(config, run, NAME, {"model": policy, NAME: fixed_keys(config.behaviour)}, parents, demos, config.demos):
+        return
+
+    def ready() -> None:
+        if home.resolve() != run.resolve():
+            link_world_model(run, parent if parent == "pretrained" else home)
+        store_config(config, run)
+
+    device = open_device(config)
+    videos = open_videos(config, demos, "train-baseline")
+    source = first_demonstrations(videos, config.demos)
+    moves = transitions(source)
+    actions = real_actions(source, moves.rows, config.env.action_dim).to(device)
+    savi = load_savi(parent, device)
+    model = replace(config.model, savi=stage_model(slots)[0].savi)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derived_seed(config.seed, 0, NAME))
+        oracle = LatentPolicy(model.policy, model.savi.slot_dim, config.env.action_dim).to(device)
+    cached = slot_cache(videos, savi, slots.fingerprint, config.data.cache, device, config.logging.progress)
+    stage = oracle_stage(oracle, torch.from_numpy(cached[moves.rows]).to(device), actions, config.behaviour)
+    result = fit(
+        stage,
+        config.behaviour,
+        run / NAME,
+        name=NAME,
+        seed=config.seed,
+        device=device,
+        logging=config.logging,
+        identity={"model": policy, "data": source.fingerprint, "slots": slots.fingerprint},
+        ready=ready,
+    )
+    save_stage(
+        checkpoint_folder(run, NAME),
+        stage=NAME,
+        modules=stage.modules,
+        config={"env": to_dict(config.env), "model": to_dict(model), NAME: to_dict(config.behaviour)},
+        data={"demos": source.fingerprint},
+        parents={"slots": slots.fingerprint},
+        metrics=result.metrics,
+        steps=result.step,
+        seconds=result.seconds,
+        extra={"demos": len(moves.lengths), "labelled_demos": len(moves.lengths), "seed": config.seed},
+    )
+    print(f"{NAME}: {len(moves.lengths)} demos, all labelled, {run / NAME}", flush=True)

@@ -1,0 +1,99 @@
+"""`playslot compare methods=M,... demos=N,... seeds=S,... out=DIR`: methods side by side (docs/baselines.md)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from playslot_rl.comparison.config import CompareConfig
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.errors import OutputError, PlaySlotError
+
+if TYPE_CHECKING:
+    from playslot_rl.comparison.plan import Job
+
+
+def main(config: ExperimentConfig) -> None:
+    """Run what is missing, reuse what is done, write `OUT/comparison.json`, `.md`, `.png` and `.svg`.
+
+    Raises:
+        ConfigError, DataError, CheckpointError: what is asked for cannot be compared; before anything is computed.
+        PlaySlotError: a job failed; the others have finished, and the table says so.
+        KeyboardInterrupt: Ctrl-C; the same command carries on.
+    """
+    from playslot_rl.comparison.launch import run_in_sequence, run_process, run_sweep
+    from playslot_rl.comparison.plan import check_comparison, job_record
+    from playslot_rl.comparison.report import Comparison
+    from playslot_rl.comparison.status import read_status
+    from playslot_rl.evaluation.success import DEFAULT_EPISODES
+    from playslot_rl.recipes import compare_data
+    from playslot_rl.training.atomic import write_json
+
+    began = time.monotonic()
+    out = Path(config.out or f"runs/compare_{config.env.name}_{config.preset}")
+    config = replace(config, episodes=config.episodes or DEFAULT_EPISODES, out=str(out))
+    check_comparison(config)
+    _open(out)
+    config = compare_data.prepare(config, out)
+    plan = _plan(config, out)
+    report = Comparison(config, out, [job for job, _, _ in plan], began)
+    report.references()
+    due = []
+    for job, own, parents in plan:
+        record = job_record(job, own, parents)
+        write_json(job.file, record)
+        status = read_status(job.file)
+        if status.status == "done" and status.fingerprint == record["fingerprint"]:
+            print(f"{job.name}: done before, skipped", flush=True)
+        else:
+            due.append(job)
+    print(f"compare: {len(due)} of {len(plan)} jobs to run", flush=True)
+    by_file = {job.file: job for job in due}
+    try:
+        if due and config.compare.launcher:
+            run_sweep(list(by_file), config.compare.launcher, config.compare.hydra)
+        elif due:
+            run_in_sequence(list(by_file), run_process, lambda file: report.ended(by_file[file]))
+    except KeyboardInterrupt:
+        report.write()
+        raise KeyboardInterrupt(f"compare interrupted; the same command carries on in {out}") from None
+    failed = report.write()
+    print(report.table(), flush=True)
+    print(f"compare: {time.monotonic() - began:.0f} s, {out / 'comparison.md'}", flush=True)
+    if failed:
+        names = ", ".join(row["name"] for row in failed)
+        raise PlaySlotError(
+            f"compare: {len(failed)} of {len(plan)} jobs failed ({names}), the others finished; "
+            f"{out / 'comparison.md'} says why, and the same command tries them again"
+        )
+
+
+def _open(out: Path) -> None:
+    """Refuse a folder that holds something else.
+
+    Raises:
+        OutputError: it does.
+    """
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"out={out}: got a file, expected a folder: choose another out=")
+    known = {"jobs", "data", "world_model", "lapo_world", "runs", "references.json", "comparison.json"}
+    if out.is_dir() and any(out.iterdir()) and not known & {path.name for path in out.iterdir()}:
+        raise OutputError(f"out={out}: got a folder that holds something else, expected none: choose another out=")
+
+
+def _plan(config: ExperimentConfig, out: Path) -> Sequence[tuple[Job, ExperimentConfig, dict[str, Any]]]:
+    """Every job with its own config and the fingerprints of what it builds on."""
+    from playslot_rl.baselines.methods import METHODS
+    from playslot_rl.comparison.plan import job_config, jobs
+    from playslot_rl.recipes.compare_data import parents_of
+
+    plain = replace(config, compare=CompareConfig(evaluation_seed=config.compare.evaluation_seed))
+    lapo = str(out / "lapo_world")
+    return [
+        (job, job_config(plain, job, config.run, lapo if job.method == "lapo" else ""),
+         parents_of(job.method, config.run if METHODS[job.method].slots else "", out))
+        for job in jobs(config, out)
+    ]  # fmt: skip

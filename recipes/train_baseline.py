@@ -1,0 +1,36 @@
+"""`playslot train-baseline method=M out=DIR`: one of the methods that PlaySlot is compared with (docs/baselines.md)."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+from playslot_rl.baselines.methods import METHODS
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.envs import gym_id
+from playslot_rl.errors import ConfigError
+
+
+def main(config: ExperimentConfig) -> None:
+    """Train `config.method` into `out`; killed, the same command carries on; finished, it says so.
+
+    Raises:
+        ConfigError: no `out`, or the folder of the world model in `run`; a method on slots without `run`; an
+            environment without a simulator.
+        PlaySlotError: see the method's recipe.
+    """
+    if not config.out:
+        raise ConfigError("out: got nothing, expected the folder of the baseline's run, such as out=runs/oracle")
+    if config.run and Path(config.run).resolve() == Path(config.out).resolve():
+        raise ConfigError(
+            f"out: got {config.out}, the folder of run=, expected another: a baseline has a run folder of its own"
+        )
+    method = METHODS[config.method]
+    if method.slots and not config.run:
+        raise ConfigError(
+            f"run: got nothing with method={config.method}, expected the world model whose slots it builds on: "
+            "a run folder, or run=pretrained"
+        )
+    gym_id(config.env.name)
+    recipe = importlib.import_module(f"playslot_rl.recipes.{method.recipe}")
+    recipe.main(config)

@@ -1,0 +1,109 @@
+"""LAPO's mathematics: what each network sees, where gradients go, what the stage learns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from clips import moving_square
+
+from playslot_rl.baselines.lapo.config import LAPOConfig
+from playslot_rl.baselines.lapo.load import FramePolicy, lapo_actor
+from playslot_rl.baselines.lapo.model import ForwardModel, InverseModel
+from playslot_rl.baselines.lapo.stage import LAPOModelStage, infer_latents
+from playslot_rl.config import ActionDecoderConfig, OptimConfig, StageConfig
+from playslot_rl.data.demonstrations import transitions
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.training.seeding import StepGenerators, global_seed
+
+CONFIG = LAPOConfig(channels=(8, 16), hidden=32, groups=2, code_dim=4, codes=4)
+
+
+@pytest.fixture
+def models() -> tuple[InverseModel, ForwardModel]:
+    torch.manual_seed(0)
+    return InverseModel(CONFIG, 32), ForwardModel(CONFIG)
+
+
+def test_a_latent_action_is_made_of_codes(models: tuple[InverseModel, ForwardModel]) -> None:
+    inverse, _ = models
+    inferred = inverse(torch.rand(6, 3, 32, 32), torch.rand(6, 3, 32, 32))
+    assert inferred.z.shape == (6, 8)
+    assert inferred.code.shape == (6, 2)
+    inverse.eval()
+    inferred = inverse(torch.rand(6, 3, 32, 32), torch.rand(6, 3, 32, 32))
+    codes = inverse.quantizer.prototypes[inferred.code].flatten(1)
+    torch.testing.assert_close(inferred.z, codes, atol=1e-5, rtol=0)
+
+
+def test_the_codebook_moves_in_training_only(models: tuple[InverseModel, ForwardModel]) -> None:
+    inverse, _ = models
+    frames = torch.rand(2, 6, 3, 32, 32)
+    inverse(*frames)
+    before = inverse.quantizer.prototypes.clone()
+    inverse.eval()(*frames)
+    assert torch.equal(inverse.quantizer.prototypes, before)
+    inverse.train()(*(frames * 0.5))
+    assert not torch.equal(inverse.quantizer.prototypes, before)
+
+
+def test_the_forward_model_starts_from_no_change(models: tuple[InverseModel, ForwardModel]) -> None:
+    _, forward = models
+    frame = torch.rand(2, 3, 32, 32)
+    assert torch.equal(forward(frame, torch.randn(2, 8)), frame)
+
+
+def test_the_image_error_trains_the_inverse_model_through_the_latent(
+    models: tuple[InverseModel, ForwardModel],
+) -> None:
+    inverse, forward = models
+    with torch.no_grad():
+        for weights in forward.ups[-1].parameters():
+            weights.normal_(std=0.1)
+    first, second = torch.rand(4, 3, 32, 32), torch.rand(4, 3, 32, 32)
+    inferred = inverse(first, second)
+    (forward(first, inferred.z) - second).square().mean().backward()
+    grads = [p.grad for p in inverse.network.parameters()]
+    assert all(grad is not None for grad in grads)
+    assert any(bool(grad.abs().sum() > 0) for grad in grads if grad is not None)
+
+
+def test_training_predicts_the_change_and_the_codes_tell_directions_apart(
+    models: tuple[InverseModel, ForwardModel],
+) -> None:
+    inverse, forward = models
+    source = moving_square(episodes=24)
+    config = StageConfig(steps=120, batch_size=16, optim=OptimConfig(lr=3e-3))
+    stage = LAPOModelStage(inverse, forward, source, config, validation=0.2, seed=0)
+    optimizer = torch.optim.Adam([*inverse.parameters(), *forward.parameters()], lr=3e-3)
+    with torch.no_grad():
+        start = stage.loss(0, StepGenerators(0, 0))["loss_image"]
+    assert 0.5 < float(start) < 2, "before training the error is that of no change"
+    for step in range(config.steps):
+        optimizer.zero_grad()
+        with global_seed(0, step):
+            stage.loss(step, StepGenerators(0, step))["loss"].backward()
+        optimizer.step()
+    inverse.eval(), forward.eval()
+    with torch.no_grad():
+        assert stage.validate(config.steps)["unexplained"] < 0.6
+    moves = transitions(source)
+    latents = infer_latents(inverse, source, moves)
+    assert source.actions is not None
+    right = torch.from_numpy(source.actions[moves.rows, 0] > 0)
+    centres = torch.stack([latents[right].mean(0), latents[~right].mean(0)])
+    nearest = torch.cdist(latents, centres).argmin(1) == 0
+    assert float((nearest == right).float().mean()) > 0.8
+
+
+def test_the_actor_decodes_the_policys_latent() -> None:
+    from playslot_rl import keys
+
+    torch.manual_seed(0)
+    config = replace(CONFIG, channels=(4, 4))
+    policy, decoder = FramePolicy(config, 32), ActionDecoder(ActionDecoderConfig(8), config.latent_dim, 4)
+    actor = lapo_actor(policy, decoder)
+    pixels = torch.randint(256, (3, 3, 32, 32), dtype=torch.uint8)
+    out = actor.module(actor.initial([1, 2, 3]).set(keys.PIXELS, pixels))
+    torch.testing.assert_close(out[keys.ACTION], decoder(policy(pixels.float() / 255)))

@@ -1,0 +1,37 @@
+"""The folder's helper modules, and a comparison that has ended."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from jobs_on_disk import comparison, finish
+
+from playslot_rl.comparison.plan import Job
+from playslot_rl.comparison.results import job_rows, summarise
+from playslot_rl.comparison.status import Status, write_status
+from playslot_rl.training.atomic import write_json
+
+
+@pytest.fixture
+def ended(tmp_path: Path) -> dict[str, Any]:
+    """Two seeds of PlaySlot and the oracle, one failed LAPO, one online method with a curve."""
+    jobs = [
+        finish(Job("playslot", 10, 0, tmp_path), {"simulation": 8, "imagination": 3}, labelled_demos=5),
+        finish(Job("playslot", 10, 1, tmp_path), {"simulation": 6, "imagination": 1}, labelled_demos=5),
+        finish(Job("slot_oracle", 10, 0, tmp_path), {"simulation": 10}),
+        finish(Job("slot_oracle", 50, 0, tmp_path), {"simulation": 10}),
+        finish(Job("resnet_oracle", 10, 0, tmp_path), {"simulation": 4}, pretraining="scratch"),
+        finish(Job("dreamer", None, 0, tmp_path), {"simulation": 7}, env_steps=2000),
+    ]
+    points = [{"env_steps": n, "success_rate": n / 4000, "ci95": [0, 1]} for n in (0, 1000, 2000)]
+    write_json(jobs[-1].run / "dreamer" / "curve.json", {"rows": points})
+    failed = Job("lapo", 10, 0, tmp_path)
+    write_status(failed.file, Status("failed", "f", "loss is nan at step 3, expected a finite number", 1.0))
+    rows = [row for job in [*jobs, failed] for row in job_rows(job)]
+    return comparison(tmp_path, rows, summarise(rows))

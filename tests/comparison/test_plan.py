@@ -1,0 +1,96 @@
+"""Which jobs there are, what each is told, and what is refused before anything is computed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from playslot_rl.comparison.plan import Job, check_comparison, check_demos, job_config, job_record, jobs
+from playslot_rl.compose import compose
+from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
+from playslot_rl.errors import CheckpointError, ConfigError
+
+OUT = Path("out")
+
+
+def compared(*typed: str) -> ExperimentConfig:
+    return compose(["preset=compact", *typed], "compare")
+
+
+def test_offline_methods_have_a_job_for_each_number_and_seed_and_online_ones_for_each_seed() -> None:
+    names = [job.name for job in jobs(compared("methods=playslot,lapo,sold", "demos=50,10", "seeds=0,4"), OUT)]
+    assert names == [
+        "playslot-d10-s0", "lapo-d10-s0", "playslot-d50-s0", "lapo-d50-s0",
+        "playslot-d10-s4", "lapo-d10-s4", "playslot-d50-s4", "lapo-d50-s4",
+        "sold-s0", "sold-s4",
+    ]  # fmt: skip
+
+
+def test_a_job_has_its_own_folder_and_playslot_both_protocols() -> None:
+    job = Job("playslot", 10, 0, OUT)
+    assert (job.run, job.file) == (OUT / "runs" / "playslot-d10-s0", OUT / "jobs" / "playslot-d10-s0.json")
+    assert (job.stage, job.protocols) == ("policy", ("simulation", "imagination"))
+    assert (Job("lapo", 10, 0, OUT).stage, Job("lapo", 10, 0, OUT).protocols) == ("lapo", ("simulation",))
+
+
+@pytest.mark.parametrize(("demos", "labels"), [(10, 10), (50, 50), (150, 50)])
+def test_labels_are_the_presets_or_all_there_are(demos: int, labels: int) -> None:
+    own = job_config(compared(), Job("playslot", demos, 2, OUT), "pretrained", "")
+    assert (own.behaviour.labelled_demos, own.demos, own.seed, own.run) == (labels, demos, 2, "pretrained")
+    assert not own.behaviour.oracle
+    assert not own.evaluation.references
+
+
+def test_only_methods_on_slots_get_the_world_model_and_only_lapo_lapos() -> None:
+    config = compared()
+    assert job_config(config, Job("resnet_oracle", 10, 0, OUT), "world", "").run == ""
+    assert job_config(config, Job("sold", None, 0, OUT), "world", "").run == "world"
+    assert job_config(config, Job("lapo", 10, 0, OUT), "world", "models").baselines.lapo.world == "models"
+
+
+def test_a_jobs_name_for_its_content_ignores_the_machine_and_nothing_else() -> None:
+    config, job = compared(), Job("playslot", 10, 0, OUT)
+    own = job_config(config, job, "pretrained", "")
+    name = job_record(job, own, {"slots": "a"})["fingerprint"]
+    assert job_record(job, replace(own, device="cpu", threads=1, workers=3), {"slots": "a"})["fingerprint"] == name
+    changed = replace(own, behaviour=replace(own.behaviour, steps=7))
+    others = [
+        job_record(job, changed, {"slots": "a"}),
+        job_record(job, own, {"slots": "b"}),
+        job_record(job, replace(own, episodes=3), {"slots": "a"}),
+        job_record(job, replace(own, compare=CompareConfig(evaluation_seed=1)), {"slots": "a"}),
+    ]
+    assert name not in {other["fingerprint"] for other in others}
+    record = job_record(job, own, {"slots": "a"})
+    assert from_dict(ExperimentConfig, record["config"]) == own
+
+
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        (["env=grid_shapes"], "env=grid_shapes: got an environment without a simulator"),
+        (["env=block_reach", "env.blocks.reward=sparse", "methods=dreamer"], "got sparse with dreamer, expected dense"),
+        (["hydra.launcher=ray"], "got ray, expected an installed launcher: install it by"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(typed: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        check_comparison(compared(*typed))
+
+
+def test_a_sparse_reward_is_no_hindrance_to_methods_that_do_not_act() -> None:
+    check_comparison(compared("env=block_reach", "env.blocks.reward=sparse", "methods=resnet_oracle,lapo"))
+
+
+def test_the_shipped_world_model_of_another_task_is_refused() -> None:
+    check_comparison(compared("run=pretrained"))
+    with pytest.raises(CheckpointError, match="got a world model of env=button_press, expected env=block_reach"):
+        check_comparison(compared("run=pretrained", "env=block_reach"))
+
+
+def test_too_few_demonstrations_are_refused() -> None:
+    check_demos(compared("demos=10,20"), 20, "data.demos=x")
+    with pytest.raises(ConfigError, match="demos: got 20, expected at most the 19 demonstrations of data.demos=x"):
+        check_demos(compared("demos=10,20"), 19, "data.demos=x")

@@ -1,0 +1,111 @@
+"""Rows, their summary over seeds, the page and the plot."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from jobs_on_disk import finish
+
+from playslot_rl.comparison.plan import Job
+from playslot_rl.comparison.results import count_parameters, failures, job_rows
+from playslot_rl.comparison.table import cell, comparison_page
+from playslot_rl.config import MethodName
+from playslot_rl.evaluation.intervals import wilson
+from playslot_rl.visualization.comparison import comparison_figure, figure_bytes
+from playslot_rl.visualization.palette import LIGHT, METHOD_STYLES
+
+
+def _of(result: dict[str, Any], method: str, protocol: str = "simulation", demos: int | None = 10) -> dict[str, Any]:
+    rows = [r for r in result["summary"] if (r["method"], r["protocol"], r["demos"]) == (method, protocol, demos)]
+    assert len(rows) == 1
+    return dict(rows[0])
+
+
+def test_seeds_are_pooled_and_their_range_is_kept(ended: dict[str, Any]) -> None:
+    row = _of(ended, "playslot")
+    assert row["success_rate"] == pytest.approx(0.7)
+    assert row["ci95"] == list(wilson(14, 20))
+    assert (row["lowest"], row["highest"], row["seeds"], row["episodes"]) == (0.6, 0.8, [0, 1], 20)
+    assert _of(ended, "playslot", "imagination")["success_rate"] == pytest.approx(0.2)
+
+
+def test_a_failed_job_is_a_row_and_no_number(ended: dict[str, Any]) -> None:
+    assert [row["name"] for row in failures(ended["rows"])] == ["lapo-d10-s0"]
+    row = next(row for row in ended["rows"] if row["method"] == "lapo")
+    assert (row["status"], row["success_rate"], row["parameters"]) == ("failed", None, None)
+    assert "lapo" not in {row["method"] for row in ended["summary"]}
+
+
+def test_what_an_older_run_of_a_failed_job_left_is_not_counted(tmp_path: Path) -> None:
+    from playslot_rl.comparison.status import Status, write_status
+
+    job = finish(Job("lapo", 10, 0, tmp_path), {"simulation": 9})
+    write_status(job.file, Status("failed", "f", "out of memory", 1.0))
+    assert job_rows(job)[0]["success_rate"] is None
+
+
+def test_parameters_count_floats_of_run_and_parents(tmp_path: Path) -> None:
+    job = finish(Job("lapo", 10, 0, tmp_path), {"simulation": 9})
+    assert count_parameters(job.run, "lapo") == 12
+    finish(Job("lapo", 10, 0, tmp_path), {"simulation": 9}, parents={"lapo_model": "x"})
+    (job.run / "lapo_model").mkdir()
+    (job.run / "lapo" / "checkpoint").rename(job.run / "lapo_model" / "checkpoint")
+    finish(job, {"simulation": 9}, parents={"lapo_model": "x"})
+    assert count_parameters(job.run, "lapo") == 24
+
+
+def test_the_page_has_the_table_the_footnotes_and_the_failure(ended: dict[str, Any]) -> None:
+    page = comparison_page(ended)
+    assert "| PlaySlot, simulation | 70 % (48 to 85; seeds 60 to 80) | – |" in page
+    assert "| Slot Oracle, simulation | 100 % (72 to 100) | 100 % (72 to 100) |" in page
+    assert "| DreamerV3 | 2,000 | 70 % (40 to 89) |" in page
+    assert "PlaySlot saw the real actions of 5 of 10 demonstrations" in page
+    assert "Slot Oracle saw the real actions of 10 of 10, 50 of 50 demonstrations" in page
+    assert "ResNet Oracle starts from scratch weights" in page
+    assert "**lapo-d10-s0: failed.** loss is nan at step 3" in page
+    assert "Failures: 1 of 7 jobs" in page
+    assert "expert: 100 % (70 to 100)" in page
+    assert "PlaySlot 30 s a training, 8 s its evaluation" in page
+
+
+def test_a_cell_of_one_seed_has_no_range(ended: dict[str, Any]) -> None:
+    assert cell(_of(ended, "resnet_oracle")) == "40 % (17 to 69)"
+
+
+def test_the_result_is_json(ended: dict[str, Any]) -> None:
+    assert json.loads(json.dumps(ended, allow_nan=False)) == ended
+
+
+def test_every_method_has_a_colour_and_a_marker_of_its_own() -> None:
+    assert set(METHOD_STYLES) == set(MethodName.__args__)  # type: ignore[attr-defined]
+    assert len({style.colour for style in METHOD_STYLES.values()}) == len(METHOD_STYLES)
+    assert len({style.marker for style in METHOD_STYLES.values()}) == len(METHOD_STYLES)
+
+
+def test_the_plot_shows_every_series_in_its_methods_colour(ended: dict[str, Any]) -> None:
+    figure = comparison_figure(ended, LIGHT)
+    left, right = figure.axes
+    labels = left.get_legend_handles_labels()[1]
+    assert {"PlaySlot", "PlaySlot, imagination", "Slot Oracle", "ResNet Oracle", "expert actions"} <= set(labels)
+    colours = {line.get_color() for line in left.get_lines()}
+    assert {LIGHT.series[METHOD_STYLES[m].colour] for m in ("playslot", "slot_oracle", "resnet_oracle")} <= colours
+    assert "DreamerV3" in right.get_legend_handles_labels()[1]
+    curve = max(right.get_lines(), key=lambda line: len(line.get_xdata()))
+    assert list(curve.get_xdata()) == [0, 1000, 2000]
+
+
+@pytest.mark.parametrize("kind", ["png", "svg"])
+def test_the_same_comparison_is_the_same_picture(ended: dict[str, Any], kind: str) -> None:
+    pictures = [figure_bytes(comparison_figure(ended, LIGHT), LIGHT, kind) for _ in range(2)]
+    assert pictures[0] == pictures[1]
+    assert pictures[0].startswith(b"\x89PNG" if kind == "png" else b"<?xml")
+
+
+def test_a_comparison_without_results_is_drawn_too(ended: dict[str, Any]) -> None:
+    rows = [row for row in ended["rows"] if row["method"] == "lapo"]
+    empty = {**ended, "rows": rows, "summary": []}
+    assert figure_bytes(comparison_figure(empty, LIGHT), LIGHT, "png")
+    assert "**lapo-d10-s0: failed.**" in comparison_page(empty)

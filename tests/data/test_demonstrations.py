@@ -1,0 +1,59 @@
+"""The first N demonstrations, and the transitions of a data set."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from playslot_rl.data.demonstrations import first_demonstrations, real_actions, require_labelled, transitions
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.errors import DataError
+
+
+@pytest.fixture
+def source() -> EpisodeFrames:
+    """Episodes of 3, 1 and 2 frames."""
+    return EpisodeFrames(
+        frames=np.zeros((6, 2, 2, 3), np.uint8), starts=np.array([0, 3, 4]), lengths=np.array([3, 1, 2]),
+        actions=np.arange(12, dtype=np.float32).reshape(6, 2) - 1, success=None, seeds=np.array([7, 8, 9]),
+        fingerprint="whole", fps=10.0, task="", camera="",
+    )  # fmt: skip
+
+
+def test_the_first_demonstrations_keep_their_rows_and_have_a_name_of_their_own(source: EpisodeFrames) -> None:
+    two = first_demonstrations(source, 2)
+    assert (two.starts.tolist(), two.lengths.tolist()) == ([0, 3], [3, 1])
+    assert two.seeds is not None
+    assert two.seeds.tolist() == [7, 8]
+    assert len(two.frames) == 6, "the slot cache is indexed by the rows of the whole data set"
+    assert len({source.fingerprint, two.fingerprint, first_demonstrations(source, 1).fingerprint}) == 3
+
+
+def test_all_demonstrations_are_the_data_set_itself(source: EpisodeFrames) -> None:
+    assert first_demonstrations(source, None) is source
+    assert first_demonstrations(source, 3) is source
+
+
+def test_too_few_are_refused(source: EpisodeFrames) -> None:
+    with pytest.raises(DataError, match="demos: got 4, expected at most the 3 demonstrations"):
+        first_demonstrations(source, 4)
+    require_labelled(3, 3)
+    with pytest.raises(DataError, match=r"behaviour\.labelled_demos: got 4, expected at most the 3"):
+        require_labelled(4, 3)
+
+
+def test_transitions_leave_last_frames_and_single_frames_out(source: EpisodeFrames) -> None:
+    moves = transitions(source)
+    assert moves.rows.tolist() == [0, 1, 4]
+    assert moves.episode.tolist() == [0, 0, 1]
+    assert moves.lengths.tolist() == [2, 1]
+    with pytest.raises(DataError, match="no episode of two frames"):
+        transitions(replace(source, lengths=np.array([1, 1, 1])))
+
+
+def test_actions_are_clamped_and_of_the_right_width(source: EpisodeFrames) -> None:
+    assert real_actions(source, np.array([0, 1]), 2).tolist() == [[-1.0, 0.0], [1.0, 1.0]]
+    with pytest.raises(DataError, match="got actions of width 2, expected 4"):
+        real_actions(source, np.array([0]), 4)

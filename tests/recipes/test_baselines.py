@@ -1,0 +1,187 @@
+"""The offline baselines from end to end: trained, evaluated, carried on, refused."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import shutil
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import ONE_CORE, contents, refused, smoke, weights
+
+from playslot_rl import cli
+from playslot_rl.compose import compose
+from playslot_rl.config import to_dict
+
+METHODS = ("slot_oracle", "resnet_oracle", "lapo")
+SECOND_HALF = {
+    "slot_oracle": ("behaviour.steps=60", "behaviour.checkpoint_every=5"),
+    "resnet_oracle": ("baselines.resnet_oracle.steps=6", "baselines.resnet_oracle.checkpoint_every=1"),
+    "lapo": ("baselines.lapo.policy.steps=80", "baselines.lapo.policy.checkpoint_every=5"),
+}
+
+
+def _command(method: str, shared_run: Path, out: Path, *more: object) -> tuple[str, ...]:
+    demos, videos = shared_run / "data" / "expert", shared_run / "data" / "random"
+    own = (f"run={shared_run}",) if method == "slot_oracle" else (f"data.root={videos}",)
+    return ("train-baseline", f"method={method}", "preset=smoke", f"data.demos={demos}", f"out={out}", *own,
+            *map(str, more))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def trained(shared_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A run of each method on the first four demonstrations."""
+    runs = {}
+    for method in METHODS:
+        runs[method] = tmp_path_factory.mktemp("baselines") / method
+        smoke(*_command(method, shared_run, runs[method], "demos=4"))
+    return runs
+
+
+def _meta(run: Path, stage: str) -> dict[str, Any]:
+    values: dict[str, Any] = json.loads((run / stage / "checkpoint" / "meta.json").read_text())
+    return values
+
+
+@pytest.mark.parametrize(("method", "labels"), [("slot_oracle", 4), ("resnet_oracle", 4), ("lapo", 3)])
+def test_a_baseline_is_a_run_that_says_what_it_saw(trained: dict[str, Path], method: str, labels: int) -> None:
+    run = trained[method]
+    meta = _meta(run, method)
+    assert (meta["demos"], meta["labelled_demos"]) == (4, labels)
+    assert json.loads((run / "config.json").read_text())["method"] == method
+    assert (run / method / "metrics.jsonl").is_file()
+    assert ("pretraining" in meta) == (method == "resnet_oracle")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_it_is_evaluated_as_playslot_is(trained: dict[str, Path], shared_run: Path, method: str) -> None:
+    run = trained[method]
+    done = smoke("evaluate", f"run={run}", "episodes=2")
+    info = json.loads((run / "evaluation" / "simulation" / "eval_info.json").read_text())
+    playslot = json.loads((shared_run / "evaluation" / "simulation" / "eval_info.json").read_text())
+    assert info.keys() - {"pretraining"} == playslot.keys()
+    assert info["method"] == method
+    assert info["seeds"] == playslot["seeds"]
+    for name in ("random", "expert"):
+        assert info["references"][name] == playslot["references"][name]
+    assert info["references"]["slot_oracle"]["success_rate"] is None
+    assert info["fingerprints"][method] == _meta(run, method)["fingerprint"]
+    assert "simulation:" in done.out
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_same_command_again_skips_it(trained: dict[str, Path], shared_run: Path, method: str) -> None:
+    before = contents(trained[method])
+    done = smoke(*_command(method, shared_run, trained[method], "demos=4"))
+    assert f"{method}: finished before" in done.out
+    assert contents(trained[method]) == before
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_another_number_of_demonstrations_or_another_seed_is_refused(
+    trained: dict[str, Path], shared_run: Path, method: str
+) -> None:
+    refused(*_command(method, shared_run, trained[method], "demos=3"), message="data: got [0-9a-f]{16}, expected")
+    refused(*_command(method, shared_run, trained[method], "demos=4", "seed=1"), message="seed: got 1, expected 0")
+
+
+def test_imagination_is_refused(trained: dict[str, Path]) -> None:
+    refused("evaluate", f"run={trained['lapo']}", "protocol=imagination",
+            message="protocol: got imagination for method=lapo, expected simulation")  # fmt: skip
+
+
+def test_lapos_models_are_taken_from_another_run(trained: dict[str, Path], shared_run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "few"
+    smoke(*_command("lapo", shared_run, out, "demos=3", f"baselines.lapo.world={trained['lapo']}"))
+    assert weights(out, "lapo_model") == weights(trained["lapo"], "lapo_model")
+    assert weights(out, "lapo") != weights(trained["lapo"], "lapo")
+    assert not (out / "lapo_model" / "checkpoints").exists(), "nothing was trained there"
+    refused(*_command("lapo", shared_run, tmp_path / "x", f"baselines.lapo.world={trained['lapo']}",
+                      "baselines.lapo.codes=3"), message="lapo.codes: got 3, expected 4")  # fmt: skip
+
+
+def test_playslot_learns_from_the_first_demonstrations(shared_run: Path, demos: Path, tmp_path: Path) -> None:
+    few, out = tmp_path / "few", f"out={tmp_path / 'all'}"
+    base = (f"run={shared_run}", f"data.demos={demos}", "preset=smoke")
+    config = to_dict(compose(["preset=smoke"]))
+    assert config["behaviour"]["labelled_demos"] == 3
+    smoke("train-baseline", "method=playslot", *base, "demos=4", f"out={few}")
+    assert _meta(few, "policy")["demos"] == 4
+    smoke("train-baseline", "method=playslot", *base, out)
+    assert weights(tmp_path / "all", "policy") == weights(shared_run, "policy"), "all demonstrations: as train-policy"
+    assert weights(few, "policy") != weights(shared_run, "policy")
+
+
+@pytest.mark.parametrize("method", ["playslot", "lapo"])
+def test_more_labels_than_demonstrations_are_refused(shared_run: Path, tmp_path: Path, method: str) -> None:
+    command = [*_command(method, shared_run, tmp_path / "new", "demos=2"), f"run={shared_run}"]
+    refused(*command, message="behaviour.labelled_demos: got 3, expected at most the 2 demonstrations")
+    command = [*_command(method, shared_run, tmp_path / "new", "demos=9"), f"run={shared_run}"]
+    refused(*command, message="demos: got 9, expected at most the 6 demonstrations")
+    assert not (tmp_path / "new").exists()
+
+
+def test_bad_arguments_are_refused(shared_run: Path, trained: dict[str, Path], tmp_path: Path) -> None:
+    out = f"out={tmp_path / 'new'}"
+    demos = f"data.demos={shared_run / 'data' / 'expert'}"
+    refused("train-baseline", "method=lapoo", out, message="method: got 'lapoo', expected one of playslot", code=2)
+    refused("train-baseline", "method=lapo", demos, message="out: got nothing, expected the folder of the baseline's")
+    refused("train-baseline", "method=slot_oracle", demos, out, message="run: got nothing with method=slot_oracle")
+    refused("train-baseline", "method=slot_oracle", demos, f"run={shared_run}", f"out={shared_run}", "preset=smoke",
+            message="a baseline has a run folder of its own")  # fmt: skip
+    refused("train-baseline", "method=lapo", "env=grid_shapes", demos, out, message="without a simulator")
+    refused(*_command("resnet_oracle", shared_run, tmp_path / "new", "baselines.resnet_oracle.weights=none.pth"),
+            message="expected a file of ResNet-18's weights")  # fmt: skip
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_oracle_on_other_slots_is_refused(trained: dict[str, Path], videos: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(trained["slot_oracle"], tmp_path / "run"))
+    smoke("train-slots", f"out={tmp_path / 'other'}", f"data.root={videos}", "seed=1")
+    (run / "world_model.json").write_text(json.dumps({"source": str(tmp_path / "other")}))
+    refused("evaluate", f"run={run}", message="was trained on slots [0-9a-f]{16}, got slots [0-9a-f]{16}")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_nan_stops_with_the_last_good_checkpoint(
+    shared_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    from playslot_rl.training.stage_regression import RegressionStage
+
+    original = RegressionStage.loss
+
+    def poisoned(self: RegressionStage, step: int, generators: Any) -> Any:
+        losses = original(self, step, generators)
+        return {"loss": losses["loss"] * float("nan")} if step == 1 else losses
+
+    monkeypatch.setattr(RegressionStage, "loss", poisoned)
+    every = {"slot_oracle": "behaviour", "resnet_oracle": "baselines.resnet_oracle", "lapo": "baselines.lapo.policy"}
+    refused(*_command(method, shared_run, tmp_path / "run", f"{every[method]}.checkpoint_every=1"),
+            message="loss is nan at step 2, expected a finite number; the last good checkpoint is .*step_0*1")  # fmt: skip
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(
+    shared_run: Path, tmp_path: Path, method: str
+) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    smoke(*_command(method, shared_run, whole, *SECOND_HALF[method]))
+    command = [*_command(method, shared_run, killed, *SECOND_HALF[method]), *ONE_CORE]
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["torchrl.data", "torchvision", "playslot_rl.training.checkpoints"])
+    process = context.Process(target=cli.main, args=(command,))
+    process.start()
+    limit = time.monotonic() + 120
+    while not list((killed / method / "checkpoints").glob("step_*")) and time.monotonic() < limit:
+        assert process.is_alive()
+        time.sleep(0.002)
+    process.kill()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    assert not (killed / method / "checkpoint").exists()
+    smoke(*command[: -len(ONE_CORE)])
+    assert weights(killed, method) == weights(whole, method)

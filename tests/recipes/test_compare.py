@@ -1,0 +1,207 @@
+"""`playslot compare` from end to end; the quick tests run the jobs in this process, the slow ones as it does."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import ONE_CORE, Done, assert_one_line, contents, playslot
+
+from playslot_rl.comparison import launch
+from playslot_rl.comparison.status import Status
+from playslot_rl.recipes import compare_job
+
+Compare = Callable[..., Done]
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Jobs run in this process; their names in the order in which they started."""
+    names: list[str] = []
+
+    def here(file: Path) -> Status:
+        names.append(file.stem)
+        return compare_job.main(file)
+
+    monkeypatch.setattr(launch, "run_process", here)
+    return names
+
+
+def _arguments(shared_run: Path, out: Path, *more: object) -> list[str]:
+    demos, videos = shared_run / "data" / "expert", shared_run / "data" / "random"
+    return ["compare", "preset=smoke", f"run={shared_run}", f"data.demos={demos}", f"data.root={videos}",
+            f"out={out}", "episodes=2", *map(str, more), *ONE_CORE]  # fmt: skip
+
+
+def _result(out: Path) -> dict[str, Any]:
+    values: dict[str, Any] = json.loads((out / "comparison.json").read_text())
+    return values
+
+
+def test_two_methods_two_numbers_of_demonstrations_one_seed(
+    shared_run: Path, tmp_path: Path, started: list[str]
+) -> None:
+    out = tmp_path / "compared"
+    command = _arguments(shared_run, out, "methods=playslot,slot_oracle")
+    done = playslot(*command)
+    assert (done.code, done.err) == (0, "")
+    assert started == ["playslot-d2-s0", "slot_oracle-d2-s0", "playslot-d3-s0", "slot_oracle-d3-s0"]
+    result = _result(out)
+    assert [(row["method"], row["protocol"], row["demos"]) for row in result["summary"]] == [
+        ("playslot", "simulation", 2), ("playslot", "imagination", 2), ("slot_oracle", "simulation", 2),
+        ("playslot", "simulation", 3), ("playslot", "imagination", 3), ("slot_oracle", "simulation", 3),
+    ]  # fmt: skip
+    assert {row["status"] for row in result["rows"]} == {"done"}
+    assert [row["labelled_demos"] for row in result["summary"]] == [2, 2, 2, 3, 3, 3]
+    seeds = {tuple(json.loads(path.read_text())["seeds"]) for path in (out / "runs").rglob("eval_info.json")}
+    assert len(seeds) == 1, "every method and seed meets the same episodes"
+    assert min(seeds.pop()) >= 1_000_000_000 + 100 * 1_000_000
+    assert {path.name for path in out.glob("comparison.*")} == {f"comparison.{s}" for s in ("json", "md", "png", "svg")}
+    assert "PlaySlot, imagination" in (out / "comparison.md").read_text()
+
+    kept = contents(out / "runs")
+    started.clear()
+    again = playslot(*command)
+    assert again.code == 0
+    assert started == []
+    assert again.out.count("done before, skipped") == 4
+    more = playslot(*command, "demos=2,3,4")
+    assert more.code == 0
+    assert started == ["playslot-d4-s0", "slot_oracle-d4-s0"]
+    assert {name: contents(out / "runs")[name] for name in kept} == kept
+
+
+def test_a_method_that_crashes_is_a_row_and_the_others_finish(
+    shared_run: Path, tmp_path: Path, started: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from playslot_rl.baselines.lapo.behaviour import LAPOBehaviour
+
+    def broken(self: LAPOBehaviour, *arguments: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    command = _arguments(shared_run, tmp_path / "out", "methods=lapo,slot_oracle", "demos=2")
+    with monkeypatch.context() as patch:
+        patch.setattr(LAPOBehaviour, "__init__", broken)
+        done = playslot(*command)
+    assert done.code == 1
+    assert "lapo-d2-s0: error: ZeroDivisionError: a bug" in done.err
+    assert "compare: 1 of 2 jobs failed (lapo-d2-s0), the others finished" in done.err
+    rows = {row["name"]: row for row in _result(tmp_path / "out")["rows"]}
+    assert (rows["lapo-d2-s0"]["status"], rows["slot_oracle-d2-s0"]["status"]) == ("failed", "done")
+    assert "ZeroDivisionError" in rows["lapo-d2-s0"]["error"]
+    assert "**lapo-d2-s0: failed.** ZeroDivisionError: a bug" in (tmp_path / "out" / "comparison.md").read_text()
+    started.clear()
+    assert playslot(*command).code == 0, "the same command tries it again"
+    assert started == ["lapo-d2-s0"]
+    assert {row["status"] for row in _result(tmp_path / "out")["rows"]} == {"done"}
+
+
+def test_a_changed_setting_is_not_mixed_with_old_results(shared_run: Path, tmp_path: Path, started: list[str]) -> None:
+    command = _arguments(shared_run, tmp_path / "out", "methods=slot_oracle", "demos=2")
+    assert playslot(*command).code == 0
+    done = playslot(*command, "behaviour.steps=7")
+    assert done.code == 1
+    assert "steps: got 7, expected 6" in _result(tmp_path / "out")["rows"][0]["error"]
+
+
+@pytest.mark.parametrize(
+    ("typed", "message", "code"),
+    [
+        ("methods=playslot,magic", "compare.methods: got 'magic', expected one of playslot", 2),
+        ("demos=2,7", "demos: got 7, expected at most the 6 demonstrations of data.demos=", 1),
+        ("env=grid_shapes", "env=grid_shapes: got an environment without a simulator", 1),
+        ("hydra.launcher=ray", "expected an installed launcher", 1),
+        ("run=nowhere", "run=nowhere: no such folder", 1),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_before_anything_is_computed(
+    shared_run: Path, tmp_path: Path, typed: str, message: str, code: int
+) -> None:
+    done = playslot(*_arguments(shared_run, tmp_path / "out", "methods=playslot"), typed)
+    assert done.code == code
+    assert_one_line(done.err, "compare")
+    assert message in done.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_sparse_reward_is_refused_for_a_method_that_acts(tmp_path: Path) -> None:
+    done = playslot("compare", "preset=smoke", "env=block_reach", "methods=dreamer", "env.blocks.reward=sparse",
+                    f"out={tmp_path / 'out'}")  # fmt: skip
+    assert (done.code, list(tmp_path.iterdir())) == (1, [])
+    assert "env.blocks.reward: got sparse with dreamer, expected dense" in done.err
+
+
+def test_a_folder_of_something_else_is_refused(shared_run: Path, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    done = playslot(*_arguments(shared_run, tmp_path, "methods=slot_oracle"))
+    assert done.code == 1
+    assert "holds something else" in done.err
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.slow
+def test_from_nothing_data_and_world_model_are_made_once(tmp_path: Path, started: list[str]) -> None:
+    out = tmp_path / "out"
+    command = ["compare", "preset=smoke", "methods=slot_oracle,lapo", "demos=3", f"out={out}", "episodes=2", *ONE_CORE]
+    done = playslot(*command)
+    assert (done.code, done.err) == (0, "")
+    assert {path.name for path in (out / "data").iterdir() if path.is_dir()} == {"expert", "random"}
+    assert (out / "world_model" / "dynamics" / "checkpoint").is_dir()
+    assert (out / "lapo_world" / "lapo_model" / "checkpoint").is_dir()
+    assert _result(out)["world_model"]["source"] == "world_model"
+    shared = {name: contents(out / name) for name in ("data", "world_model", "lapo_world")}
+    assert playslot(*command, "demos=3,6").code == 0
+    assert {name: contents(out / name) for name in shared} == shared
+
+
+def _process(command: list[str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "playslot_rl", *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_killed_it_carries_on_and_ends_as_one_that_was_not(shared_run: Path, tmp_path: Path) -> None:
+    whole, killed = (
+        _arguments(shared_run, tmp_path / name, "methods=slot_oracle", "demos=2,3") for name in ("whole", "killed")
+    )
+    process = _process(whole)
+    assert process.communicate(timeout=280)[1] == ""
+    assert process.returncode == 0
+    process = _process(killed)
+    limit = time.monotonic() + 120
+    while not list((tmp_path / "killed" / "runs").rglob("eval_info.json")) and time.monotonic() < limit:
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    assert _process(killed).wait(timeout=280) == 0
+    results = [_result(tmp_path / name) for name in ("whole", "killed")]
+    assert results[0]["summary"] == results[1]["summary"]
+    prints = [
+        [
+            json.loads(path.read_text())["fingerprint"]
+            for path in sorted((tmp_path / n / "runs").rglob("checkpoint/meta.json"))
+        ]
+        for n in ("whole", "killed")
+    ]
+    assert prints[0] == prints[1]
+
+
+@pytest.mark.slow
+def test_joblib_runs_the_jobs_side_by_side(shared_run: Path, tmp_path: Path) -> None:
+    command = _arguments(shared_run, tmp_path / "out", "methods=slot_oracle", "demos=2,3",
+                         "hydra.launcher=joblib", "hydra.launcher.n_jobs=2")  # fmt: skip
+    done = playslot(*command)
+    assert (done.code, done.err) == (0, ""), (tmp_path / "out" / "jobs" / "launcher.log").read_text()
+    assert [row["status"] for row in _result(tmp_path / "out")["rows"]] == ["done", "done"]
+    assert "Joblib.Parallel" in (tmp_path / "out" / "jobs" / "launcher.log").read_text()
