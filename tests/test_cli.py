@@ -23,6 +23,7 @@ COMMANDS = [
     "train-dynamics",
     "train-policy",
     "evaluate",
+    "export",
     "pipeline",
     "demo",
     "bench",

@@ -12,7 +12,7 @@ The slot oracle of a run stays behind: it was trained on every real action, and 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -116,14 +116,16 @@ def new_folder(folder: Path) -> Iterator[Path]:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
-def save_pretrained(agent: Agent, folder: Path, config: PolicyConfig, card: str) -> PolicyConfig:
+def save_pretrained(
+    agent: Agent, folder: Path, config: PolicyConfig, card: Callable[[PolicyConfig], str]
+) -> PolicyConfig:
     """Write a model folder, whole or not at all.
 
     Args:
         agent: what to store, without its slot oracle.
         folder: must not exist.
         config: its fingerprint is set here.
-        card: text of README.md.
+        card: gives the text of README.md for the config with its fingerprint.
 
     Returns:
         The config with the fingerprint of the weights.
@@ -136,7 +138,7 @@ def save_pretrained(agent: Agent, folder: Path, config: PolicyConfig, card: str)
         write_json(temporary / CONFIG, config.to_lerobot())
         for pipeline in make_processors("cpu"):
             pipeline.save_pretrained(temporary, config_filename=f"{pipeline.name}.json")
-        write_text(temporary / CARD, card)
+        write_text(temporary / CARD, card(config))
     return config
 
 

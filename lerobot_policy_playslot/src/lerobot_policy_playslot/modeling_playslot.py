@@ -54,7 +54,7 @@ class PlaySlotPolicy(PreTrainedPolicy):
         if camera not in batch:
             had = ", ".join(sorted(name for name in batch if name.startswith("observation."))) or "none"
             raise ValueError(
-                f"observation: got {had}, expected {camera}: rename yours by --rename_map='{{\"yours\": \"{camera}\"}}'"
+                f'observation: got {had}, expected {camera}: rename yours by --rename_map=\'{{"yours": "{camera}"}}\''
             )
         return self._frames.act(batch[camera], camera)
 

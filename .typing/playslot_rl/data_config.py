@@ -1,0 +1,1 @@
+../../playslot_rl/data_config.py

@@ -1,0 +1,1 @@
+../../playslot_rl/env_config.py

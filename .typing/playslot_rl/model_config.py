@@ -1,0 +1,1 @@
+../../playslot_rl/model_config.py
