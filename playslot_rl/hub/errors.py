@@ -155,8 +155,8 @@ def no_repository(place: Place) -> HubError:
     """Nothing of that name, or private."""
     who = "your token" if place.has_token else "you: no token was sent"
     return HubError(
-        f"{place.repo_id}: got no such {place.what} on {place.endpoint}, or one hidden from {who}; expected user/name of "
-        f"a {place.what}: check the name" + ("" if place.has_token else f"; if it is private, {LOG_IN}")
+        f"{place.repo_id}: got no such {place.what} on {place.endpoint}, or one hidden from {who}; expected user/name "
+        f"of a {place.what}: check the name" + ("" if place.has_token else f"; if it is private, {LOG_IN}")
     )
 
 
