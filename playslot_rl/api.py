@@ -142,6 +142,7 @@ class PlaySlot:
         from playslot_rl.sharing.config import PolicyConfig
         from playslot_rl.sharing.folder import save_pretrained
         from playslot_rl.sharing.run import plain_card
+        from playslot_rl.sharing.source import versions
 
         if self.agent is None:
             raise CheckpointError(
@@ -149,7 +150,8 @@ class PlaySlot:
             )
         path, agent = Path(folder), self.agent
         known = self._policy or PolicyConfig()
-        config = replace(known, env=agent.world_model.env, model=agent.world_model.config)
+        source = {**known.source, "versions": versions()}
+        config = replace(known, env=agent.world_model.env, model=agent.world_model.config, source=source)
         save_pretrained(agent, path, config, lambda written: plain_card(written, agent, path.name))
 
     @torch.no_grad()

@@ -214,13 +214,18 @@ def _limits(given: CardInput) -> list[str]:
 
 
 def _versions(given: CardInput) -> list[str]:
-    numbers = given.policy.source.get("versions", {})
-    trained = given.policy.source.get("trained_with", {})
-    return [
-        "Exported with " + ", ".join(f"{name} {number}" for name, number in numbers.items()) + ".",
-        "Trained with " + ", ".join(f"{name} {number or 'not recorded'}" for name, number in trained.items()) + ".",
-        f"Weights (fingerprint `{given.policy.fingerprint}`) and card: Apache License 2.0.",
-    ]
+    source = given.policy.source
+    rows = {
+        "exported with": _numbers(source.get("versions", {})),
+        "trained with": _numbers(source.get("trained_with", {})),
+        "weights": f"fingerprint `{given.policy.fingerprint}`",
+        "licence": "Apache License 2.0, of the weights and of this card",
+    }
+    return _table(rows)
+
+
+def _numbers(versions: dict[str, str]) -> str:
+    return ", ".join(f"{name} {number or 'not recorded'}" for name, number in versions.items()) or "not recorded"
 
 
 def _table(rows: dict[str, str]) -> list[str]:

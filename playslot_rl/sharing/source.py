@@ -14,7 +14,6 @@ from typing import Any, Final
 from playslot_rl.errors import CheckpointError
 from playslot_rl.evaluation.success import PROTOCOLS, run_facts
 from playslot_rl.training.checkpoints import (
-    PRETRAINED,
     checkpoint_folder,
     pretrained_folder,
     read_stage,
@@ -86,7 +85,7 @@ def versions() -> dict[str, str]:
 def _is_shipped(env: str, prints: dict[str, str]) -> bool:
     """Whether the world model is the one that ships with the package."""
     try:
-        shipped = world_model_checkpoints(PRETRAINED if env == "button_press" else pretrained_folder(env))
+        shipped = world_model_checkpoints(pretrained_folder(env))
     except CheckpointError:
         return False
     return prints == {name: checkpoint.fingerprint for name, checkpoint in shipped.items()}

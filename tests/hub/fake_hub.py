@@ -407,7 +407,8 @@ class _Handler(BaseHTTPRequestHandler):
             else:
                 raise RefusedError(400, f"unknown operation {key}")
         commit = repository.commit(branch, files)
-        return {"commitUrl": f"{self.server_hub.url}/datasets/{name}/commit/{commit}", "commitOid": commit}
+        page = name.removeprefix("models/") if name.startswith("models/") else f"datasets/{name}"
+        return {"commitUrl": f"{self.server_hub.url}/{page}/commit/{commit}", "commitOid": commit}
 
     def _on_branch(self, name: str, branch: str) -> Any:
         repository = self._repository(name, write=True)

@@ -18,6 +18,7 @@ pytestmark = pytest.mark.slow  # a process of its own imports torch and huggingf
 
 Client = Callable[..., dict[str, Any]]
 NAME = "models/owner/press"
+HEADER = "---\nlicense: apache-2.0\n---\n"
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
 def write(folder: Path, seed: int) -> Path:
     agent = tiny_agent(seed=seed)
     config = PolicyConfig(env=agent.world_model.env, model=agent.world_model.config)
-    save_pretrained(agent, folder, config, lambda written: f"{MARK}\nweights {written.fingerprint}\n")
+    save_pretrained(agent, folder, config, lambda written: f"{HEADER}{MARK}\nweights {written.fingerprint}\n")
     return folder
 
 
@@ -79,9 +80,9 @@ def test_a_card_written_by_hand_and_foreign_files_stay(hub: FakeHub, client: Cli
     assert answer["result"]["card_kept"]
     assert there.files()["README.md"] == b"by hand"
     assert there.files()["video.mp4"] == b"press"
-    (folder / "README.md").write_text("my own words")
+    (folder / "README.md").write_text(f"{HEADER}my own words")
     push(client, folder)
-    assert there.files()["README.md"] == b"my own words"
+    assert there.files()["README.md"] == f"{HEADER}my own words".encode()
 
 
 def test_a_tag_never_moves(hub: FakeHub, client: Client, folder: Path, tmp_path: Path) -> None:

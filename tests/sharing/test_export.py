@@ -66,7 +66,7 @@ def test_the_card_tells_task_data_results_limits_and_versions(run: Path, tmp_pat
     assert "| random actions | 0 % | 0 to 7 % |" in card
     assert "slot oracle" not in card, "it was not measured"
     assert "ICML 2025" in card
-    assert re.search(r"Exported with playslot_rl \S+, torch \S+, .*lerobot 0\.6\.1", card)
+    assert re.search(r"exported with \| playslot_rl \S+, torch \S+, .*lerobot 0\.6\.1", card)
     assert read_config(tmp_path / "press").fingerprint in card
 
 
