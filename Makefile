@@ -12,6 +12,7 @@ UV := $(BIN)/uv
 UV_VERSION := 0.13.8
 STAMP := $(VENV)/.setup-done
 LOCK := requirements.lock
+PLUGIN := lerobot_policy_playslot
 ARGS ?=
 PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
 PYTHON ?=
@@ -61,9 +62,9 @@ $(UV): $(if $(VENV_OK),,FORCE)
 	if [ -z "$(VENV_OK)" ]; then "$$python" -m venv --clear $(VENV); fi
 	@$(BIN)/python -m pip install --quiet "uv==$(UV_VERSION)"
 
-$(STAMP): $(UV) $(LOCK) pyproject.toml
+$(STAMP): $(UV) $(LOCK) pyproject.toml $(PLUGIN)/pyproject.toml
 	@$(UV) pip install --require-hashes -r $(LOCK)
-	@$(UV) pip install --no-deps --editable .
+	@$(UV) pip install --no-deps --editable . --editable ./$(PLUGIN)
 	@touch $@
 
 demo: $(STAMP)
@@ -100,5 +101,5 @@ lock: $(UV)
 	@echo "renewed $(LOCK); make setup installs it"
 
 clean:
-	@rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	@rm -rf $(VENV) build dist *.egg-info $(PLUGIN)/build $(PLUGIN)/src/*.egg-info .pytest_cache .mypy_cache .ruff_cache
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -87,23 +87,13 @@ def rows(episode: Episode, task: str) -> Iterator[dict[str, Any]]:
 
 def env_metadata(spec: CollectionSpec) -> dict[str, Any]:
     """Gymnasium's metadata of the task, or those of an environment without a simulator."""
-    from playslot_rl.envs import PROCEDURAL
+    from playslot_rl.envs import PROCEDURAL, task_metadata
 
     if spec.env.name in PROCEDURAL:
         from playslot_rl.envs.grid_shapes import METADATA
 
         return METADATA
-    import gymnasium
-    from gymnasium.envs.registration import load_env_creator
-
-    from playslot_rl.envs import gym_id, register
-
-    register()
-    entry_point = gymnasium.spec(gym_id(spec.env.name)).entry_point
-    creator: Any = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
-    describe = getattr(creator, "metadata_of", None)  # a family of tasks says what is to be done in each
-    metadata: dict[str, Any] = creator.metadata if describe is None else describe(spec.env)
-    return metadata
+    return task_metadata(spec.env)
 
 
 def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str, Any]]:

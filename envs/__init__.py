@@ -104,6 +104,24 @@ def task_env(env: gym.Env[Any, Any]) -> TaskEnv:
     return cast(TaskEnv, env.unwrapped)
 
 
+def task_metadata(env: EnvConfig) -> dict[str, Any]:
+    """Gymnasium's metadata of a task, without making it: `control_hz`, `task` (a sentence), `action` (its numbers).
+
+    Raises:
+        ConfigError: there is no such environment, or it has no simulator.
+    """
+    name = gym_id(env.name)
+    import gymnasium
+    from gymnasium.envs.registration import load_env_creator
+
+    register()
+    entry_point = gymnasium.spec(name).entry_point
+    creator: Any = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    describe = getattr(creator, "metadata_of", None)  # a family of tasks says what is to be done in each
+    metadata: dict[str, Any] = creator.metadata if describe is None else describe(env)
+    return metadata
+
+
 def make_torchrl_env(env: EnvConfig | None = None, render: RenderConfig | None = None) -> EnvBase:
     """Make a task in its TorchRL form; see `playslot_rl.envs.torchrl`."""
     from playslot_rl.envs.torchrl import make_torchrl_env as make
@@ -121,4 +139,5 @@ __all__ = [
     "make_torchrl_env",
     "register",
     "task_env",
+    "task_metadata",
 ]

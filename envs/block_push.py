@@ -68,6 +68,7 @@ class BlockEnv(PixelTask):
         "render_fps": 12,
         "control_hz": 25,
         "task": "",
+        "action": "grip displacement x, y, z in units of 0.05 m and gripper effort (used by Pick only)",
     }
     """`control_hz` counts environment steps: an agent step of `frame_skip` of them takes `frame_skip / 25` seconds."""
 

@@ -46,6 +46,7 @@ class ButtonPressEnv(PixelTask):
         "render_fps": 16,
         "control_hz": 80,
         "task": "Press the red button.",
+        "action": "hand displacement x, y, z and gripper effort",
     }
     """`control_hz` counts environment steps: an agent step of `frame_skip` of them takes `frame_skip / 80` seconds."""
 

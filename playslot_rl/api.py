@@ -17,7 +17,7 @@ H W image height and width. "[B,]" may be there or not; "[N,]" is there with one
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,9 @@ from playslot_rl.modules.inverse_dynamics import LatentActions
 from playslot_rl.modules.savi import Decoded
 from playslot_rl.world_model import Agent, WorldModel, module_device
 
+if TYPE_CHECKING:
+    from playslot_rl.sharing.config import PolicyConfig
+
 Array = npt.NDArray[Any] | Tensor
 
 
@@ -37,8 +40,8 @@ def load(run: str | Path = "pretrained", device: str = "", seed: int = 0) -> Pla
     """Load a run folder, or the world model that ships with the package.
 
     Args:
-        run: folder of a run, or `pretrained/ENV` (`pretrained` is ButtonPress's). Without a finished `train-policy` the
-            model cannot `act`.
+        run: folder of a run, of an exported policy, or `pretrained/ENV` (`pretrained` is ButtonPress's). Without a
+            finished `train-policy` the model cannot `act`.
         device: torch device; empty means a GPU if there is one.
         seed: of sampled initial slots (only models with `initial: gaussian` draw any).
 
@@ -51,8 +54,11 @@ def load(run: str | Path = "pretrained", device: str = "", seed: int = 0) -> Pla
         >>> model.world_model.slot_shape[0]
         4
     """
+    from playslot_rl.sharing.config import is_model_folder
     from playslot_rl.training.checkpoints import checkpoint_folder, load_agent, load_world_model, run_folder
 
+    if is_model_folder(Path(run)):
+        return PlaySlot.from_pretrained(run, device, seed=seed)
     target = device or ("cuda" if torch.cuda.is_available() else "cpu")
     if (checkpoint_folder(run_folder(run), "policy") / "meta.json").is_file():
         agent = load_agent(run, target)
@@ -74,6 +80,7 @@ class PlaySlot:
         self.agent = None if agent is None else agent.eval()
         self._seed = seed
         self._state: Tensor | None = None
+        self._policy: PolicyConfig | None = None
 
     @classmethod
     def untrained(cls, config: ExperimentConfig | None = None, seed: int = 0) -> PlaySlot:
@@ -87,6 +94,65 @@ class PlaySlot:
 
         agent = tiny_agent(config, seed)
         return cls(agent.world_model, agent, seed)
+
+    @classmethod
+    def from_pretrained(
+        cls, name: str | Path, device: str = "", revision: str = "", token: str | None = None, seed: int = 0
+    ) -> PlaySlot:
+        """Load a policy that `playslot export` or `save_pretrained` wrote, from a folder or from the Hugging Face Hub.
+
+        Args:
+            name: a folder, or `user/name` on the Hub where there is no such folder.
+            device: torch device; empty means a GPU if there is one.
+            revision: branch, tag or commit on the Hub; empty means main.
+            token: None takes HF_TOKEN or what `hf auth login` stored; not needed for public models.
+            seed: see `load`.
+
+        Raises:
+            CheckpointError: the folder is not whole, its files do not belong together, or it is no PlaySlot policy.
+            HubError: no such repository or revision, no network, or an error of the Hub.
+        """
+        from playslot_rl.sharing.folder import load_pretrained
+
+        folder = Path(name)
+        if not folder.is_dir():
+            from playslot_rl.hub.pull_policy import pull_policy
+
+            folder = pull_policy(str(name), revision, token=token)
+        agent, policy = load_pretrained(folder, device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        model = cls(agent.world_model, agent, seed)
+        model._policy = policy
+        return model
+
+    def save_pretrained(self, folder: str | Path) -> None:
+        """Write the policy as a folder that LeRobot loads (`playslot_rl.sharing.folder`).
+
+        What a loaded policy says of its origin is written again; of one that was just trained nothing is known here:
+        `playslot export` reads it from the run, with the results for the card.
+
+        Args:
+            folder: must not exist.
+
+        Raises:
+            CheckpointError: the model has no policy.
+            OutputError: `folder` exists, or cannot be written.
+        """
+        from dataclasses import replace
+
+        from playslot_rl.sharing.config import PolicyConfig
+        from playslot_rl.sharing.folder import save_pretrained
+        from playslot_rl.sharing.run import plain_card
+        from playslot_rl.sharing.source import versions
+
+        if self.agent is None:
+            raise CheckpointError(
+                "save_pretrained: got a world model without a policy; run `playslot train-policy` and load that run"
+            )
+        path, agent = Path(folder), self.agent
+        known = self._policy or PolicyConfig()
+        source = {**known.source, "versions": versions()}
+        config = replace(known, env=agent.world_model.env, model=agent.world_model.config, source=source)
+        save_pretrained(agent, path, config, lambda written: plain_card(written, agent, path.name))
 
     @torch.no_grad()
     def parse(self, frames: Array) -> Tensor:

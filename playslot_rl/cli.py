@@ -95,6 +95,16 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot evaluate run=runs/shapes episodes=100",
         ),
     ),
+    "export": Command(
+        "a trained policy as a folder that LeRobot loads, with a model card; also to the Hub",
+        "Writes config.json, model.safetensors (world model, policy and action decoder), LeRobot's processors and a "
+        "model card into a new folder. With `export.repo=user/name` the folder is pushed to the Hugging Face Hub too; "
+        "export.private, export.branch and export.tag say how.",
+        (
+            "playslot export run=runs/demo out=policies/press",
+            "playslot export run=runs/demo out=policies/press export.repo=me/press export.private=true",
+        ),
+    ),
     "pipeline": Command(
         "all stages from nothing: data, three trainings, evaluation, report",
         "Runs every stage and skips the finished ones, so the same command carries on after a stop.",

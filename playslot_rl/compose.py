@@ -21,7 +21,7 @@ from playslot_rl.errors import ConfigError
 
 CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
-CONTINUES: Final = frozenset({"evaluate", "train-dynamics", "train-policy"})
+CONTINUES: Final = frozenset({"evaluate", "export", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
 COMPARE: Final = "compare"
 """The command whose `methods=`, `demos=` and `seeds=` are lists, and which takes `hydra.` keys."""
@@ -31,7 +31,7 @@ SHIPPED: Final = "pretrained"
 _FOLDERS: Final = frozenset({"out", "run", "data.root", "data.demos", "data.cache", "slots.start_from"})
 
 # These say what one invocation does, on which machine; a stored run does not hand them on.
-_OF_THE_CALL: Final = ("out", "run", "episodes", "policy", "protocol", "workers", "collector", "device")
+_OF_THE_CALL: Final = ("out", "run", "episodes", "policy", "protocol", "workers", "collector", "device", "export")
 
 
 def shipped(run: str) -> bool:

@@ -117,6 +117,23 @@ class EvaluationConfig:
 
 
 @dataclass(frozen=True)
+class ExportConfig:
+    """Where `export` pushes the model folder; nowhere with an empty `repo`.
+
+    Attributes:
+        repo: `user/name` on the Hugging Face Hub; made if it is not there.
+        private: make it private; refused where it is public.
+        branch: empty means main.
+        tag: one more name for the commit; never moved.
+    """
+
+    repo: str = ""
+    private: bool = False
+    branch: str = ""
+    tag: str = ""
+
+
+@dataclass(frozen=True)
 class LoggingConfig:
     """Logging: `tensorboard` (default), `wandb`, `trackio` or `none`, and a progress bar."""
 
@@ -169,6 +186,7 @@ class ExperimentConfig:
     compare: CompareConfig = field(default_factory=CompareConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     logging: LoggingConfig = field(default_factory=LoggingConfig)
+    export: ExportConfig = field(default_factory=ExportConfig)
 
     def __post_init__(self) -> None:
         check(self.episodes is None or self.episodes >= 1, "episodes", self.episodes, "at least 1")

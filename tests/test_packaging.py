@@ -15,6 +15,7 @@ import pytest
 import playslot_rl
 
 MAPPED = ("envs", "collectors", "recipes")
+PLUGIN = "lerobot_policy_playslot"
 DATA_SUFFIXES = {".yaml", ".safetensors", ".json", ".md", ".typed"}
 # Machines have hosts and folders of their own: none of them belongs into a file that is shared.
 INDEX_ADDRESS = re.compile(r"(?i)https?://|file:|--(extra-)?index-url|--find-links|^-i |^-f ")
@@ -111,6 +112,33 @@ def test_the_wheel_is_complete(repository: Path, tmp_path: Path) -> None:
     assert {name for name in names if name.startswith("playslot_rl/")} == installed_files(repository)
     assert {name.partition("/")[0].partition("-")[0] for name in names} == {"playslot_rl"}
     assert any(name.endswith("dist-info/licenses/LICENSE") for name in names)
+
+
+def test_the_plugins_wheel_is_complete(repository: Path, tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    shutil.copytree(repository / PLUGIN, source, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info", "build"))
+    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), str(source)]
+    done = subprocess.run(build, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+        (metadata,) = (archive.read(name).decode() for name in names if name.endswith("/METADATA"))
+    files = {path.name for path in (repository / PLUGIN / "src" / PLUGIN).iterdir() if path.is_file()}
+    assert {f"{part}_playslot.py" for part in ("configuration", "modeling", "processor")} <= files, "LeRobot's names"
+    assert {name for name in names if name.startswith(f"{PLUGIN}/")} == {f"{PLUGIN}/{name}" for name in files}
+    assert f"\nName: {PLUGIN}\n" in metadata, "LeRobot imports the distribution by this very name"
+    assert any(name.endswith("dist-info/licenses/LICENSE") for name in names)
+
+
+def test_the_plugin_stands_on_this_version(repository: Path) -> None:
+    plugin = tomllib.loads((repository / PLUGIN / "pyproject.toml").read_text())["project"]
+    ours = settings(repository)["project"]
+    assert isinstance(ours, dict)
+    assert plugin["version"] == playslot_rl.__version__
+    lerobot = next(name for name in ours["dependencies"] if name.startswith("lerobot"))
+    assert plugin["dependencies"] == [f"playslot_rl=={playslot_rl.__version__}", lerobot]
+    assert (repository / PLUGIN / "LICENSE").read_bytes() == (repository / "LICENSE").read_bytes()
 
 
 @pytest.mark.slow

@@ -60,7 +60,9 @@ def test_a_documented_command_is_accepted(page: str, command: str) -> None:
         # A page names runs that are not here: composed as by a command that reads no run.
         assert compose(typed, name if name == "compare" else "collect")
     else:
-        assert program in {"cd", "cp", "git", "hf", "python", "pip", "tensorboard"}, f"{page}: unknown program"
+        assert program in {"cd", "cp", "git", "hf", "lerobot-eval", "python", "pip", "tensorboard"}, (
+            f"{page}: unknown program"
+        )
 
 
 def test_the_cheap_commands_run() -> None:

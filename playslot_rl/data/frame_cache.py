@@ -64,7 +64,7 @@ def frame_cache(files: LeRobotFiles, camera: str, cache: str | Path, size: int |
 def _build(files: LeRobotFiles, camera: str, size: int | None, folder: Path) -> None:
     writer: ArrayWriter | None = None
     for piece in files.pieces(camera):
-        frames = piece if size is None or piece.shape[1:3] == (size, size) else _resize(piece, size)
+        frames = piece if size is None or piece.shape[1:3] == (size, size) else resize_frames(piece, size)
         if writer is None:
             writer = ArrayWriter(folder / "frames.npy", (files.frames, *frames.shape[1:]), np.uint8)
         if frames.shape[1:] != writer.shape[1:]:
@@ -80,7 +80,8 @@ def _build(files: LeRobotFiles, camera: str, size: int | None, folder: Path) -> 
     write_json(folder / "meta.json", {"camera": camera, "fps": files.fps, "task": files.task})
 
 
-def _resize(frames: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.uint8]:
+def resize_frames(frames: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.uint8]:
+    """Resize whole frames by area averaging: uint8 (n, H, W, 3) to (n, size, size, 3)."""
     from PIL import Image
 
     resized = [np.asarray(Image.fromarray(f).resize((size, size), Image.Resampling.BOX)) for f in frames]

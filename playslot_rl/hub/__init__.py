@@ -1,1 +1,1 @@
-"""Data sets to and from the Hugging Face Hub. `push.push` and `pull.pull` are the two ways in."""
+"""Data sets (`push`, `pull`) and policies (`push_policy`, `pull_policy`) to and from the Hugging Face Hub."""

@@ -17,12 +17,13 @@ class Place:
     """What was being done, for the messages.
 
     Attributes:
-        repo_id: the data set on the Hub, `user/name`.
+        repo_id: the repository on the Hub, `user/name`.
         endpoint: address of the Hub.
         root: local folder.
         writing: a push (a pull otherwise).
         has_token: whether a token was sent.
         revision: the revision asked for; empty if none was.
+        what: what the repository is, in words.
     """
 
     repo_id: str
@@ -31,6 +32,7 @@ class Place:
     writing: bool
     has_token: bool
     revision: str = ""
+    what: str = "data set"
 
 
 def offline(place: Place) -> HubError:
@@ -69,7 +71,7 @@ def _one(error: BaseException, place: Place) -> PlaySlotError | None:
     if isinstance(error, hub.HfHubHTTPError):
         return _http(error, place)
     if isinstance(error, hub.HFValidationError | hub.HfUriError):
-        return bad_name(place.repo_id)
+        return bad_name(place)
     if isinstance(error, httpx.UnsupportedProtocol | httpx.InvalidURL):
         return HubError(
             f"got HF_ENDPOINT={place.endpoint}, expected the address of a Hub: unset HF_ENDPOINT or mend it"
@@ -107,7 +109,8 @@ def _http(error: BaseException, place: Place) -> HubError:
         return no_revision(place)
     if isinstance(error, hub.GatedRepoError):
         return HubError(
-            f"{place.repo_id}: got a gated data set, expected access to it: ask for access on its page, then {LOG_IN}"
+            f"{place.repo_id}: got a gated {place.what}, expected access to it: ask for access on its page, then "
+            f"{LOG_IN}"
         )
     if status == 401:
         return _unauthorised(error, place)
@@ -152,8 +155,8 @@ def no_repository(place: Place) -> HubError:
     """Nothing of that name, or private."""
     who = "your token" if place.has_token else "you: no token was sent"
     return HubError(
-        f"{place.repo_id}: got no such data set on {place.endpoint}, or one hidden from {who}; expected user/name of a "
-        f"data set: check the name" + ("" if place.has_token else f"; if it is private, {LOG_IN}")
+        f"{place.repo_id}: got no such {place.what} on {place.endpoint}, or one hidden from {who}; expected user/name "
+        f"of a {place.what}: check the name" + ("" if place.has_token else f"; if it is private, {LOG_IN}")
     )
 
 
@@ -165,9 +168,9 @@ def no_revision(place: Place) -> HubError:
     )
 
 
-def bad_name(repo_id: str) -> HubError:
+def bad_name(place: Place) -> HubError:
     """Not `user/name`."""
     return HubError(
-        f"got the data set name {repo_id!r}, expected user/name of letters, digits, '-', '_' and '.': your name on the "
-        "Hub, a slash, and a name for the data set"
+        f"got the {place.what} name {place.repo_id!r}, expected user/name of letters, digits, '-', '_' and '.': your "
+        f"name on the Hub, a slash, and a name for the {place.what}"
     )

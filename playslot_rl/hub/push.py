@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -117,7 +118,7 @@ def push(
         sizes, left = local_files(root)
         content: dict[str, Path | bytes] = {path: root / path for path in sizes}
         content[REMOTE_RECORD] = record.to_bytes()
-        card = _own_card(hub, root, head, remote)
+        card = own_card(hub, root, head, remote, is_ours)
         if card != KEPT:
             content[CARD_NAME] = card or make_card(files, hub.name, record).encode()
         expected = {path: sizes.get(path, _size(item)) for path, item in content.items()}
@@ -167,7 +168,9 @@ def _check_tag(hub: Repository, tag: str | None, tags: dict[str, str], content: 
         )
 
 
-def _own_card(hub: Repository, root: Path, head: str, remote: dict[str, RemoteFile]) -> Path | Literal["", "kept"]:
+def own_card(
+    hub: Repository, root: Path, head: str, remote: dict[str, RemoteFile], is_ours: Callable[[str], bool]
+) -> Path | Literal["", "kept"]:
     """A card written by hand: the one in the folder, else `KEPT` for the one on the Hub; empty if there is none."""
     local = root / CARD_NAME
     if local.is_file() and not is_ours(local.read_text(errors="replace")):

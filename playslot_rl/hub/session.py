@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 from playslot_rl.errors import HubError, PlaySlotError
 from playslot_rl.hub.errors import Place, bad_name, no_token, offline, translate
@@ -24,20 +24,24 @@ WAITS = (1.0, 2.0, 4.0)
 SECONDS = 120.0
 """Longest silence of the Hub; the client's own default is to wait for ever."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*/[A-Za-z0-9][A-Za-z0-9._-]*")
-KIND = "dataset"
+Kind = Literal["dataset", "model"]
+WORDS: Final[dict[Kind, str]] = {"dataset": "data set", "model": "model"}
+_PAGES: Final[dict[Kind, str]] = {"dataset": "datasets/", "model": ""}
 
 
 @dataclass(frozen=True)
 class Repository:
-    """A data set on the Hub, and how to talk about it.
+    """A data set or model on the Hub, and how to talk about it.
 
     Attributes:
         place: for messages.
         api: `huggingface_hub.HfApi` with the token.
+        kind: what it is.
     """
 
     place: Place
     api: Any
+    kind: Kind = "dataset"
 
     @property
     def name(self) -> str:
@@ -47,7 +51,7 @@ class Repository:
     @property
     def address(self) -> str:
         """Its page."""
-        return f"{self.place.endpoint}/datasets/{self.name}"
+        return f"{self.place.endpoint}/{_PAGES[self.kind]}{self.name}"
 
     def call(self, function: Callable[..., Any], **arguments: Any) -> Any:
         """Call the Hub, again after a server error or a broken connection (not where there is none).
@@ -81,30 +85,31 @@ class Repository:
         Raises:
             HubError: it is there and public, though `private` is asked for.
         """
-        self.call(self.api.create_repo, repo_id=self.name, repo_type=KIND, private=private, exist_ok=True)
-        is_private = bool(self.call(self.api.dataset_info, repo_id=self.name).private)
+        self.call(self.api.create_repo, repo_id=self.name, repo_type=self.kind, private=private, exist_ok=True)
+        is_private = bool(self.call(self.api.repo_info, repo_id=self.name, repo_type=self.kind).private)
         if private and not is_private:
             raise HubError(
-                f"{self.name}: got a public data set, expected a private one: make it private in its settings on the "
-                "Hub, or push to another name"
+                f"{self.name}: got a public {self.place.what}, expected a private one: make it private in its settings "
+                "on the Hub, or push to another name"
             )
         return is_private
 
     def refs(self) -> tuple[dict[str, str], dict[str, str]]:
         """Commits of the branches and of the tags, by name."""
-        refs = self.call(self.api.list_repo_refs, repo_id=self.name, repo_type=KIND)
+        refs = self.call(self.api.list_repo_refs, repo_id=self.name, repo_type=self.kind)
         return ({ref.name: ref.target_commit for ref in refs.branches},
                 {ref.name: ref.target_commit for ref in refs.tags})  # fmt: skip
 
     def commit_of(self, revision: str) -> str:
         """Full commit of a branch, tag or commit."""
-        return str(self.call(self.api.dataset_info, repo_id=self.name, revision=revision).sha)
+        info = self.call(self.api.repo_info, repo_id=self.name, repo_type=self.kind, revision=revision)
+        return str(info.sha)
 
     def tree(self, commit: str) -> dict[str, RemoteFile]:
         """All files of a commit, by path."""
 
         def listed() -> list[Any]:
-            entries = self.api.list_repo_tree(repo_id=self.name, repo_type=KIND, revision=commit, recursive=True)
+            entries = self.api.list_repo_tree(repo_id=self.name, repo_type=self.kind, revision=commit, recursive=True)
             return list(entries)
 
         files: dict[str, RemoteFile] = {}
@@ -117,13 +122,13 @@ class Repository:
 
     def make_branch(self, branch: str) -> None:
         """A branch from main."""
-        self.call(self.api.create_branch, repo_id=self.name, repo_type=KIND, branch=branch, exist_ok=True)
+        self.call(self.api.create_branch, repo_id=self.name, repo_type=self.kind, branch=branch, exist_ok=True)
 
     def set_tag(self, tag: str, commit: str, *, replace: bool) -> None:
         """Name a commit. Moving a tag is two requests: after a failure in between the same push sets it."""
         if replace:
-            self.call(self.api.delete_tag, repo_id=self.name, repo_type=KIND, tag=tag)
-        self.call(self.api.create_tag, repo_id=self.name, repo_type=KIND, tag=tag, revision=commit, exist_ok=True)
+            self.call(self.api.delete_tag, repo_id=self.name, repo_type=self.kind, tag=tag)
+        self.call(self.api.create_tag, repo_id=self.name, repo_type=self.kind, tag=tag, revision=commit, exist_ok=True)
 
     def commit(self, files: dict[str, Path | bytes], stale: Sequence[str], message: str, branch: str, head: str) -> str:
         """Add `files` and delete `stale` in one commit on top of `head`; nothing is visible before it.
@@ -139,16 +144,16 @@ class Repository:
         def send() -> str:
             operations: list[Any] = [CommitOperationDelete(path, is_folder=False) for path in stale]
             operations += [CommitOperationAdd(path, content) for path, content in files.items()]
-            info = self.api.create_commit(repo_id=self.name, repo_type=KIND, operations=operations, revision=branch,
-                                          commit_message=message, parent_commit=head)  # fmt: skip
+            info = self.api.create_commit(repo_id=self.name, repo_type=self.kind, operations=operations,
+                                          revision=branch, commit_message=message, parent_commit=head)  # fmt: skip
             return str(info.oid)
 
         return str(self.call(send))
 
     def read(self, path: str, commit: str, folder: Path) -> bytes:
         """Content of one file, downloaded below `folder`."""
-        got = self.call(self.api.hf_hub_download, repo_id=self.name, repo_type=KIND, filename=path, revision=commit,
-                        local_dir=folder)  # fmt: skip
+        got = self.call(self.api.hf_hub_download, repo_id=self.name, repo_type=self.kind, filename=path,
+                        revision=commit, local_dir=folder)  # fmt: skip
         return Path(got).read_bytes()
 
     def download(self, paths: Sequence[str], commit: str, folder: Path) -> None:
@@ -158,7 +163,7 @@ class Repository:
         answer, and says nothing.
         """
         pattern = [_literal(path) for path in paths]
-        self.call(self.api.snapshot_download, repo_id=self.name, repo_type=KIND, revision=commit, local_dir=folder,
+        self.call(self.api.snapshot_download, repo_id=self.name, repo_type=self.kind, revision=commit, local_dir=folder,
                   allow_patterns=pattern)  # fmt: skip
 
 
@@ -191,9 +196,9 @@ def _limit_silence() -> None:
 
 @contextlib.contextmanager
 def open_repository(
-    repo_id: str, root: Path, *, token: str | None, writing: bool, revision: str = ""
+    repo_id: str, root: Path, *, token: str | None, writing: bool, revision: str = "", kind: Kind = "dataset"
 ) -> Iterator[Repository]:
-    """Talk to the Hub about one data set.
+    """Talk to the Hub about one data set or model.
 
     Args:
         repo_id: `user/name`.
@@ -201,6 +206,7 @@ def open_repository(
         token: None takes HF_TOKEN or what `hf auth login` stored.
         writing: needs a token.
         revision: asked for, for messages.
+        kind: what the repository is.
 
     Raises:
         HubError: a bad name, offline mode, no token, or anything that goes wrong inside, in one line without tokens.
@@ -210,16 +216,17 @@ def open_repository(
 
     token = checked_token(token) or checked_token(get_token())
     redactor = Redactor(token)
-    place = Place(redactor.text(repo_id), redactor.text(constants.ENDPOINT), root, writing, token is not None, revision)
+    name, endpoint = redactor.text(repo_id), redactor.text(constants.ENDPOINT)
+    place = Place(name, endpoint, root, writing, token is not None, revision, WORDS[kind])
     if not _NAME.fullmatch(repo_id):
-        raise bad_name(place.repo_id)
+        raise bad_name(place)
     if is_offline_mode():
         raise offline(place)
     if writing and token is None:
         raise no_token(place)
     with redactor.logs():
         try:
-            yield Repository(place, HfApi(token=token or False, library_name="playslot_rl"))
+            yield Repository(place, HfApi(token=token or False, library_name="playslot_rl"), kind)
         except PlaySlotError as error:
             redactor.error(error)
             raise

@@ -66,11 +66,16 @@ def _faults(patches: dict[str, Any]) -> Iterator[None]:
 
 def _run(request: dict[str, Any]) -> dict[str, Any]:
     from playslot_rl.hub.pull import pull
+    from playslot_rl.hub.pull_policy import pull_policy
     from playslot_rl.hub.push import push
+    from playslot_rl.hub.push_policy import push_policy
 
     arguments = dict(request["arguments"])
-    arguments["root"] = Path(arguments["root"])
-    result = {"push": push, "pull": pull}[request["call"]](**arguments)
+    for name in {"root", "folder"} & arguments.keys():
+        arguments[name] = Path(arguments[name])
+    if request["call"] == "pull_policy":
+        return {"folder": str(pull_policy(**arguments))}
+    result = {"push": push, "pull": pull, "push_policy": push_policy}[request["call"]](**arguments)
     return {"lines": result.lines(), "result": dataclasses.asdict(result)}
 
 

@@ -1,4 +1,6 @@
-"""A small Hugging Face Hub on localhost, for data sets only, with faults on demand.
+"""A small Hugging Face Hub on localhost, for data sets and models, with faults on demand.
+
+A model `owner/press` is the repository `models/owner/press` here.
 
 It answers the requests that huggingface_hub 1.33 makes for a push and a pull: whoami, create, info, refs, tree,
 validate-yaml, preupload, large files (batch, upload, verify), commit (ndjson), branch, tag, resolve with ranges.
@@ -18,7 +20,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
 
-LARGE = (".parquet", ".mp4")
+LARGE = (".parquet", ".mp4", ".safetensors")
 WRITE_TOKEN = "hf_MARKERofTheOwner0123456789abcdef"
 READ_TOKEN = "hf_MARKERofAReader0123456789abcdef"
 PLAIN_TOKEN = "no.shape-that-tells-MARKER_it"
@@ -142,21 +144,36 @@ ROUTES: list[tuple[str, re.Pattern[str], str]] = [
         ("GET", r"/api/whoami-v2", "whoami"),
         ("POST", r"/api/repos/create", "create"),
         ("POST", r"/api/validate-yaml", "validate"),
-        ("GET", r"/api/datasets/([^/]+/[^/]+)", "info"),
-        ("GET", r"/api/datasets/([^/]+/[^/]+)/revision/(.+)", "info"),
-        ("GET", r"/api/datasets/([^/]+/[^/]+)/refs", "refs"),
-        ("GET", r"/api/datasets/([^/]+/[^/]+)/tree/([^/]+)", "tree"),
-        ("POST", r"/api/datasets/([^/]+/[^/]+)/preupload/([^/]+)", "preupload"),
-        ("POST", r"/api/datasets/([^/]+/[^/]+)/commit/([^/]+)", "commit"),
-        ("POST", r"/api/datasets/([^/]+/[^/]+)/branch/([^/]+)", "branch"),
-        ("POST", r"/api/datasets/([^/]+/[^/]+)/tag/([^/]+)", "tag"),
-        ("DELETE", r"/api/datasets/([^/]+/[^/]+)/tag/([^/]+)", "untag"),
-        ("POST", r"/datasets/([^/]+/[^/]+)\.git/info/lfs/objects/batch", "batch"),
+        ("GET", r"/api/((?:datasets|models)/[^/]+/[^/]+)", "info"),
+        ("GET", r"/api/((?:datasets|models)/[^/]+/[^/]+)/revision/(.+)", "info"),
+        ("GET", r"/api/((?:datasets|models)/[^/]+/[^/]+)/refs", "refs"),
+        ("GET", r"/api/((?:datasets|models)/[^/]+/[^/]+)/tree/([^/]+)", "tree"),
+        ("POST", r"/api/((?:datasets|models)/[^/]+/[^/]+)/preupload/([^/]+)", "preupload"),
+        ("POST", r"/api/((?:datasets|models)/[^/]+/[^/]+)/commit/([^/]+)", "commit"),
+        ("POST", r"/api/((?:datasets|models)/[^/]+/[^/]+)/branch/([^/]+)", "branch"),
+        ("POST", r"/api/((?:datasets|models)/[^/]+/[^/]+)/tag/([^/]+)", "tag"),
+        ("DELETE", r"/api/((?:datasets|models)/[^/]+/[^/]+)/tag/([^/]+)", "untag"),
+        ("POST", r"/((?:datasets/)?[^/]+/[^/]+)\.git/info/lfs/objects/batch", "batch"),
         ("PUT", r"/large/([0-9a-f]{64})", "upload"),
         ("POST", r"/large/([0-9a-f]{64})/verify", "verify"),
     )
 ]
-RESOLVE = re.compile(r"/datasets/([^/]+/[^/]+)/resolve/([^/]+)/(.+)\Z")
+RESOLVE = re.compile(r"/((?:datasets/)?[^/]+/[^/]+)/resolve/([^/]+)/(.+)\Z")
+
+
+def named(place: str) -> str:
+    """Name of the repository that an address means: those of models on the pages have no prefix."""
+    if "/" not in place:
+        return place  # a hash: it is no repository
+    if place.startswith("datasets/"):
+        return place.removeprefix("datasets/")
+    return place if place.startswith("models/") else f"models/{place}"
+
+
+def parts(matched: re.Match[str]) -> list[str]:
+    """What an address names: the repository first."""
+    groups = [unquote(group) for group in matched.groups()]
+    return [named(groups[0]), *groups[1:]] if groups else []
 
 
 def blob_id(data: bytes) -> str:
@@ -198,12 +215,12 @@ class _Handler(BaseHTTPRequestHandler):
             raw = urlsplit(self.path).path  # matched before it is unquoted: a branch's slash arrives as %2F
             matched = RESOLVE.match(raw)
             if matched and self.command in ("GET", "HEAD"):
-                return self._file(*map(unquote, matched.groups()))
+                return self._file(*parts(matched))
             for method, pattern, name in ROUTES:
                 matched = pattern.match(raw)
                 if method == self.command and matched:
                     with hub.lock:
-                        return self._json(200, getattr(self, f"_on_{name}")(*map(unquote, matched.groups())))
+                        return self._json(200, getattr(self, f"_on_{name}")(*parts(matched)))
             raise RefusedError(404, f"no such route: {self.command} {path}")
         except RefusedError as refused:
             self._refuse(refused)
@@ -284,10 +301,11 @@ class _Handler(BaseHTTPRequestHandler):
     def _on_create(self) -> Any:
         self._user(write=True)
         asked = json.loads(self.body)
-        name = f"{asked['organization']}/{asked['name']}"
-        address = f"{self.server_hub.url}/datasets/{name}"
+        kind = "datasets/" if asked.get("type") == "dataset" else ""
+        name = named(f"{kind}{asked['organization']}/{asked['name']}")
+        address = f"{self.server_hub.url}/{kind}{asked['organization']}/{asked['name']}"
         if name in self.server_hub.repositories:
-            raise RefusedError(409, "You already created this dataset repo", url=address)
+            raise RefusedError(409, "You already created this repo", url=address)
         self.server_hub.make(name, private=asked.get("visibility") == "private")
         return {"url": address}
 
@@ -389,7 +407,8 @@ class _Handler(BaseHTTPRequestHandler):
             else:
                 raise RefusedError(400, f"unknown operation {key}")
         commit = repository.commit(branch, files)
-        return {"commitUrl": f"{self.server_hub.url}/datasets/{name}/commit/{commit}", "commitOid": commit}
+        page = name.removeprefix("models/") if name.startswith("models/") else f"datasets/{name}"
+        return {"commitUrl": f"{self.server_hub.url}/{page}/commit/{commit}", "commitOid": commit}
 
     def _on_branch(self, name: str, branch: str) -> Any:
         repository = self._repository(name, write=True)

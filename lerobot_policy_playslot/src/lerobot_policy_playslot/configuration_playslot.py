@@ -1,0 +1,103 @@
+"""The policy's config as LeRobot reads and writes it. What the values mean: `playslot_rl.sharing.config`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NoReturn
+
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+
+from playslot_rl.config import EnvConfig, ModelConfig, to_dict
+from playslot_rl.sharing.config import LICENCE, TYPE, PolicyConfig, camera_of
+
+NOT_TRAINED_HERE = (
+    "playslot: got a call to train, expected one to act: its three stages are trained from videos by `playslot "
+    "pipeline` or `playslot train-policy`, then shared by `playslot export`"
+)
+
+
+@PreTrainedConfig.register_subclass(TYPE)
+@dataclass
+class PlaySlotConfig(PreTrainedConfig):
+    """A PlaySlot policy.
+
+    Attributes:
+        env: the task it was trained on, plain values of `playslot_rl.config.EnvConfig`.
+        model: sizes of its networks, plain values of `playslot_rl.config.ModelConfig`.
+        resize: resize frames of another size by area averaging; False refuses them.
+        fingerprint: first 16 hex digits of the SHA-256 of `model.safetensors`; empty for fresh weights.
+        source: where the weights came from.
+
+    Raises:
+        ValueError: unknown keys or values outside their range in `env` or `model`, or features that do not fit them.
+    """
+
+    env: dict[str, Any] = field(default_factory=lambda: to_dict(EnvConfig()))
+    model: dict[str, Any] = field(default_factory=lambda: to_dict(ModelConfig()))
+    resize: bool = False
+    fingerprint: str = ""
+    source: dict[str, Any] = field(default_factory=dict)
+    license: str | None = LICENCE
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        inputs, outputs = self.policy_config().features()
+        self.input_features = self.input_features or _features(inputs)
+        self.output_features = self.output_features or _features(outputs)
+        self.validate_features()
+
+    def policy_config(self) -> PolicyConfig:
+        """The same values as playslot_rl's own dataclass."""
+        inputs = {name: {"type": feature.type.value} for name, feature in (self.input_features or {}).items()}
+        camera = camera_of(inputs) if inputs else PolicyConfig().camera
+        ours = ("env", "model", "resize", "fingerprint", "source")
+        return PolicyConfig.of(camera, {name: getattr(self, name) for name in ours})
+
+    def validate_features(self) -> None:
+        """Check that frames and actions have the sizes of `env`.
+
+        Raises:
+            ValueError: they have not.
+        """
+        inputs, outputs = self.policy_config().features()
+        for got, expected in ((self.input_features, inputs), (self.output_features, outputs)):
+            for name, feature in expected.items():
+                found = (got or {}).get(name)
+                shape = None if found is None else list(found.shape)
+                if shape != feature["shape"] and not (self.resize and feature["type"] == FeatureType.VISUAL.value):
+                    raise ValueError(f"{name}: got shape {shape}, expected {feature['shape']}, as in its env")
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """The present frame only: the past is in SAVi's state."""
+        return
+
+    @property
+    def action_delta_indices(self) -> None:
+        """One action a step."""
+        return
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """Rewards are not used."""
+        return
+
+    def get_optimizer_preset(self) -> NoReturn:
+        """Refuse `lerobot-train` before it reads any data.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(NOT_TRAINED_HERE)
+
+    def get_scheduler_preset(self) -> NoReturn:
+        """Refuse `lerobot-train`.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(NOT_TRAINED_HERE)
+
+
+def _features(plain: dict[str, dict[str, Any]]) -> dict[str, PolicyFeature]:
+    return {name: PolicyFeature(FeatureType(value["type"]), tuple(value["shape"])) for name, value in plain.items()}

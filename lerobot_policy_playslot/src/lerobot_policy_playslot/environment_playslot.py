@@ -1,0 +1,85 @@
+"""Our simulated tasks as an environment of LeRobot: `--env.type=playslot --env.task=button_press`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
+from lerobot.envs.utils import freeze_after_episode_end
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+
+import playslot_rl.config as ours
+from playslot_rl.envs.lerobot import CAMERA, LeRobotTask, frames_a_second
+
+IMAGE = f"{OBS_IMAGES}.{CAMERA}"
+STATE = "agent_pos"
+
+
+@EnvConfig.register_subclass("playslot")
+@dataclass
+class PlaySlotEnv(EnvConfig):
+    """A task of playslot_rl.
+
+    Attributes:
+        task: `button_press`, `block_push`, `block_push_easy`, `block_reach` or `block_pick`.
+        episode_length: longest episode in agent steps; None takes the task's own.
+        image_size: side of the square frames.
+        quality: `fast` or `full`, as `render.quality` of the commands.
+        fps: agent steps a second, set from the task.
+
+    Raises:
+        ConfigError: there is no such task, or it has no simulator.
+        ValueError: a value outside its range.
+    """
+
+    task: str | None = "button_press"
+    episode_length: int | None = None
+    image_size: int = 64
+    quality: str = "fast"
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=lambda: {ACTION: ACTION, IMAGE: IMAGE, STATE: OBS_STATE})
+
+    def __post_init__(self) -> None:
+        env = self.task_config()
+        self.fps = frames_a_second(env)
+        side = env.image_size
+        self.features = {
+            ACTION: PolicyFeature(FeatureType.ACTION, (env.action_dim,)),
+            IMAGE: PolicyFeature(FeatureType.VISUAL, (side, side, 3)),
+            STATE: PolicyFeature(FeatureType.STATE, (4,)),
+        }
+
+    def task_config(self) -> ours.EnvConfig:
+        """The task's settings in playslot_rl, with the changes made here."""
+        from playslot_rl.compose import compose
+
+        env = replace(compose([f"env={self.task}"]).env, image_size=self.image_size)
+        return env if self.episode_length is None else replace(env, max_steps=self.episode_length)
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments of `playslot_rl.envs.lerobot.LeRobotTask`."""
+        render = ours.from_dict(ours.RenderConfig, {"quality": self.quality}, "render.")
+        return {"env": self.task_config(), "render": render}
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """`n_envs` environments side by side, in processes of their own if asked for.
+
+        An environment that is done waits for the others without simulating; what it does then is not counted.
+
+        Returns:
+            {task: {0: the vector environment}}.
+        """
+        make = freeze_after_episode_end(partial(LeRobotTask, **self.gym_kwargs))
+        makers = [make for _ in range(n_envs)]
+        vector: gym.vector.VectorEnv
+        if use_async_envs and n_envs > 1:
+            vector = AsyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP, context="forkserver")
+        else:
+            vector = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+        return {str(self.task): {0: vector}}

@@ -1,0 +1,108 @@
+"""The policy as LeRobot calls it. Shapes: B environments in lock-step, A action width, H W image height and width."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NoReturn
+
+from lerobot.policies import PreTrainedPolicy
+from torch import Tensor
+
+from lerobot_policy_playslot.configuration_playslot import NOT_TRAINED_HERE, PlaySlotConfig
+from playslot_rl.sharing.config import WEIGHTS
+from playslot_rl.sharing.folder import build_agent, load_weights, write_weights
+from playslot_rl.sharing.frame_policy import FramePolicy
+
+
+class PlaySlotPolicy(PreTrainedPolicy):
+    """World model, latent policy and action decoder.
+
+    The policy remembers: it carries SAVi's recurrent state from one `select_action` to the next, one row for each
+    environment. `reset` forgets it, and has to be called before new episodes, as LeRobot's programs do.
+
+    Args:
+        config: sizes.
+        kwargs: what LeRobot's factory passes to every policy (`dataset_stats`, `dataset_meta`); not used.
+    """
+
+    config_class = PlaySlotConfig
+    name = "playslot"
+
+    def __init__(self, config: PlaySlotConfig, **kwargs: Any) -> None:
+        del kwargs
+        super().__init__(config)
+        self.policy_config = config.policy_config()
+        self.agent = build_agent(self.policy_config)
+        self._frames = FramePolicy(self.agent, self.policy_config.resize)
+
+    def reset(self) -> None:
+        """Forget the episodes."""
+        self._frames.reset()
+
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Actions (B, A) in [-1, 1] for the present frames.
+
+        Args:
+            batch: the policy's camera, float (B, 3, H, W) in [0, 1]; other entries are not looked at.
+            kwargs: not used.
+
+        Raises:
+            ValueError: no such camera, frames of another shape, or another number of environments without a `reset`.
+        """
+        del kwargs
+        camera = self.policy_config.camera
+        if camera not in batch:
+            had = ", ".join(sorted(name for name in batch if name.startswith("observation."))) or "none"
+            raise ValueError(
+                f'observation: got {had}, expected {camera}: rename yours by --rename_map=\'{{"yours": "{camera}"}}\''
+            )
+        return self._frames.act(batch[camera], camera)
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """The next action as a chunk of one, (B, 1, A). It is an agent step: the frames are remembered.
+
+        Raises:
+            ValueError: see `select_action`.
+        """
+        return self.select_action(batch, **kwargs)[:, None]
+
+    def forward(self, batch: dict[str, Tensor]) -> NoReturn:
+        """Refuse to train.
+
+        Raises:
+            NotImplementedError: always; `lerobot-train` is refused before, by the config.
+        """
+        raise NotImplementedError(NOT_TRAINED_HERE)
+
+    def get_optim_params(self) -> NoReturn:
+        """Refuse to train.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(NOT_TRAINED_HERE)
+
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        """Write weights, then the config with their fingerprint.
+
+        Raises:
+            NotImplementedError: a gathered `state_dict` is given, as sharded training does.
+            OutputError: full disk.
+        """
+        if state_dict is not None:
+            raise NotImplementedError(NOT_TRAINED_HERE)
+        self.config.fingerprint = write_weights(self.agent, save_directory / WEIGHTS)
+        self.config._save_pretrained(save_directory)
+
+    @classmethod
+    def _load_as_safetensor(
+        cls, model: PlaySlotPolicy, model_file: str, map_location: str, strict: bool
+    ) -> PlaySlotPolicy:
+        """Load the weights, every one of them, whatever `strict` says.
+
+        Raises:
+            CheckpointError: missing, unexpected or misshapen tensors, or a file that is not the config's.
+        """
+        del strict
+        load_weights(model.agent, Path(model_file), model.policy_config.fingerprint)
+        return model.to(map_location)

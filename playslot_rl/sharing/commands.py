@@ -1,0 +1,87 @@
+"""The commands that make a policy again, from its run's config: never a folder of this machine."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.sharing.source import Result
+
+RUN: Final = "runs/again"
+GROUPS: Final = ("env", "render", "collect", "model", "slots", "dynamics", "behaviour", "evaluation")
+"""Parts of a config that a result depends on; intervals of logging and the like do no harm in between."""
+BEHAVIOUR: Final = ("env", "render", "collect", "model.policy", "model.action_decoder", "behaviour", "evaluation")
+"""Those a policy on the shipped world model depends on."""
+
+
+def reproduce(config: ExperimentConfig, source: Mapping[str, Any], results: Sequence[Result]) -> list[str]:
+    """Command lines from nothing to the evaluated policy.
+
+    Args:
+        config: of the run.
+        source: see `playslot_rl.sharing.source.read_source`.
+        results: what was measured of it.
+    """
+    seed = source.get("seed")
+    base = [f"env={config.env.name}", f"preset={config.preset}"]
+    seeded = [] if seed is None else [f"seed={seed}"]
+    evaluate = [
+        _line("evaluate", f"run={RUN}", f"protocol={r.protocol}", f"episodes={r.episodes}", f"seed={r.seed}")
+        for r in results
+    ]
+    if not source.get("shipped_world_model"):
+        return [_line("pipeline", *base, *seeded, *changes(config, GROUPS), f"out={RUN}"), *evaluate]
+    changed = changes(config, BEHAVIOUR)
+    recorded = source.get("recorded") or {}
+    episodes = recorded.get("episodes") or source.get("demos")
+    count = [] if episodes is None else [f"episodes={episodes}"]
+    first = [f"seed={recorded['seed']}"] if recorded else seeded
+    demos = "data/demonstrations"
+    recording = _of(changed, "env", "render", "collect")
+    return [
+        _line("collect", *base, "policy=expert", *count, *first, *recording, f"out={demos}"),
+        _line("train-policy", "run=pretrained", *base, *seeded, *changed, f"data.demos={demos}", f"out={RUN}"),
+        *evaluate,
+    ]
+
+
+def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
+    """`key=value` of what differs from the run's preset, in some groups of keys.
+
+    Raises:
+        ConfigError: the preset or the environment is not one of this version.
+    """
+    from playslot_rl.compose import compose
+    from playslot_rl.training.fit import FREE_KEYS
+
+    preset = dict(_leaves(to_dict(compose([f"env={config.env.name}", f"preset={config.preset}"]))))
+    return [
+        f"{key}={_value(value)}"
+        for key, value in _leaves(to_dict(config))
+        if any(key.startswith(f"{group}.") for group in groups)
+        and key.rpartition(".")[2] not in FREE_KEYS
+        and (key not in preset or preset[key] != value)
+    ]
+
+
+def _of(assignments: list[str], *groups: str) -> list[str]:
+    return [text for text in assignments if text.startswith(tuple(f"{group}." for group in groups))]
+
+
+def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _value(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+
+
+def _line(command: str, *arguments: str) -> str:
+    return shlex.join(["playslot", command, *arguments])

@@ -1,0 +1,192 @@
+"""A policy as a folder that LeRobot loads: config, weights, processors and card.
+
+    FOLDER/config.json                  `playslot_rl.sharing.config`
+    FOLDER/model.safetensors            `agent.*`: world model, latent policy, action decoder
+    FOLDER/policy_preprocessor.json     LeRobot's pipeline before the policy
+    FOLDER/policy_postprocessor.json    and the one after it
+    FOLDER/README.md                    model card
+
+The slot oracle of a run stays behind: it was trained on every real action, and is no part of the policy.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import torch
+from torch import nn
+
+from playslot_rl.errors import CheckpointError, OutputError
+from playslot_rl.sharing.config import CONFIG, WEIGHTS, PolicyConfig, read_config
+from playslot_rl.training.atomic import explain_write_errors, replace_dir, temporary_name, write_json, write_text
+from playslot_rl.training.tensors import (
+    load_modules,
+    load_tensors,
+    module_tensors,
+    save_tensors,
+    weights_fingerprint,
+)
+
+if TYPE_CHECKING:
+    from playslot_rl.world_model import Agent
+
+CARD: Final = "README.md"
+PREPROCESSOR: Final = "policy_preprocessor"
+POSTPROCESSOR: Final = "policy_postprocessor"
+FILES: Final = (CONFIG, WEIGHTS, f"{PREPROCESSOR}.json", f"{POSTPROCESSOR}.json", CARD)
+"""Everything a model folder holds."""
+ROOT: Final = "agent"
+"""First part of every tensor's name, as of a LeRobot policy whose attribute `agent` is the agent."""
+
+
+def build_agent(config: PolicyConfig) -> Agent:
+    """Networks of a config with fresh weights, without a slot oracle; the global random state stays as it was.
+
+    Raises:
+        ConfigError: the model has one latent action per slot, and therefore no policy.
+    """
+    from playslot_rl.world_model import Agent, WorldModel
+
+    with torch.random.fork_rng(devices=[]):
+        return Agent.untrained(WorldModel(config.model, config.env), oracle=False)
+
+
+def shared_modules(agent: nn.Module) -> dict[str, nn.Module]:
+    """The modules of an agent that are stored, by the names of their tensors."""
+    return {f"{ROOT}.{name}": getattr(agent, name) for name in ("world_model", "policy", "action_decoder")}
+
+
+def write_weights(agent: nn.Module, path: Path) -> str:
+    """Write an agent's weights, atomically, and return their fingerprint.
+
+    Raises:
+        OutputError: full disk.
+    """
+    save_tensors(path, module_tensors(shared_modules(agent)))
+    return weights_fingerprint(path)
+
+
+def load_weights(agent: nn.Module, path: Path, fingerprint: str) -> None:
+    """Load a weights file into an agent, in place; nothing is changed unless everything fits.
+
+    Args:
+        agent: of the sizes of the file's config.
+        path: `model.safetensors`.
+        fingerprint: what the config says of the file; empty says nothing.
+
+    Raises:
+        CheckpointError: missing or damaged file, missing, unexpected or misshapen tensors, or another file than the
+            config's.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path} is missing, expected a policy's weights: export or download the policy again")
+    tensors = load_tensors(path)
+    got = weights_fingerprint(path)
+    load_modules(shared_modules(agent), tensors, str(path))
+    if fingerprint and got != fingerprint:
+        raise CheckpointError(
+            f"{path}: got fingerprint {got}, expected {fingerprint} from its config.json: the file was changed or "
+            "damaged; export or download the policy again"
+        )
+
+
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder that becomes `folder` if all goes well, and is removed otherwise.
+
+    Raises:
+        OutputError: there is something at `folder`, the disk is full, or it cannot be written.
+    """
+    if folder.exists() or folder.is_symlink():
+        raise OutputError(f"out={folder}: got something that is there already, expected a new folder: choose another")
+    temporary = temporary_name(folder)
+    with explain_write_errors(folder):
+        for leftover in folder.parent.glob(f".{folder.name}.tmp-*"):  # of a process that was killed
+            shutil.rmtree(leftover)
+        temporary.mkdir(parents=True)
+        try:
+            yield temporary
+            replace_dir(temporary, folder)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def save_pretrained(
+    agent: Agent, folder: Path, config: PolicyConfig, card: Callable[[PolicyConfig], str]
+) -> PolicyConfig:
+    """Write a model folder, whole or not at all.
+
+    Args:
+        agent: what to store, without its slot oracle.
+        folder: must not exist.
+        config: its fingerprint is set here.
+        card: gives the text of README.md for the config with its fingerprint.
+
+    Returns:
+        The config with the fingerprint of the weights.
+
+    Raises:
+        OutputError: `folder` exists, the disk is full, or it cannot be written.
+    """
+    with new_folder(folder) as temporary:
+        config = replace(config, fingerprint=write_weights(agent, temporary / WEIGHTS))
+        write_json(temporary / CONFIG, config.to_lerobot())
+        for pipeline in make_processors("cpu"):
+            pipeline.save_pretrained(temporary, config_filename=f"{pipeline.name}.json")
+        write_text(temporary / CARD, card(config))
+    return config
+
+
+def load_pretrained(folder: Path, device: torch.device | str = "cpu") -> tuple[Agent, PolicyConfig]:
+    """Agent and config of a model folder; the agent in evaluation mode, without gradients for its weights.
+
+    Raises:
+        CheckpointError: the folder is not whole, or its files do not belong together.
+    """
+    if not folder.is_dir():
+        raise CheckpointError(f"{folder}: no such folder, expected a policy made by `playslot export`")
+    config = read_config(folder)
+    agent = build_agent(config)
+    load_weights(agent, folder / WEIGHTS, config.fingerprint)
+    agent.to(device).eval().requires_grad_(False)
+    return agent, config
+
+
+def make_processors(device: str) -> tuple[Any, Any]:
+    """LeRobot's pipelines before and after the policy: rename, add a batch dimension, move to the device; and back.
+
+    Nothing is normalised: frames go in as LeRobot gives them, floats in [0, 1], and actions come out in [-1, 1], the
+    range of the environments.
+
+    Args:
+        device: torch device of the policy.
+    """
+    from lerobot.processor import (
+        AddBatchDimensionProcessorStep,
+        DeviceProcessorStep,
+        PolicyProcessorPipeline,
+        RenameObservationsProcessorStep,
+        policy_action_to_transition,
+        transition_to_policy_action,
+    )
+
+    before = PolicyProcessorPipeline(
+        steps=[
+            RenameObservationsProcessorStep(rename_map={}),
+            AddBatchDimensionProcessorStep(),
+            DeviceProcessorStep(device=device),
+        ],
+        name=PREPROCESSOR,
+    )
+    after = PolicyProcessorPipeline(
+        steps=[DeviceProcessorStep(device="cpu")],
+        name=POSTPROCESSOR,
+        to_transition=policy_action_to_transition,
+        to_output=transition_to_policy_action,
+    )
+    return before, after

@@ -1,0 +1,58 @@
+"""`playslot export run=RUN out=DIR [export.repo=user/name]`: a trained policy as a folder that LeRobot loads."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.errors import ConfigError, OutputError
+from playslot_rl.recipes import evaluate
+
+
+def main(config: ExperimentConfig) -> None:
+    """Write the policy of `config.run` to the new folder `config.out`, and push it where `config.export.repo` is given.
+
+    A folder that holds this very policy already is pushed as it is: that is how a failed push is tried again.
+
+    Raises:
+        ConfigError: no run or no `out`, or the run is a baseline's.
+        CheckpointError: the run has no trained policy, or its checkpoints are damaged or do not belong together.
+        OutputError: `out` exists, or cannot be written.
+        HubError: the push failed; the folder stays.
+    """
+    run, folder = evaluate.check_run(replace(config, out="")), check_out(config)
+    from playslot_rl.sharing.config import is_model_folder, read_config
+    from playslot_rl.sharing.run import export_run
+    from playslot_rl.sharing.source import read_source
+
+    source = read_source(run)
+    there = folder.exists() or folder.is_symlink()
+    if there and not (config.export.repo and is_model_folder(folder)):
+        raise OutputError(f"out={folder}: got something that is there already, expected a new folder: choose another")
+    if there and read_config(folder).source["fingerprints"] != source["fingerprints"]:
+        raise OutputError(
+            f"out={folder}: got another policy, expected a new folder or that of run={run}: choose another"
+        )
+    if not there:
+        export_run(run, folder, config, source)
+        print(f"policy: {folder}", flush=True)
+    if config.export.repo:
+        from playslot_rl.hub.push_policy import push_policy
+
+        want = config.export
+        result = push_policy(folder, want.repo, private=want.private, branch=want.branch or None, tag=want.tag or None)
+        print("\n".join(result.lines()), flush=True)
+
+
+def check_out(config: ExperimentConfig) -> Path:
+    """The folder to write.
+
+    Raises:
+        ConfigError: none was named, or the run is a baseline's.
+    """
+    if not config.out or Path(config.out).resolve() == Path(config.run).resolve():
+        raise ConfigError("out: got nothing or the run itself, expected a new folder, such as out=policies/press")
+    if config.method != "playslot":
+        raise ConfigError(f"run={config.run}: got a run of method={config.method}, expected one of PlaySlot")
+    return Path(config.out)

@@ -1,0 +1,63 @@
+"""LeRobot's own `lerobot-eval` on the stored policy and the shipped world model."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from playslot_rl.compose import compose
+from playslot_rl.evaluation.success import evaluate
+from playslot_rl.sharing.run import export_run
+from playslot_rl.training.atomic import write_json
+from playslot_rl.training.checkpoints import load_agent
+
+pytestmark = pytest.mark.slow  # a process that imports all of LeRobot
+
+ASSET = Path(__file__).parents[1] / "assets" / "button_press_policy"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with the stored policy."""
+    root = tmp_path_factory.mktemp("run")
+    shutil.copytree(ASSET / "policy" / "checkpoint", root / "policy" / "checkpoint")
+    write_json(root / "world_model.json", {"source": "pretrained"})
+    return root
+
+
+def lerobot_eval(policy: Path, out: Path, *arguments: str) -> dict[str, Any]:
+    """Run it as a user would; what it wrote."""
+    program = Path(sys.executable).with_name("lerobot-eval")
+    command = [str(program), f"--policy.path={policy}", "--env.type=playslot", "--env.task=button_press",
+               f"--output_dir={out}", "--policy.device=cpu", *arguments]  # fmt: skip
+    environment = {**os.environ, "MUJOCO_GL": "egl", "HF_HUB_OFFLINE": "1"}
+    done = subprocess.run(command, cwd=out.parent, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    info: dict[str, Any] = json.loads((out / "eval_info.json").read_text())
+    return info
+
+
+@pytest.mark.parametrize("side_by_side", [1, 2])
+def test_lerobot_eval_measures_what_our_evaluation_measures(run: Path, tmp_path: Path, side_by_side: int) -> None:
+    config = compose(["preset=compact", "evaluation.references=false", "device=cpu"])
+    ours = evaluate(load_agent(run), config, "simulation", 2, 0)
+    export_run(run, tmp_path / "policy", config)
+    info = lerobot_eval(
+        tmp_path / "policy", tmp_path / "eval", "--eval.n_episodes=2", f"--eval.batch_size={side_by_side}",
+        "--eval.use_async_envs=false", f"--seed={ours['seeds'][0]}",
+    )  # fmt: skip
+    assert ours["redrawn"] == 0, "the same seeds on both sides"
+    (group,) = info["per_task"]
+    assert group["task_group"] == "button_press"
+    assert group["metrics"]["successes"] == [episode["success"] for episode in ours["per_episode"]]
+    assert info["overall"]["n_episodes"] == 2
+    assert info["overall"]["pc_success"] == 100 * ours["success_rate"]
+    assert all((tmp_path / path).is_file() for path in info["overall"]["video_paths"])
+    assert len(info["overall"]["video_paths"]) == 2

@@ -1,0 +1,51 @@
+"""Fixtures: an untrained agent in a model folder, and a run with the stored ButtonPress policy."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
+
+from playslot_rl.sharing.config import PolicyConfig
+from playslot_rl.sharing.folder import save_pretrained
+from playslot_rl.testing import tiny_agent
+from playslot_rl.training.atomic import write_json
+from playslot_rl.world_model import Agent
+
+ASSET = Path(__file__).parents[1] / "assets" / "button_press_policy"
+
+
+@pytest.fixture(scope="session")
+def agent() -> Agent:
+    """Untrained, with a slot oracle."""
+    return tiny_agent()
+
+
+@pytest.fixture(scope="session")
+def config(agent: Agent) -> PolicyConfig:
+    """Of that agent."""
+    return PolicyConfig(env=agent.world_model.env, model=agent.world_model.config, source={"demos": 3})
+
+
+@pytest.fixture
+def folder(agent: Agent, config: PolicyConfig, tmp_path: Path) -> Path:
+    """That agent's model folder, to break."""
+    save_pretrained(agent, tmp_path / "policy", config, lambda _: "card\n")
+    return tmp_path / "policy"
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run with the stored policy on the shipped world model."""
+    from playslot_rl.compose import compose
+    from playslot_rl.config import to_dict
+
+    root = tmp_path / "run"
+    shutil.copytree(ASSET / "policy" / "checkpoint", root / "policy" / "checkpoint")
+    write_json(root / "world_model.json", {"source": "pretrained"})
+    write_json(root / "config.json", to_dict(compose(["preset=compact", "data.demos=/home/someone/data"])))
+    return root

@@ -1,0 +1,153 @@
+"""`playslot export`: a whole folder with a truthful card, or one line of what is wrong."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from commands import ONE_CORE, contents, playslot, refused
+
+from playslot_rl.compose import compose
+from playslot_rl.sharing.config import read_config
+from playslot_rl.sharing.source import read_results, read_source
+from playslot_rl.training.atomic import write_json
+
+
+def evaluated(run: Path, protocol: str, **changes: Any) -> dict[str, Any]:
+    """Store a result of this run's policy."""
+    info = {
+        "protocol": protocol, "episodes": 50, "seed": 0, "success_rate": 0.98, "ci95": [0.895, 0.996],
+        "mean_steps_to_success": 14.5, "fingerprints": read_source(run)["fingerprints"],
+        "references": {"random": {"success_rate": 0.0, "ci95": [0.0, 0.07]},
+                       "slot_oracle": {"success_rate": None, "ci95": None}},
+    } | changes  # fmt: skip
+    write_json(run / "evaluation" / protocol / "eval_info.json", info)
+    return info
+
+
+def exported(run: Path, out: Path) -> str:
+    """Export; the card."""
+    done = playslot("export", f"run={run}", f"out={out}", *ONE_CORE)
+    assert (done.code, done.err) == (0, ""), done.err
+    return (out / "README.md").read_text()
+
+
+def test_a_run_becomes_a_folder_and_stays_as_it_was(run: Path, tmp_path: Path) -> None:
+    before = contents(run)
+    exported(run, tmp_path / "policies" / "press")
+    assert contents(run) == before
+    config = read_config(tmp_path / "policies" / "press")
+    stored = json.loads((run / "policy" / "checkpoint" / "meta.json").read_text())
+    assert config.source["fingerprints"] == {**stored["parents"], "policy": stored["fingerprint"]}
+    assert (config.source["demos"], config.source["labelled_demos"]) == (150, 50)
+    assert config.source["shipped_world_model"]
+    assert config.camera == "observation.images.front"
+
+
+def test_the_card_tells_task_data_results_limits_and_versions(run: Path, tmp_path: Path) -> None:
+    evaluated(run, "simulation")
+    card = exported(run, tmp_path / "press")
+    header = yaml.safe_load(card.split("---")[1])
+    assert header["license"] == "apache-2.0"
+    assert header["library_name"] == "lerobot"
+    assert {"lerobot", "robotics", "playslot", "button_press"} <= set(header["tags"])
+    assert "| task | Press the red button. |" in card
+    assert "4 numbers in [-1, 1]: hand displacement x, y, z and gripper effort" in card
+    assert "`observation.images.front`, 64 x 64 RGB" in card
+    assert "real actions of 50 demonstrations" in card
+    assert "7b45eb63425fa8bc" in card, "fingerprint of the demonstrations"
+    assert "| this policy, in simulation (closed loop) | 98 % | 90 to 100 % | 14.5 | 50 | 0 |" in card
+    assert "| random actions | 0 % | 0 to 7 % |" in card
+    assert "slot oracle" not in card, "it was not measured"
+    assert "ICML 2025" in card
+    assert re.search(r"exported with \| playslot_rl \S+, torch \S+, .*lerobot 0\.6\.1", card)
+    assert read_config(tmp_path / "press").fingerprint in card
+
+
+def test_the_card_names_no_folder_of_this_machine(run: Path, tmp_path: Path) -> None:
+    path = run / "policy" / "checkpoint" / "meta.json"
+    meta = json.loads(path.read_text())
+    write_json(path, meta | {"command": "playslot demo out=/home/someone/x", "data_root": "/home/someone/data"})
+    exported(run, tmp_path / "press")
+    written = "".join(file.read_bytes().decode("latin-1") for file in (tmp_path / "press").iterdir())
+    assert "someone" not in written
+    assert str(tmp_path) not in written
+
+
+def test_results_of_an_older_policy_are_left_out(run: Path, tmp_path: Path) -> None:
+    evaluated(run, "simulation", fingerprints={"policy": "0" * 16})
+    evaluated(run, "imagination", success_rate=0.46, ci95=[0.33, 0.6])
+    assert [result.protocol for result in read_results(run, read_source(run))] == ["imagination"]
+    card = exported(run, tmp_path / "press")
+    assert "in imagination (open loop) | 46 % | 33 to 60 %" in card
+    assert "98 %" not in card
+
+
+def test_without_results_the_card_says_so(run: Path, tmp_path: Path) -> None:
+    assert "Not evaluated yet" in exported(run, tmp_path / "press")
+
+
+def test_the_commands_of_the_card_are_accepted_and_bring_back_the_config(run: Path, tmp_path: Path) -> None:
+    stored = json.loads((run / "config.json").read_text())
+    stored["behaviour"]["steps"] = 77
+    stored["collect"]["noise"] = 0.25
+    write_json(run / "config.json", stored)
+    evaluated(run, "simulation")
+    card = exported(run, tmp_path / "press")
+    block = card.split("## Make it again")[1].split("```bash\n")[1].split("```")[0]
+    lines = [shlex.split(line)[1:] for line in block.splitlines()]
+    assert [line[0] for line in lines] == ["collect", "train-policy", "evaluate"]
+    recorded, trained = (compose(line[1:], "collect") for line in lines[:2])
+    assert (recorded.episodes, recorded.collect.noise, recorded.policy) == (150, 0.25, "expert")
+    assert (trained.behaviour.steps, trained.seed, trained.run) == (77, 7, "pretrained")
+    assert (trained.preset, trained.env.name) == ("compact", "button_press")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message", "code"),
+    [
+        (["run={run}"], "out: got nothing or the run itself", 1),
+        (["run={run}", "out={run}"], "out: got nothing or the run itself", 1),
+        (["run={run}", "out={there}"], "there already", 1),
+        (["run={run}", "out={there}", "export.repo=me/press"], "there already", 1),
+        (["run=pretrained", "out={new}"], "world model without a policy", 1),
+        (["out={new}"], "run: got nothing", 1),
+        (["run={none}", "out={new}"], "expected the folder of a run", 2),
+        (["run={run}", "out={new}", "method=lapo"], "got a run of method=lapo", 1),
+        (["run={run}", "out={new}", "data.camera=a,b"], "data.camera: got a, b", 1),
+        (["run={run}", "out={new}", "export.rep=me/press"], "unknown key export.rep", 2),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_in_one_line(
+    run: Path, tmp_path: Path, arguments: list[str], message: str, code: int
+) -> None:
+    (tmp_path / "there").mkdir()
+    places = {name: tmp_path / name for name in ("there", "new", "none")} | {"run": run}
+    refused("export", *(text.format(**places) for text in arguments), message=message, code=code)
+    assert not (tmp_path / "new").exists()
+    assert list((tmp_path / "there").iterdir()) == []
+
+
+def test_a_run_without_a_policy_or_with_damaged_weights_is_refused(run: Path, tmp_path: Path) -> None:
+    weights = run / "policy" / "checkpoint" / "weights.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1] + b"\x00")
+    refused("export", f"run={run}", f"out={tmp_path / 'new'}", message="got fingerprint")
+    shutil.rmtree(run / "policy")
+    refused("export", f"run={run}", f"out={tmp_path / 'new'}", message="expected a trained policy")
+    assert not (tmp_path / "new").exists()
+
+
+def test_another_runs_folder_is_not_pushed_in_its_name(run: Path, tmp_path: Path) -> None:
+    exported(run, tmp_path / "press")
+    config = tmp_path / "press" / "config.json"
+    values = json.loads(config.read_text())
+    values["source"]["fingerprints"]["policy"] = "0" * 16
+    write_json(config, values)
+    out = f"out={tmp_path / 'press'}"
+    refused("export", f"run={run}", out, "export.repo=me/press", message="got another policy")

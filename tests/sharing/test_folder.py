@@ -1,0 +1,164 @@
+"""The model folder: whole or not there, and refused in one line where its files do not belong together."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from playslot_rl.errors import CheckpointError, OutputError
+from playslot_rl.sharing.config import PolicyConfig, is_model_folder, read_config
+from playslot_rl.sharing.folder import FILES, load_pretrained, save_pretrained
+from playslot_rl.world_model import Agent
+
+
+def test_a_saved_policy_comes_back_with_equal_weights_and_config(
+    agent: Agent, config: PolicyConfig, folder: Path
+) -> None:
+    before = torch.random.get_rng_state()
+    loaded, read = load_pretrained(folder)
+    assert torch.equal(before, torch.random.get_rng_state()), "loading drew from the global generator"
+    assert replace(read, fingerprint="") == config
+    assert len(read.fingerprint) == 16
+    expected = {name: value for name, value in agent.state_dict().items() if not name.startswith("oracle.")}
+    got = loaded.state_dict()
+    assert got.keys() == expected.keys()
+    assert all(torch.equal(got[name], value) for name, value in expected.items())
+    assert not loaded.training
+    assert not any(parameter.requires_grad for parameter in loaded.parameters())
+
+
+def test_a_folder_holds_what_lerobot_looks_for_and_no_oracle(folder: Path) -> None:
+    assert {path.name for path in folder.iterdir()} == set(FILES)
+    assert is_model_folder(folder)
+    tensors = load_file(folder / "model.safetensors")
+    assert {name.split(".")[1] for name in tensors} == {"world_model", "policy", "action_decoder"}
+    values = json.loads((folder / "config.json").read_text())
+    assert values["type"] == "playslot"
+    assert values["input_features"] == {"observation.images.front": {"type": "VISUAL", "shape": [3, 64, 64]}}
+    assert values["output_features"] == {"action": {"type": "ACTION", "shape": [4]}}
+
+
+def test_saving_twice_gives_equal_files(agent: Agent, config: PolicyConfig, folder: Path, tmp_path: Path) -> None:
+    save_pretrained(agent, tmp_path / "again", config, lambda _: "card\n")
+    assert all((folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes() for name in FILES)
+
+
+def edit_tensors(change: Callable[[dict[str, torch.Tensor]], None]) -> Callable[[Path], None]:
+    def edit(folder: Path) -> None:
+        tensors = load_file(folder / "model.safetensors")
+        change(tensors)
+        save_file(tensors, folder / "model.safetensors")
+
+    return edit
+
+
+def edit_config(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
+    def edit(folder: Path) -> None:
+        values = json.loads((folder / "config.json").read_text())
+        change(values)
+        (folder / "config.json").write_text(json.dumps(values))
+
+    return edit
+
+
+def truncate(folder: Path) -> None:
+    path = folder / "model.safetensors"
+    path.write_bytes(path.read_bytes()[:1000])
+
+
+NAME = "agent.action_decoder"
+
+
+def nudge(tensors: dict[str, torch.Tensor]) -> None:
+    name = next(key for key in tensors if key.startswith(NAME))
+    tensors[name] = tensors[name] + 1
+
+
+def drop(tensors: dict[str, torch.Tensor]) -> None:
+    del tensors[next(key for key in tensors if key.startswith(NAME))]
+
+
+def reshape(tensors: dict[str, torch.Tensor]) -> None:
+    name = next(key for key in tensors if key.startswith(NAME))
+    tensors[name] = torch.zeros(3)
+
+
+DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
+    "other weights": (edit_tensors(nudge), "got fingerprint"),
+    "a lost tensor": (edit_tensors(drop), "misses tensor agent.action_decoder"),
+    "a foreign tensor": (edit_tensors(lambda t: t.update(x=torch.zeros(1))), "unexpected tensor x"),
+    "a misshapen tensor": (edit_tensors(reshape), r"has shape \(3,\), expected"),
+    "no weights": (lambda f: (f / "model.safetensors").unlink(), "model.safetensors is missing"),
+    "half a weights file": (truncate, "is damaged"),
+    "no config": (lambda f: (f / "config.json").unlink(), "config.json is missing"),
+    "half a config": (lambda f: (f / "config.json").write_text("{"), "is damaged"),
+    "another policy": (edit_config(lambda v: v.update(type="act")), "got a policy of type 'act'"),
+    "an unknown size": (edit_config(lambda v: v["model"].update(wings=2)), "unknown key model.wings"),
+    "no sizes": (edit_config(lambda v: v.pop("model")), "no 'model'"),
+    "two cameras": (
+        edit_config(lambda v: v["input_features"].update(side={"type": "VISUAL", "shape": [3, 64, 64]})),
+        "got 2 cameras",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damaged_folder_is_refused_in_one_line(folder: Path, name: str) -> None:
+    damage, message = DAMAGES[name]
+    damage(folder)
+    with pytest.raises(CheckpointError, match=message) as raised:
+        load_pretrained(folder)
+    assert "\n" not in str(raised.value)
+    assert "expected" in str(raised.value)
+
+
+def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="no such folder"):
+        load_pretrained(tmp_path / "none")
+
+
+def test_what_is_there_already_is_never_replaced(agent: Agent, config: PolicyConfig, tmp_path: Path) -> None:
+    (tmp_path / "policy").mkdir()
+    with pytest.raises(OutputError, match="there already"):
+        save_pretrained(agent, tmp_path / "policy", config, lambda _: "")
+    assert list((tmp_path / "policy").iterdir()) == []
+
+
+def test_a_failed_save_leaves_nothing_and_the_next_removes_what_a_kill_left(
+    agent: Agent, config: PolicyConfig, tmp_path: Path
+) -> None:
+    def fail(_: PolicyConfig) -> str:
+        raise RuntimeError("in the card")
+
+    with pytest.raises(RuntimeError, match="in the card"):
+        save_pretrained(agent, tmp_path / "policy", config, fail)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / ".policy.tmp-0123").mkdir()
+    save_pretrained(agent, tmp_path / "policy", config, lambda _: "")
+    assert [path.name for path in tmp_path.iterdir()] == ["policy"]
+
+
+def test_the_front_door_saves_and_loads(agent: Agent, tmp_path: Path) -> None:
+    import playslot_rl
+
+    model = playslot_rl.PlaySlot(agent.world_model, agent)
+    frames = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    expected = [model.act(frame) for frame in frames]
+    model.save_pretrained(tmp_path / "policy")
+    for loaded in (
+        playslot_rl.PlaySlot.from_pretrained(tmp_path / "policy", device="cpu"),
+        playslot_rl.load(tmp_path / "policy", device="cpu"),
+    ):
+        assert all((loaded.act(frame) == e).all() for frame, e in zip(frames, expected, strict=True))
+    again = playslot_rl.load(tmp_path / "policy", device="cpu")
+    again.save_pretrained(tmp_path / "again")
+    assert read_config(tmp_path / "again") == read_config(tmp_path / "policy")
+    with pytest.raises(CheckpointError, match="without a policy"):
+        playslot_rl.PlaySlot(agent.world_model).save_pretrained(tmp_path / "none")
