@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import demo_root, finished, fixed_keys, open_device, open_run, open_videos, store_config
@@ -119,7 +119,7 @@ def _train_policy(config: ExperimentConfig, run: Path, model: StageCheckpoint) -
     sizes = {"action_decoder": to_dict(config.model.action_decoder), NAME: sizes_of(own)}
     labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
     identity = {**sizes, "data": source.fingerprint, MODEL: model.fingerprint, "loss": own.loss, "shift": own.shift}
-    common = {"seed": config.seed, "device": device, "logging": config.logging}
+    common: dict[str, Any] = {"seed": config.seed, "device": device, "logging": config.logging}
     cloned = fit(behaviour.policy_stage(), own.policy, run / NAME, name=f"{NAME}.policy", identity=identity, **common)
     decode = replace(own.policy, steps=own.decoder_steps, optim=replace(own.policy.optim, lr=own.decoder_lr))
     decoded = fit(behaviour.decoder_stage(), decode, run / NAME / "decoder", name=f"{NAME}.decoder",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from playslot_rl.compose import shipped
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
     demo_root,
@@ -62,7 +63,7 @@ def main(config: ExperimentConfig) -> None:
 
     def ready() -> None:
         if home.resolve() != run.resolve():
-            link_world_model(run, parent if parent == "pretrained" else home)
+            link_world_model(run, parent if shipped(parent) else home)
         store_config(config, run)
 
     device = open_device(config)

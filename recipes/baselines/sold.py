@@ -5,8 +5,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
+from playslot_rl.compose import shipped
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import finished, open_device, open_run, parent_run, store_config
 
@@ -37,14 +36,12 @@ def main(config: ExperimentConfig) -> None:
         load_savi,
         require_adoptable,
         require_config,
-        run_folder,
         save_stage,
         world_model_folder,
     )
     from playslot_rl.training.seeding import derived_seed
 
     parent = parent_run(config, run)
-    run_folder(parent, config.env.name)
     slots = slots_checkpoint(parent)
     require_adoptable(slots, run)
     require_config(slots, {"env": {"image_size": config.env.image_size}})
@@ -56,7 +53,7 @@ def main(config: ExperimentConfig) -> None:
     def ready() -> None:
         home = world_model_folder(parent)
         if home.resolve() != run.resolve():
-            link_world_model(run, parent if parent == "pretrained" else Path(home))
+            link_world_model(run, parent if shipped(parent) else home)
         store_config(config, run)
 
     device = open_device(config)
