@@ -92,5 +92,5 @@ def test_the_shipped_world_model_of_another_task_is_refused() -> None:
 
 def test_too_few_demonstrations_are_refused() -> None:
     check_demos(compared("demos=10,20"), 20, "data.demos=x")
-    with pytest.raises(ConfigError, match="demos: got 20, expected at most the 19 demonstrations of data.demos=x"):
+    with pytest.raises(ConfigError, match=r"demos: got 20, expected at most the 19 demonstrations of data\.demos=x"):
         check_demos(compared("demos=10,20"), 19, "data.demos=x")

@@ -160,8 +160,10 @@ def test_a_nan_stops_with_the_last_good_checkpoint(
 
     monkeypatch.setattr(RegressionStage, "loss", poisoned)
     every = {"slot_oracle": "behaviour", "resnet_oracle": "baselines.resnet_oracle", "lapo": "baselines.lapo.policy"}
-    refused(*_command(method, shared_run, tmp_path / "run", f"{every[method]}.checkpoint_every=1"),
-            message="loss is nan at step 2, expected a finite number; the last good checkpoint is .*step_0*1")  # fmt: skip
+    refused(
+        *_command(method, shared_run, tmp_path / "run", f"{every[method]}.checkpoint_every=1"),
+        message="loss is nan at step 2, expected a finite number; the last good checkpoint is .*step_0*1",
+    )
 
 
 @pytest.mark.parametrize("method", METHODS)
