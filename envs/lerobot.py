@@ -74,4 +74,5 @@ def _named(observation: Any) -> Observation:
 
 def frames_a_second(env: EnvConfig) -> int:
     """Agent steps a second of a task, at least 1: the rate of its videos and of its data sets."""
-    return max(1, round(task_metadata(env)["control_hz"] / env.frame_skip))
+    hertz: int = task_metadata(env)["control_hz"]
+    return max(1, round(hertz / env.frame_skip))

@@ -39,6 +39,10 @@ class PlaySlotConfig(PreTrainedConfig):
     source: dict[str, Any] = field(default_factory=dict)
     license: str | None = LICENCE
 
+    # LeRobot's own fields, declared again with their types, which mypy cannot read there.
+    input_features: dict[str, PolicyFeature] | None = field(default_factory=dict)
+    output_features: dict[str, PolicyFeature] | None = field(default_factory=dict)
+
     def __post_init__(self) -> None:
         super().__post_init__()
         inputs, outputs = self.policy_config().features()

@@ -105,4 +105,5 @@ class PlaySlotPolicy(PreTrainedPolicy):
         """
         del strict
         load_weights(model.agent, Path(model_file), model.policy_config.fingerprint)
-        return model.to(map_location)
+        model.to(map_location)
+        return model
