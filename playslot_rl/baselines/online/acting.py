@@ -57,8 +57,7 @@ def play(
         pool: environments.
         seeds: episode seeds; an episode that starts solved is drawn anew.
         learner: sees every frame; None looks at none (`random` only) and stores none.
-        device: the learner's.
-        generator: of what the learner draws, on `device`.
+        device, generator: the learner's, and of what it draws.
         explore: it samples its actions.
         random: uniform actions in [-1, 1] instead, a function of the episode's seed.
     """
@@ -90,8 +89,8 @@ def play(
             observation, reward, _, _, info = task.step(action)
             frames[i], rewards[step + 1, i] = observation["pixels"], reward
             solved[i] |= info["success"]
-    returns = tuple(float(value) for value in rewards.sum(axis=0, dtype=np.float64))
-    return Episodes(_with_rewards(torch.stack(kept, 1), rewards), returns, tuple(bool(value) for value in solved))
+    returns = tuple(rewards.sum(axis=0, dtype=np.float64).tolist())
+    return Episodes(_with_rewards(torch.stack(kept, 1), rewards), returns, tuple(solved.tolist()))
 
 
 def _no_memory(n: int, width: int) -> TensorDict:

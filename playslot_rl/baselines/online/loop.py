@@ -100,20 +100,8 @@ def train_online(
         ready()
     start = run.state.step
     run.history.rewind(start)
-    logging = config.logging
     if not run.finished:
-        logger = open_logger(logging, folder / "logs", name, start)
-        progress = StageProgress(name, start, online.steps, logging.progress, online.evaluate_every)
-        try:
-            with progress, run.pool:
-                while not run.finished:
-                    run.advance(logger, progress)
-        except KeyboardInterrupt:
-            last = run.checkpoints.last()
-            where = f"step {int(last.name.removeprefix('step_'))} ({last})" if last else "the beginning"
-            raise KeyboardInterrupt(f"{name} interrupted; the same command carries on from {where}") from None
-        finally:
-            logger.close()
+        run.go_on()
     run.write_curve()
     draw_curve(folder, title, run.state.curve, run.state.random)
     return OnlineResult(run.state, start, run.state.random)
@@ -155,6 +143,22 @@ class _Run:
         """Whether the steps, or the minutes, are used up."""
         late = 0 < self.online.minutes * 60 <= self.state.seconds
         return self.state.step >= self.online.steps or late
+
+    def go_on(self) -> None:
+        """All rounds that are left."""
+        start, logging = self.state.step, self.config.logging
+        logger = open_logger(logging, self.folder / "logs", self.name, start)
+        progress = StageProgress(self.name, start, self.online.steps, logging.progress, self.online.evaluate_every)
+        try:
+            with progress, self.pool:
+                while not self.finished:
+                    self.advance(logger, progress)
+        except KeyboardInterrupt:
+            last = self.checkpoints.last()
+            where = f"step {int(last.name.removeprefix('step_'))} ({last})" if last else "the beginning"
+            raise KeyboardInterrupt(f"{self.name} interrupted; the same command carries on from {where}") from None
+        finally:
+            logger.close()
 
     def advance(self, logger: MetricLogger, progress: StageProgress) -> None:
         """One round of episodes, its updates, and whatever is due after it."""
