@@ -164,6 +164,7 @@ def test_a_nan_stops_with_the_last_good_checkpoint(
     refused(*_command(method, shared_run, tmp_path / "run", f"{every[method]}.checkpoint_every=1"), message=message)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(
     shared_run: Path, tmp_path: Path, method: str

@@ -46,6 +46,7 @@ def _result(out: Path) -> dict[str, Any]:
     return values
 
 
+@pytest.mark.slow
 def test_two_methods_two_numbers_of_demonstrations_one_seed(
     shared_run: Path, tmp_path: Path, started: list[str]
 ) -> None:
