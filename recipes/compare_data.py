@@ -89,7 +89,8 @@ def parents_of(method: str, world: str, out: Path) -> dict[str, str]:
         world: run folder of the world model, or `pretrained`; empty for a method without slots.
         out: folder of the comparison.
     """
-    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, world_model_checkpoints
+    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage
+    from playslot_rl.training.runs import world_model_checkpoints
 
     prints = {name: c.fingerprint for name, c in world_model_checkpoints(world).items()} if world else {}
     if method == "lapo":

@@ -18,7 +18,7 @@ def main(config: ExperimentConfig) -> None:
     """Collect demonstrations, train policy and decoder, evaluate under both protocols, write the report."""
     from playslot_rl.collectors import collect
     from playslot_rl.envs import gym_id
-    from playslot_rl.training.checkpoints import world_model_checkpoints
+    from playslot_rl.training.runs import world_model_checkpoints
 
     began = time.monotonic()
     gym_id(config.env.name)  # one without a simulator is refused before anything is written

@@ -45,7 +45,7 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
     from playslot_rl.evaluation.episodes import TaskPool
     from playslot_rl.evaluation.success import check_protocol, evaluate_run, run_facts
     from playslot_rl.recipes.run import open_device
-    from playslot_rl.training.checkpoints import load_agent
+    from playslot_rl.training.runs import load_agent
 
     check_protocol(config.protocol)
     run_facts(run)  # a run without a policy is refused before anything is loaded
@@ -78,7 +78,7 @@ def main_if_needed(config: ExperimentConfig) -> None:
         main(replace(config, protocol=protocol), report=False)
     if due or not (run / "report.html").is_file():
         from playslot_rl.recipes.run import open_device
-        from playslot_rl.training.checkpoints import load_agent
+        from playslot_rl.training.runs import load_agent
         from playslot_rl.visualization.report import write_report
 
         print(f"report: {write_report(run, agent=load_agent(run, open_device(config)))}", flush=True)

@@ -22,7 +22,7 @@ def main(config: ExperimentConfig, run: Path) -> None:
     from playslot_rl.evaluation.objects import evaluate_run_objects
     from playslot_rl.recipes.evaluate import check_environment
     from playslot_rl.recipes.run import open_device
-    from playslot_rl.training.checkpoints import load_world_model
+    from playslot_rl.training.runs import load_world_model
     from playslot_rl.visualization.report import write_report
 
     model = load_world_model(run, open_device(config))

@@ -34,17 +34,15 @@ def main(config: ExperimentConfig) -> None:
 
     from playslot_rl.data.demonstrations import first_demonstrations, label_demonstrations, require_labelled
     from playslot_rl.data.slot_cache import slot_cache
-    from playslot_rl.training.checkpoints import (
-        checkpoint_folder,
+    from playslot_rl.training.checkpoints import checkpoint_folder, require_config, save_stage
+    from playslot_rl.training.fit import FitResult, Stage, fit
+    from playslot_rl.training.runs import (
         link_world_model,
         load_world_model,
         require_adoptable,
-        require_config,
-        save_stage,
         world_model_checkpoints,
         world_model_folder,
     )
-    from playslot_rl.training.fit import FitResult, Stage, fit
     from playslot_rl.training.seeding import derived_seed
     from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage
     from playslot_rl.world_model import Agent

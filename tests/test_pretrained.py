@@ -15,7 +15,8 @@ import pytest
 
 from playslot_rl.compose import compose
 from playslot_rl.training.atomic import write_json
-from playslot_rl.training.checkpoints import load_agent, load_world_model, pretrained_folder, read_stage
+from playslot_rl.training.checkpoints import read_stage
+from playslot_rl.training.runs import load_agent, load_world_model, pretrained_folder
 
 ENVS = ("button_press", "block_push_easy", "block_push")
 ASSET = Path(__file__).parent / "assets" / "button_press_policy"

@@ -27,6 +27,6 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
     Raises:
         CheckpointError: a stage is missing or damaged.
     """
-    from playslot_rl.training.checkpoints import load_agent
+    from playslot_rl.training.runs import load_agent
 
     return playslot_actor(load_agent(run, device))

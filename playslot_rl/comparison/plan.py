@@ -109,7 +109,8 @@ def check_comparison(config: ExperimentConfig) -> None:
     if wanted.launcher and importlib.util.find_spec(LAUNCHERS[wanted.launcher]) is None:
         raise _no_launcher(wanted.launcher)
     if uses_slots(config) and config.run:
-        from playslot_rl.training.checkpoints import require_config, world_model_checkpoints
+        from playslot_rl.training.checkpoints import require_config
+        from playslot_rl.training.runs import world_model_checkpoints
 
         for checkpoint in world_model_checkpoints(config.run).values():
             require_config(checkpoint, {"env": {"image_size": env.image_size, "action_dim": env.action_dim}})

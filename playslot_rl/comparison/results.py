@@ -64,7 +64,8 @@ def learning_curve(job: Job) -> list[dict[str, Any]] | None:
 
 def count_parameters(run: Path, stage: str) -> int:
     """Floating-point numbers in a run's checkpoint and in those of its parents (weights, and a few buffers)."""
-    from playslot_rl.training.checkpoints import checkpoint_folder, world_model_folder
+    from playslot_rl.training.checkpoints import checkpoint_folder
+    from playslot_rl.training.runs import world_model_folder
 
     parents = _read(checkpoint_folder(run, stage) / "meta.json").get("parents", {})
     folders = [checkpoint_folder(run, stage)]

@@ -14,7 +14,7 @@ from playslot_rl.sharing.card import CardInput, make_card
 from playslot_rl.sharing.config import PolicyConfig
 from playslot_rl.sharing.folder import save_pretrained
 from playslot_rl.sharing.source import Result, read_results, read_source
-from playslot_rl.training.checkpoints import load_agent
+from playslot_rl.training.runs import load_agent
 
 if TYPE_CHECKING:
     from playslot_rl.world_model import Agent

@@ -14,7 +14,8 @@ from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.episodes import TaskPool
 from playslot_rl.training.atomic import write_bytes, write_text
-from playslot_rl.training.checkpoints import checkpoint_folder, world_model_folder
+from playslot_rl.training.checkpoints import checkpoint_folder
+from playslot_rl.training.runs import world_model_folder
 from playslot_rl.visualization.document import Block, Document, Picture, Section, Table, Text
 from playslot_rl.visualization.html import to_html
 from playslot_rl.visualization.latents import latent_section

@@ -20,7 +20,8 @@ def evaluate(config: ExperimentConfig, run: Path) -> None:
     from playslot_rl.evaluation.success import check_baseline_protocol, evaluate_actor, run_facts
     from playslot_rl.recipes.evaluate import check_environment, describe
     from playslot_rl.recipes.run import open_device
-    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, stage_model
+    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage
+    from playslot_rl.training.runs import stage_model
 
     check_baseline_protocol(config)
     run_facts(run, config.method)  # a run without a policy is refused before anything is loaded

@@ -27,7 +27,7 @@ def main(config: ExperimentConfig) -> None:
     """
     from playslot_rl.baselines.lapo.load import MODEL, NAME, given_model
     from playslot_rl.data.demonstrations import first_demonstrations, require_labelled
-    from playslot_rl.training.checkpoints import adopt_stage
+    from playslot_rl.training.runs import adopt_stage
 
     run, own, demos = open_run(config), config.baselines.lapo, demo_root(config)
     source = first_demonstrations(open_videos(config, demos, "train-baseline"), config.demos)

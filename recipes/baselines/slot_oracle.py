@@ -35,18 +35,15 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.data.demonstrations import first_demonstrations, real_actions, transitions
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.modules.policy import LatentPolicy
-    from playslot_rl.training.checkpoints import (
-        checkpoint_folder,
+    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
+    from playslot_rl.training.fit import fit
+    from playslot_rl.training.runs import (
         link_world_model,
         load_savi,
-        read_stage,
         require_adoptable,
-        require_config,
-        save_stage,
         stage_model,
         world_model_folder,
     )
-    from playslot_rl.training.fit import fit
     from playslot_rl.training.seeding import derived_seed
     from playslot_rl.training.stage_behaviour import oracle_stage
 

@@ -30,15 +30,8 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.baselines.online.loop import fixed_keys, train_online
     from playslot_rl.baselines.sold.learner import SOLDLearner
     from playslot_rl.baselines.sold.load import NAME, build_networks, prior_steps, slots_checkpoint
-    from playslot_rl.training.checkpoints import (
-        checkpoint_folder,
-        link_world_model,
-        load_savi,
-        require_adoptable,
-        require_config,
-        save_stage,
-        world_model_folder,
-    )
+    from playslot_rl.training.checkpoints import checkpoint_folder, require_config, save_stage
+    from playslot_rl.training.runs import link_world_model, load_savi, require_adoptable, world_model_folder
     from playslot_rl.training.seeding import derived_seed
 
     parent = parent_run(config, run)

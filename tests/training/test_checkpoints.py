@@ -14,16 +14,13 @@ import torch
 from playslot_rl.config import to_dict
 from playslot_rl.errors import CheckpointError
 from playslot_rl.testing import tiny_config
-from playslot_rl.training.checkpoints import (
-    checkpoint_folder,
+from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
+from playslot_rl.training.runs import (
     link_world_model,
     load_agent,
     load_savi,
     load_world_model,
-    read_stage,
-    require_config,
     run_folder,
-    save_stage,
     world_model_folder,
 )
 from playslot_rl.training.tensors import load_tensors, module_tensors, save_tensors

@@ -84,14 +84,8 @@ def given_model(config: LAPOConfig, image_size: int, run: Path) -> StageCheckpoi
     Raises:
         CheckpointError: it is missing or damaged, of other sizes, or `run` has another one of its own.
     """
-    from playslot_rl.training.checkpoints import (
-        checkpoint_folder,
-        read_stage,
-        require_adoptable,
-        require_config,
-        require_whole,
-        run_folder,
-    )
+    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, require_whole
+    from playslot_rl.training.runs import require_adoptable, run_folder
 
     model = read_stage(checkpoint_folder(run_folder(config.world), MODEL), MODEL)
     require_whole(model)
@@ -106,14 +100,8 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
     Raises:
         CheckpointError: it is missing or damaged, or was trained on another inverse model.
     """
-    from playslot_rl.training.checkpoints import (
-        checkpoint_folder,
-        freeze_on,
-        load_weights,
-        read_stage,
-        require_parents,
-        stage_model,
-    )
+    from playslot_rl.training.checkpoints import checkpoint_folder, load_weights, read_stage, require_parents
+    from playslot_rl.training.runs import freeze_on, stage_model
 
     done = read_stage(checkpoint_folder(run, NAME), NAME)
     require_parents(done, {MODEL: read_stage(checkpoint_folder(run, MODEL), MODEL)})

@@ -161,7 +161,8 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
     Raises:
         CheckpointError: it is missing or damaged.
     """
-    from playslot_rl.training.checkpoints import checkpoint_folder, freeze_on, load_weights, read_stage, stage_model
+    from playslot_rl.training.checkpoints import checkpoint_folder, load_weights, read_stage
+    from playslot_rl.training.runs import freeze_on, stage_model
 
     done = read_stage(checkpoint_folder(run, NAME), NAME)
     model, env = stage_model(done)

@@ -14,14 +14,11 @@ from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.training.checkpoints import (
     StageCheckpoint,
     checkpoint_folder,
-    load_savi,
     load_weights,
     read_stage,
     require_parents,
-    run_folder,
-    stage_model,
-    world_model_folder,
 )
+from playslot_rl.training.runs import load_savi, run_folder, stage_model, world_model_folder
 
 NAME = "sold"
 
