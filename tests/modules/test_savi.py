@@ -5,29 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
-from playslot_rl.config import SAViConfig
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.modules.savi.corrector import SlotAttention
 from playslot_rl.modules.savi.initializer import SlotInitializer
+from playslot_rl.testing import tiny_savi
 
 
 def small(initial: str = "learned", **changes: object) -> SAVi:
-    torch.manual_seed(0)
-    values: dict[str, object] = {
-        "n_slots": 3,
-        "slot_dim": 16,
-        "encoder_channels": (8, 8),
-        "encoder_strides": (2, 2),
-        "encoder": "strided",
-        "token_dim": 12,
-        "decoder": "pixel_shuffle",
-        "decoder_channels": (8, 8),
-        "corrector_mlp": 16,
-        "transition_heads": 2,
-        "transition_mlp": 16,
-        "initial": initial,
-    }
-    return SAVi(SAViConfig(**(values | changes)), image_size=32)  # type: ignore[arg-type]
+    torch.manual_seed(1)  # the frames that the tests draw
+    return tiny_savi(initial=initial, **changes)
 
 
 @pytest.mark.parametrize("initial", ["learned", "gaussian"])

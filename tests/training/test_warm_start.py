@@ -5,33 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from playslot_rl.config import SAViConfig
 from playslot_rl.errors import CheckpointError
-from playslot_rl.modules.savi import SAVi
+from playslot_rl.testing import tiny_savi
 from playslot_rl.training.warm_start import warm_start
 
 
-def small(seed: int, **changes: object) -> SAVi:
-    torch.manual_seed(seed)
-    values: dict[str, object] = {
-        "n_slots": 3,
-        "slot_dim": 16,
-        "encoder_channels": (8, 8),
-        "encoder_strides": (2, 2),
-        "encoder": "strided",
-        "token_dim": 12,
-        "decoder": "pixel_shuffle",
-        "decoder_channels": (8, 8),
-        "corrector_mlp": 16,
-        "transition_heads": 2,
-        "transition_mlp": 16,
-        "initial": "learned",
-    }
-    return SAVi(SAViConfig(**(values | changes)), image_size=32)  # type: ignore[arg-type]
-
-
 def test_a_warm_start_parses_and_renders_as_its_source() -> None:
-    savi, source, frames = small(0), small(1), torch.rand(1, 3, 3, 32, 32)
+    savi, source, frames = tiny_savi(0), tiny_savi(1), torch.rand(1, 3, 3, 32, 32)
     assert not torch.allclose(savi(frames)[0], source(frames)[0])
     warm_start(savi, source, "runs/other")
     slots = source(frames)[0]
@@ -41,7 +21,7 @@ def test_a_warm_start_parses_and_renders_as_its_source() -> None:
 
 @pytest.mark.parametrize("count", [2, 5])
 def test_with_another_number_of_slots_the_first_initial_ones_are_copied(count: int) -> None:
-    savi, source = small(0, n_slots=count), small(1)
+    savi, source = tiny_savi(0, n_slots=count), tiny_savi(1)
     own = savi.initializer.mean.detach().clone()
     warm_start(savi, source, "runs/other")
     both = min(count, 3)
@@ -50,7 +30,7 @@ def test_with_another_number_of_slots_the_first_initial_ones_are_copied(count: i
 
 
 def test_the_source_stays_as_it_is_when_the_copy_learns() -> None:
-    savi, source = small(0), small(1)
+    savi, source = tiny_savi(0), tiny_savi(1)
     before = {name: value.clone() for name, value in source.state_dict().items()}
     warm_start(savi, source, "runs/other")
     with torch.no_grad():
@@ -62,5 +42,5 @@ def test_the_source_stays_as_it_is_when_the_copy_learns() -> None:
 @pytest.mark.parametrize("changes", [{"slot_dim": 32}, {"initial": "gaussian"}, {"decoder_position": "learned"}])
 def test_other_sizes_are_refused_in_one_line(changes: dict[str, object]) -> None:
     with pytest.raises(CheckpointError, match=r"slots\.start_from=runs/other: got \S+ of .*, expected .*") as caught:
-        warm_start(small(0, **changes), small(1), "runs/other")
+        warm_start(tiny_savi(0, **changes), tiny_savi(1), "runs/other")
     assert "\n" not in str(caught.value)
