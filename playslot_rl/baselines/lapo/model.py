@@ -5,9 +5,10 @@
 The forward model sees the next frame only through z_t, whose few codes are the bottleneck: what they best carry is what
 the agent did.
 
-Note: LAPO's inverse model also sees o_{t-1}; two frames make the latent comparable with InvDyn's. Each group of z is
-normalised (LayerNorm without weights) before it is quantised, so that the commitment term has a fixed scale. The
-forward model predicts the change of the frame and starts from no change at all.
+Note: LAPO's inverse model also sees o_{t-1}; two frames make the latent comparable with InvDyn's. Each dimension of z
+is standardised over the batch (BatchNorm without weights) before it is quantised: pairs of frames differ little from
+each other, and otherwise all of them fall to one code, from which nothing is learned. The forward model predicts the
+change of the frame and starts from no change at all.
 
 Shapes: B batch, H W image height and width, G groups, Z = G times the width of a code.
 """
@@ -52,6 +53,7 @@ class InverseModel(nn.Module):
         super().__init__()
         self.config = config
         self.network = EncoderMLP(6, config.channels, image_size, config.hidden, config.latent_dim)
+        self.standardise = nn.BatchNorm1d(config.latent_dim, affine=False)
         self.quantizer = ActionQuantizer(
             config.code_dim, config.codes, config.decay, config.dead_threshold, config.commitment
         )
@@ -59,7 +61,7 @@ class InverseModel(nn.Module):
     def forward(self, first: Tensor, second: Tensor) -> Inferred:
         """Frames (B, 3, H, W), uint8 or float [0, 1], to latent actions; the codebook moves in training mode."""
         z = self.network(torch.cat((normalise(first), normalise(second)), dim=1)).float()
-        grouped = F.layer_norm(z.view(-1, self.config.groups, self.config.code_dim), (self.config.code_dim,))
+        grouped = self.standardise(z).view(-1, self.config.groups, self.config.code_dim)
         p, code, loss = self.quantizer(grouped)
         return Inferred(p.flatten(1), code, loss)
 
