@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import ExperimentConfig, StageConfig, to_dict
 from playslot_rl.recipes.run import demo_root, finished, fixed_keys, open_device, open_run, open_videos, store_config
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def _train_policy(config: ExperimentConfig, run: Path, model: StageCheckpoint) -
     from playslot_rl.baselines.lapo.load import MODEL, NAME, sizes_of
     from playslot_rl.data.demonstrations import first_demonstrations
     from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
-    from playslot_rl.training.fit import fit
+    from playslot_rl.training.fit import FitResult, Stage, fit
 
     own, device = config.baselines.lapo, open_device(config)
     source = first_demonstrations(open_videos(config, demo_root(config), "train-baseline"), config.demos)
@@ -119,11 +119,22 @@ def _train_policy(config: ExperimentConfig, run: Path, model: StageCheckpoint) -
     sizes = {"action_decoder": to_dict(config.model.action_decoder), NAME: sizes_of(own)}
     labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
     identity = {**sizes, "data": source.fingerprint, MODEL: model.fingerprint, "loss": own.loss, "shift": own.shift}
-    common: dict[str, Any] = {"seed": config.seed, "device": device, "logging": config.logging}
-    cloned = fit(behaviour.policy_stage(), own.policy, run / NAME, name=f"{NAME}.policy", identity=identity, **common)
+
+    def train(stage: Stage, part: StageConfig, folder: Path, more: dict[str, object]) -> FitResult:
+        return fit(
+            stage,
+            part,
+            folder,
+            name=f"{NAME}.{next(iter(stage.modules))}",
+            seed=config.seed,
+            device=device,
+            logging=config.logging,
+            identity={**identity, **more},
+        )
+
+    cloned = train(behaviour.policy_stage(), own.policy, run / NAME, {})
     decode = replace(own.policy, steps=own.decoder_steps, optim=replace(own.policy.optim, lr=own.decoder_lr))
-    decoded = fit(behaviour.decoder_stage(), decode, run / NAME / "decoder", name=f"{NAME}.decoder",
-                  identity={**identity, **labelled}, **common)  # fmt: skip
+    decoded = train(behaviour.decoder_stage(), decode, run / NAME / "decoder", dict(labelled))
     save_stage(
         checkpoint_folder(run, NAME),
         stage=NAME,

@@ -97,5 +97,5 @@ class ForwardModel(nn.Module):
             x = F.pixel_shuffle(up(F.relu(x)), 2)
             if i < len(skips):
                 x = torch.cat((x, skips[-1 - i]), dim=1)
-        after: Tensor = frame + x
-        return after
+        predicted: Tensor = frame + x
+        return predicted
