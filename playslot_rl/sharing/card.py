@@ -115,7 +115,7 @@ def _data(given: CardInput) -> dict[str, str]:
         f"{recorded['policy']}, noise {recorded['noise']:g}, seed {recorded['seed']}" if recorded else "not recorded"
     )
     return {
-        "demonstrations": f"{_count(source.get('demos'))} (videos; no action is read from most of them)",
+        "demonstrations": f"videos of {_count(source.get('demos'))}",
         "labels used": f"real actions of {_count(source.get('labelled_demos'))} demonstrations, by the action decoder",
         "demonstrator": maker,
         "data set of the demonstrations": f"fingerprint `{data.get('demonstrations') or 'not recorded'}`",
