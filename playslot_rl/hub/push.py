@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import re
-import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
 
 from playslot_rl.data.lerobot_files import open_files
 from playslot_rl.errors import HubError
 from playslot_rl.hub.card import is_ours, make_card
 from playslot_rl.hub.checks import check_before_push
-from playslot_rl.hub.layout import CARD_NAME, REMOTE_RECORD, RemoteFile, is_data, local_files, same_content
+from playslot_rl.hub.compare import KEPT, check_remote, check_tag, few, own_card, size_of
+from playslot_rl.hub.layout import CARD_NAME, REMOTE_RECORD, is_data, local_files
 from playslot_rl.hub.record import HubRecord
 from playslot_rl.hub.session import Repository, open_repository
 
 MAIN = "main"
-KEPT: Final = "kept"
 _VERSION = re.compile(r"v?\d+(\.\d+)*")
 
 
@@ -70,17 +67,12 @@ class PushResult:
         else:
             lines.append(f"tag: none moved; pull this branch by revision={self.branch}")
         if self.stale:
-            lines.append(f"deleted on the Hub: {_few(self.stale)}")
+            lines.append(f"deleted on the Hub: {few(self.stale)}")
         if self.left:
-            lines.append(f"not uploaded: {_few(self.left)}")
+            lines.append(f"not uploaded: {few(self.left)}")
         if self.card == "kept":
             lines.append(f"card: the one written by hand is kept ({CARD_NAME})")
         return lines
-
-
-def _few(paths: tuple[str, ...]) -> str:
-    more = f" and {len(paths) - 3} more" if len(paths) > 3 else ""
-    return ", ".join(paths[:3]) + more
 
 
 def push(
@@ -121,22 +113,18 @@ def push(
         card = own_card(hub, root, head, remote, is_ours)
         if card != KEPT:
             content[CARD_NAME] = card or make_card(files, hub.name, record).encode()
-        expected = {path: sizes.get(path, _size(item)) for path, item in content.items()}
+        expected = {path: sizes.get(path, size_of(item)) for path, item in content.items()}
         stale = tuple(sorted(path for path in remote if is_data(path) and path not in content))
-        _check_tag(hub, tag, tags, content)
+        check_tag(hub, tag, tags, content, is_data)
         message = f"{record.episodes} episodes, {record.frames} frames, fingerprint {record.fingerprint}"
         commit = hub.commit(content, stale, message, target, head)
-        _check_remote(hub, commit, expected)
+        check_remote(hub, commit, expected, is_data)
         version = str(files.info["codebase_version"]) if target == MAIN else None
         set_tags = _set_tags(hub, commit, version, tag, tags)
     return PushResult(
         hub.name, hub.address, target, commit, commit != head, is_private, set_tags, record, len(expected),
         sum(expected.values()), stale, tuple(left), "kept" if card else "made",
     )  # fmt: skip
-
-
-def _size(item: Path | bytes) -> int:
-    return len(item) if isinstance(item, bytes) else item.stat().st_size
 
 
 def _check_names(branch: str, tag: str | None, version: str) -> None:
@@ -149,48 +137,6 @@ def _check_names(branch: str, tag: str | None, version: str) -> None:
         raise HubError(
             f"tag={tag}: got the name of a format version, expected another: LeRobot would load it as that; "
             f"{version} is set by every push to main"
-        )
-
-
-def _check_tag(hub: Repository, tag: str | None, tags: dict[str, str], content: dict[str, Path | bytes]) -> None:
-    """A tag never moves: it may be there already only where it names exactly what is pushed."""
-    if tag is None or tag not in tags:
-        return
-    tagged = hub.tree(tags[tag])
-    data = {path for path in tagged if is_data(path)}
-    same = data <= content.keys() and all(
-        path in tagged and same_content(item, tagged[path]) for path, item in content.items()
-    )
-    if not same:
-        raise HubError(
-            f"tag={tag}: {hub.name} has it on commit {tags[tag][:12]}, which holds something else, expected a new "
-            "name: tags of data are not moved, choose another"
-        )
-
-
-def own_card(
-    hub: Repository, root: Path, head: str, remote: dict[str, RemoteFile], is_ours: Callable[[str], bool]
-) -> Path | Literal["", "kept"]:
-    """A card written by hand: the one in the folder, else `KEPT` for the one on the Hub; empty if there is none."""
-    local = root / CARD_NAME
-    if local.is_file() and not is_ours(local.read_text(errors="replace")):
-        return local
-    if CARD_NAME not in remote:
-        return ""
-    with tempfile.TemporaryDirectory(prefix="playslot-card-") as folder:
-        there = hub.read(CARD_NAME, head, Path(folder)).decode(errors="replace")
-    return "" if is_ours(there) else KEPT
-
-
-def _check_remote(hub: Repository, commit: str, expected: dict[str, int]) -> None:
-    """Compare the commit's tree with what was sent."""
-    listed = hub.tree(commit)
-    wrong = [path for path, size in expected.items() if path not in listed or listed[path].size != size]
-    extra = [path for path in listed if is_data(path) and path not in expected]
-    if wrong or extra:
-        raise HubError(
-            f"{hub.name}: got commit {commit[:12]} with {len(wrong)} missing or different and {len(extra)} foreign "
-            f"files ({_few(tuple(wrong + extra))}), expected exactly the local ones: run the same command again"
         )
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from playslot_rl.errors import CheckpointError, HubError
+from playslot_rl.errors import CheckpointError
+from playslot_rl.hub.compare import KEPT, check_remote, check_tag, own_card, size_of
 from playslot_rl.hub.layout import RemoteFile, same_content
-from playslot_rl.hub.push import KEPT, MAIN, own_card
-from playslot_rl.hub.session import Repository, open_repository
+from playslot_rl.hub.push import MAIN
+from playslot_rl.hub.session import open_repository
 from playslot_rl.sharing.card import is_ours
 from playslot_rl.sharing.folder import CARD, FILES, load_pretrained
 
@@ -98,12 +99,13 @@ def push_policy(
         kept = own_card(hub, folder, head, remote, is_ours) == KEPT
         if kept:
             del content[CARD]
-        _check_tag(hub, tag, tags, content)
+        check_tag(hub, tag, tags, content, lambda _: False)
         changed = {path: item for path, item in content.items() if not _there(item, remote.get(path))}
         commit = head
         if changed:
             commit = hub.commit(content, (), f"PlaySlot policy, weights {config.fingerprint}", target, head)
-            _check_remote(hub, commit, content)
+            sizes = {path: size_of(item) for path, item in content.items()}
+            check_remote(hub, commit, sizes, lambda _: False)
         if tag is not None and tag not in tags:
             hub.set_tag(tag, commit, replace=False)
     size = sum((folder / name).stat().st_size for name in content)
@@ -114,26 +116,3 @@ def push_policy(
 
 def _there(item: Path | bytes, remote: RemoteFile | None) -> bool:
     return remote is not None and same_content(item, remote)
-
-
-def _check_tag(hub: Repository, tag: str | None, tags: dict[str, str], content: dict[str, Path | bytes]) -> None:
-    """A tag never moves: it may be there already only where it names exactly what is pushed."""
-    if tag is None or tag not in tags:
-        return
-    tagged = hub.tree(tags[tag])
-    if not all(_there(item, tagged.get(path)) for path, item in content.items()):
-        raise HubError(
-            f"tag={tag}: {hub.name} has it on commit {tags[tag][:12]}, which holds another policy, expected a new "
-            "name: tags are not moved, choose another"
-        )
-
-
-def _check_remote(hub: Repository, commit: str, content: dict[str, Path | bytes]) -> None:
-    """Compare the commit's tree with what was sent."""
-    listed = hub.tree(commit)
-    wrong = [path for path, item in content.items() if not _there(item, listed.get(path))]
-    if wrong:
-        raise HubError(
-            f"{hub.name}: got commit {commit[:12]} with {len(wrong)} missing or different files ({wrong[0]}), expected "
-            "exactly the local ones: run the same command again"
-        )
