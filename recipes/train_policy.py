@@ -6,9 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
-from playslot_rl.compose import shipped
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
     demo_root,
@@ -37,11 +35,10 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.training.checkpoints import checkpoint_folder, require_config, save_stage
     from playslot_rl.training.fit import FitResult, Stage, fit
     from playslot_rl.training.runs import (
-        link_world_model,
         load_world_model,
         require_adoptable,
+        use_world_model,
         world_model_checkpoints,
-        world_model_folder,
     )
     from playslot_rl.training.seeding import derived_seed
     from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage
@@ -62,9 +59,7 @@ def main(config: ExperimentConfig) -> None:
         return
 
     def ready() -> None:
-        home = world_model_folder(parent)
-        if Path(parent).resolve() != run.resolve() and home.resolve() != run.resolve():
-            link_world_model(run, parent if shipped(parent) else home)
+        use_world_model(run, parent)
         store_config(config, run)
 
     device = open_device(config)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from playslot_rl.errors import CheckpointError, OutputError
 from playslot_rl.training.atomic import explain_write_errors, replace_dir, temporary_name, write_json
@@ -93,29 +93,9 @@ class TrainingCheckpoints:
         Raises:
             OutputError: full disk; the earlier checkpoints stay.
         """
-        final = self.folder / f"step_{state.step:08d}"
-        temporary = temporary_name(final)
-        with explain_write_errors(final):
-            temporary.mkdir(parents=True)
-            try:
-                save_tensors(temporary / "modules.safetensors", module_tensors(modules))
-                save_tensors(temporary / "optimizer.safetensors", adam_tensors(optimizer, parameters))
-                write_json(
-                    temporary / "state.json",
-                    {
-                        "format": FORMAT,
-                        "step": state.step,
-                        "seconds": state.seconds,
-                        "metrics": state.metrics,
-                        "identity": self.identity,
-                    },
-                )
-                replace_dir(temporary, final)
-            finally:
-                shutil.rmtree(temporary, ignore_errors=True)
-        for old in self.saved()[:-KEPT]:
-            shutil.rmtree(old)
-        return final
+        tensors = {"modules": module_tensors(modules), "optimizer": adam_tensors(optimizer, parameters)}
+        values = {"step": state.step, "seconds": state.seconds, "metrics": state.metrics}
+        return self._write(state.step, tensors, values)
 
     def resume(
         self, modules: Mapping[str, nn.Module], optimizer: torch.optim.Adam, parameters: Mapping[str, nn.Parameter]
@@ -126,10 +106,46 @@ class TrainingCheckpoints:
             CheckpointError: the config differs from the stored one, or the checkpoint is damaged.
             OutputError: a file stands where the folder should be.
         """
+        newest = self._newest()
+        if newest is None:
+            return TrainingState()
+        last, stored = newest
+        load_modules(modules, load_tensors(last / "modules.safetensors"), str(last))
+        restore_adam(optimizer, parameters, load_tensors(last / "optimizer.safetensors"), str(last))
+        return TrainingState(stored["step"], stored["seconds"], stored["metrics"])
+
+    def _write(self, step: int, files: Mapping[str, Mapping[str, Tensor]], state: Mapping[str, Any]) -> Path:
+        """Write `step_STEP` of tensors `NAME.safetensors` and a `state.json`; keep the newest two.
+
+        Raises:
+            OutputError: full disk; the earlier checkpoints stay.
+        """
+        final = self.folder / f"step_{step:08d}"
+        temporary = temporary_name(final)
+        with explain_write_errors(final):
+            temporary.mkdir(parents=True)
+            try:
+                for name, tensors in files.items():
+                    save_tensors(temporary / f"{name}.safetensors", tensors)
+                write_json(temporary / "state.json", {"format": FORMAT, **state, "identity": self.identity})
+                replace_dir(temporary, final)
+            finally:
+                shutil.rmtree(temporary, ignore_errors=True)
+        for old in self.saved()[:-KEPT]:
+            shutil.rmtree(old)
+        return final
+
+    def _newest(self) -> tuple[Path, dict[str, Any]] | None:
+        """The newest checkpoint and its `state.json`, checked to belong to this run; None if there is none.
+
+        Raises:
+            CheckpointError: the config differs from the stored one, or the checkpoint is damaged.
+            OutputError: a file stands where the folder should be.
+        """
         self._tidy()
         last = self.last()
         if last is None:
-            return TrainingState()
+            return None
         stored = self._read(last)
         difference = first_difference(stored["identity"], self.identity)
         if difference is not None:
@@ -138,9 +154,7 @@ class TrainingCheckpoints:
                 f"{key}: got {new}, expected {old}, with which {self.folder.parent} was begun: "
                 f"set {key} back, use another out=, or delete that folder"
             )
-        load_modules(modules, load_tensors(last / "modules.safetensors"), str(last))
-        restore_adam(optimizer, parameters, load_tensors(last / "optimizer.safetensors"), str(last))
-        return TrainingState(stored["step"], stored["seconds"], stored["metrics"])
+        return last, stored
 
     def _tidy(self) -> None:
         if self.folder.exists() and not self.folder.is_dir():

@@ -132,6 +132,18 @@ def link_world_model(run: Path, source: Path | str) -> None:
     write_json(run / "world_model.json", {"source": text})
 
 
+def use_world_model(run: Path, parent: Path | str) -> None:
+    """Have `run` build on the world model of `parent`: its own, another run's, or a shipped one (`pretrained/ENV`).
+
+    Raises:
+        CheckpointError: no such parent.
+        OutputError: full disk.
+    """
+    home = world_model_folder(parent)
+    if run.resolve() not in (home.resolve(), Path(parent).resolve()):
+        link_world_model(run, parent if shipped_env(parent) else home)
+
+
 def world_model_folder(run: Path | str) -> Path:
     """The run folder that holds the world model of `run`: itself, or the one `world_model.json` names.
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from playslot_rl.compose import shipped
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
     demo_root,
@@ -38,10 +37,10 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
     from playslot_rl.training.fit import fit
     from playslot_rl.training.runs import (
-        link_world_model,
         load_savi,
         require_adoptable,
         stage_model,
+        use_world_model,
         world_model_folder,
     )
     from playslot_rl.training.seeding import derived_seed
@@ -49,8 +48,7 @@ def main(config: ExperimentConfig) -> None:
 
     run = open_run(config)
     parent = parent_run(config, run)
-    home = world_model_folder(parent)
-    slots = read_stage(checkpoint_folder(home, "slots"), "slots")
+    slots = read_stage(checkpoint_folder(world_model_folder(parent), "slots"), "slots")
     require_adoptable(slots, run)
     require_config(slots, {"env": {"image_size": config.env.image_size}})
     policy = {"policy": to_dict(config.model.policy)}
@@ -59,8 +57,7 @@ def main(config: ExperimentConfig) -> None:
         return
 
     def ready() -> None:
-        if home.resolve() != run.resolve():
-            link_world_model(run, parent if shipped(parent) else home)
+        use_world_model(run, parent)
         store_config(config, run)
 
     device = open_device(config)

@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from playslot_rl.compose import shipped
 from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.recipes.baselines.online import train_and_save
 from playslot_rl.recipes.run import finished, open_device, open_run, parent_run, store_config
 
 
@@ -26,12 +26,11 @@ def main(config: ExperimentConfig) -> None:
 
     import torch
 
-    from playslot_rl.baselines.methods import METHODS
-    from playslot_rl.baselines.online.loop import fixed_keys, train_online
+    from playslot_rl.baselines.online.loop import fixed_keys
     from playslot_rl.baselines.sold.learner import SOLDLearner
     from playslot_rl.baselines.sold.load import NAME, build_networks, prior_steps, slots_checkpoint
-    from playslot_rl.training.checkpoints import checkpoint_folder, require_config, save_stage
-    from playslot_rl.training.runs import link_world_model, load_savi, require_adoptable, world_model_folder
+    from playslot_rl.training.checkpoints import require_config
+    from playslot_rl.training.runs import load_savi, require_adoptable, use_world_model
     from playslot_rl.training.seeding import derived_seed
 
     parent = parent_run(config, run)
@@ -44,9 +43,7 @@ def main(config: ExperimentConfig) -> None:
     before = prior_steps(own, slots)
 
     def ready() -> None:
-        home = world_model_folder(parent)
-        if home.resolve() != run.resolve():
-            link_world_model(run, parent if shipped(parent) else home)
+        use_world_model(run, parent)
         store_config(config, run)
 
     device = open_device(config)
@@ -54,42 +51,6 @@ def main(config: ExperimentConfig) -> None:
         torch.manual_seed(derived_seed(config.seed, 0, NAME))
         networks = build_networks(own, slots, config.env.action_dim, config.env.max_steps).to(device)
     learner = SOLDLearner(load_savi(parent, device), networks, own, config.env.action_dim)
-    result = train_online(
-        learner,
-        own,
-        config,
-        run / NAME,
-        name=NAME,
-        title=METHODS[NAME].title,
-        device=device,
-        identity={"slots": slots.fingerprint},
-        ready=ready,
-        prior_steps=before,
-    )
-    state = result.state
-    save_stage(
-        checkpoint_folder(run, NAME),
-        stage=NAME,
-        modules=networks.parts,
-        config={"env": to_dict(config.env), NAME: to_dict(own)},
-        data={},
-        parents={"slots": slots.fingerprint},
-        metrics=state.metrics,
-        steps=state.updates,
-        seconds=state.seconds,
-        extra={
-            "env_steps": state.step + before,
-            "savi_steps": before,
-            "episodes": state.episodes,
-            "seed": config.seed,
-            "random_policy": result.random,
-            "parameters": sum(parameter.numel() for parameter in networks.parameters()),
-        },
-    )
-    random, last = result.random, state.curve[-1]
-    print(
-        f"{NAME}: {state.step} agent steps and {before} of SAVi's data, {state.updates} updates; development episodes: "
-        f"return {last['return_mean']:.2f} (random {random['return_mean']:.2f}), success "
-        f"{100 * last['success_rate']:.0f} % (random {100 * random['success_rate']:.0f} %); {run / NAME}",
-        flush=True,
+    train_and_save(
+        config, own, run, NAME, learner, networks.parts, device=device, ready=ready, slots=slots, prior_steps=before
     )

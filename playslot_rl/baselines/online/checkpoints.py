@@ -9,7 +9,6 @@ Frames are most of it, so the journal is only appended to; its file is on the di
 from __future__ import annotations
 
 import itertools
-import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -21,8 +20,7 @@ from torch import Tensor, nn
 
 from playslot_rl.baselines.online.replay import Replay
 from playslot_rl.errors import CheckpointError
-from playslot_rl.training.atomic import explain_write_errors, replace_dir, temporary_name, write_json
-from playslot_rl.training.resume import FORMAT, KEPT, TrainingCheckpoints, first_difference
+from playslot_rl.training.resume import KEPT, TrainingCheckpoints
 from playslot_rl.training.tensors import load_modules, load_tensors, module_tensors, save_tensors
 
 
@@ -182,19 +180,8 @@ class OnlineCheckpoints(TrainingCheckpoints):
         """
         if new is not None:
             self.journal.append(state.episodes - len(new), new)
-        final = self.folder / f"step_{state.step:08d}"
-        temporary = temporary_name(final)
-        with explain_write_errors(final):
-            temporary.mkdir(parents=True)
-            try:
-                save_tensors(temporary / "modules.safetensors", module_tensors(modules))
-                save_tensors(temporary / "optimizers.safetensors", optimizer_tensors(optimizers))
-                write_json(temporary / "state.json", {"format": FORMAT, **asdict(state), "identity": self.identity})
-                replace_dir(temporary, final)
-            finally:
-                shutil.rmtree(temporary, ignore_errors=True)
-        for old in self.saved()[:-KEPT]:
-            shutil.rmtree(old)
+        tensors = {"modules": module_tensors(modules), "optimizers": optimizer_tensors(optimizers)}
+        final = self._write(state.step, tensors, asdict(state))
         # Both checkpoints that are kept must find their episodes.
         self._counted = [*self._counted, state.episodes][-KEPT:]
         self.journal.forget(self._counted[0] - capacity)
@@ -209,19 +196,11 @@ class OnlineCheckpoints(TrainingCheckpoints):
             CheckpointError: the config differs from the stored one, or something is damaged.
             OutputError: a file stands where the folder should be.
         """
-        self._tidy()
-        last = self.last()
-        if last is None:
+        newest = self._newest()
+        if newest is None:
             self.journal.rewind(0)
             return OnlineState()
-        stored = self._read(last)
-        difference = first_difference(stored["identity"], self.identity)
-        if difference is not None:
-            key, old, new = difference
-            raise CheckpointError(
-                f"{key}: got {new}, expected {old}, with which {self.folder.parent} was begun: "
-                f"set {key} back, use another out=, or delete that folder"
-            )
+        last, stored = newest
         load_modules(modules, load_tensors(last / "modules.safetensors"), str(last))
         restore_optimizers(optimizers, load_tensors(last / "optimizers.safetensors"), str(last))
         state = OnlineState(**{item.name: stored[item.name] for item in fields(OnlineState)})
