@@ -69,6 +69,7 @@ def _footnotes(result: Result) -> list[str]:
     rows: Sequence[Result] = result["rows"]
     done = [row for row in rows if row["status"] == "done"]
     notes = [f"{name}: {_reference(value)}, on the same episodes." for name, value in result["references"].items()]
+    notes += _ratios(result["summary"])
     notes += [
         f"Labels: {row['title']} saw the real actions of {row['labels']}."
         for row in ({"title": t, "labels": _labels(done, t)} for t in _titles(done) if _labels(done, t))
@@ -87,11 +88,34 @@ def _footnotes(result: Result) -> list[str]:
             f"The world model ({world['source']}; slots {world['fingerprints']['slots']}, "
             f"{world['seconds']:.0f} s of training) is the same for all methods, demonstrations and seeds."
         )
-    missing = failures(rows)
-    notes += [f"**{row['name']}: {row['status']}.** {row['error'] or ''}".rstrip() for row in missing]
-    notes.append("Failures: none." if not missing else f"Failures: {len(missing)} of {result['jobs']} jobs, see above.")
+    notes += _open_jobs(rows, result["jobs"])
     notes.append(f"Made by `{result['command']}` at commit {result['commit'] or 'unknown'}; {_machine(result)}.")
     return notes
+
+
+def _open_jobs(rows: Sequence[Result], jobs: int) -> list[str]:
+    """A line for each job that failed, and one for those that have not had their turn."""
+    missing = failures(rows)
+    failed = [row for row in missing if row["status"] == "failed"]
+    waiting = [row["name"] for row in missing if row["status"] != "failed"]
+    notes = [f"**{row['name']}: failed.** {row['error'] or ''}".rstrip() for row in failed]
+    notes.append(f"Failures: {len(failed)} of {jobs} jobs, see above." if failed else "Failures: none.")
+    if waiting:
+        notes.append(f"Not finished: {len(waiting)} of {jobs} jobs; the same command carries on.")
+    return notes
+
+
+def _ratios(summary: Sequence[Result]) -> list[str]:
+    """PlaySlot's success in simulation as a share of the Slot Oracle's, which sees all real actions."""
+    rates = {(row["method"], row["demos"]): row["success_rate"] for row in summary if row["protocol"] == "simulation"}
+    shares = [
+        f"{100 * rate / rates['slot_oracle', demos]:.0f} % at {demos}"
+        for (method, demos), rate in rates.items()
+        if method == "playslot" and rates.get(("slot_oracle", demos))
+    ]
+    if not shares:
+        return []
+    return [f"PlaySlot's success in simulation over the Slot Oracle's: {', '.join(shares)} demonstrations."]
 
 
 def _titles(rows: Sequence[Result]) -> list[str]:

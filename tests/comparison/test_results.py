@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from jobs_on_disk import finish
+from jobs_on_disk import comparison, finish
 
 from playslot_rl.comparison.plan import Job
-from playslot_rl.comparison.results import count_parameters, failures, job_rows
+from playslot_rl.comparison.results import count_parameters, failures, job_rows, summarise
 from playslot_rl.comparison.table import cell, comparison_page
 from playslot_rl.config import MethodName
 from playslot_rl.evaluation.intervals import wilson
@@ -67,8 +67,18 @@ def test_the_page_has_the_table_the_footnotes_and_the_failure(ended: dict[str, A
     assert "ResNet Oracle starts from scratch weights" in page
     assert "**lapo-d10-s0: failed.** loss is nan at step 3" in page
     assert "Failures: 1 of 7 jobs" in page
+    assert "Not finished" not in page
+    assert "over the Slot Oracle's: 70 % at 10 demonstrations" in page
     assert "expert: 100 % (70 to 100)" in page
     assert "PlaySlot 30 s a training, 8 s its evaluation" in page
+
+
+def test_a_job_that_waits_is_no_failure(tmp_path: Path) -> None:
+    jobs = [finish(Job("lapo", 10, 0, tmp_path), {"simulation": 8}), Job("lapo", 50, 0, tmp_path)]
+    rows = [row for job in jobs for row in job_rows(job)]
+    page = comparison_page({**comparison(tmp_path, rows, summarise(rows)), "jobs": 2})
+    assert "Failures: none." in page
+    assert "Not finished: 1 of 2 jobs" in page
 
 
 def test_a_cell_of_one_seed_has_no_range(ended: dict[str, Any]) -> None:
