@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
@@ -12,6 +13,36 @@ from playslot_rl.hub.layout import CARD_NAME, RemoteFile, same_content
 from playslot_rl.hub.session import Repository
 
 KEPT: Final = "kept"
+
+
+@dataclass(frozen=True)
+class Pushed:
+    """What every push says.
+
+    Attributes:
+        repo_id: `user/name`.
+        address: its page.
+        branch: pushed to.
+        commit: what the branch now is.
+        changed: whether there was anything to send.
+        private: whether the repository is.
+    """
+
+    repo_id: str
+    address: str
+    branch: str
+    commit: str
+    changed: bool
+    private: bool
+
+    def head(self, what: str) -> list[str]:
+        """The first lines for people, of `what` was sent."""
+        done = "pushed" if self.changed else "nothing to push: the Hub has the same files already"
+        return [
+            f"{done}: {what}",
+            f"to: {self.address} ({'private' if self.private else 'public'}), branch {self.branch}",
+            f"commit: {self.commit}",
+        ]
 
 
 def few(paths: tuple[str, ...]) -> str:

@@ -10,7 +10,7 @@ from playslot_rl.data.lerobot_files import open_files
 from playslot_rl.errors import HubError
 from playslot_rl.hub.card import is_ours, make_card
 from playslot_rl.hub.checks import check_before_push
-from playslot_rl.hub.compare import KEPT, check_remote, check_tag, few, own_card, size_of
+from playslot_rl.hub.compare import KEPT, Pushed, check_remote, check_tag, few, own_card, size_of
 from playslot_rl.hub.layout import CARD_NAME, REMOTE_RECORD, is_data, local_files
 from playslot_rl.hub.record import HubRecord
 from playslot_rl.hub.session import Repository, open_repository
@@ -20,16 +20,10 @@ _VERSION = re.compile(r"v?\d+(\.\d+)*")
 
 
 @dataclass(frozen=True)
-class PushResult:
-    """What a push did.
+class PushResult(Pushed):
+    """What a push of a data set did.
 
     Attributes:
-        repo_id: `user/name`.
-        address: its page.
-        branch: pushed to.
-        commit: what the branch now is.
-        changed: whether there was anything to send.
-        private: whether the repository is.
         tags: set on the commit.
         record: fingerprint and counts.
         files, size: how many files and bytes the data set has there.
@@ -38,12 +32,6 @@ class PushResult:
         card: `made`, or `kept` where somebody wrote one by hand.
     """
 
-    repo_id: str
-    address: str
-    branch: str
-    commit: str
-    changed: bool
-    private: bool
     tags: tuple[str, ...]
     record: HubRecord
     files: int
@@ -54,14 +42,9 @@ class PushResult:
 
     def lines(self) -> list[str]:
         """For people."""
-        what = "pushed" if self.changed else "nothing to push: the Hub has the same files already"
         record = self.record
         counts = f"{record.episodes} episodes, {record.frames} frames, {self.files} files"
-        lines = [
-            f"{what}: {counts} of {self.size / 1e6:.1f} MB, fingerprint {record.fingerprint}",
-            f"to: {self.address} ({'private' if self.private else 'public'}), branch {self.branch}",
-            f"commit: {self.commit}",
-        ]
+        lines = self.head(f"{counts} of {self.size / 1e6:.1f} MB, fingerprint {record.fingerprint}")
         if self.tags:
             lines.append(f"tag: {', '.join(self.tags)}")
         else:

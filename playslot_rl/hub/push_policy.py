@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from playslot_rl.errors import CheckpointError
-from playslot_rl.hub.compare import KEPT, check_remote, check_tag, own_card, size_of
+from playslot_rl.hub.compare import KEPT, Pushed, check_remote, check_tag, own_card, size_of
 from playslot_rl.hub.layout import RemoteFile, same_content
 from playslot_rl.hub.push import MAIN
 from playslot_rl.hub.session import open_repository
@@ -15,28 +15,16 @@ from playslot_rl.sharing.folder import CARD, FILES, load_pretrained
 
 
 @dataclass(frozen=True)
-class PolicyPushResult:
-    """What a push did.
+class PolicyPushResult(Pushed):
+    """What a push of a policy did.
 
     Attributes:
-        repo_id: `user/name`.
-        address: its page.
-        branch: pushed to.
-        commit: what the branch now is.
-        changed: whether there was anything to send.
-        private: whether the repository is.
         tag: set on the commit; empty for none.
         fingerprint: of the weights.
         size: bytes of all files.
         card_kept: whether a card written by hand on the Hub was left as it is.
     """
 
-    repo_id: str
-    address: str
-    branch: str
-    commit: str
-    changed: bool
-    private: bool
     tag: str
     fingerprint: str
     size: int
@@ -44,12 +32,7 @@ class PolicyPushResult:
 
     def lines(self) -> list[str]:
         """For people."""
-        what = "pushed" if self.changed else "nothing to push: the Hub has the same files already"
-        lines = [
-            f"{what}: {self.size / 1e6:.1f} MB, weights {self.fingerprint}",
-            f"to: {self.address} ({'private' if self.private else 'public'}), branch {self.branch}",
-            f"commit: {self.commit}",
-        ]
+        lines = self.head(f"{self.size / 1e6:.1f} MB, weights {self.fingerprint}")
         if self.tag:
             lines.append(f"tag: {self.tag}")
         if self.card_kept:
