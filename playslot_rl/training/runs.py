@@ -188,6 +188,21 @@ def stage_model(checkpoint: StageCheckpoint) -> tuple[ModelConfig, EnvConfig]:
         ) from error
 
 
+def stage_env(checkpoint: StageCheckpoint) -> EnvConfig:
+    """The environment config a stage was trained with; all stages store it, also those without a `model`.
+
+    Raises:
+        CheckpointError: its config.json is not one of this version.
+    """
+    try:
+        return from_dict(EnvConfig, checkpoint.config["env"], "env.")
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{checkpoint.path}/config.json: {error}; expected the env of this version of playslot_rl: "
+            "train that stage again"
+        ) from error
+
+
 def freeze_on(module: nn.Module, device: torch.device | str) -> None:
     """Move a module to a device, into evaluation mode, without gradients for its weights."""
     module.to(device).eval().requires_grad_(False)

@@ -21,11 +21,11 @@ def evaluate(config: ExperimentConfig, run: Path) -> None:
     from playslot_rl.recipes.evaluate import check_environment, describe
     from playslot_rl.recipes.run import open_device
     from playslot_rl.training.checkpoints import checkpoint_folder, read_stage
-    from playslot_rl.training.runs import stage_model
+    from playslot_rl.training.runs import stage_env
 
     check_baseline_protocol(config)
     run_facts(run, config.method)  # a run without a policy is refused before anything is loaded
-    _, env = stage_model(read_stage(checkpoint_folder(run, config.method), config.method))
+    env = stage_env(read_stage(checkpoint_folder(run, config.method), config.method))
     check_environment(config, env.image_size, env.action_dim)
     device = open_device(config)
     module, _, function = METHODS[config.method].actor.partition(":")

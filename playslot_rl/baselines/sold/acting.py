@@ -27,7 +27,7 @@ class SlotActing(TensorDictModuleBase):
     Args:
         savi: frozen.
         actor: the policy.
-        window: W, the last frames the actor sees. It was trained on that many; ALiBi lets it slide.
+        window: W, the last frames the actor sees (`acting_window`); ALiBi lets it slide.
         action_dim: A.
     """
 

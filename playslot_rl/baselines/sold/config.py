@@ -14,13 +14,17 @@ class SOLDConfig(OnlineConfig):
     """Sizes and schedule of SOLD (Mosbach et al., 2025); the defaults are the source's where our references name them.
 
     Of `OnlineConfig`, `sequence` (18 frames: 3 of context and 15 predicted) differs, and so do the sizes of batches.
+    Of a longer sequence (0: whole episodes) the dynamics and the reward learn from a window of C + H frames, drawn anew
+    each time; imagination starts anywhere in it.
 
     Attributes:
         dim, heads, mlp_dim: token width, attention heads and hidden width of all four transformers.
         dynamics_layers: layers of OCVP-Seq, each one attention over objects and one over time.
         head_layers: layers of the slot-aggregation transformers of reward, value and actor.
-        bins: categories of the two-hot heads, evenly spaced in symlog from -20 to 20.
-        context: frames (C) that a rollout starts from, at most; imagination draws 1 to C.
+        bins: categories of the two-hot heads, evenly spaced in symlog from -`limit` to `limit`.
+        limit: the grid's ends, in symlog.
+        mean: how a head's probabilities become a value, averaged in `symlog` or `linear` (see `two_hot.py`).
+        context: frames (C) that a rollout starts from, at most: 1 to C are drawn. The actor acts on its last C frames.
         horizon: imagined steps (H).
         starts: imagined rollouts in an update, from frames drawn from its batch.
         gamma, lmbda: discount and lambda of the returns.
@@ -44,6 +48,8 @@ class SOLDConfig(OnlineConfig):
     dynamics_layers: int = 4
     head_layers: int = 3
     bins: int = 255
+    limit: float = 20.0
+    mean: Literal["symlog", "linear"] = "symlog"
     context: int = 3
     horizon: int = 15
     starts: int = 256
@@ -71,6 +77,7 @@ class SOLDConfig(OnlineConfig):
         check(self.horizon >= 1, f"{group}.horizon", self.horizon, "at least 1")
         check(self.starts >= 1, f"{group}.starts", self.starts, "at least 1")
         check(self.bins >= 3 and self.bins % 2 == 1, f"{group}.bins", self.bins, "an odd number from 3 on")
+        check(self.limit > 0, f"{group}.limit", self.limit, "above 0")
         longer = self.sequence == 0 or self.sequence > self.context
         check(longer, f"{group}.sequence", self.sequence, f"0, or more than {group}.context={self.context}")
         for name in ("gamma", "lmbda", "critic_decay", "return_rate"):

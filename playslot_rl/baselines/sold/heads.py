@@ -27,13 +27,13 @@ class ScalarHead(nn.Module):
     Args:
         backbone: the slot-aggregation transformer.
         dim: its width.
-        bins: categories.
+        two_hot: its categories.
     """
 
-    def __init__(self, backbone: SlotAggregation, dim: int, bins: int) -> None:
+    def __init__(self, backbone: SlotAggregation, dim: int, two_hot: SymlogTwoHot) -> None:
         super().__init__()
-        self.backbone, self.two_hot = backbone, SymlogTwoHot(bins)
-        self.out = nn.Linear(dim, bins)
+        self.backbone, self.two_hot = backbone, two_hot
+        self.out = nn.Linear(dim, len(two_hot.grid))
         # Zero logits decode to zero: an untrained head promises nothing (DreamerV3).
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)

@@ -24,12 +24,14 @@ class Imagined(NamedTuple):
         actions: (B, H, A) in [-1, 1], reparameterised.
         log_probs: (B, H) of the actions, as constants, summed over A.
         entropies: (B, H), summed over A.
+        locations: (B, H, A), the modes of the actions' distributions, as constants.
     """
 
     slots: Tensor
     actions: Tensor
     log_probs: Tensor
     entropies: Tensor
+    locations: Tensor
 
 
 def imagine(
@@ -54,11 +56,12 @@ def imagine(
     """
     memory = None
     if context.shape[1] > 1:
-        _, memory = dynamics(context[:, :-1], actions)
+        with torch.no_grad():  # no action that is judged leads there
+            _, memory = dynamics(context[:, :-1], actions)
     location, std, past = actor(context.detach())
-    frames, chosen, log_probs, entropies = [context], [], [], []
+    frames, chosen, log_probs, entropies, locations = [context], [], [], [], []
     current = context[:, -1:]
-    for _ in range(horizon):
+    for step in range(horizon):
         distribution = action_distribution(location[:, -1:], std[:, -1:])
         action = sample_action(distribution, generator)
         current, memory = dynamics(current, action, memory)
@@ -66,7 +69,7 @@ def imagine(
         chosen.append(action)
         log_probs.append(distribution.log_prob(action.detach()))
         entropies.append(distribution.base_dist.entropy().sum(dim=-1))
-        location, std, past = actor(current.detach(), past)
-    return Imagined(
-        torch.cat(frames, dim=1), torch.cat(chosen, dim=1), torch.cat(log_probs, dim=1), torch.cat(entropies, dim=1)
-    )
+        locations.append(location[:, -1:].detach())
+        if step + 1 < horizon:
+            location, std, past = actor(current.detach(), past)
+    return Imagined(*(torch.cat(parts, dim=1) for parts in (frames, chosen, log_probs, entropies, locations)))

@@ -82,11 +82,15 @@ class SOLDLearner:
 
         Note: the reward's targets are the same on both; it is asked about predicted slots in imagination.
         """
-        c, slots, is_first = self.config.context, batch[keys.SLOTS], batch[keys.IS_FIRST].squeeze(-1)
+        batch, c = self._window(batch, generators)
+        slots, is_first = batch[keys.SLOTS], batch[keys.IS_FIRST].squeeze(-1)
         valid = losses.same_episode(is_first)
         predicted = self.networks.dynamics.rollout(slots[:, :c], batch[keys.ACTION][:, 1:])
         slot = losses.slot_loss(predicted, slots[:, 1:], valid[:, 1:])
-        loss, metrics = self.config.slot_weight * slot, {"slot_mse": slot.detach()}
+        still = losses.slot_loss(slots[:, c - 1 : c].expand_as(slots[:, c:]), slots[:, c:], valid[:, c:])
+        ahead = losses.slot_loss(predicted[:, c - 1 :], slots[:, c:], valid[:, c:])
+        metrics = {"slot_mse": slot.detach(), "unexplained": ahead.detach() / still.clamp(min=1e-12)}
+        loss = self.config.slot_weight * slot
         if self.config.image_weight > 0:
             image = self._image_loss(predicted, batch[keys.PIXELS][:, 1:], valid[:, 1:], generators)
             loss, metrics["image_mse"] = loss + self.config.image_weight * image, image.detach()
@@ -98,6 +102,19 @@ class SOLDLearner:
             self.networks.reward, torch.cat((slots, imagined)), rewards.repeat(2, 1), arrived.repeat(2, 1)
         )
         return metrics | {"loss_reward": reward.detach(), "reward_grad_norm": self._step("reward", reward)}
+
+    def _window(self, batch: TensorDict, generators: StepGenerators) -> tuple[TensorDict, int]:
+        """A window of C + H frames of each sequence (all of it, where it is shorter), and the frames c it starts from.
+
+        Note: c is drawn from 1 to C, as for imagination, which asks both networks about no other rollouts.
+        """
+        draw = generators.torch("window", "cpu")
+        b, t = batch.batch_size
+        frames = min(t, self.config.context + self.config.horizon)
+        first = torch.randint(t - frames + 1, (b, 1), generator=draw)
+        c = int(torch.randint(1, min(self.config.context, frames - 1) + 1, (), generator=draw))
+        window = first + torch.arange(frames)
+        return batch[torch.arange(b)[:, None], window.to(batch.device or "cpu")], c
 
     def _image_loss(self, predicted: Tensor, pixels: Tensor, valid: Tensor, generators: StepGenerators) -> Tensor:
         """Mean squared error of decoded frames, through the frozen decoder."""
@@ -142,6 +159,7 @@ class SOLDLearner:
             "imagined_return": returns.detach().mean(),
             "return_scale": self.returns.scale().detach().squeeze(),
             "entropy": imagined.entropies.detach().mean(),
+            "action_size": imagined.locations.abs().mean(),
         }
 
     def _starts(self, batch: TensorDict, generators: StepGenerators) -> tuple[Tensor, Tensor]:

@@ -10,6 +10,7 @@ from playslot_rl.baselines.sold.aggregation import SlotAggregation
 from playslot_rl.baselines.sold.config import SOLDConfig
 from playslot_rl.baselines.sold.dynamics import OCVPSeq
 from playslot_rl.baselines.sold.heads import ActorHead, ScalarHead
+from playslot_rl.baselines.sold.two_hot import SymlogTwoHot
 
 
 class SOLDNetworks(nn.Module):
@@ -27,13 +28,17 @@ class SOLDNetworks(nn.Module):
         c = config
         context = max(frames, c.context + c.horizon)
         self.dynamics = OCVPSeq(slot_dim, action_dim, c.dim, c.dynamics_layers, c.heads, c.mlp_dim, context)
-        self.reward = ScalarHead(self._backbone(c, slot_dim), c.dim, c.bins)
-        self.critic = ScalarHead(self._backbone(c, slot_dim), c.dim, c.bins)
+        self.reward = ScalarHead(self._backbone(c, slot_dim), c.dim, self._grid(c))
+        self.critic = ScalarHead(self._backbone(c, slot_dim), c.dim, self._grid(c))
         self.actor = ActorHead(self._backbone(c, slot_dim), c.dim, action_dim)
 
     @staticmethod
     def _backbone(c: SOLDConfig, slot_dim: int) -> SlotAggregation:
         return SlotAggregation(slot_dim, c.dim, c.head_layers, c.heads, c.mlp_dim)
+
+    @staticmethod
+    def _grid(c: SOLDConfig) -> SymlogTwoHot:
+        return SymlogTwoHot(c.bins, c.limit, c.mean)
 
     @property
     def parts(self) -> Mapping[str, nn.Module]:
@@ -42,5 +47,9 @@ class SOLDNetworks(nn.Module):
 
 
 def acting_window(config: SOLDConfig) -> int:
-    """Frames the actor looks back when it acts: as many as it sees in imagination."""
-    return config.context + config.horizon
+    """Frames the actor looks back when it acts.
+
+    Note: C. In imagination its first decision follows 1 to C parsed frames and later ones follow predicted frames too;
+    longer windows of parsed frames only are what it never saw.
+    """
+    return config.context

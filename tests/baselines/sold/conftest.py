@@ -1,4 +1,4 @@
-"""SOLD small enough for tests: 3 slots of 32, networks of one layer of 16."""
+"""SOLD small enough for tests: 4 slots of 32, networks of one layer of 16."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def test_grids_without_a_zero_are_refused(bins: int) -> None:
 
 
 def test_an_untrained_scalar_head_says_zero() -> None:
-    head = ScalarHead(_backbone(), 16, 41)
+    head = ScalarHead(_backbone(), 16, SymlogTwoHot(41))
     assert head.decode(head(torch.randn(2, 3, 4, 6))).abs().max() < 1e-5
 
 

@@ -12,7 +12,7 @@ from playslot_rl.baselines.sold.imagination import Imagined
 
 def _imagined(batch: int = 2, horizon: int = 3) -> Imagined:
     zeros = torch.zeros(batch, horizon)
-    return Imagined(torch.zeros(batch, 1 + horizon, 1, 1), zeros.unsqueeze(-1), zeros, zeros)
+    return Imagined(torch.zeros(batch, 1 + horizon, 1, 1), zeros.unsqueeze(-1), zeros, zeros, zeros.unsqueeze(-1))
 
 
 def test_lambda_returns_equal_a_plain_loop() -> None:
