@@ -14,6 +14,7 @@ from playslot_rl.errors import OutputError, PlaySlotError
 
 if TYPE_CHECKING:
     from playslot_rl.comparison.plan import Job
+    from playslot_rl.comparison.report import Comparison
 
 
 def main(config: ExperimentConfig) -> None:
@@ -24,43 +25,27 @@ def main(config: ExperimentConfig) -> None:
         PlaySlotError: a job failed; the others have finished, and the table says so.
         KeyboardInterrupt: Ctrl-C; the same command carries on.
     """
-    from playslot_rl.comparison.launch import run_in_sequence, run_process, run_sweep
     from playslot_rl.comparison.plan import check_comparison, job_record
     from playslot_rl.comparison.report import Comparison
-    from playslot_rl.comparison.status import read_status
+    from playslot_rl.comparison.status import comparison_lock
     from playslot_rl.evaluation.success import DEFAULT_EPISODES
     from playslot_rl.recipes import compare_data
-    from playslot_rl.training.atomic import write_json
+    from playslot_rl.recipes.run import parent_run
 
     began = time.monotonic()
     out = Path(config.out or f"runs/compare_{config.env.name}_{config.preset}")
-    config = replace(config, episodes=config.episodes or DEFAULT_EPISODES, out=str(out))
+    run = parent_run(config, out) if config.run else ""  # `pretrained` is the task's own
+    config = replace(config, episodes=config.episodes or DEFAULT_EPISODES, out=str(out), run=run)
     check_comparison(config)
     _open(out)
-    config = compare_data.prepare(config, out)
-    plan = _plan(config, out)
-    report = Comparison(config, out, [job for job, _, _ in plan], began)
-    report.references()
-    due = []
-    for job, own, parents in plan:
-        record = job_record(job, own, parents)
-        write_json(job.file, record)
-        status = read_status(job.file)
-        if status.status == "done" and status.fingerprint == record["fingerprint"]:
-            print(f"{job.name}: done before, skipped", flush=True)
-        else:
-            due.append(job)
-    print(f"compare: {len(due)} of {len(plan)} jobs to run", flush=True)
-    by_file = {job.file: job for job in due}
-    try:
-        if due and config.compare.launcher:
-            run_sweep(list(by_file), config.compare.launcher, config.compare.hydra)
-        elif due:
-            run_in_sequence(list(by_file), run_process, lambda file: report.ended(by_file[file]))
-    except KeyboardInterrupt:
-        report.write()
-        raise KeyboardInterrupt(f"compare interrupted; the same command carries on in {out}") from None
-    failed = report.write()
+    config = compare_data.check_data(config, out)
+    with comparison_lock(out):
+        config = compare_data.prepare(config, out)
+        plan = _plan(config, out)
+        report = Comparison(config, out, {job: job_record(job, own, parents) for job, own, parents in plan}, began)
+        report.references()
+        _run_due(config, report)
+        failed = report.write()
     print(report.table(), flush=True)
     print(f"compare: {time.monotonic() - began:.0f} s, {out / 'comparison.md'}", flush=True)
     if failed:
@@ -71,29 +56,62 @@ def main(config: ExperimentConfig) -> None:
         )
 
 
+def _run_due(config: ExperimentConfig, report: Comparison) -> None:
+    """Write every job's file, and run those that are not done as they stand there.
+
+    Raises:
+        PlaySlotError: the launcher itself failed.
+        KeyboardInterrupt: Ctrl-C. In both cases what there is has been written.
+    """
+    from playslot_rl.comparison.launch import run_in_sequence, run_process, run_sweep
+    from playslot_rl.comparison.status import read_status
+    from playslot_rl.training.atomic import write_json
+
+    due = {}
+    for job, record in report.jobs.items():
+        write_json(job.file, record)
+        status = read_status(job.file)
+        if status.status == "done" and status.fingerprint == record["fingerprint"]:
+            print(f"{job.name}: done before, skipped", flush=True)
+        else:
+            due[job.file] = job
+    print(f"compare: {len(due)} of {len(report.jobs)} jobs to run", flush=True)
+    try:
+        if due and config.compare.launcher:
+            run_sweep(list(due), config.compare.launcher, config.compare.hydra)
+        elif due:
+            run_in_sequence(list(due), run_process, lambda file: report.ended(due[file]))
+    except KeyboardInterrupt:
+        report.write()
+        raise KeyboardInterrupt(f"compare interrupted; the same command carries on in {report.out}") from None
+    except PlaySlotError:
+        report.write()
+        raise
+
+
 def _open(out: Path) -> None:
     """Refuse a folder that holds something else.
 
     Raises:
         OutputError: it does.
     """
+    from playslot_rl.comparison.status import LOCK
+
     if out.exists() and not out.is_dir():
         raise OutputError(f"out={out}: got a file, expected a folder: choose another out=")
-    known = {"jobs", "data", "world_model", "lapo_world", "runs", "references.json", "comparison.json"}
-    if out.is_dir() and any(out.iterdir()) and not known & {path.name for path in out.iterdir()}:
+    names = {path.name for path in out.iterdir()} if out.is_dir() else set()
+    if names and (not names & {LOCK, "jobs"} or names & {"meta", "config.json"}):
         raise OutputError(f"out={out}: got a folder that holds something else, expected none: choose another out=")
 
 
 def _plan(config: ExperimentConfig, out: Path) -> Sequence[tuple[Job, ExperimentConfig, dict[str, Any]]]:
     """Every job with its own config and the fingerprints of what it builds on."""
-    from playslot_rl.baselines.methods import METHODS
     from playslot_rl.comparison.plan import job_config, jobs
-    from playslot_rl.recipes.compare_data import parents_of
+    from playslot_rl.recipes.compare_data import Parents
 
     plain = replace(config, compare=CompareConfig(evaluation_seed=config.compare.evaluation_seed))
-    lapo = str(out / "lapo_world")
+    parents, lapo = Parents(config, out), str(out / "lapo_world")
     return [
-        (job, job_config(plain, job, config.run, lapo if job.method == "lapo" else ""),
-         parents_of(job.method, config.run if METHODS[job.method].slots else "", out))
+        (job, job_config(plain, job, config.run, lapo if job.method == "lapo" else ""), parents.of(job))
         for job in jobs(config, out)
-    ]  # fmt: skip
+    ]

@@ -5,23 +5,46 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from playslot_rl.baselines.methods import METHODS
 from playslot_rl.config import DataConfig, ExperimentConfig, from_dict
 from playslot_rl.errors import ConfigError
+from playslot_rl.recipes.run import open_videos
+
+if TYPE_CHECKING:
+    from playslot_rl.comparison.plan import Job
+
+RECORDED = Path("data") / "expert"
+
+
+def check_data(config: ExperimentConfig, out: Path) -> ExperimentConfig:
+    """The config with the data sets that are known already; refuses those that do not fit, before anything is written.
+
+    Raises:
+        ConfigError: too few demonstrations, or an evaluation seed among the training seeds.
+        DataError: a data set cannot be read.
+    """
+    from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
+
+    config = replace(config, data=_known(config), method="playslot", demos=None)
+    _check_demos(config, out)
+    start = first_seed(config, config.compare.evaluation_seed)
+    check_disjoint(range(start, start + (config.episodes or 0)), training_seeds(config, out))
+    return config
 
 
 def prepare(config: ExperimentConfig, out: Path) -> ExperimentConfig:
     """Record, train or find what the jobs share; finished parts are skipped.
 
     Args:
-        config: of the comparison.
+        config: of the comparison, checked.
         out: its folder.
 
     Returns:
         The config with `data` and `run` complete.
 
     Raises:
-        ConfigError: too few demonstrations; before anything is computed.
         DataError, CheckpointError, OutputError, TrainingError: see `playslot_rl.errors`.
     """
     from playslot_rl.comparison.plan import uses_demos, uses_slots
@@ -30,8 +53,6 @@ def prepare(config: ExperimentConfig, out: Path) -> ExperimentConfig:
 
     methods = config.compare.methods
     world = uses_slots(config) and not config.run
-    config = replace(config, data=_known(config), method="playslot", demos=None)
-    _check_demos(config)
     if uses_demos(config) or (world and config.collect.learn_from_demos):
         config = replace(config, data=_demos(config, out))
     if (world or "lapo" in methods) and not config.data.root:
@@ -59,19 +80,31 @@ def _known(config: ExperimentConfig) -> DataConfig:
     return replace(config.data, root=root) if there else config.data
 
 
-def _check_demos(config: ExperimentConfig) -> None:
+def _check_demos(config: ExperimentConfig, out: Path) -> None:
     from playslot_rl.comparison.plan import check_demos, uses_demos
+
+    if uses_demos(config) and (config.data.demos or _recorded(out)):
+        where = config.data.demos or str(out / RECORDED)
+        check_demos(config, _episodes(where), f"data.demos={where}")
+
+
+def _recorded(out: Path) -> bool:
+    """Whether this comparison has recorded its demonstrations."""
+    return (out / RECORDED / "meta" / "info.json").is_file()
+
+
+def _episodes(root: str | Path) -> int:
     from playslot_rl.data.lerobot_files import open_files
 
-    if config.data.demos and uses_demos(config):
-        check_demos(config, len(open_files(config.data.demos).episodes), f"data.demos={config.data.demos}")
+    return len(open_files(root).episodes)
 
 
 def _demos(config: ExperimentConfig, out: Path) -> DataConfig:
     """Enough demonstrations for the largest number; at least the preset's, so that the first ones stay the same."""
     from playslot_rl.recipes.pipeline import collect_demos
 
-    most = max(config.collect.expert_episodes, *config.compare.demos)
+    there = _episodes(out / RECORDED) if not config.data.demos and _recorded(out) else 0
+    most = there or max(config.collect.expert_episodes, *config.compare.demos)
     return collect_demos(replace(config, collect=replace(config.collect, expert_episodes=most)), out)
 
 
@@ -81,18 +114,34 @@ def _videos(config: ExperimentConfig, out: Path) -> DataConfig:
     return collect_videos(config, out)
 
 
-def parents_of(method: str, world: str, out: Path) -> dict[str, str]:
-    """Fingerprints of the weights a method's jobs build on, by stage.
+class Parents:
+    """Fingerprints of what jobs build on: weights by stage, and the demonstrations they take.
 
     Args:
-        method: its name.
-        world: run folder of the world model, or `pretrained`; empty for a method without slots.
-        out: folder of the comparison.
+        config: of the comparison, complete.
+        out: its folder.
     """
-    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage
-    from playslot_rl.training.runs import world_model_checkpoints
 
-    prints = {name: c.fingerprint for name, c in world_model_checkpoints(world).items()} if world else {}
-    if method == "lapo":
-        prints["lapo_model"] = read_stage(checkpoint_folder(out / "lapo_world", "lapo_model"), "lapo_model").fingerprint
-    return prints
+    def __init__(self, config: ExperimentConfig, out: Path) -> None:
+        from playslot_rl.comparison.plan import uses_demos, uses_slots
+        from playslot_rl.training.checkpoints import checkpoint_folder, read_stage
+        from playslot_rl.training.runs import world_model_checkpoints
+
+        stages = world_model_checkpoints(config.run).items() if uses_slots(config) else ()
+        self._world = {name: stage.fingerprint for name, stage in stages}
+        self._lapo = {}
+        if "lapo" in config.compare.methods:
+            stage = read_stage(checkpoint_folder(out / "lapo_world", "lapo_model"), "lapo_model")
+            self._lapo = {"lapo_model": stage.fingerprint}
+        self._demos = open_videos(config, config.data.demos, "compare") if uses_demos(config) else None
+
+    def of(self, job: Job) -> dict[str, str]:
+        """Of one job."""
+        from playslot_rl.data.demonstrations import first_demonstrations
+
+        prints = dict(self._world) if METHODS[job.method].slots else {}
+        if job.method == "lapo":
+            prints |= self._lapo
+        if job.demos is not None and self._demos is not None:
+            prints["demos"] = first_demonstrations(self._demos, job.demos).fingerprint
+        return prints

@@ -46,7 +46,7 @@ def main(file: Path) -> Status:
 
 
 def _run(job: dict[str, Any]) -> None:
-    from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts
+    from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts, task_facts
     from playslot_rl.recipes import evaluate, train_baseline
 
     config = from_dict(ExperimentConfig, job["config"])
@@ -56,6 +56,7 @@ def _run(job: dict[str, Any]) -> None:
         "episodes": config.episodes or DEFAULT_EPISODES,
         "seed": seed,
         "fingerprints": run_facts(run, job["stage"]).fingerprints,
+        **task_facts(config, seed),
     }
     for protocol in job["protocols"]:
         if not evaluate.measured(run, protocol, facts):

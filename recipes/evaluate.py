@@ -62,7 +62,7 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
 
 def main_if_needed(config: ExperimentConfig) -> None:
     """Evaluate under both protocols and renew the report, leaving out what this policy was measured on before."""
-    from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts
+    from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts, task_facts
 
     run = check_run(config)
     if config.env.name in PROCEDURAL:
@@ -72,6 +72,7 @@ def main_if_needed(config: ExperimentConfig) -> None:
         "episodes": config.episodes or DEFAULT_EPISODES,
         "seed": config.seed,
         "fingerprints": run_facts(run).fingerprints,
+        **task_facts(config, config.seed),
     }
     due = [protocol for protocol in PROTOCOLS if not measured(run, protocol, facts)]
     for protocol in due:

@@ -30,7 +30,7 @@ def main(config: ExperimentConfig) -> None:
     there = folder.exists() or folder.is_symlink()
     if there and not (config.export.repo and is_model_folder(folder)):
         raise OutputError(f"out={folder}: got something that is there already, expected a new folder: choose another")
-    if there and read_config(folder).source["fingerprints"] != source["fingerprints"]:
+    if there and read_config(folder).source.get("fingerprints") != source["fingerprints"]:
         raise OutputError(
             f"out={folder}: got another policy, expected a new folder or that of run={run}: choose another"
         )

@@ -15,13 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl.baselines.methods import METHODS, MethodName
+from playslot_rl.baselines.online.requirements import require_online
 from playslot_rl.comparison.config import LAUNCHERS
+from playslot_rl.compose import shipped
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
 
-_OF_THE_MACHINE = ("device", "threads", "workers", "logging", "collector", "compare", "preset")
-"""Config that says where and how loudly a job runs, not what comes out."""
+_OF_THE_MACHINE = ("device", "threads", "workers", "logging", "collector", "compare", "preset", "out", "run")
+"""Config that says where and how loudly a job runs, not what comes out; of data and parents the content counts."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ def jobs(config: ExperimentConfig, out: Path) -> list[Job]:
     online = [m for m in wanted.methods if METHODS[m].online]
     return [
         *(Job(m, n, s, out) for s in wanted.seeds for n in sorted(wanted.demos) for m in offline),
-        *(Job(m, None, s, out) for s in wanted.seeds for m in online),
+        *(Job(m, None, s, out) for s in wanted.online_seeds or wanted.seeds for m in online),
     ]
 
 
@@ -98,12 +100,8 @@ def check_comparison(config: ExperimentConfig) -> None:
     """
     env, wanted = config.env, config.compare
     gym_id(env.name)
-    online = [m for m in wanted.methods if METHODS[m].online]
-    if online and env.blocks.reward == "sparse" and env.name.startswith("block_"):
-        raise ConfigError(
-            f"env.blocks.reward: got sparse with {', '.join(online)}, expected dense: a method that learns by acting "
-            "needs a dense reward; set env.blocks.reward=dense or leave it out of methods="
-        )
+    for method in (m for m in wanted.methods if METHODS[m].online):
+        require_online(config, getattr(config.baselines, method), method)
     if wanted.launcher and importlib.util.find_spec(LAUNCHERS[wanted.launcher].split(".")[0]) is None:
         raise _no_launcher(wanted.launcher)
     if wanted.launcher and importlib.util.find_spec(LAUNCHERS[wanted.launcher]) is None:
@@ -146,6 +144,7 @@ def job_config(config: ExperimentConfig, job: Job, world: str, lapo_world: str) 
 
     Labels are `behaviour.labelled_demos` or, with fewer demonstrations than that, all of them. PlaySlot's own oracle
     and the references of each evaluation are left out: the slot oracle is a method, and the references run once.
+    Paths are absolute, so that a job runs from any folder.
 
     Args:
         config: of the comparison, with `data` complete.
@@ -154,14 +153,21 @@ def job_config(config: ExperimentConfig, job: Job, world: str, lapo_world: str) 
         lapo_world: run folder of LAPO's inverse and forward model.
     """
     labelled = min(config.behaviour.labelled_demos, job.demos or config.behaviour.labelled_demos)
-    lapo = replace(config.baselines.lapo, world=lapo_world)
+    lapo = replace(config.baselines.lapo, world=absolute(lapo_world))
+    data = replace(
+        config.data,
+        root=",".join(absolute(part.strip()) for part in config.data.root.split(",")),
+        demos=absolute(config.data.demos),
+        cache=absolute(config.data.cache),
+    )
     return replace(
         config,
         method=job.method,
         demos=job.demos,
         seed=job.seed,
-        out=str(job.run),
-        run=world if METHODS[job.method].slots else "",
+        data=data,
+        out=absolute(str(job.run)),
+        run=absolute(world) if METHODS[job.method].slots else "",
         protocol="simulation",
         behaviour=replace(config.behaviour, labelled_demos=labelled, oracle=False),
         baselines=replace(config.baselines, lapo=lapo),
@@ -170,16 +176,23 @@ def job_config(config: ExperimentConfig, job: Job, world: str, lapo_world: str) 
     )
 
 
+def absolute(path: str) -> str:
+    """A path from the root; nothing and shipped models (`pretrained/ENV`) as they are."""
+    return path if not path or shipped(path) else str(Path(path).expanduser().resolve())
+
+
 def job_record(job: Job, config: ExperimentConfig, parents: Mapping[str, str]) -> dict[str, Any]:
     """What the job's file says.
 
     Args:
         job: which one.
         config: its own (`job_config`).
-        parents: fingerprints of the weights it builds on, by stage.
+        parents: fingerprints of the weights and demonstrations it builds on.
     """
     values = to_dict(config)
     result = {key: value for key, value in values.items() if key not in _OF_THE_MACHINE}
+    result["data"] = {key: value for key, value in result["data"].items() if key not in ("root", "demos", "cache")}
+    result["baselines"] = {**result["baselines"], "lapo": {**result["baselines"]["lapo"], "world": ""}}
     identity = json.dumps([result, config.compare.evaluation_seed, dict(parents)], sort_keys=True)
     return {
         "name": job.name,

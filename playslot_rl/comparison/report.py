@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,14 @@ from playslot_rl.comparison.plan import Job, uses_slots
 from playslot_rl.comparison.results import failures, job_rows, summarise
 from playslot_rl.comparison.status import read_status
 from playslot_rl.comparison.table import comparison_page
+from playslot_rl.compose import shipped
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.episodes import TaskPool
 from playslot_rl.evaluation.references import run_references
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.training.atomic import write_bytes, write_json, write_text
+from playslot_rl.training.checkpoints import checkpoint_folder, read_stage
 from playslot_rl.training.provenance import provenance
 from playslot_rl.training.runs import world_model_checkpoints
 from playslot_rl.visualization.comparison import comparison_figure, figure_bytes
@@ -30,11 +32,13 @@ class Comparison:
     Args:
         config: of the comparison, complete (`episodes`, `data`, `run`).
         out: its folder.
-        jobs: all of them.
+        jobs: all of them, with what their files say.
         began: `time.monotonic()` at the start of the command.
     """
 
-    def __init__(self, config: ExperimentConfig, out: Path, jobs: Sequence[Job], began: float) -> None:
+    def __init__(
+        self, config: ExperimentConfig, out: Path, jobs: Mapping[Job, Mapping[str, Any]], began: float
+    ) -> None:
         self.config, self.out, self.jobs, self._began = config, out, jobs, began
         self._spent = float(self._before().get("seconds", 0.0))
         self._references: dict[str, dict[str, Any]] = {}
@@ -65,7 +69,7 @@ class Comparison:
         status = read_status(job.file)
         rates = [
             f"{100 * row['success_rate']:.0f} % in {row['protocol']}"
-            for row in job_rows(job)
+            for row in self._rows(job)
             if row["success_rate"] is not None
         ]
         print(f"{job.name}: {status.error or ', '.join(rates)} ({status.seconds:.0f} s)", flush=True)
@@ -94,7 +98,7 @@ class Comparison:
     def result(self) -> dict[str, Any]:
         """What `comparison.json` holds."""
         config = self.config
-        rows = [row for job in self.jobs for row in job_rows(job)]
+        rows = [row for job in self.jobs for row in self._rows(job)]
         made = provenance()
         return {
             "env": config.env.name,
@@ -110,6 +114,9 @@ class Comparison:
             "references": self._references,
             "rows": rows,
             "world_model": self._world_model(),
+            "lapo_model": self._lapo_model(),
+            "learn_from_demos": config.collect.learn_from_demos,
+            "frame_skip": config.env.frame_skip,
             "seconds": round(self._spent + time.monotonic() - self._began, 1),
             "command": made["command"],
             "commit": made["commit"],
@@ -117,12 +124,25 @@ class Comparison:
             "hardware": hardware(),
         }
 
+    def _rows(self, job: Job) -> list[dict[str, Any]]:
+        """A job's rows; what was done with other settings, data or parents than those asked for is still to be done."""
+        return job_rows(job, str(self.jobs[job]["fingerprint"]))
+
     def _world_model(self) -> dict[str, Any] | None:
         if not uses_slots(self.config):
             return None
         stages = world_model_checkpoints(self.config.run)
         return {
-            "source": "pretrained" if self.config.run == "pretrained" else Path(self.config.run).name,
+            "source": self.config.run if shipped(self.config.run) else Path(self.config.run).name,
             "fingerprints": {name: stage.fingerprint for name, stage in stages.items()},
             "seconds": sum(float(stage.meta.get("seconds", 0.0)) for stage in stages.values()),
+            "episodes": stages["slots"].meta.get("episodes"),
         }
+
+    def _lapo_model(self) -> dict[str, Any] | None:
+        """What all of LAPO's jobs share."""
+        if "lapo" not in self.config.compare.methods:
+            return None
+        stage = read_stage(checkpoint_folder(self.out / "lapo_world", "lapo_model"), "lapo_model")
+        names = ("fingerprint", "seconds", "episodes")
+        return {name: stage.meta.get(name) for name in names}

@@ -4,25 +4,32 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from playslot_rl.baselines.methods import METHODS
 from playslot_rl.comparison.plan import Job
-from playslot_rl.comparison.status import read_status
+from playslot_rl.comparison.status import Status, read_status
 from playslot_rl.evaluation.intervals import wilson
 
 
-def job_rows(job: Job) -> list[dict[str, Any]]:
+def job_rows(job: Job, fingerprint: str | None = None) -> list[dict[str, Any]]:
     """One row for each protocol of a job, finished or not.
 
-    Keys: `name`, `method`, `title`, `protocol`, `demos`, `seed`, `status`, `error`, `labelled_demos`, `env_steps`,
+    Keys: `name`, `method`, `title`, `protocol`, `demos`, `seed`, `status`, `error`, `labelled_demos`, `agent_steps`
+    and `env_steps` (an agent step is `env.frame_skip` of them), `samples` (optimiser steps times batch),
     `success_rate`, `successes`, `episodes`, `ci95` (Wilson), `mean_steps_to_success`, `train_seconds`,
     `evaluation_seconds`, `parameters`, `pretraining` (null where there is nothing to say), `curve` (rows of an online
-    method's learning curve).
+    method's learning curve, with both kinds of steps).
+
+    Args:
+        job: which one.
+        fingerprint: of the job as it is asked for now; one that ended as another is `waiting`. None takes any.
     """
     status = read_status(job.file)
+    if fingerprint is not None and status.fingerprint != fingerprint:
+        status = Status()
     meta = _read(job.run / job.stage / "checkpoint" / "meta.json") if status.status == "done" else {}
     rows = []
     for protocol in job.protocols:
@@ -39,7 +46,9 @@ def job_rows(job: Job) -> list[dict[str, Any]]:
                 "status": status.status,
                 "error": status.error or None,
                 "labelled_demos": None if METHODS[job.method].online else meta.get("labelled_demos"),
-                "env_steps": meta.get("env_steps"),
+                "agent_steps": meta.get("env_steps"),
+                "env_steps": None if meta.get("env_steps") is None else meta["env_steps"] * frame_skip(job),
+                "samples": count_samples(job, meta),
                 "success_rate": rate,
                 "successes": None if rate is None else round(rate * info["episodes"]),
                 "episodes": episodes,
@@ -57,9 +66,22 @@ def job_rows(job: Job) -> list[dict[str, Any]]:
 
 def learning_curve(job: Job) -> list[dict[str, Any]] | None:
     """Rows of `RUN/METHOD/curve.json`, there before the job is done too; None without one."""
-    values: Any = _read(job.run / job.stage / "curve.json")
-    rows = values.get("rows") if isinstance(values, dict) else values
-    return rows or None
+    rows = _read(job.run / job.stage / "curve.json").get("rows") or []
+    skip = frame_skip(job)
+    return [{**row, "agent_steps": row["env_steps"], "env_steps": row["env_steps"] * skip} for row in rows] or None
+
+
+def frame_skip(job: Job) -> int:
+    """Environment steps in an agent step."""
+    config = _read(job.file).get("config", {})
+    return int(config.get("env", {}).get("frame_skip", 1))
+
+
+def count_samples(job: Job, meta: Mapping[str, Any]) -> int | None:
+    """Examples a method's policy was trained on, repeats included: optimiser steps times batch."""
+    config = _read(job.run / job.stage / "checkpoint" / "config.json").get(job.stage, {})
+    batch = config.get("batch_size", config.get("policy", {}).get("batch_size"))
+    return None if batch is None or METHODS[job.method].online or not meta else int(meta.get("steps", 0)) * int(batch)
 
 
 def count_parameters(run: Path, stage: str) -> int:
@@ -95,8 +117,11 @@ def _read(path: Path) -> dict[str, Any]:
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Rows of finished jobs, pooled over training seeds.
 
-    Keys: `method`, `title`, `protocol`, `demos`, `env_steps`, `seeds`, `success_rate` (mean over the seeds), `ci95`
-    (Wilson, all episodes of all seeds pooled), `lowest` and `highest` (of a seed), `episodes`, `labelled_demos`.
+    Keys: `method`, `title`, `protocol`, `demos`, `agent_steps` and `env_steps` (means), `seeds`, `success_rate` (mean
+    over the seeds), `ci95`, `lowest` and `highest` (of a seed), `episodes`, `labelled_demos`.
+
+    `ci95` is Wilson's interval of that mean over the episodes of one seed: all seeds play the same ones, so that
+    pooling them would count an episode that is easy, or hard, for all of them several times.
     """
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in rows:
@@ -104,7 +129,6 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             groups.setdefault((row["method"], row["protocol"], row["demos"]), []).append(row)
     summary = []
     for (method, protocol, demos), group in groups.items():
-        successes, episodes = sum(r["successes"] for r in group), sum(r["episodes"] for r in group)
         rates = [r["success_rate"] for r in group]
         summary.append(
             {
@@ -112,17 +136,22 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "title": METHODS[method].title,
                 "protocol": protocol,
                 "demos": demos,
-                "env_steps": group[0]["env_steps"],
+                **{key: _mean(r[key] for r in group) for key in ("agent_steps", "env_steps")},
                 "seeds": sorted(r["seed"] for r in group),
                 "success_rate": sum(rates) / len(rates),
-                "ci95": list(wilson(successes, episodes)),
+                "ci95": list(wilson(sum(r["successes"] for r in group) / len(group), group[0]["episodes"])),
                 "lowest": min(rates),
                 "highest": max(rates),
-                "episodes": episodes,
+                "episodes": sum(r["episodes"] for r in group),
                 "labelled_demos": group[0]["labelled_demos"],
             }
         )
     return summary
+
+
+def _mean(values: Iterable[float | None]) -> int | None:
+    known = [value for value in values if value is not None]
+    return round(sum(known) / len(known)) if known else None
 
 
 def failures(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

@@ -8,10 +8,13 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
+from playslot_rl.errors import OutputError
 from playslot_rl.plain import from_dict
 from playslot_rl.training.atomic import write_json
+
+LOCK: Final = "comparison.lock"
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,29 @@ def write_status(job_file: Path, status: Status) -> None:
         OutputError: full disk.
     """
     write_json(status_file(job_file), asdict(status))
+
+
+@contextlib.contextmanager
+def comparison_lock(out: Path) -> Iterator[None]:
+    """Keep other commands out of a comparison's folder; `OUT/comparison.lock` also marks it as one.
+
+    Raises:
+        OutputError: another command works on it, or the folder cannot be written.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        file = (out / LOCK).open("w")
+    except OSError as error:
+        raise OutputError(f"out={out}: got {error}, expected a folder to write into: choose another out=") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OutputError(
+                f"out={out}: got a folder that another `playslot compare` works on, expected one of its own: wait for "
+                "it, or use another out="
+            ) from None
+        yield
 
 
 @contextlib.contextmanager

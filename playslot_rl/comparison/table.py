@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from playslot_rl.baselines.methods import METHODS
 from playslot_rl.comparison.results import failures
 
 Result = Mapping[str, Any]
@@ -19,16 +20,15 @@ def comparison_page(result: Result) -> str:
     lead = (
         f"Preset `{result['preset']}`, training seeds {_list(result['seeds'])}, {result['episodes']} held-out episodes "
         f"(block {result['evaluation_seed']} of the evaluation seeds, the same for every method and seed), at most "
-        f"{result['max_steps']} agent steps. Success is the mean over the training seeds; in brackets the 95 % Wilson "
-        "interval of all their episodes together, which share their starts, and after it the lowest and the highest "
-        "seed."
+        f"{result['max_steps']} agent steps. Success is the mean over the training seeds; in brackets its 95 % Wilson "
+        "interval over the episodes, which all seeds share, and after it the lowest and the highest seed."
     )
     parts = [
         f"# {result['env']}: success against demonstrations",
         lead,
         "![Success rate](comparison.png)",
-        *_offline(result["summary"]),
-        *_online(result["summary"]),
+        *_offline(result["summary"], len(result["seeds"])),
+        *_online(result["summary"], len(result["seeds"])),
         "## Footnotes",
         "\n".join(f"- {note}" for note in _footnotes(result)),
         "## Every job",
@@ -37,31 +37,33 @@ def comparison_page(result: Result) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _offline(summary: Sequence[Result]) -> list[str]:
+def _offline(summary: Sequence[Result], seeds: int) -> list[str]:
     rows = [row for row in summary if row["demos"] is not None]
     if not rows:
         return []
     numbers = sorted({row["demos"] for row in rows})
     series = list(dict.fromkeys((row["title"], row["protocol"]) for row in rows))
-    cells = {(row["title"], row["protocol"], row["demos"]): cell(row) for row in rows}
+    cells = {(row["title"], row["protocol"], row["demos"]): cell(row, seeds) for row in rows}
     body = [[f"{t}, {p}", *(cells.get((t, p, n), "–") for n in numbers)] for t, p in series]
     return ["## By demonstrations", table(["", *(f"{n} demonstrations" for n in numbers)], body)]
 
 
-def _online(summary: Sequence[Result]) -> list[str]:
+def _online(summary: Sequence[Result], seeds: int) -> list[str]:
     rows = [row for row in summary if row["demos"] is None]
     if not rows:
         return []
-    body = [[row["title"], _number(row["env_steps"]), cell(row)] for row in rows]
+    body = [[row["title"], _number(row["env_steps"]), cell(row, seeds)] for row in rows]
     return ["## By acting", table(["", "environment steps", "success"], body)]
 
 
-def cell(row: Result) -> str:
-    """Rate, interval and range of the seeds: `97 % (93 to 99; seeds 96 to 98)`."""
+def cell(row: Result, seeds: int) -> str:
+    """Rate, interval and range of the seeds: `97 % (93 to 99; seeds 96 to 98)`; and how many of `seeds`, if not all."""
     low, high = (100 * end for end in row["ci95"])
     text = f"{100 * row['success_rate']:.0f} % ({low:.0f} to {high:.0f}"
     if len(row["seeds"]) > 1:
         text += f"; seeds {100 * row['lowest']:.0f} to {100 * row['highest']:.0f}"
+    if len(row["seeds"]) < seeds:
+        text += f"; {len(row['seeds'])} of {seeds} seeds"
     return f"{text})"
 
 
@@ -74,22 +76,48 @@ def _footnotes(result: Result) -> list[str]:
         f"Labels: {row['title']} saw the real actions of {row['labels']}."
         for row in ({"title": t, "labels": _labels(done, t)} for t in _titles(done) if _labels(done, t))
     ]
-    notes += _one_each(
-        done,
-        "env_steps",
-        "Environment steps (agent steps) of {title}: {value}, those of the videos its slots were trained on included.",
-    )
+    notes += _steps(result)
     notes += _one_each(done, "pretraining", "{title} starts from {value} weights.")
-    notes += _one_each(done, "parameters", "Parameters, those of the models it builds on included: {title} {value}.")
+    sizes = _one_each(done, "parameters", "{title} {value}")
+    notes += [f"Parameters, those of the models it builds on included: {'; '.join(sizes)}."] if sizes else []
+    samples = _one_each(done, "samples", "{title} {value}")
+    notes += [f"Training of the policy, optimiser steps times batch: {'; '.join(samples)}."] if samples else []
     notes.append(_times(done, result))
-    world = result.get("world_model")
-    if world:
-        notes.append(
-            f"The world model ({world['source']}; slots {world['fingerprints']['slots']}, "
-            f"{world['seconds']:.0f} s of training) is the same for all methods, demonstrations and seeds."
-        )
+    notes += _shared(result)
     notes += _open_jobs(rows, result["jobs"])
     notes.append(f"Made by `{result['command']}` at commit {result['commit'] or 'unknown'}; {_machine(result)}.")
+    return notes
+
+
+def _steps(result: Result) -> list[str]:
+    """What acting cost, in both kinds of steps."""
+    notes = []
+    for row in result["summary"]:
+        if row["demos"] is None and row["agent_steps"] is not None:
+            prior = ", those of the videos its slots were trained on included" if METHODS[row["method"]].slots else ""
+            notes.append(
+                f"{row['title']}: {row['env_steps']:,} environment steps, which are {row['agent_steps']:,} agent steps "
+                f"of {result['frame_skip']}{prior}; mean over the seeds."
+            )
+    return notes
+
+
+def _shared(result: Result) -> list[str]:
+    """Models that were trained once, on unlabelled videos, for all demonstrations and seeds."""
+    notes, world, lapo = [], result.get("world_model"), result.get("lapo_model")
+    rest = "the same for every number of demonstrations and every seed"
+    if result["learn_from_demos"]:
+        rest += "; the preset's own demonstrations are among them, as videos"
+    if world:
+        notes.append(
+            f"World model of the methods on slots ({world['source']}; slots {world['fingerprints']['slots']}): "
+            f"{world['seconds']:.0f} s of training on {world['episodes']} videos without actions, {rest}."
+        )
+    if lapo:
+        notes.append(
+            f"LAPO's inverse and forward model: {lapo['seconds']:.0f} s of training on {lapo['episodes']} videos "
+            f"without actions, {rest}."
+        )
     return notes
 
 

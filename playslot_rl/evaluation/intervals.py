@@ -6,11 +6,11 @@ import math
 from statistics import NormalDist
 
 
-def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+def wilson(successes: float, trials: int, confidence: float = 0.95) -> tuple[float, float]:
     """Interval of the success probability; unlike the normal one it stays in [0, 1] and is not empty at 0 or 100 %.
 
     Args:
-        successes: number of successes, from 0 to `trials`.
+        successes: number of successes, from 0 to `trials`; a mean over repetitions need not be whole.
         trials: number of episodes, at least 1.
         confidence: coverage, in (0, 1).
 

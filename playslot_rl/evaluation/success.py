@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from playslot_rl.baselines.actor import Actor, ActorController
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.controllers import ClosedLoop, OpenLoop
 from playslot_rl.evaluation.episodes import Controller, TaskPool, run_episodes
@@ -187,12 +187,20 @@ def measure(
         "redrawn": sum(e.redrawn for e in outcome),
         "per_episode": episode_records(outcome),
         "seed": seed,
+        **task_facts(config, seed),
         "wall_seconds": round(wall, 2),
         "wall_seconds_with_references": round(time.perf_counter() - begin, 2),
         "fingerprints": facts.fingerprints,
         "commit": facts.commit,
         "hardware": hardware(),
     }
+
+
+def task_facts(config: ExperimentConfig, seed: int) -> dict[str, Any]:
+    """What besides weights decides a result, as JSON stores it: task, renderer, first evaluation seed."""
+    values = {"env": to_dict(config.env), "render": to_dict(config.render), "first_seed": first_seed(config, seed)}
+    stored: dict[str, Any] = json.loads(json.dumps(values))
+    return stored
 
 
 def _references(

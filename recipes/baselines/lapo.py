@@ -42,9 +42,9 @@ def main(config: ExperimentConfig) -> None:
     }
     if finished(config, run, NAME, wanted, {MODEL: model}, demos, config.demos):
         return
+    store_config(config, run)  # first: it is what marks the folder as a run, should a kill come in between
     if own.world:
         adopt_stage(model, run)
-    store_config(config, run)
     _train_policy(config, run, model)
 
 

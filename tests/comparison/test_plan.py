@@ -28,6 +28,13 @@ def test_offline_methods_have_a_job_for_each_number_and_seed_and_online_ones_for
     ]  # fmt: skip
 
 
+def test_methods_that_act_may_have_fewer_seeds() -> None:
+    typed = ("methods=slot_oracle,sold", "demos=10", "seeds=0,1", "compare.online_seeds=[1]")
+    assert [job.name for job in jobs(compared(*typed), OUT)] == ["slot_oracle-d10-s0", "slot_oracle-d10-s1", "sold-s1"]
+    with pytest.raises(ConfigError, match=r"online_seeds: got .*, expected some of seeds"):
+        compared("seeds=0,1", "compare.online_seeds=[2]")
+
+
 def test_a_job_has_its_own_folder_and_playslot_both_protocols() -> None:
     job = Job("playslot", 10, 0, OUT)
     assert (job.run, job.file) == (OUT / "runs" / "playslot-d10-s0", OUT / "jobs" / "playslot-d10-s0.json")
@@ -46,8 +53,10 @@ def test_labels_are_the_presets_or_all_there_are(demos: int, labels: int) -> Non
 def test_only_methods_on_slots_get_the_world_model_and_only_lapo_lapos() -> None:
     config = compared()
     assert job_config(config, Job("resnet_oracle", 10, 0, OUT), "world", "").run == ""
-    assert job_config(config, Job("sold", None, 0, OUT), "world", "").run == "world"
-    assert job_config(config, Job("lapo", 10, 0, OUT), "world", "models").baselines.lapo.world == "models"
+    assert job_config(config, Job("sold", None, 0, OUT), "world", "").run == str(Path("world").resolve())
+    assert job_config(config, Job("lapo", 10, 0, OUT), "world", "models").baselines.lapo.world == str(
+        Path("models").resolve()
+    )
 
 
 def test_a_jobs_name_for_its_content_ignores_the_machine_and_nothing_else() -> None:
@@ -71,7 +80,7 @@ def test_a_jobs_name_for_its_content_ignores_the_machine_and_nothing_else() -> N
     ("typed", "message"),
     [
         (["env=grid_shapes"], "env=grid_shapes: got an environment without a simulator"),
-        (["env=block_reach", "env.blocks.reward=sparse", "methods=dreamer"], "got sparse with dreamer, expected dense"),
+        (["env=block_reach", "env.blocks.reward=sparse", "methods=dreamer"], "got sparse with method=dreamer"),
         (["hydra.launcher=ray"], "got ray, expected an installed launcher: install it by"),
     ],
 )

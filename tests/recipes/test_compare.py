@@ -16,7 +16,7 @@ import pytest
 from commands import ONE_CORE, Done, assert_one_line, contents, playslot
 
 from playslot_rl.comparison import launch
-from playslot_rl.comparison.status import Status
+from playslot_rl.comparison.status import Status, comparison_lock
 from playslot_rl.recipes import compare_job
 
 Compare = Callable[..., Done]
@@ -113,6 +113,40 @@ def test_a_changed_setting_is_not_mixed_with_old_results(shared_run: Path, tmp_p
     assert "steps: got 7, expected 6" in _result(tmp_path / "out")["rows"][0]["error"]
 
 
+def test_what_decides_an_evaluation_is_measured_again_when_it_changes(
+    shared_run: Path, tmp_path: Path, started: list[str]
+) -> None:
+    command = _arguments(shared_run, tmp_path / "out", "methods=slot_oracle", "demos=2")
+    assert playslot(*command).code == 0
+    first = _result(tmp_path / "out")["rows"][0]
+    info = tmp_path / "out" / "runs" / first["name"] / "evaluation" / "simulation" / "eval_info.json"
+    weights = (tmp_path / "out" / "runs" / first["name"] / "slot_oracle" / "checkpoint" / "weights.safetensors").stat()
+    assert playslot(*command, "env.max_steps=4").code == 0
+    assert started == ["slot_oracle-d2-s0"] * 2
+    assert json.loads(info.read_text())["max_steps"] == 4
+    again = (tmp_path / "out" / "runs" / first["name"] / "slot_oracle" / "checkpoint" / "weights.safetensors").stat()
+    assert again.st_mtime_ns == weights.st_mtime_ns, "the training does not depend on it"
+
+
+def test_a_method_that_acts_is_trained_and_evaluated(tmp_path: Path, started: list[str]) -> None:
+    out = tmp_path / "out"
+    done = playslot("compare", "preset=smoke", "env=block_reach", "env.max_steps=6", "methods=dreamer", "seeds=0",
+                    f"out={out}", "episodes=2", *ONE_CORE)  # fmt: skip
+    assert (done.code, done.err) == (0, "")
+    (row,) = _result(out)["rows"]
+    assert (row["status"], row["episodes"], row["agent_steps"]) == ("done", 2, 36)
+    assert row["env_steps"] == 36 * _result(out)["frame_skip"]
+    assert len(row["curve"]) == 3
+
+
+def test_a_second_command_on_the_same_folder_is_refused(shared_run: Path, tmp_path: Path) -> None:
+    with comparison_lock(tmp_path / "out"):
+        done = playslot(*_arguments(shared_run, tmp_path / "out", "methods=slot_oracle", "demos=2"))
+    assert done.code == 1
+    assert_one_line(done.err, "compare")
+    assert "that another `playslot compare` works on" in done.err
+
+
 @pytest.mark.parametrize(
     ("typed", "message", "code"),
     [
@@ -137,7 +171,7 @@ def test_a_sparse_reward_is_refused_for_a_method_that_acts(tmp_path: Path) -> No
     done = playslot("compare", "preset=smoke", "env=block_reach", "methods=dreamer", "env.blocks.reward=sparse",
                     f"out={tmp_path / 'out'}")  # fmt: skip
     assert (done.code, list(tmp_path.iterdir())) == (1, [])
-    assert "env.blocks.reward: got sparse with dreamer, expected dense" in done.err
+    assert "env.blocks.reward: got sparse with method=dreamer, expected dense" in done.err
 
 
 def test_a_folder_of_something_else_is_refused(shared_run: Path, tmp_path: Path) -> None:
