@@ -91,6 +91,7 @@ def main(config: ExperimentConfig) -> None:
             logging=config.logging,
             identity=identity,
             ready=ready,
+            rate="behaviour.optim.lr" if name == "policy" else "behaviour.decoder_lr",
         )
 
     cloned = train(clone, "policy", config.behaviour.steps, lr)

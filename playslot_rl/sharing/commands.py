@@ -11,6 +11,7 @@ from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.sharing.source import Result
 
 RUN: Final = "runs/again"
+WORLD: Final = "runs/world"
 GROUPS: Final = ("env", "render", "collect", "model", "slots", "dynamics", "behaviour", "evaluation")
 """Parts of a config that a result depends on; intervals of logging and the like do no harm in between."""
 BEHAVIOUR: Final = ("env", "render", "collect", "model.policy", "model.action_decoder", "behaviour", "evaluation")
@@ -32,18 +33,27 @@ def reproduce(config: ExperimentConfig, source: Mapping[str, Any], results: Sequ
         _line("evaluate", f"run={RUN}", f"protocol={r.protocol}", f"episodes={r.episodes}", f"seed={r.seed}")
         for r in results
     ]
+    changed, recorded, demos = changes(config, BEHAVIOUR), source.get("recorded") or {}, source.get("demos")
+    episodes = recorded.get("episodes") or demos
+    first = [f"demos={demos}"] if demos is not None and demos != episodes else []
     if not source.get("shipped_world_model"):
-        return [_line("pipeline", *base, *seeded, *changes(config, GROUPS), f"out={RUN}"), *evaluate]
-    changed = changes(config, BEHAVIOUR)
-    recorded = source.get("recorded") or {}
-    episodes = recorded.get("episodes") or source.get("demos")
+        world = source.get("world_model_seed", seed)
+        if world in (None, seed) and not first:
+            return [_line("pipeline", *base, *seeded, *changes(config, GROUPS), f"out={RUN}"), *evaluate]
+        again = [] if world is None else [f"seed={world}"]
+        collected = f"data.demos={WORLD}/data/expert"
+        return [
+            _line("pipeline", *base, *again, *changes(config, GROUPS), f"out={WORLD}"),
+            _line("train-policy", f"run={WORLD}", *base, *seeded, *first, *changed, collected, f"out={RUN}"),
+            *evaluate,
+        ]
     count = [] if episodes is None else [f"episodes={episodes}"]
-    first = [f"seed={recorded['seed']}"] if recorded else seeded
-    demos = "data/demonstrations"
+    start = [f"seed={recorded['seed']}"] if recorded else seeded
+    where = "data/demonstrations"
     recording = _of(changed, "env", "render", "collect")
     return [
-        _line("collect", *base, "policy=expert", *count, *first, *recording, f"out={demos}"),
-        _line("train-policy", "run=pretrained", *base, *seeded, *changed, f"data.demos={demos}", f"out={RUN}"),
+        _line("collect", *base, "policy=expert", *count, *start, *recording, f"out={where}"),
+        _line("train-policy", "run=pretrained", *base, *seeded, *first, *changed, f"data.demos={where}", f"out={RUN}"),
         *evaluate,
     ]
 

@@ -63,6 +63,7 @@ def read_source(run: Path) -> dict[str, Any]:
         "demos": meta.get("demos"),
         "labelled_demos": meta.get("labelled_demos"),
         "seed": meta.get("seed"),
+        "world_model_seed": parents["slots"].meta.get("seed"),
         "commit": meta.get("commit", ""),
         "shipped_world_model": _is_shipped(str(policy.config.get("env", {}).get("name", "")), prints),
         "trained_with": {"playslot_rl": meta.get("version", ""), "torch": meta.get("torch", "")},

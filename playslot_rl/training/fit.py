@@ -71,6 +71,7 @@ def fit(
     logging: LoggingConfig | None = None,
     identity: Mapping[str, Any] | None = None,
     ready: Callable[[], None] | None = None,
+    rate: str = "",
 ) -> FitResult:
     """Train a stage to `config.steps`, carrying on from its newest checkpoint if it has one.
 
@@ -86,6 +87,7 @@ def fit(
         logging: backend and progress bar; None logs to `metrics.jsonl` only, silently.
         identity: further plain values a resumed run must share (model config, data and parent fingerprints).
         ready: called once, before the first step, when a stage begun before was found to be the same.
+        rate: config key of the learning rate, for messages; empty means `NAME.optim.lr`.
 
     Raises:
         TrainingError: a loss or gradient is not finite; the last good checkpoint stays.
@@ -94,7 +96,7 @@ def fit(
         KeyboardInterrupt: Ctrl-C; its message says where the same command carries on.
     """
     logging = logging or LoggingConfig(backend="none", progress=False)
-    run = _Run(stage, config, folder, name, seed, device, identity or {})
+    run = _Run(stage, config, folder, name, seed, device, identity or {}, rate or f"{name}.optim.lr")
     if ready is not None:
         ready()
     start = run.state.step
@@ -128,7 +130,9 @@ class _Run:
         seed: int,
         device: torch.device | str,
         identity: Mapping[str, Any],
+        rate: str,
     ) -> None:
+        self.rate = rate
         self.stage, self.config, self.name, self.seed, self.device = stage, config, name, seed, device
         self.parameters = trainable_parameters(stage.modules)
         self.optimizer = build_adam(self.parameters, config.optim)
@@ -190,7 +194,7 @@ class _Run:
         kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
         return TrainingError(
             f"{self.name}: {what} is {got} at step {step + 1}, expected a finite number; {kept}; "
-            f"lower {self.name}.optim.lr or check the data, and use another out="
+            f"lower {self.rate} or check the data, and use another out="
         )
 
     def _validate(self, done: int) -> dict[str, float]:

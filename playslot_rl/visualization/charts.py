@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from playslot_rl.visualization.palette import Theme
+from playslot_rl.visualization.palette import METHOD_STYLES, Theme
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,11 +44,11 @@ def _png(figure: Figure, theme: Theme) -> bytes:
     return buffer.getvalue()
 
 
-def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], bool]], theme: Theme) -> bytes:
+def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], str]], theme: Theme) -> bytes:
     """Success rates in per cent with their 95 % intervals.
 
     Args:
-        rows: label, rate (0 to 1), interval (0 to 1), and whether it is the agent's own (else a reference).
+        rows: label, rate (0 to 1), interval (0 to 1), and the method, in whose colour it is drawn (others are grey).
         theme: page.
 
     Returns:
@@ -56,10 +56,17 @@ def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], bool]], 
     """
     figure = _figure(6.4, 0.6 + 0.42 * len(rows))
     axes = figure.add_subplot()
-    for y, (_, rate, (low, high), own) in enumerate(rows):
-        colour = theme.series[0] if own else theme.series[7]
+    for y, (_, rate, (low, high), method) in enumerate(rows):
+        style = METHOD_STYLES.get(method)
+        colour = theme.series[7 if style is None else style.colour]
         axes.plot([100 * low, 100 * high], [y, y], color=colour, linewidth=3, solid_capstyle="round", alpha=0.6)
-        axes.plot([100 * rate], [y], "o" if own else "D", color=colour, markersize=9 if own else 7)
+        axes.plot(
+            [100 * rate],
+            [y],
+            "D" if style is None else style.marker,
+            color=colour,
+            markersize=7 if style is None else 9,
+        )
         right = rate <= 0.5
         x = 100 * high + 2 if right else 100 * low - 2
         axes.text(

@@ -7,15 +7,17 @@ from typing import Any
 
 import numpy as np
 
+from playslot_rl.baselines.methods import METHODS
 from playslot_rl.visualization.charts import _figure, _png, _style
-from playslot_rl.visualization.palette import Theme
+from playslot_rl.visualization.palette import METHOD_STYLES, Theme
 
 
 def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Mapping[str, Any], theme: Theme) -> bytes:
     """Two panels: mean return with its standard error, and success rate with its 95 % interval.
 
     Args:
-        curves: method -> points with `env_steps`, `return_mean`, `return_error`, `success_rate`, `ci95`.
+        curves: method, by its name in `playslot_rl.baselines.methods` (others in a colour of no method) -> points
+            with `env_steps`, `return_mean`, `return_error`, `success_rate`, `ci95`.
         random: the random policy's point.
         theme: page.
 
@@ -29,8 +31,11 @@ def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Ma
         raise ValueError("learning_chart: got no points, expected at least one")
     figure = _figure(6.8, 2.8)
     left, right = figure.subplots(1, 2)
-    for number, (name, rows) in enumerate(curves.items()):
-        colour = theme.series[number % (len(theme.series) - 1)]
+    titles = {name: method.title for name, method in METHODS.items()}
+    for method, rows in curves.items():
+        style = METHOD_STYLES.get(method)
+        colour = theme.series[6] if style is None else theme.series[style.colour]
+        name = titles.get(method, method)
         steps = np.array([row["env_steps"] for row in rows])
         mean = np.array([row["return_mean"] for row in rows])
         error = np.array([row["return_error"] for row in rows])

@@ -116,7 +116,9 @@ def success_section(given: ReportInput) -> Section:
         headers = ["", "success rate", "95 % interval", "mean steps to success", "episodes"]
         blocks.append(Table(headers, cells, "Wilson intervals. References run closed-loop on the same seeds."))
         drawn = [
-            (n, r["success_rate"], tuple(r["ci95"]), own) for n, r, own, _ in rows if r["success_rate"] is not None
+            (n, r["success_rate"], tuple(r["ci95"]), method)
+            for n, r, method, _ in rows
+            if r["success_rate"] is not None
         ]
         alt = "; ".join(f"{n}: {percent(rate)}, {interval(list(ci))}" for n, rate, ci, _ in drawn)
         blocks.append(
@@ -141,12 +143,12 @@ def _ways(given: ReportInput) -> str:
     )
 
 
-def _success_rows(results: dict[str, dict[str, Any]]) -> list[tuple[str, dict[str, Any], bool, str]]:
-    rows = [(WAYS[p], results[p], True, str(results[p]["episodes"])) for p in PROTOCOLS if p in results]
+def _success_rows(results: dict[str, dict[str, Any]]) -> list[tuple[str, dict[str, Any], str, str]]:
+    rows = [(WAYS[p], results[p], "playslot", str(results[p]["episodes"])) for p in PROTOCOLS if p in results]
     last = next(iter(results.values()))
     for name, label in REFERENCES.items():
         if name in last.get("references", {}):
-            rows.append((label, last["references"][name], False, str(last["episodes"])))
+            rows.append((label, last["references"][name], name, str(last["episodes"])))
     return rows
 
 

@@ -130,6 +130,7 @@ def _train_policy(config: ExperimentConfig, run: Path, model: StageCheckpoint) -
             device=device,
             logging=config.logging,
             identity={**identity, **more},
+            rate="baselines.lapo.policy.optim.lr" if folder == run / NAME else "baselines.lapo.decoder_lr",
         )
 
     cloned = train(behaviour.policy_stage(), own.policy, run / NAME, {})

@@ -82,6 +82,7 @@ def main(config: ExperimentConfig) -> None:
         logging=config.logging,
         identity={"model": policy, "data": source.fingerprint, "slots": slots.fingerprint},
         ready=ready,
+        rate="behaviour.optim.lr",
     )
     save_stage(
         checkpoint_folder(run, NAME),

@@ -14,6 +14,8 @@ import yaml
 from commands import ONE_CORE, contents, playslot, refused
 
 from playslot_rl.compose import compose
+from playslot_rl.config import to_dict
+from playslot_rl.sharing.commands import reproduce
 from playslot_rl.sharing.config import read_config
 from playslot_rl.sharing.source import read_results, read_source
 from playslot_rl.training.atomic import write_json
@@ -107,6 +109,32 @@ def test_the_commands_of_the_card_are_accepted_and_bring_back_the_config(run: Pa
     assert (recorded.episodes, recorded.collect.noise, recorded.policy) == (150, 0.25, "expert")
     assert (trained.behaviour.steps, trained.seed, trained.run) == (77, 7, "pretrained")
     assert (trained.preset, trained.env.name) == ("compact", "button_press")
+
+
+@pytest.mark.parametrize(
+    ("changes", "lines", "trained"),
+    [
+        ({"demos": 10}, ["collect", "train-policy"], {"run": "pretrained", "demos": 10, "seed": 2}),
+        ({"shipped_world_model": False}, ["pipeline", "train-policy"], {"run": "runs/world", "demos": None, "seed": 2}),
+        ({"shipped_world_model": False, "demos": 10}, ["pipeline", "train-policy"], {"demos": 10, "seed": 2}),
+        ({"shipped_world_model": False, "world_model_seed": 2}, ["pipeline"], {"out": "runs/again", "seed": 2}),
+    ],
+)
+def test_the_card_says_how_many_demonstrations_and_which_seeds(
+    changes: dict[str, Any],
+    lines: list[str],
+    trained: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_json(Path("runs/world/config.json"), to_dict(compose([])))  # what the first line leaves
+    recorded = {"policy": "expert", "episodes": 150, "steps": 20, "seed": 0, "noise": 0.0}
+    source = {"seed": 2, "world_model_seed": 0, "demos": 150, "recorded": recorded, "shipped_world_model": True}
+    commands = [shlex.split(line)[1:] for line in reproduce(compose([]), source | changes, [])]
+    assert [command[0] for command in commands] == lines
+    composed = compose(commands[-1][1:], commands[-1][0])
+    assert {key: getattr(composed, key) for key in trained} == trained
 
 
 @pytest.mark.parametrize(

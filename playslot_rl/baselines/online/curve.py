@@ -58,8 +58,8 @@ def write_curve(
     write_json(folder / "curve.json", values)
 
 
-def draw_curve(folder: Path, method: str, rows: Sequence[Mapping[str, Any]], random: Mapping[str, Any]) -> None:
-    """Draw `curve_light.png` and `curve_dark.png`.
+def draw_curve(folder: Path, name: str, rows: Sequence[Mapping[str, Any]], random: Mapping[str, Any]) -> None:
+    """Draw `curve_light.png` and `curve_dark.png` of a method, by its name.
 
     Raises:
         OutputError: full disk.
@@ -68,4 +68,4 @@ def draw_curve(folder: Path, method: str, rows: Sequence[Mapping[str, Any]], ran
     from playslot_rl.visualization.palette import DARK, LIGHT
 
     for theme in (LIGHT, DARK):
-        write_bytes(folder / f"curve_{theme.name}.png", learning_chart({method: rows}, random, theme))
+        write_bytes(folder / f"curve_{theme.name}.png", learning_chart({name: rows}, random, theme))

@@ -103,7 +103,7 @@ def train_online(
     if not run.finished:
         run.go_on()
     run.write_curve()
-    draw_curve(folder, title, run.state.curve, run.state.random)
+    draw_curve(folder, name, run.state.curve, run.state.random)
     return OnlineResult(run.state, start, run.state.random)
 
 
