@@ -23,7 +23,7 @@ def check_data(config: ExperimentConfig, out: Path) -> ExperimentConfig:
 
     Raises:
         ConfigError: too few demonstrations, or an evaluation seed among the training seeds.
-        DataError: a data set cannot be read.
+        DataError: a data set cannot be read, or the demonstrations have no actions.
     """
     from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
 
@@ -86,6 +86,7 @@ def _check_demos(config: ExperimentConfig, out: Path) -> None:
     if uses_demos(config) and (config.data.demos or _recorded(out)):
         where = config.data.demos or str(out / RECORDED)
         check_demos(config, _episodes(where), f"data.demos={where}")
+        open_videos(config, where, "compare").require_actions(config.env.action_dim)
 
 
 def _recorded(out: Path) -> bool:

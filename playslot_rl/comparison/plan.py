@@ -102,6 +102,12 @@ def check_comparison(config: ExperimentConfig) -> None:
     gym_id(env.name)
     for method in (m for m in wanted.methods if METHODS[m].online):
         require_online(config, getattr(config.baselines, method), method)
+    weights = config.baselines.resnet_oracle.weights
+    named = weights in ("auto", "download", "scratch")
+    if "resnet_oracle" in wanted.methods and not named and not Path(weights).is_file():
+        raise ConfigError(
+            f"baselines.resnet_oracle.weights: got {weights}, expected a file, auto, download or scratch: check it"
+        )
     if wanted.launcher and importlib.util.find_spec(LAUNCHERS[wanted.launcher].split(".")[0]) is None:
         raise _no_launcher(wanted.launcher)
     if wanted.launcher and importlib.util.find_spec(LAUNCHERS[wanted.launcher]) is None:

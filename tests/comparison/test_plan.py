@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from playslot_rl.comparison.config import LAUNCHERS
 from playslot_rl.comparison.plan import Job, check_comparison, check_demos, job_config, job_record, jobs
 from playslot_rl.compose import compose
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
@@ -82,9 +83,11 @@ def test_a_jobs_name_for_its_content_ignores_the_machine_and_nothing_else() -> N
         (["env=grid_shapes"], "env=grid_shapes: got an environment without a simulator"),
         (["env=block_reach", "env.blocks.reward=sparse", "methods=dreamer"], "got sparse with method=dreamer"),
         (["hydra.launcher=ray"], "got ray, expected an installed launcher: install it by"),
+        (["baselines.resnet_oracle.weights=none.pt"], "weights: got none.pt, expected a file, auto"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(typed: list[str], message: str) -> None:
+def test_what_cannot_be_compared_is_refused(typed: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(LAUNCHERS, "ray", "a_module_that_is_not_installed")
     with pytest.raises(ConfigError, match=message):
         check_comparison(compared(*typed))
 

@@ -16,6 +16,7 @@ import pytest
 from commands import ONE_CORE, Done, assert_one_line, contents, playslot
 
 from playslot_rl.comparison import launch
+from playslot_rl.comparison.config import LAUNCHERS
 from playslot_rl.comparison.status import Status, comparison_lock
 from playslot_rl.recipes import compare_job
 
@@ -158,8 +159,9 @@ def test_a_second_command_on_the_same_folder_is_refused(shared_run: Path, tmp_pa
     ],
 )
 def test_what_cannot_be_compared_is_refused_before_anything_is_computed(
-    shared_run: Path, tmp_path: Path, typed: str, message: str, code: int
+    shared_run: Path, tmp_path: Path, typed: str, message: str, code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setitem(LAUNCHERS, "ray", "a_module_that_is_not_installed")
     done = playslot(*_arguments(shared_run, tmp_path / "out", "methods=playslot"), typed)
     assert done.code == code
     assert_one_line(done.err, "compare")
