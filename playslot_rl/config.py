@@ -87,6 +87,9 @@ class BehaviourStageConfig(StageConfig):
             actions, the mean that `l2` finds is neither, and the policy dithers; the median is one of them.
         slot_noise: standard deviation of Gaussian noise added to the slots that policy and oracle clone from (0 in the
             paper); slots have a standard deviation of about 0.7, and a prediction is about 0.03 off.
+        shift: policy, oracle and decoder also learn from copies of the demonstrations moved by so many pixels, with the
+            same actions (0 in the paper, none): from ten demonstrations a policy learns where it has been.
+        shifted_copies: how many, of the eight directions (`playslot_rl.data.shifted.DIRECTIONS`).
         decoder_inputs: `inverse_dynamics` (InvDyn's latents; paper), `policy` (the policy's outputs) or `both`.
         decoder_steps: optimiser steps of the action decoder.
         decoder_lr: its base learning rate; the rest of `optim` is shared.
@@ -97,10 +100,17 @@ class BehaviourStageConfig(StageConfig):
     imagined: bool = True
     loss: Literal["l2", "l1"] = "l2"
     slot_noise: float = 0.0
+    shift: int = 0
+    shifted_copies: int = 8
     decoder_inputs: Literal["inverse_dynamics", "policy", "both"] = "inverse_dynamics"
     decoder_steps: int = 2000
     decoder_lr: float = 2e-4
     oracle: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(0 <= self.shift <= 16, "behaviour.shift", self.shift, "0 to 16 pixels")
+        check(1 <= self.shifted_copies <= 8, "behaviour.shifted_copies", self.shifted_copies, "1 to 8")
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
@@ -19,6 +20,12 @@ from playslot_rl.recipes.run import (
     store_config,
 )
 
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from playslot_rl.data.source import EpisodeFrames
+
 
 def main(config: ExperimentConfig) -> None:
     """Train policy, oracle and decoder into `RUN/policy`; killed, the same command carries on.
@@ -30,7 +37,13 @@ def main(config: ExperimentConfig) -> None:
     """
     import torch
 
-    from playslot_rl.data.demonstrations import first_demonstrations, label_demonstrations, require_labelled
+    from playslot_rl.data.demonstrations import (
+        first_demonstrations,
+        label_demonstrations,
+        require_labelled,
+        with_copies,
+    )
+    from playslot_rl.data.shifted import shifted_copies
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.training.checkpoints import checkpoint_folder, require_config, save_stage
     from playslot_rl.training.fit import FitResult, Stage, fit
@@ -72,8 +85,13 @@ def main(config: ExperimentConfig) -> None:
         torch.manual_seed(derived_seed(config.seed, 0, "policy"))
         agent = Agent.untrained(world, oracle=config.behaviour.oracle).to(device)
     prints = {name: checkpoint.fingerprint for name, checkpoint in parents.items()}
-    cached = slot_cache(videos, world.savi, prints["slots"], config.data.cache, device, config.logging.progress)
-    demos = label_demonstrations(world, source, cached, device)
+
+    def parsed(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
+        return slot_cache(frames, world.savi, prints["slots"], config.data.cache, device, config.logging.progress)
+
+    copies = shifted_copies(source, config.behaviour.shift, config.behaviour.shifted_copies)
+    views = [(source, parsed(videos)), *((copy, parsed(copy)) for copy in copies)]
+    demos = with_copies([label_demonstrations(world, frames, slots, device) for frames, slots in views])
     lr = config.behaviour.optim.lr
     clone = CloneStage(agent.policy, agent.oracle, demos, config.behaviour)
     sizes = to_dict(world.config)

@@ -6,6 +6,7 @@ Shapes: M transitions of all demonstrations in a row, N slots, D slot width, Z l
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +31,7 @@ class Demonstrations:
             under the inferred latents; the first frame's are the parsed ones.
         latents: inferred latent actions (M, Z).
         actions: real actions (M, A) in [-1, 1], or None.
-        episode: number of the demonstration of each transition, int64 (M,).
+        episode: number of the demonstration of each transition, int64 (M,); a shifted copy's is its original's.
         lengths: transitions of each demonstration, int64 (E,).
     """
 
@@ -42,7 +43,8 @@ class Demonstrations:
     lengths: Tensor
 
     def labelled(self, demos: int) -> Tensor:
-        """Rows (int64) of the first `demos` demonstrations, the only ones whose actions the action decoder sees.
+        """Rows (int64) of the first `demos` demonstrations and their copies, the only ones whose actions the action
+        decoder sees.
 
         Raises:
             DataError: there are fewer demonstrations.
@@ -166,4 +168,22 @@ def label_demonstrations(
         actions=labels,
         episode=torch.from_numpy(moves.episode).to(device),
         lengths=torch.from_numpy(moves.lengths),
+    )
+
+
+def with_copies(demos: Sequence[Demonstrations]) -> Demonstrations:
+    """Demonstrations and shifted copies of them (`playslot_rl.data.shifted`), labelled one by one, as one set.
+
+    Args:
+        demos: the originals first; each with the same transitions.
+    """
+    first = demos[0]
+    actions = None if first.actions is None else first.actions.repeat(len(demos), 1)
+    return Demonstrations(
+        slots=torch.cat([copy.slots for copy in demos]),
+        imagined=torch.cat([copy.imagined for copy in demos]),
+        latents=torch.cat([copy.latents for copy in demos]),
+        actions=actions,
+        episode=first.episode.repeat(len(demos)),
+        lengths=first.lengths,
     )

@@ -40,7 +40,7 @@ def slot_cache(
     """Slots of every frame of a data set, each episode parsed from its first frame on.
 
     Args:
-        source: the frames.
+        source: the frames; the first episodes of a data set will do.
         savi: SAVi with frozen weights; moved to `device` and put in eval mode.
         savi_fingerprint: of its weights (`StageCheckpoint.fingerprint`).
         cache: the cache; empty means the default one.
@@ -58,13 +58,12 @@ def slot_cache(
     key = hashlib.sha256(json.dumps([_FORMAT, source.fingerprint, source.camera, source.image_size, savi_fingerprint])
                          .encode()).hexdigest()[:24]  # fmt: skip
     folder = cache_folder(cache) / "slots" / key
+    count = int(source.lengths.sum())
 
     def build(temporary: Path) -> None:
         if progress:
-            print(f"slots: parsing {len(source.frames)} frames once", file=sys.stderr, flush=True)
-        writer = ArrayWriter(
-            temporary / "slots.npy", (len(source.frames), savi.config.n_slots, savi.config.slot_dim), np.float32
-        )
+            print(f"slots: parsing {count} frames once", file=sys.stderr, flush=True)
+        writer = ArrayWriter(temporary / "slots.npy", (count, savi.config.n_slots, savi.config.slot_dim), np.float32)
         for slots in parse_episodes(source, savi, device):
             writer.write(slots)
         writer.close()

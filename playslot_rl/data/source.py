@@ -10,7 +10,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -26,10 +26,28 @@ if TYPE_CHECKING:
 Frames = npt.NDArray[np.uint8]
 
 
+class FrameRows(Protocol):
+    """Frames uint8 (F, H, W, 3) by row number: an array, several in a row, or one that computes what it reads."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(F, H, W, 3)."""
+
+    @property
+    def dtype(self) -> Any:
+        """uint8."""
+
+    def __len__(self) -> int:
+        """F."""
+
+    def __getitem__(self, rows: Any, /) -> Any:
+        """Frames of an integer, a slice or an integer array of any shape."""
+
+
 class ConcatFrames:
     """Several memory-mapped arrays as one along the first axis, gathered by row numbers; nothing is copied before."""
 
-    def __init__(self, parts: Sequence[Frames]) -> None:
+    def __init__(self, parts: Sequence[FrameRows]) -> None:
         self.parts = list(parts)
         self._ends = np.cumsum([len(part) for part in self.parts])
         self.shape = (int(self._ends[-1]), *self.parts[0].shape[1:])
@@ -74,7 +92,7 @@ class EpisodeFrames:
         camera: feature the frames come from.
     """
 
-    frames: Frames | ConcatFrames
+    frames: FrameRows
     starts: npt.NDArray[np.int64]
     lengths: npt.NDArray[np.int64]
     actions: npt.NDArray[np.float32] | None

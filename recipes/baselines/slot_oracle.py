@@ -32,6 +32,7 @@ def main(config: ExperimentConfig) -> None:
 
     from playslot_rl.baselines.oracles.slot import NAME
     from playslot_rl.data.demonstrations import first_demonstrations, real_actions, transitions
+    from playslot_rl.data.shifted import shifted_copies
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.modules.policy import LatentPolicy
     from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
@@ -70,8 +71,14 @@ def main(config: ExperimentConfig) -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derived_seed(config.seed, 0, NAME))
         oracle = LatentPolicy(model.policy, model.savi.slot_dim, config.env.action_dim).to(device)
-    cached = slot_cache(videos, savi, slots.fingerprint, config.data.cache, device, config.logging.progress)
-    stage = oracle_stage(oracle, torch.from_numpy(cached[moves.rows]).to(device), actions, config.behaviour)
+    views = [videos, *shifted_copies(source, config.behaviour.shift, config.behaviour.shifted_copies)]
+    parsed = torch.cat([
+        torch.from_numpy(
+            slot_cache(view, savi, slots.fingerprint, config.data.cache, device, config.logging.progress)[moves.rows]
+        )
+        for view in views
+    ])  # fmt: skip
+    stage = oracle_stage(oracle, parsed.to(device), actions.repeat(len(views), 1), config.behaviour)
     result = fit(
         stage,
         config.behaviour,
