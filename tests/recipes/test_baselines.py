@@ -164,6 +164,23 @@ def test_a_nan_stops_with_the_last_good_checkpoint(
     refused(*_command(method, shared_run, tmp_path / "run", f"{every[method]}.checkpoint_every=1"), message=message)
 
 
+def test_a_nan_in_lapos_models_stops_before_a_policy_is_cloned(
+    shared_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from playslot_rl.baselines.lapo.stage import LAPOModelStage
+
+    original = LAPOModelStage.loss
+
+    def poisoned(self: LAPOModelStage, step: int, generators: Any) -> Any:
+        losses = original(self, step, generators)
+        return {**losses, "loss": losses["loss"] * float("nan")} if step == 1 else losses
+
+    monkeypatch.setattr(LAPOModelStage, "loss", poisoned)
+    message = "loss is nan at step 2, expected a finite number; the last good checkpoint is .*lapo_model.*step_0*1"
+    refused(*_command("lapo", shared_run, tmp_path / "run", "baselines.lapo.model.checkpoint_every=1"), message=message)
+    assert not (tmp_path / "run" / "lapo").exists()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from commands import smoke
+from safetensors.torch import load_file
 
 from playslot_rl.baselines.actor import ActorController
 from playslot_rl.baselines.sold.learner import SOLDLearner
@@ -95,6 +97,22 @@ def test_the_actor_that_is_loaded_plays_and_repeats(trained: Path) -> None:
     for first, second in zip(chosen[: config.env.max_steps], chosen[config.env.max_steps :], strict=True):
         assert first.shape == (2, 4)
         np.testing.assert_array_equal(first, second)
+
+
+def test_the_actor_that_is_loaded_has_the_weights_that_were_saved(trained: Path) -> None:
+    saved = load_file(trained / "sold" / "checkpoint" / "weights.safetensors")
+    loaded = {f"actor.{name}": value for name, value in load_actor(trained).module.actor.state_dict().items()}
+    assert loaded.keys() == {name for name in saved if name.startswith("actor.")}
+    for name, value in loaded.items():
+        assert torch.equal(value, saved[name]), name
+
+
+def test_it_is_evaluated_by_the_evaluator_of_all_methods(trained: Path) -> None:
+    smoke("evaluate", f"run={trained}", "episodes=2", "evaluation.references=false")
+    info = json.loads((trained / "evaluation" / "simulation" / "eval_info.json").read_text())
+    assert info["method"] == "sold"
+    assert info["env_steps"] == 78
+    assert len(info["per_episode"]) == 2
 
 
 def test_a_finished_run_is_skipped(trained: Path, world: Path, capsys: pytest.CaptureFixture[str]) -> None:
