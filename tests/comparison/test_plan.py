@@ -77,6 +77,18 @@ def test_a_jobs_name_for_its_content_ignores_the_machine_and_nothing_else() -> N
     assert from_dict(ExperimentConfig, record["config"]) == own
 
 
+def test_a_methods_settings_are_those_of_its_own_jobs_only() -> None:
+    def names(*typed: str) -> list[str]:
+        config = compared("methods=playslot,lapo,dreamer", "demos=10", "seeds=0", *typed)
+        return [job_record(job, job_config(config, job, "", ""), {})["fingerprint"] for job in jobs(config, OUT)]
+
+    playslot, lapo, dreamer = names()
+    assert names("baselines.dreamer.minutes=5")[:2] == [playslot, lapo]
+    assert names("baselines.dreamer.minutes=5")[2] != dreamer
+    assert names("baselines.lapo.groups=2")[::2] == [playslot, dreamer]
+    assert names("baselines.lapo.groups=2")[1] != lapo
+
+
 @pytest.mark.parametrize(
     ("typed", "message"),
     [
