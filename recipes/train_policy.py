@@ -43,7 +43,7 @@ def main(config: ExperimentConfig) -> None:
         require_labelled,
         with_copies,
     )
-    from playslot_rl.data.shifted import shifted_copies
+    from playslot_rl.data.shifted import parsed_views
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.training.checkpoints import checkpoint_folder, require_config, save_stage
     from playslot_rl.training.fit import FitResult, Stage, fit
@@ -89,8 +89,7 @@ def main(config: ExperimentConfig) -> None:
     def parsed(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
         return slot_cache(frames, world.savi, prints["slots"], config.data.cache, device, config.logging.progress)
 
-    copies = shifted_copies(source, config.behaviour.shift, config.behaviour.shifted_copies)
-    views = [(source, parsed(videos)), *((copy, parsed(copy)) for copy in copies)]
+    views = parsed_views(videos, source, config.behaviour.shift, config.behaviour.shifted_copies, parsed)
     demos = with_copies([label_demonstrations(world, frames, slots, device) for frames, slots in views])
     lr = config.behaviour.optim.lr
     clone = CloneStage(agent.policy, agent.oracle, demos, config.behaviour)

@@ -9,11 +9,12 @@ Shapes: F frames, H W image height and width.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from playslot_rl.data.source import EpisodeFrames, FrameRows, Frames
 
@@ -70,3 +71,22 @@ def shifted(source: EpisodeFrames, offset: tuple[int, int]) -> EpisodeFrames:
 def shifted_copies(source: EpisodeFrames, shift: int, copies: int) -> Sequence[EpisodeFrames]:
     """The first `copies` of the eight neighbours at `shift` pixels; none where `shift` is 0."""
     return [shifted(source, (shift * y, shift * x)) for y, x in DIRECTIONS[: copies if shift else 0]]
+
+
+def parsed_views(
+    videos: EpisodeFrames,
+    first: EpisodeFrames,
+    shift: int,
+    copies: int,
+    parse: Callable[[EpisodeFrames], npt.NDArray[np.float32]],
+) -> Sequence[tuple[EpisodeFrames, npt.NDArray[np.float32]]]:
+    """Demonstrations and their shifted copies, each with the slots (F, N, D) of its frames.
+
+    Args:
+        videos: the data set; parsed whole, so that one cache serves every number of demonstrations.
+        first: the demonstrations, the first episodes of it.
+        shift: pixels; 0 makes no copies.
+        copies: how many.
+        parse: gives a data set's slots, such as `slot_cache`.
+    """
+    return [(first, parse(videos)), *((copy, parse(copy)) for copy in shifted_copies(first, shift, copies))]

@@ -6,6 +6,7 @@ Sizes are `model.policy`, the schedule is `behaviour`, as for PlaySlot's policy.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
@@ -18,6 +19,12 @@ from playslot_rl.recipes.run import (
     parent_run,
     store_config,
 )
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from playslot_rl.data.source import EpisodeFrames
 
 
 def main(config: ExperimentConfig) -> None:
@@ -32,7 +39,7 @@ def main(config: ExperimentConfig) -> None:
 
     from playslot_rl.baselines.oracles.slot import NAME
     from playslot_rl.data.demonstrations import first_demonstrations, real_actions, transitions
-    from playslot_rl.data.shifted import shifted_copies
+    from playslot_rl.data.shifted import parsed_views
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.modules.policy import LatentPolicy
     from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
@@ -71,14 +78,13 @@ def main(config: ExperimentConfig) -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derived_seed(config.seed, 0, NAME))
         oracle = LatentPolicy(model.policy, model.savi.slot_dim, config.env.action_dim).to(device)
-    views = [videos, *shifted_copies(source, config.behaviour.shift, config.behaviour.shifted_copies)]
-    parsed = torch.cat([
-        torch.from_numpy(
-            slot_cache(view, savi, slots.fingerprint, config.data.cache, device, config.logging.progress)[moves.rows]
-        )
-        for view in views
-    ])  # fmt: skip
-    stage = oracle_stage(oracle, parsed.to(device), actions.repeat(len(views), 1), config.behaviour)
+
+    def parsed(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
+        return slot_cache(frames, savi, slots.fingerprint, config.data.cache, device, config.logging.progress)
+
+    views = parsed_views(videos, source, config.behaviour.shift, config.behaviour.shifted_copies, parsed)
+    inputs = torch.cat([torch.from_numpy(cached[moves.rows]) for _, cached in views])
+    stage = oracle_stage(oracle, inputs.to(device), actions.repeat(len(views), 1), config.behaviour)
     result = fit(
         stage,
         config.behaviour,
