@@ -126,7 +126,7 @@ class Comparison:
 
     def _rows(self, job: Job) -> list[dict[str, Any]]:
         """A job's rows; what was done with other settings, data or parents than those asked for is still to be done."""
-        return job_rows(job, str(self.jobs[job]["fingerprint"]))
+        return job_rows(job, self.config.env.frame_skip, str(self.jobs[job]["fingerprint"]))
 
     def _world_model(self) -> dict[str, Any] | None:
         if not uses_slots(self.config):

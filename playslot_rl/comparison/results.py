@@ -14,17 +14,18 @@ from playslot_rl.comparison.status import Status, read_status
 from playslot_rl.evaluation.intervals import wilson
 
 
-def job_rows(job: Job, fingerprint: str | None = None) -> list[dict[str, Any]]:
+def job_rows(job: Job, frame_skip: int, fingerprint: str | None = None) -> list[dict[str, Any]]:
     """One row for each protocol of a job, finished or not.
 
     Keys: `name`, `method`, `title`, `protocol`, `demos`, `seed`, `status`, `error`, `labelled_demos`, `agent_steps`
-    and `env_steps` (an agent step is `env.frame_skip` of them), `samples` (optimiser steps times batch),
+    and `env_steps` (an agent step is `frame_skip` of them), `samples` (optimiser steps times batch),
     `success_rate`, `successes`, `episodes`, `ci95` (Wilson), `mean_steps_to_success`, `train_seconds`,
     `evaluation_seconds`, `parameters`, `pretraining` (null where there is nothing to say), `curve` (rows of an online
     method's learning curve, with both kinds of steps).
 
     Args:
         job: which one.
+        frame_skip: environment steps in an agent step.
         fingerprint: of the job as it is asked for now; one that ended as another is `waiting`. None takes any.
     """
     status = read_status(job.file)
@@ -47,7 +48,7 @@ def job_rows(job: Job, fingerprint: str | None = None) -> list[dict[str, Any]]:
                 "error": status.error or None,
                 "labelled_demos": None if METHODS[job.method].online else meta.get("labelled_demos"),
                 "agent_steps": meta.get("env_steps"),
-                "env_steps": None if meta.get("env_steps") is None else meta["env_steps"] * frame_skip(job),
+                "env_steps": None if meta.get("env_steps") is None else meta["env_steps"] * frame_skip,
                 "samples": count_samples(job, meta),
                 "success_rate": rate,
                 "successes": None if rate is None else round(rate * info["episodes"]),
@@ -58,23 +59,18 @@ def job_rows(job: Job, fingerprint: str | None = None) -> list[dict[str, Any]]:
                 "evaluation_seconds": info.get("wall_seconds"),
                 "parameters": count_parameters(job.run, job.stage) if meta else None,
                 "pretraining": meta.get("pretraining"),
-                "curve": learning_curve(job) if METHODS[job.method].online else None,
+                "curve": learning_curve(job, frame_skip) if METHODS[job.method].online else None,
             }
         )
     return rows
 
 
-def learning_curve(job: Job) -> list[dict[str, Any]] | None:
+def learning_curve(job: Job, frame_skip: int) -> list[dict[str, Any]] | None:
     """Rows of `RUN/METHOD/curve.json`, there before the job is done too; None without one."""
     rows = _read(job.run / job.stage / "curve.json").get("rows") or []
-    skip = frame_skip(job)
-    return [{**row, "agent_steps": row["env_steps"], "env_steps": row["env_steps"] * skip} for row in rows] or None
-
-
-def frame_skip(job: Job) -> int:
-    """Environment steps in an agent step."""
-    config = _read(job.file).get("config", {})
-    return int(config.get("env", {}).get("frame_skip", 1))
+    return [
+        {**row, "agent_steps": row["env_steps"], "env_steps": row["env_steps"] * frame_skip} for row in rows
+    ] or None
 
 
 def count_samples(job: Job, meta: Mapping[str, Any]) -> int | None:

@@ -31,9 +31,8 @@ def ended(tmp_path: Path) -> dict[str, Any]:
     ]
     points = [{"env_steps": n, "success_rate": n / 4000, "ci95": [0, 1]} for n in (0, 1000, 2000)]
     write_json(jobs[-1].run / "dreamer" / "curve.json", {"rows": points})
-    write_json(jobs[-1].file, {"config": {"env": {"frame_skip": 5}}})
     write_json(jobs[2].run / "slot_oracle" / "checkpoint" / "config.json", {"slot_oracle": {"batch_size": 16}})
     failed = Job("lapo", 10, 0, tmp_path)
     write_status(failed.file, Status("failed", "f", "loss is nan at step 3, expected a finite number", 1.0))
-    rows = [row for job in [*jobs, failed] for row in job_rows(job)]
+    rows = [row for job in [*jobs, failed] for row in job_rows(job, frame_skip=5)]
     return comparison(tmp_path, rows, summarise(rows))
