@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
@@ -23,8 +24,13 @@ from playslot_rl.recipes.run import (
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
+    import torch
 
+    from playslot_rl.data.demonstrations import Demonstrations
     from playslot_rl.data.source import EpisodeFrames
+    from playslot_rl.training.checkpoints import StageCheckpoint
+    from playslot_rl.training.fit import FitResult, Stage
+    from playslot_rl.world_model import Agent, WorldModel
 
 
 def main(config: ExperimentConfig) -> None:
@@ -35,40 +41,16 @@ def main(config: ExperimentConfig) -> None:
         DataError: no demonstrations, none with actions, or fewer than `demos` or `behaviour.labelled_demos`.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    import torch
-
-    from playslot_rl.data.demonstrations import (
-        first_demonstrations,
-        label_demonstrations,
-        require_labelled,
-        with_copies,
-    )
-    from playslot_rl.data.shifted import parsed_views
-    from playslot_rl.data.slot_cache import slot_cache
-    from playslot_rl.training.checkpoints import checkpoint_folder, require_config, save_stage
-    from playslot_rl.training.fit import FitResult, Stage, fit
-    from playslot_rl.training.runs import (
-        load_world_model,
-        require_adoptable,
-        use_world_model,
-        world_model_checkpoints,
-    )
-    from playslot_rl.training.seeding import derived_seed
+    from playslot_rl.data.demonstrations import first_demonstrations, require_labelled
+    from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
+    from playslot_rl.training.fit import fit
+    from playslot_rl.training.runs import use_world_model
     from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage
-    from playslot_rl.world_model import Agent
 
     run = open_run(config)
     parent = parent_run(config, run)
-    parents, model = world_model_checkpoints(parent), config.model
-    for checkpoint in parents.values():
-        require_adoptable(checkpoint, run)
-        env = {"image_size": config.env.image_size, "action_dim": config.env.action_dim}
-        require_config(checkpoint, {"env": env})
-    trained_as = {
-        "model": {"policy": to_dict(model.policy), "action_decoder": to_dict(model.action_decoder)},
-        "policy": fixed_keys(config.behaviour),
-    }
-    if finished(config, run, "policy", trained_as, parents, demo_root(config), config.demos):
+    parents = _world_model_of(config, parent, run)
+    if finished(config, run, "policy", _trained_as(config), parents, demo_root(config), config.demos):
         return
 
     def ready() -> None:
@@ -76,50 +58,39 @@ def main(config: ExperimentConfig) -> None:
         store_config(config, run)
 
     device = open_device(config)
-    world = load_world_model(parent, device)
-    world.config = replace(world.config, policy=config.model.policy, action_decoder=config.model.action_decoder)
     videos = open_videos(config, demo_root(config), "train-policy")
     source = first_demonstrations(videos, config.demos)
     require_labelled(config.behaviour.labelled_demos, source.episodes)  # before anything is computed
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derived_seed(config.seed, 0, "policy"))
-        agent = Agent.untrained(world, oracle=config.behaviour.oracle).to(device)
+    world, agent = _untrained(config, parent, device)
     prints = {name: checkpoint.fingerprint for name, checkpoint in parents.items()}
-
-    def parsed(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
-        return slot_cache(frames, world.savi, prints["slots"], config.data.cache, device, config.logging.progress)
-
-    views = parsed_views(videos, source, config.behaviour.shift, config.behaviour.shifted_copies, parsed)
-    demos = with_copies([label_demonstrations(world, frames, slots, device) for frames, slots in views])
-    lr = config.behaviour.optim.lr
-    clone = CloneStage(agent.policy, agent.oracle, demos, config.behaviour)
+    demos = _parsed(config, world, videos, source, prints["slots"])
     sizes = to_dict(world.config)
-    identity = {"model": sizes, "data": source.fingerprint, **prints}
+    behaviour = config.behaviour
 
-    def train(stage: Stage, name: str, steps: int, lr: float) -> FitResult:
-        part = run / "policy" if name == "policy" else run / "policy" / name
+    def train(stage: Stage, folder: Path, steps: int, lr: float) -> FitResult:
         return fit(
             stage,
-            replace(config.behaviour, steps=steps, optim=replace(config.behaviour.optim, lr=lr)),
-            part,
-            name=name,
+            replace(behaviour, steps=steps, optim=replace(behaviour.optim, lr=lr)),
+            folder,
+            name=folder.name,
             seed=config.seed,
             device=device,
             logging=config.logging,
-            identity=identity,
+            identity={"model": sizes, "data": source.fingerprint, **prints},
             ready=ready,
-            rate="behaviour.optim.lr" if name == "policy" else "behaviour.decoder_lr",
+            rate="behaviour.optim.lr" if stage is clone else "behaviour.decoder_lr",
         )
 
-    cloned = train(clone, "policy", config.behaviour.steps, lr)
+    clone = CloneStage(agent.policy, agent.oracle, demos, behaviour)
+    cloned = train(clone, run / "policy", behaviour.steps, behaviour.optim.lr)
     agent.eval()
-    decode = DecoderStage(agent.action_decoder, agent.policy, demos, config.behaviour)
-    decoded = train(decode, "decoder", config.behaviour.decoder_steps, config.behaviour.decoder_lr)
+    decode = DecoderStage(agent.action_decoder, agent.policy, demos, behaviour)
+    decoded = train(decode, run / "policy" / "decoder", behaviour.decoder_steps, behaviour.decoder_lr)
     save_stage(
         checkpoint_folder(run, "policy"),
         stage="policy",
         modules={**clone.modules, **decode.modules},
-        config={"env": to_dict(world.env), "model": sizes, "policy": to_dict(config.behaviour)},
+        config={"env": to_dict(world.env), "model": sizes, "policy": to_dict(behaviour)},
         data={"demos": source.fingerprint},
         parents=prints,
         metrics={**cloned.metrics, **{f"decoder_{key}": value for key, value in decoded.metrics.items()}},
@@ -127,10 +98,63 @@ def main(config: ExperimentConfig) -> None:
         seconds=cloned.seconds + decoded.seconds,
         extra={
             "demos": len(demos.lengths),
-            "labelled_demos": config.behaviour.labelled_demos,
+            "labelled_demos": behaviour.labelled_demos,
             "seed": config.seed,
             "data_root": demo_root(config),
         },
     )
-    labelled = config.behaviour.labelled_demos
-    print(f"policy: {len(demos.lengths)} demos, {labelled} labelled, {run / 'policy'}", flush=True)
+    print(f"policy: {len(demos.lengths)} demos, {behaviour.labelled_demos} labelled, {run / 'policy'}", flush=True)
+
+
+def _world_model_of(config: ExperimentConfig, parent: str | Path, run: Path) -> dict[str, StageCheckpoint]:
+    """The world model's checkpoints: whole, of this task's frames and actions, and fit for `run`."""
+    from playslot_rl.training.checkpoints import require_config
+    from playslot_rl.training.runs import require_adoptable, world_model_checkpoints
+
+    parents = world_model_checkpoints(parent)
+    for checkpoint in parents.values():
+        require_adoptable(checkpoint, run)
+        env = {"image_size": config.env.image_size, "action_dim": config.env.action_dim}
+        require_config(checkpoint, {"env": env})
+    return parents
+
+
+def _trained_as(config: ExperimentConfig) -> dict[str, object]:
+    """Settings that a finished stage must share."""
+    return {
+        "model": {"policy": to_dict(config.model.policy), "action_decoder": to_dict(config.model.action_decoder)},
+        "policy": fixed_keys(config.behaviour),
+    }
+
+
+def _untrained(config: ExperimentConfig, parent: str | Path, device: torch.device) -> tuple[WorldModel, Agent]:
+    """The frozen world model, and fresh policy, oracle and decoder on top of it."""
+    import torch
+
+    from playslot_rl.training.runs import load_world_model
+    from playslot_rl.training.seeding import derived_seed
+    from playslot_rl.world_model import Agent
+
+    world = load_world_model(parent, device)
+    world.config = replace(world.config, policy=config.model.policy, action_decoder=config.model.action_decoder)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derived_seed(config.seed, 0, "policy"))
+        return world, Agent.untrained(world, oracle=config.behaviour.oracle).to(device)
+
+
+def _parsed(
+    config: ExperimentConfig, world: WorldModel, videos: EpisodeFrames, source: EpisodeFrames, slots_print: str
+) -> Demonstrations:
+    """Slots and latents of the demonstrations `source`, the first of `videos`, and of their shifted copies."""
+    from playslot_rl.data.demonstrations import label_demonstrations, with_copies
+    from playslot_rl.data.shifted import parsed_views
+    from playslot_rl.data.slot_cache import slot_cache
+    from playslot_rl.world_model import module_device
+
+    device, behaviour = module_device(world), config.behaviour
+
+    def parse(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
+        return slot_cache(frames, world.savi, slots_print, config.data.cache, device, config.logging.progress)
+
+    views = parsed_views(videos, source, behaviour.shift, behaviour.shifted_copies, parse)
+    return with_copies([label_demonstrations(world, frames, slots, device) for frames, slots in views])
