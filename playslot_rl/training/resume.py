@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
@@ -51,9 +51,15 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+ADDED: Final[Mapping[str, Any]] = {"reward_scale": 1.0}
+"""Settings that came after the first checkpoints, and what those were trained with."""
+
+
 def first_difference(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> tuple[str, Any, Any] | None:
     """The first dotted key at which two nested configs differ: (key, stored value, wanted value)."""
-    left, right = flatten(stored), flatten(wanted)
+    right = flatten(wanted)
+    added = {key: ADDED[name] for key in right if (name := key.rpartition(".")[-1]) in ADDED}
+    left = {**added, **flatten(stored)}
     for key in sorted(left.keys() | right.keys()):
         if left.get(key, _ABSENT) != right.get(key, _ABSENT):
             return key, left.get(key, _ABSENT), right.get(key, _ABSENT)

@@ -23,6 +23,8 @@ class OnlineConfig:
         batch_size: sequences in an update (B).
         sequence: frames in a sequence (T); 0 means whole episodes. Sequences longer than an episode run across
             episodes, shorter ones stay within one.
+        reward_scale: rewards are multiplied by it before the method learns from them; the curve's returns are not.
+            Grids of values and the least range of returns that is divided by (1) suit rewards of the order of 1 to 10.
         capacity: frames that the replay keeps; the oldest episodes go first.
         replay_on_disk: memory-map the replay, where it does not fit into memory.
         evaluate_every: agent steps between points of the learning curve.
@@ -38,6 +40,7 @@ class OnlineConfig:
     update_ratio: float = 0.5
     batch_size: int = 16
     sequence: int = 64
+    reward_scale: float = 1.0
     capacity: int = 1_000_000
     replay_on_disk: bool = False
     evaluate_every: int = 10_000
@@ -52,6 +55,7 @@ class OnlineConfig:
         ):  # fmt: skip
             check(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         check(self.minutes >= 0, "minutes", self.minutes, "at least 0")
+        check(self.reward_scale > 0, "reward_scale", self.reward_scale, "above 0")
         check(self.update_ratio > 0, "update_ratio", self.update_ratio, "above 0")
         check(self.sequence == 0 or self.sequence >= 2, "sequence", self.sequence, "0 (whole episodes), or at least 2")
         check(self.prefill <= self.steps, "prefill", self.prefill, f"at most steps ({self.steps})")

@@ -24,7 +24,8 @@ STREAM: Final = "stream"
 class Replay:
     """A ring of the latest episodes.
 
-    Every frame comes with `keys.ACTION` and `keys.REWARD`, of the step that led to it, and `keys.IS_FIRST` and
+    Every frame comes with `keys.ACTION` and `keys.REWARD`, of the step that led to it (the reward as the task gave it;
+    `sample` multiplies it by `reward_scale`), and `keys.IS_FIRST` and
     `keys.IS_LAST`. A sequence no longer than an episode lies within one; a longer one runs on into the next episode,
     with its `IS_FIRST`.
 
@@ -44,6 +45,7 @@ class Replay:
         from torchrl.data import LazyMemmapStorage, LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
         self.batch_size, self.sequence = config.batch_size, config.sequence or episode_frames
+        self.reward_scale = config.reward_scale
         self.episode_frames, self.capacity = episode_frames, config.capacity // episode_frames
         if self.capacity * episode_frames < max(self.sequence, episode_frames):
             need = max(self.sequence, episode_frames) + episode_frames
@@ -109,7 +111,7 @@ class Replay:
         self._buffer.set_rng(generator)
         flat = self._buffer.sample().exclude("index", STREAM)
         batch: TensorDict = flat.reshape(self.batch_size, self.sequence)
-        return batch
+        return batch.set(keys.REWARD, batch.get(keys.REWARD) * self.reward_scale)
 
 
 @contextlib.contextmanager
