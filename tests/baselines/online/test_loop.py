@@ -177,6 +177,18 @@ def test_a_run_begun_with_other_values_is_refused(tmp_path: Path) -> None:
         train(tmp_path, batch_size=5)
 
 
+def test_a_run_from_before_rewards_were_scaled_had_a_scale_of_one(tmp_path: Path) -> None:
+    train(tmp_path, minutes=1e-9)
+    state = next(iter(sorted((tmp_path / "checkpoints").glob("step_*")))) / "state.json"
+    stored = json.loads(state.read_text())
+    assert stored["identity"]["toy"].pop("reward_scale") == 1.0
+    state.write_text(json.dumps(stored))
+    with pytest.raises(CheckpointError, match=r"toy\.reward_scale: got 2\.0, expected 1\.0"):
+        train(tmp_path, reward_scale=2.0)
+    _, result = train(tmp_path)
+    assert (result.resumed_from, result.state.step) == (8, 64)
+
+
 def test_a_missing_file_of_the_journal_is_named(tmp_path: Path) -> None:
     train(tmp_path, minutes=1e-9)
     shutil.rmtree(tmp_path / "replay")
@@ -188,6 +200,7 @@ def test_values_out_of_range_are_refused() -> None:
     for change, message in (
         ({"update_ratio": 0.0}, "update_ratio"),
         ({"sequence": 1}, "sequence"),
+        ({"reward_scale": 0.0}, "reward_scale"),
         ({"prefill": 100}, "prefill"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -21,6 +21,7 @@ def episodes(first: int, count: int) -> TensorDict:
     values = {
         "place": place,
         keys.ACTION: place.unsqueeze(-1).float(),
+        keys.REWARD: place.unsqueeze(-1) / 10,
         keys.IS_FIRST: (frame == 0).unsqueeze(-1),
         keys.IS_LAST: (frame == FRAMES - 1).unsqueeze(-1),
     }
@@ -46,6 +47,17 @@ def test_a_sequence_no_longer_than_an_episode_lies_within_one(sequence: int) -> 
     assert len((places[:, 0] // 10).unique()) == 5
     starts = (places[:, 0] % 10).unique().tolist()
     assert starts == list(range(FRAMES - sequence + 1))
+
+
+def test_rewards_are_scaled_when_they_are_drawn_and_stored_as_they_came() -> None:
+    config = OnlineConfig(batch_size=64, sequence=FRAMES, capacity=100, reward_scale=5.0)
+    source, added = Replay(config, FRAMES), episodes(0, 5)
+    before = added[keys.REWARD].clone()
+    source.add(added)
+    for seed in (0, 1):
+        batch = draw(source, seed)
+        assert torch.equal(batch[keys.REWARD], 0.5 * batch[keys.ACTION])
+    assert torch.equal(added[keys.REWARD], before)
 
 
 def test_zero_means_whole_episodes() -> None:
