@@ -20,7 +20,7 @@ def comparison_figure(result: Result, theme: Theme) -> Figure:
     """Draw a comparison.
 
     A method has its colour and marker everywhere; imagination is dashed. Bars are 95 % Wilson intervals over the
-    episodes of all seeds, small dots are single seeds, the grey lines the references.
+    episodes, which all seeds share, small dots are single seeds, the grey lines the references.
 
     Args:
         result: what `comparison.json` holds.
@@ -113,13 +113,19 @@ def _steps(axes: Axes, curves: Sequence[Result], final: Sequence[Result], theme:
                 [end["env_steps"]], [100 * end["success_rate"]], error, color=colour, marker=style.marker,
                 markersize=7, linestyle="none", capsize=2, label=end["title"],
             )  # fmt: skip
+        dots = [r for r in own if r["env_steps"] is not None and r["success_rate"] is not None]
+        if len(dots) > 1:
+            rates = [100 * r["success_rate"] for r in dots]
+            axes.plot([r["env_steps"] for r in dots], rates, ".", color=colour, markersize=4, alpha=0.5)
         if not any(row["method"] == method and row["env_steps"] is not None for row in final):
             axes.plot([], [], color=colour, marker=style.marker, label=(own or list(final))[0]["title"])
+    axes.locator_params(axis="x", nbins=6)
+    axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.set_xlabel("environment steps (lines: development episodes)")
 
 
 def _finish(axes: Axes, result: Result, theme: Theme) -> None:
-    for name, line in (("expert", ":"), ("random", (0, (1, 3)))):
+    for name, line in (("expert", ":"), ("random", "--")):
         rate = result["references"].get(name, {}).get("success_rate")
         if rate is not None:
             axes.axhline(100 * rate, color=theme.series[7], linestyle=line, linewidth=1.2, label=f"{name} actions")

@@ -98,6 +98,16 @@ def test_every_method_has_a_colour_and_a_marker_of_its_own() -> None:
     assert len({style.marker for style in METHOD_STYLES.values()}) == len(METHOD_STYLES)
 
 
+def test_seeds_of_a_method_that_acts_are_dots_beside_their_mean(ended: dict[str, Any]) -> None:
+    first = next(row for row in ended["rows"] if row["method"] == "dreamer")
+    second = {**first, "name": "dreamer-s1", "seed": 1, "success_rate": 0.1, "env_steps": 9000}
+    rows = [*ended["rows"], second]
+    figure = comparison_figure({**ended, "rows": rows, "summary": summarise(rows)}, LIGHT)
+    points = [(tuple(line.get_xdata()), tuple(line.get_ydata())) for line in figure.axes[1].lines]
+    assert ((10000, 9000), (pytest.approx(70), pytest.approx(10))) in points
+    assert ((9500,), (pytest.approx(40),)) in points
+
+
 def test_the_plot_shows_every_series_in_its_methods_colour(ended: dict[str, Any]) -> None:
     figure = comparison_figure(ended, LIGHT)
     left, right = figure.axes
