@@ -52,5 +52,5 @@ def main(config: ExperimentConfig) -> None:
         networks = build_networks(own, slots, config.env.action_dim, config.env.max_steps).to(device)
     learner = SOLDLearner(load_savi(parent, device), networks, own, config.env.action_dim)
     train_and_save(
-        config, own, run, NAME, learner, networks.parts, device=device, ready=ready, slots=slots, prior_steps=before
+        config, own, run, NAME, learner, learner.trained, device=device, ready=ready, slots=slots, prior_steps=before
     )

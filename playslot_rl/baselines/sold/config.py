@@ -32,6 +32,7 @@ class SOLDConfig(OnlineConfig):
         actor_gradient: `dynamics` (through the imagined rollout) or `reinforce`.
         return_rate: share of the new batch in the average of the returns' 5-95 percentile range.
         critic_decay: of the average of the critic's weights, which its loss pulls it towards.
+        actor_average: of the average of the actor's weights, which is evaluated and saved; 0 takes the last weights.
         slot_weight, image_weight: weights of the dynamics' losses. With an image loss the replay keeps pixels too.
         decoded_frames: predicted frames decoded for the image loss, drawn at random; 0 decodes all of them.
         actor_lr, critic_lr, model_lr: Adam's rates; `model_lr` is that of dynamics and reward.
@@ -59,6 +60,7 @@ class SOLDConfig(OnlineConfig):
     actor_gradient: Literal["dynamics", "reinforce"] = "dynamics"
     return_rate: float = 0.01
     critic_decay: float = 0.98
+    actor_average: float = 0.0
     slot_weight: float = 1.0
     image_weight: float = 1.0
     decoded_frames: int = 0
@@ -80,7 +82,7 @@ class SOLDConfig(OnlineConfig):
         check(self.limit > 0, f"{group}.limit", self.limit, "above 0")
         longer = self.sequence == 0 or self.sequence > self.context
         check(longer, f"{group}.sequence", self.sequence, f"0, or more than {group}.context={self.context}")
-        for name in ("gamma", "lmbda", "critic_decay", "return_rate"):
+        for name in ("gamma", "lmbda", "critic_decay", "actor_average", "return_rate"):
             check(0 <= getattr(self, name) <= 1, f"{group}.{name}", getattr(self, name), "a number in [0, 1]")
         learns = self.slot_weight + self.image_weight > 0 and min(self.slot_weight, self.image_weight) >= 0
         check(learns, f"{group}.slot_weight", self.slot_weight, "slot_weight or image_weight above 0, none below")

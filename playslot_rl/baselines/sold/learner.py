@@ -41,8 +41,11 @@ class SOLDLearner:
     def __init__(self, savi: SAVi, networks: SOLDNetworks, config: SOLDConfig, action_dim: int) -> None:
         self.savi, self.networks, self.config = savi, networks, config
         self.slow_critic = copy.deepcopy(networks.critic).requires_grad_(False)
+        self.mean_actor = copy.deepcopy(networks.actor).requires_grad_(False)
         self.returns = PercentileValueNorm(rate=config.return_rate, min_scale=1.0).to(next(savi.parameters()).device)
-        self.acting = SlotActing(savi, networks.actor, acting_window(config), action_dim)
+        window = acting_window(config)
+        self.exploring = SlotActing(savi, networks.actor, window, action_dim)
+        self.acting = SlotActing(savi, self.mean_actor, window, action_dim)
         self.stored: tuple[str, ...] = (keys.SLOTS,) if config.image_weight == 0 else (keys.SLOTS, keys.PIXELS)
         rates = {"actor": config.actor_lr, "critic": config.critic_lr}
         self._adam = {
@@ -52,8 +55,14 @@ class SOLDLearner:
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """The four networks, the critic's slow copy and the scale of the returns."""
-        return {**self.networks.parts, "slow_critic": self.slow_critic, "returns": self.returns}
+        """The four networks, the slow copies of critic and actor, and the scale of the returns."""
+        slow = {"slow_critic": self.slow_critic, "mean_actor": self.mean_actor}
+        return {**self.networks.parts, **slow, "returns": self.returns}
+
+    @property
+    def trained(self) -> Mapping[str, nn.Module]:
+        """The four networks as a finished run keeps them: the actor is the average."""
+        return {**self.networks.parts, "actor": self.mean_actor}
 
     @property
     def optimizers(self) -> Mapping[str, torch.optim.Optimizer]:
@@ -65,8 +74,11 @@ class SOLDLearner:
         return self.acting.initial(n)
 
     def act(self, memory: TensorDictBase, generator: torch.Generator, explore: bool) -> TensorDictBase:
-        """See `Learner.act`."""
-        return self.acting.act(memory, generator, explore) if explore else self.acting(memory)
+        """See `Learner.act`; explores with the actor's last weights, and evaluates the average of them.
+
+        Note: the source does not average. Between updates a few of the last weights' most likely actions are far off.
+        """
+        return self.exploring.act(memory, generator, explore) if explore else self.acting(memory)
 
     def update(self, batch: TensorDict, generators: StepGenerators) -> Mapping[str, Tensor]:
         """See `Learner.update`."""
@@ -198,7 +210,11 @@ class SOLDLearner:
 
     @torch.no_grad()
     def _follow(self) -> None:
-        """Move the slow critic towards the critic."""
-        pairs = zip(self.slow_critic.parameters(), self.networks.critic.parameters(), strict=True)
-        for slow, fast in pairs:
-            slow.lerp_(cast(Tensor, fast), 1 - self.config.critic_decay)
+        """Move the slow critic towards the critic, and the mean actor towards the actor."""
+        copies = (
+            (self.slow_critic, self.networks.critic, self.config.critic_decay),
+            (self.mean_actor, self.networks.actor, self.config.actor_average),
+        )
+        for copied, network, decay in copies:
+            for slow, fast in zip(copied.parameters(), network.parameters(), strict=True):
+                slow.lerp_(cast(Tensor, fast), 1 - decay)

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 
 from playslot_rl import keys
 from playslot_rl.baselines.sold import losses
+from playslot_rl.baselines.sold.heads import action_distribution, sample_action
 from playslot_rl.baselines.sold.imagination import imagine
 from playslot_rl.baselines.sold.learner import SOLDLearner
 from playslot_rl.training.seeding import StepGenerators
@@ -39,7 +40,7 @@ def test_every_loss_moves_its_own_network(
         learner, "_step", lambda n, loss, keep=False: step(n, loss, keep) if n == name else torch.zeros(())
     )
     learner.update(batch, StepGenerators(0, 0))
-    followers = {"returns"} | ({"slow_critic"} if name == "critic" else set())
+    followers = {"returns"} | {"critic": {"slow_critic"}, "actor": {"mean_actor"}}.get(name, set())
     assert _moved(learner, before) == {name} | followers
 
 
@@ -48,7 +49,7 @@ def test_savi_is_untouched_even_by_the_image_loss(make_learner: Make, batch: Ten
     before = _weights(learner)
     metrics = learner.update(batch, StepGenerators(0, 0))
     assert metrics["image_mse"] > 0
-    assert _moved(learner, before) == {*NETWORKS, "slow_critic", "returns"}
+    assert _moved(learner, before) == {*NETWORKS, "slow_critic", "mean_actor", "returns"}
     assert all(parameter.grad is None for parameter in learner.savi.parameters())
 
 
@@ -75,6 +76,34 @@ def test_the_slow_critic_follows_at_its_rate(make_learner: Make, batch: TensorDi
     learner.update(batch, StepGenerators(0, 0))
     expected = 0.75 * old + 0.25 * learner.networks.critic.out.weight
     torch.testing.assert_close(learner.slow_critic.out.weight, expected)
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.75])
+def test_the_mean_actor_follows_at_its_rate_and_is_what_a_run_keeps(
+    make_learner: Make, batch: TensorDict, decay: float
+) -> None:
+    learner = make_learner(actor_average=decay)
+    old = {key: value.clone() for key, value in learner.mean_actor.state_dict().items()}
+    learner.update(batch, StepGenerators(0, 0))
+    for key, value in learner.networks.actor.state_dict().items():
+        expected = decay * old[key] + (1 - decay) * value
+        torch.testing.assert_close(
+            learner.trained["actor"].state_dict()[key], expected, rtol=0, atol=1e-7 * (decay > 0)
+        )
+
+
+def test_the_last_weights_explore_and_their_average_is_evaluated(make_learner: Make, batch: TensorDict) -> None:
+    learner = make_learner(actor_average=0.5, actor_lr=0.1)
+    learner.update(batch, StepGenerators(0, 0))
+    memory = learner.initial(1)
+    memory[keys.PIXELS] = torch.zeros(1, 3, 64, 64, dtype=torch.uint8)
+    slots = learner.act(memory, torch.Generator().manual_seed(0), explore=False)[keys.SLOTS].unsqueeze(1)
+    best, _, _ = learner.mean_actor(slots)
+    location, std, _ = learner.networks.actor(slots)
+    sampled = sample_action(action_distribution(location[:, 0], std[:, 0]), torch.Generator().manual_seed(0))
+    for explore, expected in ((False, best[:, 0]), (True, sampled)):
+        seen = learner.act(memory, torch.Generator().manual_seed(0), explore)
+        torch.testing.assert_close(seen[keys.ACTION], expected)
 
 
 def test_the_first_updates_may_leave_actor_and_critic_alone(make_learner: Make, batch: TensorDict) -> None:
