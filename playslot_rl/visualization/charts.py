@@ -38,6 +38,12 @@ def _style(axes: Axes, theme: Theme) -> None:
         spine.set_color(theme.grid)
 
 
+def _step_axis(axes: Axes) -> None:
+    """Few ticks, thousands separated: long numbers side by side run into each other."""
+    axes.locator_params(axis="x", nbins=6)
+    axes.xaxis.set_major_formatter("{x:,.0f}")
+
+
 def _png(figure: Figure, theme: Theme) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=144, facecolor=theme.ground)

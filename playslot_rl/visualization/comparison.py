@@ -6,7 +6,7 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from playslot_rl.visualization.charts import _figure, _style
+from playslot_rl.visualization.charts import _figure, _step_axis, _style
 from playslot_rl.visualization.palette import METHOD_STYLES, Theme
 
 if TYPE_CHECKING:
@@ -119,8 +119,7 @@ def _steps(axes: Axes, curves: Sequence[Result], final: Sequence[Result], theme:
             axes.plot([r["env_steps"] for r in dots], rates, ".", color=colour, markersize=4, alpha=0.5)
         if not any(row["method"] == method and row["env_steps"] is not None for row in final):
             axes.plot([], [], color=colour, marker=style.marker, label=(own or list(final))[0]["title"])
-    axes.locator_params(axis="x", nbins=6)
-    axes.xaxis.set_major_formatter("{x:,.0f}")
+    _step_axis(axes)
     axes.set_xlabel("environment steps (lines: development episodes)")
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from playslot_rl.baselines.methods import METHODS
-from playslot_rl.visualization.charts import _figure, _png, _style
+from playslot_rl.visualization.charts import _figure, _png, _step_axis, _style
 from playslot_rl.visualization.palette import METHOD_STYLES, Theme
 
 
@@ -53,8 +53,7 @@ def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Ma
     right.set_ylim(-3, 103)
     for axes in (left, right):
         axes.set_xlabel("agent steps", fontsize=9)
-        axes.locator_params(axis="x", nbins=6)
-        axes.xaxis.set_major_formatter("{x:,.0f}")
+        _step_axis(axes)
         _style(axes, theme)
     figure.legend(loc="outside upper right", ncols=4, frameon=False, labelcolor=theme.text, fontsize=9)
     return _png(figure, theme)

@@ -25,9 +25,8 @@ class Replay:
     """A ring of the latest episodes.
 
     Every frame comes with `keys.ACTION` and `keys.REWARD`, of the step that led to it (the reward as the task gave it;
-    `sample` multiplies it by `reward_scale`), and `keys.IS_FIRST` and
-    `keys.IS_LAST`. A sequence no longer than an episode lies within one; a longer one runs on into the next episode,
-    with its `IS_FIRST`.
+    `sample` multiplies it by `reward_scale`), and `keys.IS_FIRST` and `keys.IS_LAST`. A sequence no longer than an
+    episode lies within one; a longer one runs on into the next episode, with its `IS_FIRST`.
 
     Args:
         config: batch, sequence length, capacity.
