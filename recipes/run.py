@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,9 +12,12 @@ from playslot_rl.config import ExperimentConfig, StageConfig, to_dict
 from playslot_rl.errors import ConfigError, DataError, OutputError
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
     import torch
 
     from playslot_rl.data.source import EpisodeFrames
+    from playslot_rl.modules.savi import SAVi
 
 OURS = ("slots", "dynamics", "policy", "world_model.json")  # known names of a run folder without config.json
 
@@ -100,6 +103,28 @@ def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrame
 def demo_root(config: ExperimentConfig) -> str:
     """Data set of the demonstrations: `data.demos`, or else `data.root`."""
     return config.data.demos or config.data.root
+
+
+def demonstration_views(
+    config: ExperimentConfig, videos: EpisodeFrames, source: EpisodeFrames, savi: SAVi, slots_print: str
+) -> Sequence[tuple[EpisodeFrames, npt.NDArray[np.float32]]]:
+    """Demonstrations and their shifted copies (`behaviour.shift`), each with the slots of its frames, cached on disk.
+
+    Args:
+        config: of the command.
+        videos: the data set.
+        source: the demonstrations, the first episodes of it.
+        savi: parses the frames, on its device.
+        slots_print: fingerprint of SAVi's checkpoint.
+    """
+    from playslot_rl.data.shifted import parsed_views
+    from playslot_rl.data.slot_cache import slot_cache
+    from playslot_rl.world_model import module_device
+
+    def parse(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
+        return slot_cache(frames, savi, slots_print, config.data.cache, module_device(savi), config.logging.progress)
+
+    return parsed_views(videos, source, config.behaviour.shift, config.behaviour.shifted_copies, parse)
 
 
 def parent_run(config: ExperimentConfig, folder: Path) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
     demo_root,
+    demonstration_views,
     finished,
     fixed_keys,
     open_device,
@@ -22,12 +23,8 @@ from playslot_rl.recipes.run import (
 )
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
     import torch
 
-    from playslot_rl.data.demonstrations import Demonstrations
-    from playslot_rl.data.source import EpisodeFrames
     from playslot_rl.training.checkpoints import StageCheckpoint
     from playslot_rl.training.fit import FitResult, Stage
     from playslot_rl.world_model import Agent, WorldModel
@@ -41,7 +38,12 @@ def main(config: ExperimentConfig) -> None:
         DataError: no demonstrations, none with actions, or fewer than `demos` or `behaviour.labelled_demos`.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.data.demonstrations import first_demonstrations, require_labelled
+    from playslot_rl.data.demonstrations import (
+        first_demonstrations,
+        label_demonstrations,
+        require_labelled,
+        with_copies,
+    )
     from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
     from playslot_rl.training.fit import fit
     from playslot_rl.training.runs import use_world_model
@@ -63,7 +65,8 @@ def main(config: ExperimentConfig) -> None:
     require_labelled(config.behaviour.labelled_demos, source.episodes)  # before anything is computed
     world, agent = _untrained(config, parent, device)
     prints = {name: checkpoint.fingerprint for name, checkpoint in parents.items()}
-    demos = _parsed(config, world, videos, source, prints["slots"])
+    views = demonstration_views(config, videos, source, world.savi, prints["slots"])
+    demos = with_copies([label_demonstrations(world, frames, slots, device) for frames, slots in views])
     sizes = to_dict(world.config)
     behaviour = config.behaviour
 
@@ -140,21 +143,3 @@ def _untrained(config: ExperimentConfig, parent: str | Path, device: torch.devic
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derived_seed(config.seed, 0, "policy"))
         return world, Agent.untrained(world, oracle=config.behaviour.oracle).to(device)
-
-
-def _parsed(
-    config: ExperimentConfig, world: WorldModel, videos: EpisodeFrames, source: EpisodeFrames, slots_print: str
-) -> Demonstrations:
-    """Slots and latents of the demonstrations `source`, the first of `videos`, and of their shifted copies."""
-    from playslot_rl.data.demonstrations import label_demonstrations, with_copies
-    from playslot_rl.data.shifted import parsed_views
-    from playslot_rl.data.slot_cache import slot_cache
-    from playslot_rl.world_model import module_device
-
-    device, behaviour = module_device(world), config.behaviour
-
-    def parse(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
-        return slot_cache(frames, world.savi, slots_print, config.data.cache, device, config.logging.progress)
-
-    views = parsed_views(videos, source, behaviour.shift, behaviour.shifted_copies, parse)
-    return with_copies([label_demonstrations(world, frames, slots, device) for frames, slots in views])

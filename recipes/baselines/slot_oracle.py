@@ -6,11 +6,11 @@ Sizes are `model.policy`, the schedule is `behaviour`, as for PlaySlot's policy.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
     demo_root,
+    demonstration_views,
     finished,
     fixed_keys,
     open_device,
@@ -19,12 +19,6 @@ from playslot_rl.recipes.run import (
     parent_run,
     store_config,
 )
-
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    from playslot_rl.data.source import EpisodeFrames
 
 
 def main(config: ExperimentConfig) -> None:
@@ -39,8 +33,6 @@ def main(config: ExperimentConfig) -> None:
 
     from playslot_rl.baselines.oracles.slot import NAME
     from playslot_rl.data.demonstrations import first_demonstrations, real_actions, transitions
-    from playslot_rl.data.shifted import parsed_views
-    from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.modules.policy import LatentPolicy
     from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
     from playslot_rl.training.fit import fit
@@ -78,11 +70,7 @@ def main(config: ExperimentConfig) -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derived_seed(config.seed, 0, NAME))
         oracle = LatentPolicy(model.policy, model.savi.slot_dim, config.env.action_dim).to(device)
-
-    def parsed(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
-        return slot_cache(frames, savi, slots.fingerprint, config.data.cache, device, config.logging.progress)
-
-    views = parsed_views(videos, source, config.behaviour.shift, config.behaviour.shifted_copies, parsed)
+    views = demonstration_views(config, videos, source, savi, slots.fingerprint)
     inputs = torch.cat([torch.from_numpy(cached[moves.rows]) for _, cached in views])
     stage = oracle_stage(oracle, inputs.to(device), actions.repeat(len(views), 1), config.behaviour)
     result = fit(
