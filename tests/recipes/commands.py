@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import multiprocessing
 import re
+import signal
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,6 +63,26 @@ def _defaults(arguments: tuple[object, ...]) -> tuple[str, ...]:
     own_config = any(text.startswith("run=") and text != "run=pretrained" for text in texts)
     named = any(text.startswith("preset=") for text in texts)
     return () if own_config or named else ("preset=smoke",)
+
+
+def killed_at_first_checkpoint(folder: Path, *command: object) -> None:
+    """Run a command in a process of its own, and kill it (SIGKILL) when its stage's first checkpoint is there.
+
+    The process starts from a server that has the imports already. It calls `cli.main`, which it finds by name wherever
+    the tests lie: other packages install a module `tests` too.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["torchrl.objectives", "torchvision", "playslot_rl.training.checkpoints"])
+    process = context.Process(target=cli.main, args=(list(map(str, command)),))
+    process.start()
+    limit = time.monotonic() + 120
+    while not list((folder / "checkpoints").glob("step_*")) and time.monotonic() < limit:
+        assert process.is_alive(), "finished before it could be killed"
+        time.sleep(0.002)
+    process.kill()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    assert not (folder / "checkpoint").exists()
 
 
 def contents(folder: Path) -> dict[str, str]:

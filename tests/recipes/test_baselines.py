@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import shutil
-import signal
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import ONE_CORE, contents, refused, smoke, weights
+from commands import ONE_CORE, contents, killed_at_first_checkpoint, refused, smoke, weights
 
-from playslot_rl import cli
 from playslot_rl.compose import compose
 from playslot_rl.config import to_dict
 
@@ -188,18 +184,7 @@ def test_a_killed_training_ends_with_the_weights_of_one_that_was_not(
 ) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     smoke(*_command(method, shared_run, whole, *SECOND_HALF[method]))
-    command = [*_command(method, shared_run, killed, *SECOND_HALF[method]), *ONE_CORE]
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["torchrl.data", "torchvision", "playslot_rl.training.checkpoints"])
-    process = context.Process(target=cli.main, args=(command,))
-    process.start()
-    limit = time.monotonic() + 120
-    while not list((killed / method / "checkpoints").glob("step_*")) and time.monotonic() < limit:
-        assert process.is_alive()
-        time.sleep(0.002)
-    process.kill()
-    process.join()
-    assert process.exitcode == -signal.SIGKILL
-    assert not (killed / method / "checkpoint").exists()
-    smoke(*command[: -len(ONE_CORE)])
+    command = _command(method, shared_run, killed, *SECOND_HALF[method])
+    killed_at_first_checkpoint(killed / method, *command, *ONE_CORE)
+    smoke(*command)
     assert weights(killed, method) == weights(whole, method)

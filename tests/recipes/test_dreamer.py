@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 import torch
+from commands import killed_at_first_checkpoint
 
 from playslot_rl.baselines.actor import ActorController
 from playslot_rl.baselines.dreamer.load import load_actor
@@ -108,19 +104,7 @@ def test_what_cannot_be_learned_from_is_refused_before_anything_is_written(
 @pytest.mark.slow
 def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "killed"
-    code = (
-        "import sys; from playslot_rl.compose import compose; from playslot_rl.recipes.baselines import dreamer; "
-        "dreamer.main(compose(sys.argv[1:]))"
-    )
-    command = [sys.executable, "-c", code, *SMOKE, f"out={out}"]
-    process = subprocess.Popen(command, env=os.environ)
-    limit = time.monotonic() + 200
-    while not list((out / "dreamer" / "checkpoints").glob("step_*")) and time.monotonic() < limit:
-        assert process.poll() is None, "finished before it could be killed"
-        time.sleep(0.005)
-    process.kill()
-    assert process.wait(timeout=30) == -signal.SIGKILL
-    assert not (out / "dreamer" / "checkpoint").exists()
-    subprocess.run(command, check=True, env=os.environ, timeout=200)
+    killed_at_first_checkpoint(out / "dreamer", "train-baseline", *SMOKE, f"out={out}")
+    train(out)
     assert weights(out) == weights(run)
     assert not list(out.rglob("*.tmp-*"))

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from commands import smoke
+from commands import killed_at_first_checkpoint, smoke
 from safetensors.torch import load_file
 
 from playslot_rl.baselines.actor import ActorController
@@ -28,10 +23,11 @@ from playslot_rl.modules.savi import SAVi
 from playslot_rl.recipes.baselines import sold
 from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
 
+FIXED = ("preset=smoke", "method=sold", "device=cpu", "threads=1", "logging.backend=none")
+
 
 def _config(world: Path, out: Path, *overrides: str) -> ExperimentConfig:
-    fixed = ("preset=smoke", "method=sold", "device=cpu", "threads=1", "logging.backend=none")
-    return compose([*fixed, f"run={world}", f"out={out}", *overrides])
+    return compose([*FIXED, f"run={world}", f"out={out}", *overrides])
 
 
 def _weights(run: Path) -> bytes:
@@ -212,19 +208,6 @@ def test_settings_that_cannot_be_are_refused(override: str, message: str) -> Non
 @pytest.mark.slow
 def test_a_killed_run_ends_with_the_same_weights(trained: Path, world: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    code = (
-        "import sys; from playslot_rl.compose import compose; from playslot_rl.recipes.baselines import sold; "
-        "sold.main(compose(sys.argv[1:]))"
-    )
-    fixed = ("preset=smoke", "method=sold", "device=cpu", "threads=1", "logging.backend=none")
-    command = [sys.executable, "-c", code, *fixed, f"run={world}", f"out={run}"]
-    process = subprocess.Popen(command, env=os.environ)
-    deadline = time.monotonic() + 120
-    while not list((run / "sold" / "checkpoints").glob("step_*")) and time.monotonic() < deadline:
-        assert process.poll() is None, "finished before it could be killed"
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait(timeout=30)
-    assert not (run / "sold" / "checkpoint").exists()
-    subprocess.run(command, check=True, env=os.environ, timeout=200)
+    killed_at_first_checkpoint(run / "sold", "train-baseline", *FIXED, f"run={world}", f"out={run}")
+    sold.main(_config(world, run))
     assert _weights(run) == _weights(trained)
