@@ -24,7 +24,7 @@ def main() -> int:
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="changes of the config")
     options = parser.parse_intermixed_args()
 
-    from playslot_rl.compose import compose
+    from playslot_rl.config.compose import compose
     from playslot_rl.envs.rendering import import_mujoco
     from playslot_rl.errors import PlaySlotError
 
@@ -34,8 +34,8 @@ def main() -> int:
         import torch
 
         torch.set_num_threads(1)  # as in the workers
-        from playslot_rl.benchmark.collecting import measure, table
-        from playslot_rl.training.atomic import write_json
+        from playslot_rl.speed.collecting import measure, table
+        from playslot_rl.storage.atomic import write_json
 
         figures = measure(
             config,

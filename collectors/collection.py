@@ -14,8 +14,8 @@ from playslot_rl.collectors.journal import Journal, journal_path, read_spec
 from playslot_rl.collectors.spec import CollectionSpec, completed, difference
 from playslot_rl.config import CollectorConfig, ExperimentConfig
 from playslot_rl.errors import DataError, OutputError
+from playslot_rl.progress import format_seconds
 from playslot_rl.threads import available_cores
-from playslot_rl.training.progress import format_seconds
 
 PLAIN_EVERY_S = 10.0
 """Seconds between progress lines where standard error is no terminal."""

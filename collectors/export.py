@@ -22,7 +22,7 @@ from playslot_rl.collectors.journal import Journal
 from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.data.quiet import quiet_datasets
 from playslot_rl.errors import OutputError
-from playslot_rl.training.atomic import explain_write_errors, replace_dir, write_json
+from playslot_rl.storage.atomic import explain_write_errors, replace_dir, write_json
 
 META_NAME = "meta/playslot.json"
 PACKAGES = ("metaworld", "gymnasium-robotics", "mujoco", "gymnasium", "torchrl", "lerobot", "playslot_rl")

@@ -15,7 +15,7 @@ from playslot_rl.collectors.encoding import encode, read
 from playslot_rl.collectors.episodes import Episode
 from playslot_rl.collectors.spec import CollectionSpec, completed, difference
 from playslot_rl.errors import OutputError
-from playslot_rl.training.atomic import explain_write_errors, write_bytes, write_json
+from playslot_rl.storage.atomic import explain_write_errors, write_bytes, write_json
 
 SPEC_NAME = "collection.json"
 LOCK_NAME = "lock"

@@ -55,7 +55,7 @@ def load(run: str | Path = "pretrained", device: str = "", seed: int = 0) -> Pla
         4
     """
     from playslot_rl.sharing.config import is_model_folder
-    from playslot_rl.training.checkpoints import checkpoint_folder
+    from playslot_rl.storage.checkpoints import checkpoint_folder
     from playslot_rl.training.runs import load_agent, load_world_model, run_folder
 
     if is_model_folder(Path(run)):

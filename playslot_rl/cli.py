@@ -149,7 +149,7 @@ COMMANDS: Final[dict[str, Command]] = {
 GROUPS: Final = {"dataset": "data sets: info, verify, repair, merge, split, viz, push, pull"}
 """Commands with actions and options of their own instead of `key=value`."""
 
-KEYS_HELP: Final = """common keys (any key of playslot_rl/config.py works, with dots: slots.optim.lr=5e-4):
+KEYS_HELP: Final = """common keys (any key of playslot_rl/config works, with dots: slots.optim.lr=5e-4):
   env=button_press      the task
   preset=compact        sizes and schedule: smoke (seconds, for tests), compact (two CPU cores), paper (one GPU)
   policy=expert         collector policy: random or expert
@@ -233,7 +233,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(name: str, options: argparse.Namespace) -> int:
-    from playslot_rl.compose import compose
+    from playslot_rl.config.compose import compose
 
     try:
         config = compose(options.overrides, name)

@@ -19,7 +19,7 @@ from playslot_rl.errors import ConfigError
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.policy import LatentPolicy
-from playslot_rl.modules.predictor import COCVP
+from playslot_rl.modules.predictors.cocvp import COCVP
 from playslot_rl.modules.savi import SAVi
 
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from playslot_rl.comparison.config import CompareConfig
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.compare import CompareConfig
 from playslot_rl.errors import OutputError, PlaySlotError
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def _run_due(config: ExperimentConfig, report: Comparison) -> None:
     """
     from playslot_rl.comparison.launch import run_in_sequence, run_process, run_sweep
     from playslot_rl.comparison.status import read_status
-    from playslot_rl.training.atomic import write_json
+    from playslot_rl.storage.atomic import write_json
 
     due = {}
     for job, record in report.jobs.items():

@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from playslot_rl.baselines.methods import METHODS
 from playslot_rl.config import DataConfig, ExperimentConfig, from_dict
+from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import ConfigError
 from playslot_rl.recipes.run import open_videos
 
@@ -125,7 +125,7 @@ class Parents:
 
     def __init__(self, config: ExperimentConfig, out: Path) -> None:
         from playslot_rl.comparison.plan import uses_demos, uses_slots
-        from playslot_rl.training.checkpoints import checkpoint_folder, read_stage
+        from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
         from playslot_rl.training.runs import world_model_checkpoints
 
         stages = world_model_checkpoints(config.run).items() if uses_slots(config) else ()

@@ -10,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from playslot_rl.baselines.methods import METHODS
-from playslot_rl.compose import shipped
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.compose import shipped
+from playslot_rl.config.methods import METHODS
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes import baselines, objects
@@ -42,7 +42,7 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
     if config.env.name in PROCEDURAL:
         objects.main(config, run)
         return
-    from playslot_rl.evaluation.episodes import TaskPool
+    from playslot_rl.acting.episodes import TaskPool
     from playslot_rl.evaluation.success import check_protocol, evaluate_run, run_facts
     from playslot_rl.recipes.run import open_device
     from playslot_rl.training.runs import load_agent

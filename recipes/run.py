@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from playslot_rl.compose import SHIPPED, shipped
 from playslot_rl.config import ExperimentConfig, StageConfig, to_dict
+from playslot_rl.config.compose import SHIPPED, shipped
 from playslot_rl.errors import ConfigError, DataError, OutputError
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def store_config(config: ExperimentConfig, folder: Path) -> None:
     Raises:
         OutputError: the folder cannot be written.
     """
-    from playslot_rl.training.atomic import write_json
+    from playslot_rl.storage.atomic import write_json
 
     write_json(folder / "config.json", to_dict(config))
 
@@ -154,7 +154,7 @@ def finished(
     """
     from playslot_rl.data.demonstrations import first_demonstrations
     from playslot_rl.errors import CheckpointError
-    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, require_parents
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, require_parents
 
     path = checkpoint_folder(folder, stage)
     if not (path / "meta.json").is_file():

@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib
 from pathlib import Path
 
-from playslot_rl.baselines.methods import METHODS
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.methods import METHODS
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import ConfigError
 

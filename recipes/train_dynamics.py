@@ -18,10 +18,10 @@ def main(config: ExperimentConfig) -> None:
     import torch
 
     from playslot_rl.data.slot_cache import slot_cache
-    from playslot_rl.training.checkpoints import checkpoint_folder, load_weights, read_stage, require_config, save_stage
+    from playslot_rl.seeding import derived_seed
+    from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage, require_config, save_stage
     from playslot_rl.training.fit import fit
     from playslot_rl.training.runs import adopt_stage, require_adoptable, run_folder, stage_model
-    from playslot_rl.training.seeding import derived_seed
     from playslot_rl.training.stage_dynamics import DynamicsStage
     from playslot_rl.world_model import WorldModel
 

@@ -25,7 +25,7 @@ from playslot_rl.recipes.run import (
 if TYPE_CHECKING:
     import torch
 
-    from playslot_rl.training.checkpoints import StageCheckpoint
+    from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.fit import FitResult, Stage
     from playslot_rl.world_model import Agent, WorldModel
 
@@ -44,7 +44,7 @@ def main(config: ExperimentConfig) -> None:
         require_labelled,
         with_copies,
     )
-    from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
+    from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
     from playslot_rl.training.fit import fit
     from playslot_rl.training.runs import use_world_model
     from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage
@@ -111,7 +111,7 @@ def main(config: ExperimentConfig) -> None:
 
 def _world_model_of(config: ExperimentConfig, parent: str | Path, run: Path) -> dict[str, StageCheckpoint]:
     """The world model's checkpoints: whole, of this task's frames and actions, and fit for `run`."""
-    from playslot_rl.training.checkpoints import require_config
+    from playslot_rl.storage.checkpoints import require_config
     from playslot_rl.training.runs import require_adoptable, world_model_checkpoints
 
     parents = world_model_checkpoints(parent)
@@ -134,8 +134,8 @@ def _untrained(config: ExperimentConfig, parent: str | Path, device: torch.devic
     """The frozen world model, and fresh policy, oracle and decoder on top of it."""
     import torch
 
+    from playslot_rl.seeding import derived_seed
     from playslot_rl.training.runs import load_world_model
-    from playslot_rl.training.seeding import derived_seed
     from playslot_rl.world_model import Agent
 
     world = load_world_model(parent, device)

@@ -15,10 +15,10 @@ def main(config: ExperimentConfig) -> None:
     import torch
 
     from playslot_rl.modules.savi import SAVi
-    from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
+    from playslot_rl.seeding import derived_seed
+    from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
     from playslot_rl.training.fit import fit
     from playslot_rl.training.runs import load_savi, slots_fingerprint
-    from playslot_rl.training.seeding import derived_seed
     from playslot_rl.training.stage_slots import SlotsStage
     from playslot_rl.training.warm_start import warm_start
 

@@ -16,8 +16,8 @@ from playslot_rl import api
 from playslot_rl.api import PlaySlot
 from playslot_rl.config import to_dict
 from playslot_rl.errors import CheckpointError
+from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
 from playslot_rl.testing import tiny_config
-from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
 from playslot_rl.world_model import Agent
 
 

@@ -74,7 +74,7 @@ def test_help_explains_with_examples_and_the_common_keys(command: str, capsys: p
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_example_in_the_help_is_accepted(command: str, recipe: Callable[[str, Recipe], None]) -> None:
-    from playslot_rl.compose import compose
+    from playslot_rl.config.compose import compose
 
     for example in cli.COMMANDS[command].examples:
         words = example.split()

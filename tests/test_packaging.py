@@ -150,7 +150,7 @@ def test_the_wheel_works_outside_the_repository(repository: Path, tmp_path: Path
     subprocess.run([*install, "--target", str(target), str(copy)], check=True, capture_output=True)
     code = (
         "import playslot_rl, multiprocessing as mp\n"
-        "from playslot_rl.compose import choices, compose\n"
+        "from playslot_rl.config.compose import choices, compose\n"
         "from playslot_rl.envs import make_env\n"
         "print(playslot_rl.__file__, compose(['preset=smoke']).preset, 'block_push' in choices('env'))\n"
     )

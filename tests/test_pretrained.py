@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from playslot_rl.compose import compose
-from playslot_rl.training.atomic import write_json
-from playslot_rl.training.checkpoints import read_stage
+from playslot_rl.config.compose import compose
+from playslot_rl.storage.atomic import write_json
+from playslot_rl.storage.checkpoints import read_stage
 from playslot_rl.training.runs import load_agent, load_world_model, pretrained_folder
 
 ENVS = ("button_press", "block_push_easy", "block_push")

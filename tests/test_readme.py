@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from playslot_rl import cli
-from playslot_rl.compose import compose
+from playslot_rl.config.compose import compose
 from playslot_rl.datasets.command import parser as dataset_parser
 
 ROOT = Path(__file__).resolve().parents[1]

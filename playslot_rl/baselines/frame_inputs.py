@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.training.seeding import StepGenerators
+from playslot_rl.seeding import StepGenerators
 
 
 class FrameInputs:

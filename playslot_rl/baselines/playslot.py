@@ -1,6 +1,6 @@
 """PlaySlot as an actor: parse, latent policy, action decoder (closed loop).
 
-Acts as `playslot_rl.evaluation.controllers.ClosedLoop` does (tested), so that it can be compared with the baselines.
+Acts as `playslot_rl.acting.controllers.ClosedLoop` does (tested), so that it can be compared with the baselines.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from pathlib import Path
 
 import torch
 
-from playslot_rl.baselines.actor import Actor
-from playslot_rl.baselines.slot_actor import SlotActor
+from playslot_rl.acting.actor import Actor
+from playslot_rl.acting.slot_actor import SlotActor
 from playslot_rl.world_model import Agent, action_decoder_module, latent_policy_module
 
 

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from playslot_rl.baselines.methods import METHODS, MethodName
 from playslot_rl.baselines.online.requirements import require_online
-from playslot_rl.comparison.config import LAUNCHERS
-from playslot_rl.compose import shipped
 from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config.compare import LAUNCHERS
+from playslot_rl.config.compose import shipped
+from playslot_rl.config.methods import METHODS, MethodName
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
 
@@ -113,7 +113,7 @@ def check_comparison(config: ExperimentConfig) -> None:
     if wanted.launcher and importlib.util.find_spec(LAUNCHERS[wanted.launcher]) is None:
         raise _no_launcher(wanted.launcher)
     if uses_slots(config) and config.run:
-        from playslot_rl.training.checkpoints import require_config
+        from playslot_rl.storage.checkpoints import require_config
         from playslot_rl.training.runs import world_model_checkpoints
 
         for checkpoint in world_model_checkpoints(config.run).values():

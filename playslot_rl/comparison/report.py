@@ -8,19 +8,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.comparison.plan import Job, uses_slots
 from playslot_rl.comparison.results import failures, job_rows, summarise
 from playslot_rl.comparison.status import read_status
 from playslot_rl.comparison.table import comparison_page
-from playslot_rl.compose import shipped
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.evaluation.episodes import TaskPool
+from playslot_rl.config.compose import shipped
 from playslot_rl.evaluation.references import run_references
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
 from playslot_rl.evaluation.success import hardware
-from playslot_rl.training.atomic import write_bytes, write_json, write_text
-from playslot_rl.training.checkpoints import checkpoint_folder, read_stage
-from playslot_rl.training.provenance import provenance
+from playslot_rl.storage.atomic import write_bytes, write_json, write_text
+from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+from playslot_rl.storage.provenance import provenance
 from playslot_rl.training.runs import world_model_checkpoints
 from playslot_rl.visualization.comparison import comparison_figure, figure_bytes
 from playslot_rl.visualization.palette import LIGHT

@@ -8,9 +8,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from playslot_rl.baselines.methods import METHODS
 from playslot_rl.comparison.plan import Job
 from playslot_rl.comparison.status import Status, read_status
+from playslot_rl.config.methods import METHODS
 from playslot_rl.evaluation.intervals import wilson
 
 
@@ -82,7 +82,7 @@ def count_samples(job: Job, meta: Mapping[str, Any]) -> int | None:
 
 def count_parameters(run: Path, stage: str) -> int:
     """Floating-point numbers in a run's checkpoint and in those of its parents (weights, and a few buffers)."""
-    from playslot_rl.training.checkpoints import checkpoint_folder
+    from playslot_rl.storage.checkpoints import checkpoint_folder
     from playslot_rl.training.runs import world_model_folder
 
     parents = _read(checkpoint_folder(run, stage) / "meta.json").get("parents", {})

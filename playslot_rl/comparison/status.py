@@ -10,9 +10,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final, Literal
 
+from playslot_rl.config.plain import from_dict
 from playslot_rl.errors import OutputError
-from playslot_rl.plain import from_dict
-from playslot_rl.training.atomic import write_json
+from playslot_rl.storage.atomic import write_json
 
 LOCK: Final = "comparison.lock"
 

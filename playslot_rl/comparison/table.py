@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from playslot_rl.baselines.methods import METHODS
 from playslot_rl.comparison.results import failures
+from playslot_rl.config.methods import METHODS
 
 Result = Mapping[str, Any]
 

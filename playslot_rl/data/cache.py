@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.errors import DataError
-from playslot_rl.training.atomic import explain_write_errors, replace_dir
+from playslot_rl.storage.atomic import explain_write_errors, replace_dir
 
 
 def cache_folder(cache: str | Path = "") -> Path:

@@ -17,7 +17,7 @@ from playslot_rl import keys
 from playslot_rl.data.cache import ArrayWriter, build_once, cache_folder, require_outside
 from playslot_rl.data.lerobot_files import LeRobotFiles
 from playslot_rl.errors import DataError
-from playslot_rl.training.atomic import write_json
+from playslot_rl.storage.atomic import write_json
 
 _FORMAT = "1"
 

@@ -28,7 +28,7 @@ from playslot_rl import keys
 from playslot_rl.data.quiet import quiet_datasets
 from playslot_rl.data.tfrecord import Value, parse_example, read_records
 from playslot_rl.errors import ConfigError, DataError, OutputError
-from playslot_rl.training.atomic import explain_write_errors, replace_dir, write_json
+from playslot_rl.storage.atomic import explain_write_errors, replace_dir, write_json
 
 CAMERAS: Final = {
     "front_left": "pixels/basket_front_left",

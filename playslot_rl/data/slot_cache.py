@@ -18,7 +18,7 @@ import torch
 
 from playslot_rl.data.cache import ArrayWriter, build_once, cache_folder, load_cached
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.training.seeding import step_generator
+from playslot_rl.seeding import step_generator
 
 if TYPE_CHECKING:
     from playslot_rl.modules.savi import SAVi

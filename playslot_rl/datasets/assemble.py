@@ -35,7 +35,7 @@ from playslot_rl.datasets.contents import (
 from playslot_rl.datasets.statistics import aggregate, of_numbers
 from playslot_rl.datasets.video_copy import DEFAULT_FILES, DEFAULT_SIZE_MB, VideoCopier
 from playslot_rl.errors import DataError
-from playslot_rl.training.atomic import write_json
+from playslot_rl.storage.atomic import write_json
 
 DATA_SIZE_MB: Final = 100
 ROWS_OF_METADATA: Final = 1000

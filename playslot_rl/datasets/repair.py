@@ -21,7 +21,7 @@ from playslot_rl.datasets.transaction import new_folder, require_free
 from playslot_rl.datasets.verify import LOOSE_CAMERA, Verification, episode_statistics, verify
 from playslot_rl.datasets.video_copy import frame_count
 from playslot_rl.errors import DataError, OutputError
-from playslot_rl.training.atomic import explain_write_errors, fsync_folder
+from playslot_rl.storage.atomic import explain_write_errors, fsync_folder
 
 JOURNAL_SUFFIX = ".journal"
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from playslot_rl.datasets.verify import Verification, verify
 from playslot_rl.errors import DataError, OutputError
-from playslot_rl.training.atomic import explain_write_errors, replace_dir
+from playslot_rl.storage.atomic import explain_write_errors, replace_dir
 
 
 def require_free(out: Path) -> None:

@@ -60,7 +60,7 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
         DataError: the data set is damaged.
         OutputError: the file cannot be written.
     """
-    from playslot_rl.training.atomic import write_text
+    from playslot_rl.storage.atomic import write_text
     from playslot_rl.visualization.document import Document, Section, Table
     from playslot_rl.visualization.html import to_html
 

@@ -23,7 +23,7 @@ from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_se
 from playslot_rl.evaluation.segmentation import adjusted_rand_index, match_slots
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.evaluation.video import video_metrics
-from playslot_rl.training.atomic import write_json
+from playslot_rl.storage.atomic import write_json
 from playslot_rl.training.runs import world_model_checkpoints
 from playslot_rl.world_model import WorldModel, module_device, normalise
 

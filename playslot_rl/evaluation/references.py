@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from playslot_rl.acting.episodes import Actions, Controller, Episode, Moment, TaskPool, run_episodes
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.evaluation.episodes import Actions, Controller, Episode, Moment, TaskPool, run_episodes
 from playslot_rl.evaluation.intervals import wilson
-from playslot_rl.training.atomic import write_json
+from playslot_rl.storage.atomic import write_json
 
 
 class RandomController:

@@ -15,14 +15,14 @@ from typing import Any
 
 import torch
 
-from playslot_rl.baselines.actor import Actor, ActorController
+from playslot_rl.acting.actor import Actor, ActorController
+from playslot_rl.acting.controllers import ClosedLoop, OpenLoop
+from playslot_rl.acting.episodes import Controller, TaskPool, run_episodes
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.evaluation.controllers import ClosedLoop, OpenLoop
-from playslot_rl.evaluation.episodes import Controller, TaskPool, run_episodes
 from playslot_rl.evaluation.references import episode_records, run_references, summary
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
-from playslot_rl.training.atomic import write_json
+from playslot_rl.storage.atomic import write_json
 from playslot_rl.world_model import Agent
 
 PROTOCOLS = ("simulation", "imagination")
@@ -38,7 +38,7 @@ class RunFacts:
         labelled_demos: those of them whose real actions were used; None if the run does not say.
         fingerprints: weights of each stage.
         commit: commit the policy was trained from.
-        method: a name of `playslot_rl.baselines.methods`.
+        method: a name of `playslot_rl.config.methods`.
         extra: what the method's checkpoint says of its own (`pretraining`, `env_steps`).
     """
 

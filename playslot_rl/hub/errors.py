@@ -7,7 +7,7 @@ from pathlib import Path
 
 from playslot_rl.errors import HubError, OutputError, PlaySlotError
 from playslot_rl.hub.secrets import chain
-from playslot_rl.training.atomic import explain_write_errors
+from playslot_rl.storage.atomic import explain_write_errors
 
 LOG_IN = "run `hf auth login` once, or set HF_TOKEN"
 

@@ -17,7 +17,7 @@ from playslot_rl.hub.checks import Content, check_after_pull
 from playslot_rl.hub.layout import FORMAT_TAG, RemoteFile, is_pulled, same_content
 from playslot_rl.hub.record import SCHEME, read_origin, read_record, write_origin
 from playslot_rl.hub.session import Repository, open_repository
-from playslot_rl.training.atomic import explain_write_errors, replace_dir
+from playslot_rl.storage.atomic import explain_write_errors, replace_dir
 
 INFO = "meta/info.json"
 SPARE = 64 << 20

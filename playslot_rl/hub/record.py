@@ -10,7 +10,7 @@ from typing import Any
 from playslot_rl.errors import HubError
 from playslot_rl.hub.checks import Content
 from playslot_rl.hub.layout import LOCAL_RECORD, REMOTE_RECORD
-from playslot_rl.training.atomic import write_json
+from playslot_rl.storage.atomic import write_json
 
 SCHEME = 1
 """Version of `datasets/fingerprint.py`, to be raised when that changes: those of another version are not compared."""

@@ -64,7 +64,7 @@ def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
     Raises:
         ConfigError: the preset or the environment is not one of this version.
     """
-    from playslot_rl.compose import compose
+    from playslot_rl.config.compose import compose
     from playslot_rl.training.fit import FREE_KEYS
 
     preset = dict(_leaves(to_dict(compose([f"env={config.env.name}", f"preset={config.preset}"]))))

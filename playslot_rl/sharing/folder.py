@@ -23,8 +23,8 @@ from torch import nn
 
 from playslot_rl.errors import CheckpointError, OutputError
 from playslot_rl.sharing.config import CONFIG, WEIGHTS, PolicyConfig, read_config
-from playslot_rl.training.atomic import explain_write_errors, replace_dir, temporary_name, write_json, write_text
-from playslot_rl.training.tensors import (
+from playslot_rl.storage.atomic import explain_write_errors, replace_dir, temporary_name, write_json, write_text
+from playslot_rl.storage.tensors import (
     load_modules,
     load_tensors,
     module_tensors,

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from playslot_rl.errors import CheckpointError
 from playslot_rl.evaluation.success import PROTOCOLS, run_facts
-from playslot_rl.training.checkpoints import checkpoint_folder, read_stage
+from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
 from playslot_rl.training.runs import pretrained_folder, world_model_checkpoints
 
 LIBRARIES: Final = ("torch", "torchrl", "tensordict", "lerobot", "gymnasium", "mujoco", "metaworld")

@@ -18,12 +18,12 @@ from torch import Tensor, nn
 
 from playslot_rl.config import LoggingConfig, StageConfig, to_dict
 from playslot_rl.errors import TrainingError
+from playslot_rl.progress import StageProgress
+from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.storage.resume import TrainingCheckpoints, TrainingState
+from playslot_rl.storage.tensors import module_tensors
 from playslot_rl.training.logging import History, MetricLogger, open_logger
 from playslot_rl.training.optim import build_adam, clip_gradients, learning_rate, trainable_parameters
-from playslot_rl.training.progress import StageProgress
-from playslot_rl.training.resume import TrainingCheckpoints, TrainingState
-from playslot_rl.training.seeding import StepGenerators, global_seed
-from playslot_rl.training.tensors import module_tensors
 
 # How often we look does not change what is learned: these may differ when a run is resumed.
 FREE_KEYS = ("checkpoint_every", "validate_every", "log_every")

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from playslot_rl.config import LoggingConfig
 from playslot_rl.errors import ConfigError
-from playslot_rl.training.atomic import explain_write_errors, write_text
+from playslot_rl.storage.atomic import explain_write_errors, write_text
 
 
 class MetricLogger(Protocol):

@@ -24,8 +24,8 @@ from torch import nn
 
 from playslot_rl.config import EnvConfig, ModelConfig, from_dict
 from playslot_rl.errors import CheckpointError
-from playslot_rl.training.atomic import explain_write_errors, replace_dir, temporary_name, write_bytes, write_json
-from playslot_rl.training.checkpoints import (
+from playslot_rl.storage.atomic import explain_write_errors, replace_dir, temporary_name, write_bytes, write_json
+from playslot_rl.storage.checkpoints import (
     StageCheckpoint,
     checkpoint_folder,
     load_weights,

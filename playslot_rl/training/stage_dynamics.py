@@ -16,7 +16,7 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import sample_windows, split_episodes, spread_windows
 from playslot_rl.losses.common import total_loss
 from playslot_rl.losses.dynamics import DynamicsLoss
-from playslot_rl.training.seeding import StepGenerators, step_generator
+from playslot_rl.seeding import StepGenerators, step_generator
 from playslot_rl.world_model import WorldModel
 
 VALIDATION_WINDOWS = 32

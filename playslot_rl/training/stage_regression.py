@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from playslot_rl.config import Precision
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
-from playslot_rl.training.seeding import StepGenerators
+from playslot_rl.seeding import StepGenerators
 
 
 class Inputs(Protocol):

@@ -15,7 +15,7 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import sample_windows, split_episodes, spread_windows
 from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.training.seeding import StepGenerators, step_generator
+from playslot_rl.seeding import StepGenerators, step_generator
 
 VALIDATION_WINDOWS = 32
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from playslot_rl.baselines.methods import METHODS
+from playslot_rl.config.methods import METHODS
 from playslot_rl.visualization.charts import _figure, _png, _step_axis, _style
 from playslot_rl.visualization.palette import METHOD_STYLES, Theme
 
@@ -16,7 +16,7 @@ def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Ma
     """Two panels: mean return with its standard error, and success rate with its 95 % interval.
 
     Args:
-        curves: method, by its name in `playslot_rl.baselines.methods` (others in a colour of no method) -> points
+        curves: method, by its name in `playslot_rl.config.methods` (others in a colour of no method) -> points
             with `env_steps`, `return_mean`, `return_error`, `success_rate`, `ci95`.
         random: the random policy's point.
         theme: page.

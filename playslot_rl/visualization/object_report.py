@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs.grid_shapes import generate
-from playslot_rl.evaluation.episodes import TaskPool
 from playslot_rl.evaluation.objects import RESULT, parse_clips, seed_frames
 from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.visualization.document import Block, Document, Missing, Picture, Section, Table, Text

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.evaluation.episodes import TaskPool
-from playslot_rl.training.atomic import write_bytes, write_text
-from playslot_rl.training.checkpoints import checkpoint_folder
+from playslot_rl.storage.atomic import write_bytes, write_text
+from playslot_rl.storage.checkpoints import checkpoint_folder
 from playslot_rl.training.runs import world_model_folder
 from playslot_rl.visualization.document import Block, Document, Picture, Section, Table, Text
 from playslot_rl.visualization.html import to_html

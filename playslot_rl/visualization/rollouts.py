@@ -13,8 +13,8 @@ import numpy.typing as npt
 import torch
 from PIL import Image
 
-from playslot_rl.evaluation.controllers import ClosedLoop, OpenLoop
-from playslot_rl.evaluation.episodes import Controller, Episode, TaskPool, run_episodes
+from playslot_rl.acting.controllers import ClosedLoop, OpenLoop
+from playslot_rl.acting.episodes import Controller, Episode, TaskPool, run_episodes
 from playslot_rl.evaluation.references import ExpertController
 from playslot_rl.evaluation.video import VideoMetrics, video_metrics
 from playslot_rl.visualization.animation import side_by_side

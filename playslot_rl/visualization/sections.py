@@ -11,8 +11,8 @@ from typing import Any
 
 from PIL import Image
 
+from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.evaluation.episodes import TaskPool
 from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.evaluation.success import PROTOCOLS
 from playslot_rl.visualization.charts import loss_chart, loss_names, success_chart

@@ -15,12 +15,12 @@ def evaluate(config: ExperimentConfig, run: Path) -> None:
         ConfigError: protocol `imagination`, or an environment other than the run's.
         CheckpointError: the run has no trained policy, or a damaged one.
     """
-    from playslot_rl.baselines.methods import METHODS
-    from playslot_rl.evaluation.episodes import TaskPool
+    from playslot_rl.acting.episodes import TaskPool
+    from playslot_rl.config.methods import METHODS
     from playslot_rl.evaluation.success import check_baseline_protocol, evaluate_actor, run_facts
     from playslot_rl.recipes.evaluate import check_environment, describe
     from playslot_rl.recipes.run import open_device
-    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
     from playslot_rl.training.runs import stage_env
 
     check_baseline_protocol(config)

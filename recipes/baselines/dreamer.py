@@ -29,7 +29,7 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.baselines.dreamer.load import NAME
     from playslot_rl.baselines.dreamer.networks import DreamerNetworks
     from playslot_rl.baselines.online.loop import fixed_keys
-    from playslot_rl.training.seeding import derived_seed
+    from playslot_rl.seeding import derived_seed
 
     trained_as = {"env": to_dict(config.env), NAME: fixed_keys(own)}
     if finished(config, run, NAME, trained_as, {}, ""):

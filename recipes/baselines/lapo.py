@@ -14,7 +14,7 @@ from playslot_rl.config import ExperimentConfig, StageConfig, to_dict
 from playslot_rl.recipes.run import demo_root, finished, fixed_keys, open_device, open_run, open_videos, store_config
 
 if TYPE_CHECKING:
-    from playslot_rl.training.checkpoints import StageCheckpoint
+    from playslot_rl.storage.checkpoints import StageCheckpoint
 
 
 def main(config: ExperimentConfig) -> None:
@@ -59,9 +59,9 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
     from playslot_rl.baselines.lapo.load import MODEL, NAME, sizes_of
     from playslot_rl.baselines.lapo.model import ForwardModel, InverseModel
     from playslot_rl.baselines.lapo.stage import LAPOModelStage
-    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, save_stage
+    from playslot_rl.seeding import derived_seed
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, save_stage
     from playslot_rl.training.fit import fit
-    from playslot_rl.training.seeding import derived_seed
 
     own = config.baselines.lapo
     sizes = {NAME: sizes_of(own)}
@@ -110,7 +110,7 @@ def _train_policy(config: ExperimentConfig, run: Path, model: StageCheckpoint) -
     from playslot_rl.baselines.lapo.behaviour import LAPOBehaviour
     from playslot_rl.baselines.lapo.load import MODEL, NAME, sizes_of
     from playslot_rl.data.demonstrations import first_demonstrations
-    from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
+    from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
     from playslot_rl.training.fit import FitResult, Stage, fit
 
     own, device = config.baselines.lapo, open_device(config)

@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
-    from playslot_rl.baselines.online.config import OnlineConfig
     from playslot_rl.baselines.online.learner import Learner
-    from playslot_rl.training.checkpoints import StageCheckpoint
+    from playslot_rl.config.online import OnlineConfig
+    from playslot_rl.storage.checkpoints import StageCheckpoint
 
 
 def train_and_save(
@@ -47,9 +47,9 @@ def train_and_save(
     Raises:
         CheckpointError, OutputError, TrainingError, KeyboardInterrupt: as `train_online`.
     """
-    from playslot_rl.baselines.methods import METHODS
     from playslot_rl.baselines.online.loop import train_online
-    from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
+    from playslot_rl.config.methods import METHODS
+    from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
 
     parents = {} if slots is None else {"slots": slots.fingerprint}
     result = train_online(

@@ -24,9 +24,9 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.baselines.oracles.resnet import NAME, ResNetPolicy, load_pretrained
     from playslot_rl.data.demonstrations import first_demonstrations, real_actions, transitions
     from playslot_rl.losses.behaviour import BehaviourLoss
-    from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
+    from playslot_rl.seeding import derived_seed
+    from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
     from playslot_rl.training.fit import fit
-    from playslot_rl.training.seeding import derived_seed
     from playslot_rl.training.stage_regression import RegressionStage
 
     run, own, demos = open_run(config), config.baselines.resnet_oracle, demo_root(config)

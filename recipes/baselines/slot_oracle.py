@@ -34,7 +34,8 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.baselines.oracles.slot import NAME
     from playslot_rl.data.demonstrations import first_demonstrations, real_actions, transitions
     from playslot_rl.modules.policy import LatentPolicy
-    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
+    from playslot_rl.seeding import derived_seed
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
     from playslot_rl.training.fit import fit
     from playslot_rl.training.runs import (
         load_savi,
@@ -43,7 +44,6 @@ def main(config: ExperimentConfig) -> None:
         use_world_model,
         world_model_folder,
     )
-    from playslot_rl.training.seeding import derived_seed
     from playslot_rl.training.stage_behaviour import oracle_stage
 
     run = open_run(config)

@@ -7,7 +7,7 @@ import torch
 from clips import moving_square
 
 from playslot_rl.baselines.frame_inputs import FrameInputs, shifted
-from playslot_rl.training.seeding import StepGenerators
+from playslot_rl.seeding import StepGenerators
 
 
 def test_rows_are_those_of_the_data_set() -> None:

@@ -15,7 +15,7 @@ from jobs_on_disk import comparison, finish
 from playslot_rl.comparison.plan import Job
 from playslot_rl.comparison.results import job_rows, summarise
 from playslot_rl.comparison.status import Status, write_status
-from playslot_rl.training.atomic import write_json
+from playslot_rl.storage.atomic import write_json
 
 
 @pytest.fixture

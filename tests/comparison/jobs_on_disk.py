@@ -10,8 +10,8 @@ import torch
 from playslot_rl.comparison.plan import Job
 from playslot_rl.comparison.status import Status, write_status
 from playslot_rl.evaluation.intervals import wilson
-from playslot_rl.training.atomic import write_json
-from playslot_rl.training.tensors import save_tensors
+from playslot_rl.storage.atomic import write_json
+from playslot_rl.storage.tensors import save_tensors
 
 
 def finish(job: Job, successes: dict[str, int], episodes: int = 10, **meta: Any) -> Job:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from playslot_rl.compose import compose
+from playslot_rl.config.compose import compose
 from playslot_rl.errors import ConfigError
 
 

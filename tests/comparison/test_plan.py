@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from playslot_rl.comparison.config import LAUNCHERS
 from playslot_rl.comparison.plan import Job, check_comparison, check_demos, job_config, job_record, jobs
-from playslot_rl.compose import compose
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
+from playslot_rl.config.compare import LAUNCHERS
+from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError
 
 OUT = Path("out")

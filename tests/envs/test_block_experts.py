@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from playslot_rl.compose import compose
 from playslot_rl.config import BlocksConfig
+from playslot_rl.config.compose import compose
 from playslot_rl.envs.block_ids import block_config
 from playslot_rl.envs.block_push import BlockEnv, BlockPickEnv, BlockPushEnv, BlockReachEnv
 

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from playslot_rl.compose import compose
 from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
+from playslot_rl.config.compose import compose
 from playslot_rl.envs import ENVIRONMENTS, make_env
 from playslot_rl.envs.block_ids import EASY, block_config, family
 from playslot_rl.envs.block_push import BlockEnv, BlockPickEnv, BlockPushEnv, BlockReachEnv

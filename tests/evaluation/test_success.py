@@ -13,11 +13,11 @@ import torch
 from tensordict import TensorDict
 
 from playslot_rl import keys
+from playslot_rl.acting.controllers import ClosedLoop, unfold
+from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.config import EvaluationConfig, ExperimentConfig
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation import references
-from playslot_rl.evaluation.controllers import ClosedLoop, unfold
-from playslot_rl.evaluation.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.evaluation.references import ExpertController
 from playslot_rl.evaluation.success import RunFacts, evaluate, evaluate_run, run_facts
 from playslot_rl.testing import tiny_config
@@ -53,7 +53,7 @@ def pool(config: ExperimentConfig) -> Iterator[TaskPool]:
 def test_closed_loop_acts_as_the_torchrl_environment_does(
     config: ExperimentConfig, agent: Agent, pool: TaskPool
 ) -> None:
-    from playslot_rl.simulation import make_simulation_env
+    from playslot_rl.acting.simulation import make_simulation_env
     from playslot_rl.world_model import action_decoder_module
 
     env = make_simulation_env(config.env, config.render, agent.world_model, agent.action_decoder)
@@ -75,7 +75,7 @@ def test_closed_loop_acts_as_the_torchrl_environment_does(
 
 
 def test_unfolding_equals_a_rollout_of_the_imagination_environment_past_its_context() -> None:
-    from playslot_rl.imagination import ImaginationEnv
+    from playslot_rl.acting.imagination import ImaginationEnv
 
     agent = _agent(tiny_config(context=4))
     slots = torch.randn(2, 4, 32)

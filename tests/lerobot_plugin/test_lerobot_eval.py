@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from playslot_rl.compose import compose
+from playslot_rl.config.compose import compose
 from playslot_rl.evaluation.success import evaluate
 from playslot_rl.sharing.run import export_run
-from playslot_rl.training.atomic import write_json
+from playslot_rl.storage.atomic import write_json
 from playslot_rl.training.runs import load_agent
 
 pytestmark = pytest.mark.slow  # a process that imports all of LeRobot

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 import torch
 
+from playslot_rl.acting.controllers import ClosedLoop
+from playslot_rl.acting.episodes import Moment
 from playslot_rl.config import EnvConfig
 from playslot_rl.envs import task_env
 
 # The evaluation's imports first: MuJoCo has to find its GL backend before LeRobot imports anything that imports it.
 from playslot_rl.envs.lerobot import LeRobotTask, frames_a_second
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.evaluation.controllers import ClosedLoop
-from playslot_rl.evaluation.episodes import Moment
 from playslot_rl.sharing.config import PolicyConfig
 from playslot_rl.sharing.folder import FILES, save_pretrained
 from playslot_rl.testing import tiny_agent
@@ -222,7 +222,7 @@ def test_environments_side_by_side_wait_for_each_other() -> None:
 @pytest.mark.parametrize("task", ["block_push_easy", "block_push"])
 def test_other_tasks_have_their_own_settings(task: str) -> None:
     from lerobot_policy_playslot import PlaySlotEnv
-    from playslot_rl.compose import compose
+    from playslot_rl.config.compose import compose
 
     config = PlaySlotEnv(task=task)
     assert config.task_config() == compose([f"env={task}"]).env

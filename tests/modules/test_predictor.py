@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from playslot_rl.config import PredictorConfig
-from playslot_rl.modules.predictor import COCVP
+from playslot_rl.modules.predictors.cocvp import COCVP
 from playslot_rl.modules.transformer import TransformerBlock, sinusoidal_code
 
 B, T, N, D, Z = 2, 6, 3, 10, 4

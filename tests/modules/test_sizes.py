@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from torch import nn
 
-from playslot_rl.compose import compose
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.compose import compose
 from playslot_rl.world_model import WorldModel
 
 

@@ -72,7 +72,7 @@ def killed_at_first_checkpoint(folder: Path, *command: object) -> None:
     the tests lie: other packages install a module `tests` too.
     """
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["torchrl.objectives", "torchvision", "playslot_rl.training.checkpoints"])
+    context.set_forkserver_preload(["torchrl.objectives", "torchvision", "playslot_rl.storage.checkpoints"])
     process = context.Process(target=cli.main, args=(list(map(str, command)),))
     process.start()
     limit = time.monotonic() + 120

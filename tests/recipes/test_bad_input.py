@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from commands import assert_one_line, contents, playslot, refused, smoke, weights
 
+from playslot_rl.storage.tensors import load_tensors, save_tensors
 from playslot_rl.training.stage_slots import SlotsStage
-from playslot_rl.training.tensors import load_tensors, save_tensors
 
 # --- arguments ----------------------------------------------------------------------------------------------------
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from commands import ONE_CORE, contents, killed_at_first_checkpoint, refused, smoke, weights
 
-from playslot_rl.compose import compose
 from playslot_rl.config import to_dict
+from playslot_rl.config.compose import compose
 
 METHODS = ("slot_oracle", "resnet_oracle", "lapo")
 SECOND_HALF = {

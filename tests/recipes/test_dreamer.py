@@ -9,11 +9,11 @@ import pytest
 import torch
 from commands import killed_at_first_checkpoint
 
-from playslot_rl.baselines.actor import ActorController
+from playslot_rl.acting.actor import ActorController
+from playslot_rl.acting.episodes import TaskPool, run_episodes
 from playslot_rl.baselines.dreamer.load import load_actor
-from playslot_rl.compose import compose
+from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.evaluation.episodes import TaskPool, run_episodes
 from playslot_rl.recipes.baselines import dreamer
 
 SMOKE = ("preset=smoke", "method=dreamer", "env=block_reach", "threads=1", "device=cpu", "env.max_steps=6")

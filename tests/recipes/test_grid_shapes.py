@@ -10,8 +10,8 @@ import pytest
 from commands import ONE_CORE, playslot, refused
 
 from playslot_rl.collectors.spec import CollectionSpec
-from playslot_rl.compose import compose
 from playslot_rl.config import EnvConfig, GridConfig
+from playslot_rl.config.compose import compose
 from playslot_rl.data.source import open_source
 from playslot_rl.envs.grid_shapes import generate, moves_of
 

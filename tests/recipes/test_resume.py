@@ -18,7 +18,7 @@ from commands import ONE_CORE, assert_one_line, contents, refused, smoke, weight
 from torch import Tensor
 
 from playslot_rl import cli
-from playslot_rl.training.seeding import StepGenerators
+from playslot_rl.seeding import StepGenerators
 from playslot_rl.training.stage_slots import SlotsStage
 
 LONG = {

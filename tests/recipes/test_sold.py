@@ -12,16 +12,16 @@ import torch
 from commands import killed_at_first_checkpoint, smoke
 from safetensors.torch import load_file
 
-from playslot_rl.baselines.actor import ActorController
+from playslot_rl.acting.actor import ActorController
+from playslot_rl.acting.episodes import TaskPool, run_episodes
 from playslot_rl.baselines.sold.learner import SOLDLearner
 from playslot_rl.baselines.sold.load import load_actor, prior_steps, slots_checkpoint
-from playslot_rl.compose import compose
 from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError, TrainingError
-from playslot_rl.evaluation.episodes import TaskPool, run_episodes
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.recipes.baselines import sold
-from playslot_rl.training.checkpoints import checkpoint_folder, save_stage
+from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
 
 FIXED = ("preset=smoke", "method=sold", "device=cpu", "threads=1", "logging.backend=none")
 

@@ -12,8 +12,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 
 from playslot_rl.sharing.config import PolicyConfig
 from playslot_rl.sharing.folder import save_pretrained
+from playslot_rl.storage.atomic import write_json
 from playslot_rl.testing import tiny_agent
-from playslot_rl.training.atomic import write_json
 from playslot_rl.world_model import Agent
 
 ASSET = Path(__file__).parents[1] / "assets" / "button_press_policy"
@@ -41,8 +41,8 @@ def folder(agent: Agent, config: PolicyConfig, tmp_path: Path) -> Path:
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     """A run with the stored policy on the shipped world model."""
-    from playslot_rl.compose import compose
     from playslot_rl.config import to_dict
+    from playslot_rl.config.compose import compose
 
     root = tmp_path / "run"
     shutil.copytree(ASSET / "policy" / "checkpoint", root / "policy" / "checkpoint")

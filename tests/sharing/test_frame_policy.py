@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from playslot_rl.acting.controllers import ClosedLoop
+from playslot_rl.acting.episodes import Moment
 from playslot_rl.data.frame_cache import resize_frames
-from playslot_rl.evaluation.controllers import ClosedLoop
-from playslot_rl.evaluation.episodes import Moment
 from playslot_rl.sharing.frame_policy import FramePolicy
 from playslot_rl.world_model import Agent
 

@@ -15,12 +15,12 @@ import pytest
 import torch
 from toy_stage import ToyStage, toy_config, train
 
-import playslot_rl.training.resume as resume_module
+import playslot_rl.storage.resume as resume_module
 from playslot_rl.config import LoggingConfig
 from playslot_rl.errors import CheckpointError, ConfigError, OutputError, TrainingError
+from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
 from playslot_rl.training.fit import fit
 from playslot_rl.training.logging import History
-from playslot_rl.training.tensors import load_tensors, module_tensors, save_tensors
 
 
 def tensors(folder: Path, step: int) -> dict[str, torch.Tensor]:

@@ -8,8 +8,8 @@ import torch
 from torch import nn
 
 from playslot_rl.config import OptimConfig
+from playslot_rl.seeding import StepGenerators, global_seed, step_generator, step_numpy
 from playslot_rl.training.optim import build_adam, clip_gradients, learning_rate, trainable_parameters
-from playslot_rl.training.seeding import StepGenerators, global_seed, step_generator, step_numpy
 
 
 def test_warm_up_is_linear_and_cosine_ends_near_zero() -> None:

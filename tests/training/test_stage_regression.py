@@ -13,9 +13,9 @@ from playslot_rl.config import BehaviourStageConfig, OptimConfig, StageConfig
 from playslot_rl.data.demonstrations import Demonstrations
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.seeding import StepGenerators
 from playslot_rl.testing import tiny_config
 from playslot_rl.training.fit import fit
-from playslot_rl.training.seeding import StepGenerators
 from playslot_rl.training.stage_behaviour import CloneStage, oracle_stage
 from playslot_rl.training.stage_regression import RegressionStage, TensorInputs, unexplained
 

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from playslot_rl.config import OptimConfig, StageConfig
 from playslot_rl.modules.quantizer import ActionQuantizer
+from playslot_rl.seeding import StepGenerators, global_seed
 from playslot_rl.training.fit import FitResult, fit
-from playslot_rl.training.seeding import StepGenerators, global_seed
 
 
 class ToyStage:

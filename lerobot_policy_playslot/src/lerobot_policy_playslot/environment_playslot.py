@@ -56,7 +56,7 @@ class PlaySlotEnv(EnvConfig):
 
     def task_config(self) -> ours.EnvConfig:
         """The task's settings in playslot_rl, with the changes made here."""
-        from playslot_rl.compose import compose
+        from playslot_rl.config.compose import compose
 
         env = replace(compose([f"env={self.task}"]).env, image_size=self.image_size)
         return env if self.episode_length is None else replace(env, max_steps=self.episode_length)

@@ -11,10 +11,10 @@ from torchrl.objectives import DreamerV3Loss, SoftUpdate
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper, DreamerV3Optimizer
 
 from playslot_rl import keys
-from playslot_rl.baselines.dreamer.config import DreamerConfig
 from playslot_rl.baselines.dreamer.losses import build_loss, records
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
-from playslot_rl.training.seeding import StepGenerators
+from playslot_rl.config.dreamer import DreamerConfig
+from playslot_rl.seeding import StepGenerators
 
 
 class DreamerLearner:

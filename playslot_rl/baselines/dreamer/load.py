@@ -11,12 +11,12 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from playslot_rl import keys
-from playslot_rl.baselines.dreamer.config import DreamerConfig
 from playslot_rl.baselines.dreamer.learner import act
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
 from playslot_rl.config import EnvConfig, from_dict
+from playslot_rl.config.dreamer import DreamerConfig
 from playslot_rl.errors import CheckpointError
-from playslot_rl.training.checkpoints import checkpoint_folder, load_weights, read_stage
+from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
 
 NAME: Final = "dreamer"
 
@@ -44,7 +44,7 @@ class DreamerPolicy(TensorDictModuleBase):
 
 
 class DreamerActor:
-    """DreamerV3 as `playslot_rl.baselines.actor.Actor`.
+    """DreamerV3 as `playslot_rl.acting.actor.Actor`.
 
     Args:
         networks: trained, in eval mode.

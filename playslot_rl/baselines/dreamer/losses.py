@@ -18,8 +18,8 @@ from torchrl.objectives import DreamerV3ActorLoss, DreamerV3Loss, DreamerV3Model
 from torchrl.objectives.utils import ValueEstimators
 
 from playslot_rl import keys
-from playslot_rl.baselines.dreamer.config import DreamerConfig
 from playslot_rl.baselines.dreamer.networks import BINS, UNIMIX, DreamerNetworks, actor_module
+from playslot_rl.config.dreamer import DreamerConfig
 
 
 def world_model(networks: DreamerNetworks) -> TensorDictSequential:

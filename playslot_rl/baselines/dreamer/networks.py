@@ -30,9 +30,9 @@ from torchrl.modules import (
 )
 
 from playslot_rl import keys
-from playslot_rl.baselines.dreamer.config import DreamerConfig
 from playslot_rl.baselines.online.two_hot import SymExpTwoHot
 from playslot_rl.config import EnvConfig
+from playslot_rl.config.dreamer import DreamerConfig
 from playslot_rl.errors import ConfigError
 
 UNIMIX = 0.01

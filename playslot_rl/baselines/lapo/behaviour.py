@@ -26,9 +26,9 @@ from playslot_rl.data.demonstrations import real_actions, transitions
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
-from playslot_rl.training.checkpoints import StageCheckpoint, load_weights
+from playslot_rl.seeding import derived_seed
+from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
 from playslot_rl.training.runs import freeze_on, stage_model
-from playslot_rl.training.seeding import derived_seed
 from playslot_rl.training.stage_regression import RegressionStage, TensorInputs, apply_rows
 
 

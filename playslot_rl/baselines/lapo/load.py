@@ -13,15 +13,15 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.baselines.actor import Actor
-from playslot_rl.baselines.lapo.config import LAPOConfig
+from playslot_rl.acting.actor import Actor
 from playslot_rl.baselines.lapo.encoder import EncoderMLP
+from playslot_rl.config.lapo import LAPOConfig
+from playslot_rl.config.plain import to_dict
 from playslot_rl.modules.action_decoder import ActionDecoder
-from playslot_rl.plain import to_dict
 from playslot_rl.world_model import action_decoder_module, normalise
 
 if TYPE_CHECKING:
-    from playslot_rl.training.checkpoints import StageCheckpoint
+    from playslot_rl.storage.checkpoints import StageCheckpoint
 
 NAME: Final = "lapo"
 MODEL: Final = "lapo_model"
@@ -48,7 +48,7 @@ class FramePolicy(nn.Module):
 
 def lapo_actor(policy: FramePolicy, decoder: ActionDecoder) -> Actor:
     """The actor of networks in evaluation mode."""
-    from playslot_rl.baselines.slot_actor import ReactiveActor
+    from playslot_rl.acting.slot_actor import ReactiveActor
 
     choose = TensorDictModule(policy, in_keys=[keys.PIXELS], out_keys=[keys.LATENT_ACTION])
     return ReactiveActor(TensorDictSequential(choose, action_decoder_module(decoder)))
@@ -84,7 +84,7 @@ def given_model(config: LAPOConfig, image_size: int, run: Path) -> StageCheckpoi
     Raises:
         CheckpointError: it is missing or damaged, of other sizes, or `run` has another one of its own.
     """
-    from playslot_rl.training.checkpoints import checkpoint_folder, read_stage, require_config, require_whole
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, require_whole
     from playslot_rl.training.runs import require_adoptable, run_folder
 
     model = read_stage(checkpoint_folder(run_folder(config.world), MODEL), MODEL)
@@ -100,7 +100,7 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
     Raises:
         CheckpointError: it is missing or damaged, or was trained on another inverse model.
     """
-    from playslot_rl.training.checkpoints import checkpoint_folder, load_weights, read_stage, require_parents
+    from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage, require_parents
     from playslot_rl.training.runs import freeze_on, stage_model
 
     done = read_stage(checkpoint_folder(run, NAME), NAME)

@@ -17,9 +17,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from playslot_rl import keys
+from playslot_rl.acting.episodes import TaskPool, start_episode
 from playslot_rl.baselines.online.learner import Learner
 from playslot_rl.baselines.online.seeds import REDRAW_STRIDE
-from playslot_rl.evaluation.episodes import TaskPool, start_episode
 
 RANDOM_STREAM: Final = 7
 """Keeps the random policy's stream apart from the environment's own of the same seed (as in `RandomController`)."""

@@ -20,8 +20,8 @@ from torch import Tensor, nn
 
 from playslot_rl.baselines.online.replay import Replay
 from playslot_rl.errors import CheckpointError
-from playslot_rl.training.resume import KEPT, TrainingCheckpoints
-from playslot_rl.training.tensors import load_modules, load_tensors, module_tensors, save_tensors
+from playslot_rl.storage.resume import KEPT, TrainingCheckpoints
+from playslot_rl.storage.tensors import load_modules, load_tensors, module_tensors, save_tensors
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from playslot_rl.baselines.online.acting import Episodes
 from playslot_rl.evaluation.intervals import wilson
-from playslot_rl.training.atomic import write_bytes, write_json
+from playslot_rl.storage.atomic import write_bytes, write_json
 
 
 def curve_point(played: Episodes) -> dict[str, Any]:

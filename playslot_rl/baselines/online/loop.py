@@ -17,20 +17,20 @@ from typing import TYPE_CHECKING, Any, Final
 import torch
 from tensordict import TensorDictBase
 
+from playslot_rl.acting.episodes import LOCKSTEP, TaskPool
 from playslot_rl.baselines.online.acting import Episodes, play
 from playslot_rl.baselines.online.checkpoints import OnlineCheckpoints, OnlineState
-from playslot_rl.baselines.online.config import OnlineConfig
 from playslot_rl.baselines.online.curve import curve_point, draw_curve, write_curve
 from playslot_rl.baselines.online.learner import Learner
 from playslot_rl.baselines.online.replay import Replay
 from playslot_rl.baselines.online.seeds import development_seeds, training_seed
 from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config.online import OnlineConfig
 from playslot_rl.errors import TrainingError
-from playslot_rl.evaluation.episodes import LOCKSTEP, TaskPool
+from playslot_rl.progress import StageProgress
+from playslot_rl.seeding import StepGenerators, global_seed, step_generator
+from playslot_rl.storage.tensors import module_tensors
 from playslot_rl.training.logging import History, MetricLogger, open_logger
-from playslot_rl.training.progress import StageProgress
-from playslot_rl.training.seeding import StepGenerators, global_seed, step_generator
-from playslot_rl.training.tensors import module_tensors
 
 if TYPE_CHECKING:
     from torchrl.trainers.algorithms import DreamerV3UpdateRatio

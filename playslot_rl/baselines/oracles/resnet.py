@@ -22,8 +22,8 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.baselines.actor import Actor
-from playslot_rl.baselines.slot_actor import ReactiveActor
+from playslot_rl.acting.actor import Actor
+from playslot_rl.acting.slot_actor import ReactiveActor
 from playslot_rl.config import PolicyConfig
 from playslot_rl.errors import CheckpointError
 from playslot_rl.modules.policy import LatentPolicy
@@ -126,7 +126,7 @@ def _download(path: Path) -> None:
 
 def _read(path: Path) -> dict[str, Tensor]:
     if path.suffix == ".safetensors":
-        from playslot_rl.training.tensors import load_tensors
+        from playslot_rl.storage.tensors import load_tensors
 
         return load_tensors(path)
     try:
@@ -161,7 +161,7 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
     Raises:
         CheckpointError: it is missing or damaged.
     """
-    from playslot_rl.training.checkpoints import checkpoint_folder, load_weights, read_stage
+    from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
     from playslot_rl.training.runs import freeze_on, stage_model
 
     done = read_stage(checkpoint_folder(run, NAME), NAME)

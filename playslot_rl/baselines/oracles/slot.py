@@ -12,8 +12,8 @@ from pathlib import Path
 
 import torch
 
-from playslot_rl.baselines.actor import Actor
-from playslot_rl.baselines.slot_actor import SlotActor
+from playslot_rl.acting.actor import Actor
+from playslot_rl.acting.slot_actor import SlotActor
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.world_model import oracle_module
 
@@ -26,7 +26,7 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
     Raises:
         CheckpointError: the run or its SAVi is missing or damaged, or it was trained on other slots.
     """
-    from playslot_rl.training.checkpoints import checkpoint_folder, load_weights, read_stage, require_parents
+    from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage, require_parents
     from playslot_rl.training.runs import freeze_on, load_savi, stage_model, world_model_folder
 
     done = read_stage(checkpoint_folder(run, NAME), NAME)

@@ -80,7 +80,7 @@ class SlotActing(TensorDictModuleBase):
 
 
 class SOLDActor:
-    """SOLD as `playslot_rl.baselines.actor.Actor`: the most likely action.
+    """SOLD as `playslot_rl.acting.actor.Actor`: the most likely action.
 
     Args:
         module: the acting step.

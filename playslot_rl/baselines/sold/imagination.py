@@ -12,8 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from playslot_rl.baselines.sold.dynamics import OCVPSeq
 from playslot_rl.baselines.sold.heads import ActorHead, action_distribution, sample_action
+from playslot_rl.modules.predictors.ocvp_seq import OCVPSeq
 
 
 class Imagined(NamedTuple):

@@ -20,11 +20,11 @@ from playslot_rl import keys
 from playslot_rl.baselines.online.normaliser import PercentileValueNorm
 from playslot_rl.baselines.sold import losses
 from playslot_rl.baselines.sold.acting import SlotActing
-from playslot_rl.baselines.sold.config import SOLDConfig
 from playslot_rl.baselines.sold.imagination import imagine
 from playslot_rl.baselines.sold.networks import SOLDNetworks, acting_window
+from playslot_rl.config.sold import SOLDConfig
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.training.seeding import StepGenerators
+from playslot_rl.seeding import StepGenerators
 from playslot_rl.world_model import normalise
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import torch
 
 from playslot_rl.baselines.sold.acting import SlotActing, SOLDActor
-from playslot_rl.baselines.sold.config import SOLDConfig
 from playslot_rl.baselines.sold.networks import SOLDNetworks, acting_window
 from playslot_rl.config import from_dict
+from playslot_rl.config.sold import SOLDConfig
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.training.checkpoints import (
+from playslot_rl.storage.checkpoints import (
     StageCheckpoint,
     checkpoint_folder,
     load_weights,

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from torch import nn
 
 from playslot_rl.baselines.sold.aggregation import SlotAggregation
-from playslot_rl.baselines.sold.config import SOLDConfig
-from playslot_rl.baselines.sold.dynamics import OCVPSeq
 from playslot_rl.baselines.sold.heads import ActorHead, ScalarHead
 from playslot_rl.baselines.sold.two_hot import SymlogTwoHot
+from playslot_rl.config.sold import SOLDConfig
+from playslot_rl.modules.predictors.ocvp_seq import OCVPSeq
 
 
 class SOLDNetworks(nn.Module):

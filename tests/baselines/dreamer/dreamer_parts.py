@@ -9,11 +9,11 @@ from tensordict import TensorDict
 from torchrl.objectives import DreamerV3Loss
 
 from playslot_rl import keys
-from playslot_rl.baselines.dreamer.config import DreamerConfig
 from playslot_rl.baselines.dreamer.losses import build_loss
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
 from playslot_rl.config import EnvConfig
-from playslot_rl.training.seeding import global_seed
+from playslot_rl.config.dreamer import DreamerConfig
+from playslot_rl.seeding import global_seed
 
 B, T, A = 2, 5, 4
 

@@ -12,8 +12,8 @@ from playslot_rl.baselines.dreamer.networks import DreamerNetworks
 from playslot_rl.baselines.online.checkpoints import optimizer_tensors, restore_optimizers
 from playslot_rl.config import EnvConfig
 from playslot_rl.errors import ConfigError
-from playslot_rl.training.seeding import StepGenerators, global_seed
-from playslot_rl.training.tensors import load_modules, module_tensors
+from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.storage.tensors import load_modules, module_tensors
 
 
 def learner(seed: int = 0) -> DreamerLearner:

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from playslot_rl import keys
 from playslot_rl.baselines.dreamer.losses import records, world_model
 from playslot_rl.baselines.online.returns import lambda_returns
-from playslot_rl.training.seeding import global_seed
+from playslot_rl.seeding import global_seed
 
 MODEL = {"encoder", "prior", "posterior", "decoder", "reward"}
 

@@ -9,14 +9,14 @@ import pytest
 import torch
 from clips import moving_square
 
-from playslot_rl.baselines.lapo.config import LAPOConfig
 from playslot_rl.baselines.lapo.load import FramePolicy, lapo_actor
 from playslot_rl.baselines.lapo.model import ForwardModel, InverseModel
 from playslot_rl.baselines.lapo.stage import LAPOModelStage, infer_latents
 from playslot_rl.config import ActionDecoderConfig, OptimConfig, StageConfig
+from playslot_rl.config.lapo import LAPOConfig
 from playslot_rl.data.demonstrations import transitions
 from playslot_rl.modules.action_decoder import ActionDecoder
-from playslot_rl.training.seeding import StepGenerators, global_seed
+from playslot_rl.seeding import StepGenerators, global_seed
 
 CONFIG = LAPOConfig(channels=(8, 16), hidden=32, groups=2, code_dim=4, codes=4)
 

@@ -22,8 +22,8 @@ from playslot_rl.baselines.online.acting import play
 from playslot_rl.baselines.online.seeds import DEVELOPMENT, TRAINING, development_seeds, training_seed
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.errors import CheckpointError, TrainingError
-from playslot_rl.training.seeding import StepGenerators
-from playslot_rl.training.tensors import module_tensors
+from playslot_rl.seeding import StepGenerators
+from playslot_rl.storage.tensors import module_tensors
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,7 @@ from playslot_rl import keys
 from playslot_rl.baselines.oracles.resnet import ResNetPolicy, cached_weights, load_pretrained, resnet_actor
 from playslot_rl.config import PolicyConfig
 from playslot_rl.errors import CheckpointError
-from playslot_rl.training.tensors import save_tensors
+from playslot_rl.storage.tensors import save_tensors
 
 HEAD = PolicyConfig(dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16)
 

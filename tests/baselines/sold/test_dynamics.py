@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.baselines.sold.dynamics import OCVPSeq
+from playslot_rl.modules.predictors.ocvp_seq import OCVPSeq
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from playslot_rl.baselines.sold import losses
 from playslot_rl.baselines.sold.heads import action_distribution, sample_action
 from playslot_rl.baselines.sold.imagination import imagine
 from playslot_rl.baselines.sold.learner import SOLDLearner
-from playslot_rl.training.seeding import StepGenerators
+from playslot_rl.seeding import StepGenerators
 
 Make = Callable[..., SOLDLearner]
 NETWORKS = ("dynamics", "reward", "actor", "critic")

@@ -1,1 +1,0 @@
-../../playslot_rl/__main__.py

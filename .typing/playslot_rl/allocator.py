@@ -1,1 +1,0 @@
-../../playslot_rl/allocator.py

@@ -1,1 +1,0 @@
-../../playslot_rl/model_config.py

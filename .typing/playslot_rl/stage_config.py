@@ -1,1 +1,0 @@
-../../playslot_rl/stage_config.py

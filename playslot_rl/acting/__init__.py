@@ -1,0 +1,1 @@
+"""Acting: the actor, the environments of simulator and imagination, and the loop over episodes."""

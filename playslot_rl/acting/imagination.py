@@ -1,0 +1,183 @@
+"""The world model as an environment: `env.rollout(steps, policy)` is imagination.
+
+The state is the past the predictor attends to: a right-aligned history of C frames of slots and of the latent actions
+taken at them, and the number of frames that are there. Nothing is rendered and no real action is needed; the policy is
+the module that also acts in the simulator (`playslot_rl.acting.simulation`).
+
+Shapes: N slots, D slot width, Z latent-action width, C context frames, H W image height and width. "[N,]" is there
+with one latent action per slot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Composite, Unbounded
+from torchrl.envs.model_based import ModelBasedEnvBase
+
+from playslot_rl import keys
+from playslot_rl.world_model import WorldModel, dynamics_module, module_device, normalise
+
+FirstSlots = Callable[[int], Tensor]
+"""Draws the first slots of that many episodes: n -> (n, N, D)."""
+
+
+class ImaginationEnv(ModelBasedEnvBase):
+    """cOCVP as a TorchRL environment whose action is LATENT_ACTION and whose observation is SLOTS.
+
+    A reset takes the first slots from SLOTS (..., N, D) in the tensordict it gets, else parses PIXELS (..., 3, H, W) in
+    it, else asks `first_slots`, else parses a mid-grey frame (which is there so that the specs can be checked, not to
+    be learned from). The reward is zero: PlaySlot has no reward model.
+
+    The histories are part of the state, so a rollout stores them at every step: `rollout.select(keys.SLOTS,
+    keys.LATENT_ACTION, ("next", keys.SLOTS))` keeps what is wanted.
+
+    Args:
+        world_model: put into evaluation mode; its device is the environment's.
+        batch_size: episodes imagined at once; tensordicts of other batch sizes are taken too.
+        first_slots: draws first slots, e.g. from a data set.
+        horizon: steps after which an episode is truncated; 0 never does.
+        differentiable: keep the graph, for learning through imagination.
+        generator: of sampled initial slots where a reset parses frames.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from playslot_rl.testing import tiny_config
+        >>> from playslot_rl.world_model import Agent, WorldModel, latent_policy_module
+        >>> config = tiny_config()
+        >>> agent = Agent.untrained(WorldModel(config.model, config.env)).eval()
+        >>> env = ImaginationEnv(agent.world_model, batch_size=[2])
+        >>> start = env.reset(TensorDict({"pixels": torch.rand(2, 3, 64, 64)}, [2]))
+        >>> rollout = env.rollout(5, latent_policy_module(agent.policy), tensordict=start, auto_reset=False)
+        >>> rollout["next", "slots"].shape, rollout["latent_action"].shape
+        (torch.Size([2, 5, 4, 32]), torch.Size([2, 5, 8]))
+    """
+
+    def __init__(
+        self,
+        world_model: WorldModel,
+        batch_size: Sequence[int] = (),
+        first_slots: FirstSlots | None = None,
+        horizon: int = 0,
+        differentiable: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        if horizon < 0:
+            raise ValueError(f"horizon: got {horizon}, expected 0 (none) or more steps")
+        world_model.eval()
+        device = module_device(world_model)
+        super().__init__(
+            dynamics_module(world_model.inverse_dynamics, world_model.predictor),
+            device=device,
+            batch_size=torch.Size(batch_size),
+        )
+        self.savi = world_model.savi
+        self.slot_shape = world_model.slot_shape
+        self.latent_shape = world_model.latent_shape
+        self.context = world_model.config.predictor.context
+        self.image_size = world_model.env.image_size
+        self.first_slots = first_slots
+        self.horizon = horizon
+        self.differentiable = differentiable
+        self.generator = generator
+        self._make_specs()
+
+    def _make_specs(self) -> None:
+        batch, device = self.batch_size, self.device
+
+        def spec(shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> Unbounded:
+            return Unbounded((*batch, *shape), dtype=dtype, device=device)
+
+        self.observation_spec = Composite({keys.SLOTS: spec(self.slot_shape)}, shape=batch, device=device)
+        self.state_spec = Composite(
+            {
+                keys.SLOT_HISTORY: spec((self.context, *self.slot_shape)),
+                keys.ACTION_HISTORY: spec((self.context, *self.latent_shape)),
+                keys.HISTORY_LENGTH: spec((1,), torch.int64),
+                keys.STEP_COUNT: spec((1,), torch.int64),
+            },
+            shape=batch,
+            device=device,
+        )
+        # What the state becomes is observed too: that is how a rollout hands it to the next step.
+        self.observation_spec.update(self.state_spec.clone())
+        self.action_spec = Composite({keys.LATENT_ACTION: spec(self.latent_shape)}, shape=batch, device=device)
+        self.reward_spec = spec((1,))
+        flag = Binary(1, (*batch, 1), dtype=torch.bool, device=device)
+        self.done_spec = Composite(
+            {name: flag.clone() for name in ("done", "terminated", "truncated")}, shape=batch, device=device
+        )
+
+    def reset_from_slots(self, slots: Tensor) -> TensorDict:
+        """Start from parsed slots (..., N, D): shorthand for `reset` with SLOTS in the tensordict."""
+        batch = slots.shape[: slots.ndim - len(self.slot_shape)]
+        out: TensorDict = self.reset(TensorDict({keys.SLOTS: slots.to(self.device)}, batch, device=self.device))
+        return out
+
+    def _reset(self, tensordict: TensorDictBase | None, **_: Any) -> TensorDictBase:
+        batch = self.batch_size if tensordict is None else tensordict.batch_size
+        slots = self._first(tensordict, batch)
+        if slots.shape != (*batch, *self.slot_shape):
+            got, expected = tuple(slots.shape), (*batch, *self.slot_shape)
+            raise ValueError(f"first slots: got shape {got}, expected {expected}; parse frames with this world model")
+        history = slots.new_zeros(*batch, self.context, *self.slot_shape)
+        history[..., -1, :, :] = slots
+        actions = slots.new_zeros(*batch, self.context, *self.latent_shape)
+        count = torch.zeros(*batch, 1, dtype=torch.int64, device=self.device)
+        return TensorDict(
+            {
+                keys.SLOTS: slots,
+                keys.SLOT_HISTORY: history,
+                keys.ACTION_HISTORY: actions,
+                keys.HISTORY_LENGTH: count + 1,
+                keys.STEP_COUNT: count,
+                **self._done(count, at=None),
+            },
+            batch,
+            device=self.device,
+        )
+
+    def _first(self, tensordict: TensorDictBase | None, batch: torch.Size) -> Tensor:
+        if tensordict is not None:
+            given: Tensor | None = tensordict.get(keys.SLOTS, None)
+            if given is not None:
+                return given.to(self.device)
+            pixels: Tensor | None = tensordict.get(keys.PIXELS, None)
+            if pixels is not None:
+                return self._parse(pixels, batch)
+        if self.first_slots is not None:
+            return self.first_slots(batch.numel()).to(self.device).reshape(*batch, *self.slot_shape)
+        side = self.image_size
+        return self._parse(torch.full((*batch, 3, side, side), 0.5, device=self.device), batch)
+
+    @torch.no_grad()
+    def _parse(self, pixels: Tensor, batch: torch.Size) -> Tensor:
+        frames = normalise(pixels.to(self.device)).reshape(-1, 1, *pixels.shape[-3:])
+        parsed: tuple[Tensor, Tensor] = self.savi(frames, generator=self.generator)
+        return parsed[0][:, 0].reshape(*batch, *self.slot_shape)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        with torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled()):
+            out: TensorDictBase = super()._step(tensordict)
+        count = tensordict.get(keys.STEP_COUNT) + 1
+        out.set(keys.STEP_COUNT, count)
+        out.set("reward", torch.zeros(count.shape, device=self.device))
+        out.update(self._done(count, at=self.horizon or None))
+        return out
+
+    @staticmethod
+    def _done(count: Tensor, at: int | None) -> dict[str, Tensor]:
+        """Flags of the incoming batch's shape; `at` is the step that truncates."""
+        never = torch.zeros_like(count, dtype=torch.bool)
+        truncated = never.clone() if at is None else count >= at
+        return {"done": truncated.clone(), "terminated": never, "truncated": truncated}
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Imagination is deterministic; only first frames parsed with sampled initial slots are not."""
+        if self.generator is not None and seed is not None:
+            self.generator.manual_seed(seed)

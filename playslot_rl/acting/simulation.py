@@ -1,0 +1,190 @@
+"""The simulator seen through the world model: slots in place of pixels, latent actions in place of real ones.
+
+`make_simulation_env` wraps a task so that its observation is SLOTS and its action LATENT_ACTION, which is what
+`playslot_rl.acting.imagination.ImaginationEnv` has too: one policy module runs in both.
+
+Shapes: N slots, D slot width, Z latent-action width, A action width, H W image height and width.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import Compose, EnvBase, StepCounter, Transform, TransformedEnv
+
+from playslot_rl import keys
+from playslot_rl.config import EnvConfig, RenderConfig
+from playslot_rl.modules.savi import SAVi
+from playslot_rl.world_model import WorldModel, frame_parser_module, module_device
+
+
+class SlotTransform(Transform):
+    """Adds SLOTS to each observation, parsing PIXELS with SAVi's recurrent state.
+
+    The state travels in the tensordict (SLOT_STATE (..., N, D), SLOT_AGE (..., 1)), never on the transform, so that
+    batched environments, partial resets and interleaved rollouts each keep their own.
+
+    Args:
+        savi: the parser, in evaluation mode; its device is where it runs, the environment keeps its own.
+        slot_shape: (N, D).
+        generator: of sampled initial slots.
+    """
+
+    def __init__(self, savi: SAVi, slot_shape: tuple[int, int], generator: torch.Generator | None = None) -> None:
+        super().__init__(in_keys=[keys.PIXELS], out_keys=[keys.SLOTS, keys.SLOT_STATE, keys.SLOT_AGE])
+        self.parser = frame_parser_module(savi, generator)
+        self.slot_shape = slot_shape
+
+    @torch.no_grad()
+    def _parse(self, pixels: Tensor, state: Tensor, age: Tensor) -> dict[str, Tensor]:
+        device = module_device(self.parser)
+        slots, after, older = self.parser(pixels.to(device), state.to(device), age.to(device))
+        found = {keys.SLOTS: slots, keys.SLOT_STATE: after, keys.SLOT_AGE: older}
+        return {key: value.to(pixels.device) for key, value in found.items()}
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:  # noqa: ARG002
+        # Episodes that a partial reset leaves alone are parsed as well; `EnvBase.reset` discards their values.
+        pixels = tensordict_reset.get(keys.PIXELS)
+        batch = pixels.shape[:-3]
+        state = torch.zeros(*batch, *self.slot_shape, device=pixels.device)
+        age = torch.zeros(*batch, 1, dtype=torch.int64, device=pixels.device)
+        tensordict_reset.update(self._parse(pixels, state, age))
+        return tensordict_reset
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        state, age = tensordict.get(keys.SLOT_STATE), tensordict.get(keys.SLOT_AGE)
+        next_tensordict.update(self._parse(next_tensordict.get(keys.PIXELS), state, age))
+        return next_tensordict
+
+    def _specs(self, like: TensorSpec) -> dict[str, TensorSpec]:
+        batch, device = like.shape, like.device
+        return {
+            keys.SLOT_STATE: Unbounded((*batch, *self.slot_shape), device=device),
+            keys.SLOT_AGE: Unbounded((*batch, 1), dtype=torch.int64, device=device),
+        }
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Adds SLOTS and the recurrent state."""
+        state = self._specs(observation_spec)
+        observation_spec.update({keys.SLOTS: state[keys.SLOT_STATE].clone(), **state})
+        return observation_spec
+
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
+        """The recurrent state is an input of the next step: batched environments pass on only what is declared."""
+        state_spec.update(self._specs(state_spec))
+        return state_spec
+
+
+class ActionDecoderTransform(Transform):
+    """Turns the policy's LATENT_ACTION into the ACTION the task wants, on the way in.
+
+    Args:
+        action_decoder: latent action to real action, in evaluation mode.
+        latent_shape: ([N,] Z).
+    """
+
+    def __init__(self, action_decoder: nn.Module, latent_shape: tuple[int, ...]) -> None:
+        super().__init__(in_keys=[], out_keys=[], in_keys_inv=[keys.ACTION], out_keys_inv=[keys.LATENT_ACTION])
+        self.action_decoder = action_decoder
+        self.latent_shape = latent_shape
+
+    @torch.no_grad()
+    def _inv_apply_transform(self, state: Tensor) -> Tensor:
+        action: Tensor = self.action_decoder(state.to(module_device(self.action_decoder)))
+        return action.to(state.device)
+
+    def transform_action_spec(self, action_spec: Composite) -> Composite:
+        """LATENT_ACTION in place of ACTION."""
+        spec = Unbounded((*action_spec.shape, *self.latent_shape), device=action_spec.device)
+        return Composite({keys.LATENT_ACTION: spec}, shape=action_spec.shape, device=action_spec.device)
+
+
+def latent_env(
+    base: EnvBase,
+    world_model: WorldModel,
+    action_decoder: nn.Module,
+    max_steps: int,
+    generator: torch.Generator | None = None,
+) -> TransformedEnv:
+    """Wrap any TorchRL environment with PIXELS uint8 (..., 3, H, W) and ACTION (..., A), batched or not.
+
+    Args:
+        base: the environment.
+        world_model: put into evaluation mode.
+        action_decoder: put into evaluation mode.
+        max_steps: steps after which an episode is truncated.
+        generator: of sampled initial slots.
+
+    Raises:
+        ValueError: the environment's frames or actions are not what the world model was made for.
+    """
+    _check_fits(base, world_model)
+    world_model.eval()
+    action_decoder.eval()
+    return TransformedEnv(
+        base,
+        Compose(
+            SlotTransform(world_model.savi, world_model.slot_shape, generator),
+            ActionDecoderTransform(action_decoder, world_model.latent_shape),
+            StepCounter(max_steps=max_steps, step_count_key=keys.STEP_COUNT),
+        ),
+        auto_unwrap=True,
+    )
+
+
+def make_simulation_env(
+    env_config: EnvConfig,
+    render_config: RenderConfig,
+    world_model: WorldModel,
+    action_decoder: nn.Module,
+    generator: torch.Generator | None = None,
+    device: torch.device | str = "cpu",
+) -> TransformedEnv:
+    """The simulated task with SLOTS as observation and LATENT_ACTION as action.
+
+    The task's own keys stay (PIXELS, SUCCESS, reward, done). `action_decoder_module` on the rollout gives the real
+    actions again. Seed by `env.set_seed(seed)` before a reset.
+
+    Args:
+        env_config: the task.
+        render_config: rendering; use the one of the training data.
+        world_model: put into evaluation mode.
+        action_decoder: put into evaluation mode.
+        generator: of sampled initial slots.
+        device: device of the environment's tensors; the networks stay where they are.
+
+    Raises:
+        ConfigError: unknown environment.
+        RenderError: there is no GL backend.
+        ValueError: frame size or action width differ from the world model's.
+
+    Examples:
+        >>> from playslot_rl.config import RenderConfig
+        >>> from playslot_rl.testing import tiny_config
+        >>> from playslot_rl.world_model import Agent, WorldModel, latent_policy_module
+        >>> config = tiny_config(max_steps=3)
+        >>> agent = Agent.untrained(WorldModel(config.model, config.env)).eval()
+        >>> env = make_simulation_env(config.env, RenderConfig(), agent.world_model, agent.action_decoder)
+        >>> rollout = env.rollout(3, latent_policy_module(agent.policy))
+        >>> rollout["slots"].shape, rollout["next", "success"].shape
+        (torch.Size([3, 4, 32]), torch.Size([3, 1]))
+        >>> env.close()
+    """
+    from playslot_rl.envs import make_torchrl_env
+
+    base = make_torchrl_env(env_config, render_config)
+    if torch.device(device).type != "cpu":
+        base = base.to(device)
+    return latent_env(base, world_model, action_decoder, env_config.max_steps, generator)
+
+
+def _check_fits(base: EnvBase, world_model: WorldModel) -> None:
+    side, width = world_model.env.image_size, world_model.env.action_dim
+    frame = tuple(base.observation_spec[keys.PIXELS].shape[-3:])
+    if frame != (3, side, side):
+        raise ValueError(f"frames: got {frame}, expected {(3, side, side)}; set env.image_size to the world model's")
+    action = base.full_action_spec[keys.ACTION].shape[-1]
+    if action != width:
+        raise ValueError(f"actions: got width {action}, expected {width}; set env.action_dim to the world model's")

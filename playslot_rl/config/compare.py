@@ -1,0 +1,56 @@
+"""Config of `playslot compare` (the group `compare` of the experiment's config)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from playslot_rl.config.methods import MethodName
+from playslot_rl.config.plain import check
+
+LAUNCHERS: dict[str, str] = {
+    "basic": "hydra",
+    "joblib": "hydra_plugins.hydra_joblib_launcher",
+    "submitit_local": "hydra_plugins.hydra_submitit_launcher",
+    "submitit_slurm": "hydra_plugins.hydra_submitit_launcher",
+    "ray": "hydra_plugins.hydra_ray_launcher",
+}
+"""Hydra's launchers by name, and the module each of them needs."""
+
+
+@dataclass(frozen=True)
+class CompareConfig:
+    """What is compared. On the command line of `playslot compare` the keys are `methods=`, `demos=`, `seeds=` and
+    `hydra.launcher=`, without the group's name.
+
+    Attributes:
+        methods: names of `playslot_rl.config.methods`.
+        demos: numbers of demonstrations, for the methods that learn from them.
+        seeds: training seeds.
+        online_seeds: training seeds of the methods that act, which take the longest; empty means `seeds`.
+        evaluation_seed: block of evaluation seeds, the same for every method and training seed.
+        launcher: Hydra launcher that runs the jobs; empty runs them one after the other.
+        hydra: further overrides for Hydra, such as `hydra.launcher.n_jobs=2`.
+    """
+
+    methods: tuple[MethodName, ...] = ("playslot", "lapo", "slot_oracle", "resnet_oracle", "dreamer", "sold")
+    demos: tuple[int, ...] = (10, 50, 100, 150)
+    seeds: tuple[int, ...] = (0, 1, 2)
+    online_seeds: tuple[int, ...] = ()
+    evaluation_seed: int = 100
+    launcher: str = ""
+    hydra: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("methods", "demos", "seeds"):
+            values = getattr(self, name)
+            check(len(values) > 0, name, values, "at least one")
+            check(len(set(values)) == len(values), name, values, "each one once")
+        online = self.online_seeds
+        check(set(online) <= set(self.seeds), "compare.online_seeds", online, f"some of seeds={self.seeds}")
+        check(len(set(online)) == len(online), "compare.online_seeds", online, "each one once")
+        check(all(n >= 1 for n in self.demos), "demos", self.demos, "numbers of at least 1")
+        check(all(s >= 0 for s in self.seeds), "seeds", self.seeds, "non-negative integers")
+        check(0 <= self.evaluation_seed <= 1000, "compare.evaluation_seed", self.evaluation_seed, "0 to 1000")
+        known = ", ".join(LAUNCHERS)
+        check(self.launcher in ("", *LAUNCHERS), "hydra.launcher", self.launcher, f"one of {known}")
+        check(not self.hydra or bool(self.launcher), "hydra", self.hydra, "hydra.launcher=NAME with it")

@@ -1,0 +1,111 @@
+"""Config of the task: which environment, and how its frames are rendered (re-exported by `playslot_rl.config`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from playslot_rl.config.plain import check
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """How frames are rendered, for data and for evaluation alike.
+
+    Attributes:
+        quality: `fast` (no shadows, no multisampling, box-averaged supersampling) or `full` (MuJoCo's default look).
+        supersample: side factor of the `fast` path; 2 renders at twice the size and averages 2x2 boxes.
+    """
+
+    quality: Literal["fast", "full"] = "fast"
+    supersample: int = 2
+
+    def __post_init__(self) -> None:
+        check(1 <= self.supersample <= 8, "render.supersample", self.supersample, "an integer from 1 to 8")
+
+
+@dataclass(frozen=True)
+class GridConfig:
+    """GridShapes, read by `env=grid_shapes` only.
+
+    Attributes:
+        objects: shapes in a clip, 1 to 5; `action_dim` is twice that.
+        size: side of a shape, pixels.
+        speed: pixels a step.
+        change: probability that a shape draws a new direction at a step.
+    """
+
+    objects: int = 2
+    size: int = 15
+    speed: int = 2
+    change: float = 0.25
+
+    def __post_init__(self) -> None:
+        check(1 <= self.objects <= 5, "env.grid.objects", self.objects, "1 to 5")
+        check(self.size >= 3, "env.grid.size", self.size, "at least 3 pixels")
+        check(self.speed >= 1, "env.grid.speed", self.speed, "at least 1 pixel")
+        check(0.0 <= self.change <= 1.0, "env.grid.change", self.change, "a probability")
+
+
+@dataclass(frozen=True)
+class BlocksConfig:
+    """The blocks family, read by `env=block_push`, `block_push_easy`, `block_reach` and `block_pick` only.
+
+    Attributes:
+        task: which object: `red`, `reddest` (nearest to red by CIEDE2000), `odd` (all others share another colour) or
+            `odd_groups` (the others form groups of a colour).
+        distractors: other objects, 0 to 4.
+        distractors_to: where given, each episode draws their number from `distractors` to this.
+        colour: colour of the odd object (a name in `playslot_rl.envs.colours`); empty draws it for each episode.
+        reward: `dense` or `sparse`.
+    """
+
+    task: Literal["red", "reddest", "odd", "odd_groups"] = "odd"
+    distractors: int = 3
+    distractors_to: int | None = None
+    colour: str = ""
+    reward: Literal["dense", "sparse"] = "dense"
+
+    def __post_init__(self) -> None:
+        check(0 <= self.distractors <= 4, "env.blocks.distractors", self.distractors, "0 to 4")
+        last = self.distractors if self.distractors_to is None else self.distractors_to
+        limits = f"{self.distractors} (env.blocks.distractors) to 4, or null"
+        check(self.distractors <= last <= 4, "env.blocks.distractors_to", last, limits)
+        if self.colour:
+            from playslot_rl.envs.colours import COLOURS
+
+            check(self.colour in COLOURS, "env.blocks.colour", self.colour, f"one of {', '.join(COLOURS)}")
+            odd = self.task in ("odd", "odd_groups")
+            check(odd, "env.blocks.colour", self.colour, f"no colour with env.blocks.task={self.task}")
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """The task.
+
+    Attributes:
+        name: environment name (`button_press`, `block_push`, `grid_shapes`, ...).
+        image_size: side of the square frames, pixels.
+        action_dim: width A of the real action.
+        frame_skip: environment steps per agent step, all with the same action.
+        max_steps: agent steps in an episode.
+        warmup_steps: random agent steps after each reset, before the first observation.
+        grid: settings of `grid_shapes`.
+        blocks: settings of the `block_*` environments.
+    """
+
+    name: str = "button_press"
+    image_size: int = 64
+    action_dim: int = 4
+    frame_skip: int = 5
+    max_steps: int = 20
+    warmup_steps: int = 12
+    grid: GridConfig = field(default_factory=GridConfig)
+    blocks: BlocksConfig = field(default_factory=BlocksConfig)
+
+    def __post_init__(self) -> None:
+        check(self.image_size in (32, 64, 128), "env.image_size", self.image_size, "32, 64 or 128")
+        check(self.frame_skip >= 1, "env.frame_skip", self.frame_skip, "at least 1")
+        check(self.max_steps >= 2, "env.max_steps", self.max_steps, "at least 2")
+        used = self.name.startswith("block_") or self.blocks == BlocksConfig()
+        check(used, "env.blocks", self.blocks, f"no changes with env.name={self.name}, which has no blocks")

@@ -1,0 +1,162 @@
+"""Config of sizes: SAVi, InvDyn, cOCVP, policy, action decoder (re-exported by `playslot_rl.config`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from playslot_rl.config.plain import check
+
+LatentMode = Literal["hybrid", "discrete", "continuous", "ground_truth"]
+
+
+@dataclass(frozen=True)
+class SAViConfig:
+    """Sizes of SAVi (system.md section 1; paper, appendix A.1).
+
+    Attributes:
+        n_slots: N.
+        slot_dim: D.
+        initial: `gaussian` (learned mean and scale shared by all slots; paper) or `learned` (one vector per slot).
+        encoder: `full` (four 5x5 stride-1 convs; paper) or `strided` (5x5 convs with `encoder_strides`).
+        encoder_channels: channels of each encoder conv.
+        encoder_strides: strides of the encoder convs (all 1 for `full`).
+        token_dim: width of the encoder tokens' MLP and of q, k, v.
+        decoder: `broadcast` (full-resolution spatial broadcast; paper) or `pixel_shuffle` (from 8x8 upwards).
+        decoder_channels: channels of the decoder.
+        decoder_position: `linear` (a linear map of the coordinates; paper) or, for `pixel_shuffle`, `learned` (a free
+            8x8 map is added, so that a still background does not have to be made out of ramps).
+        collapse: use the collapsed first layer of the broadcast decoder (exact; `false` computes it plainly).
+        first_iterations: Slot Attention iterations on an episode's first frame.
+        iterations: iterations on every later frame.
+        corrector_mlp: hidden width of the corrector's residual MLP.
+        transition_heads: heads of the transition block, of width D / heads.
+        transition_mlp: hidden width of the transition block's MLP.
+        transition_start: how the transition's weights start: `xavier` (as all others) or `identity` (it starts by
+            handing slots on as they are, so that no two of them learn to change places at every frame).
+    """
+
+    n_slots: int = 4
+    slot_dim: int = 128
+    initial: Literal["gaussian", "learned"] = "gaussian"
+    encoder: Literal["full", "strided"] = "full"
+    encoder_channels: tuple[int, ...] = (32, 32, 32, 32)
+    encoder_strides: tuple[int, ...] = (1, 1, 1, 1)
+    token_dim: int = 128
+    decoder: Literal["broadcast", "pixel_shuffle"] = "broadcast"
+    decoder_channels: tuple[int, ...] = (64, 64, 64, 64)
+    decoder_position: Literal["linear", "learned"] = "linear"
+    collapse: bool = True
+    first_iterations: int = 3
+    iterations: int = 1
+    corrector_mlp: int = 256
+    transition_heads: int = 4
+    transition_mlp: int = 512
+    transition_start: Literal["xavier", "identity"] = "xavier"
+
+    def __post_init__(self) -> None:
+        check(self.n_slots >= 1, "model.savi.n_slots", self.n_slots, "at least 1")
+        check(
+            len(self.encoder_channels) == len(self.encoder_strides),
+            "model.savi.encoder_strides",
+            self.encoder_strides,
+            f"one stride for each of the {len(self.encoder_channels)} encoder channels",
+        )
+        check(
+            self.decoder_position == "linear" or self.decoder == "pixel_shuffle",
+            "model.savi.decoder_position",
+            self.decoder_position,
+            f"linear with model.savi.decoder={self.decoder}",
+        )
+        check(
+            self.slot_dim % self.transition_heads == 0,
+            "model.savi.transition_heads",
+            self.transition_heads,
+            f"a divisor of slot_dim {self.slot_dim}",
+        )
+
+
+@dataclass(frozen=True)
+class InverseDynamicsConfig:
+    """Sizes of InvDyn and its quantiser (system.md section 2; paper, appendix A.2).
+
+    Attributes:
+        variant: `single` (InvDyn_S, one z per step) or `multi` (InvDyn_M, one z per slot and step).
+        mode: latent-action mode.
+        latent_dim: Z.
+        n_prototypes: K.
+        dim, layers, heads, head_dim, mlp_dim: transformer of InvDyn_S; `dim` is the hidden width of InvDyn_M.
+        decay: EMA decay of the codebook.
+        dead_threshold: EMA cluster size under which a code is revived by a random latent of the batch.
+        commitment: weight beta of the commitment term.
+        sample: sample z at evaluation too (training always samples).
+    """
+
+    variant: Literal["single", "multi"] = "single"
+    mode: LatentMode = "hybrid"
+    latent_dim: int = 16
+    n_prototypes: int = 8
+    dim: int = 256
+    layers: int = 4
+    heads: int = 4
+    head_dim: int = 64
+    mlp_dim: int = 1024
+    decay: float = 0.99
+    dead_threshold: float = 1.0
+    commitment: float = 0.25
+    sample: bool = False
+
+    def __post_init__(self) -> None:
+        check(0.0 < self.decay < 1.0, "model.inverse_dynamics.decay", self.decay, "a number in (0, 1)")
+        check(self.n_prototypes >= 2, "model.inverse_dynamics.n_prototypes", self.n_prototypes, "at least 2")
+
+
+@dataclass(frozen=True)
+class PredictorConfig:
+    """Sizes of cOCVP (system.md section 3; paper, appendix A.3).
+
+    Attributes:
+        dim, layers, heads, head_dim, mlp_dim: the transformer.
+        residual: predict the change of the slots instead of the slots.
+        context: frames it attends to; past them the window slides and is recomputed.
+    """
+
+    dim: int = 256
+    layers: int = 4
+    heads: int = 8
+    head_dim: int = 64
+    mlp_dim: int = 1024
+    residual: bool = False
+    context: int = 24
+
+    def __post_init__(self) -> None:
+        check(self.context >= 2, "model.predictor.context", self.context, "at least 2 frames")
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """Sizes of the latent policy: InvDyn_S's architecture with one head (paper, appendix A.4)."""
+
+    dim: int = 256
+    layers: int = 4
+    heads: int = 4
+    head_dim: int = 64
+    mlp_dim: int = 1024
+
+
+@dataclass(frozen=True)
+class ActionDecoderConfig:
+    """Sizes of the action decoder: a three-layer MLP (paper, appendix A.4)."""
+
+    hidden_dim: int = 128
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """All sizes."""
+
+    savi: SAViConfig = field(default_factory=SAViConfig)
+    inverse_dynamics: InverseDynamicsConfig = field(default_factory=InverseDynamicsConfig)
+    predictor: PredictorConfig = field(default_factory=PredictorConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    action_decoder: ActionDecoderConfig = field(default_factory=ActionDecoderConfig)

@@ -1,0 +1,113 @@
+"""The benchmark's figures: a dict for JSON, a table for people, and the machine they belong to."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from playslot_rl.speed.spec import Sizes, dynamics_variants, rollout_variants, savi_variants
+from playslot_rl.threads import available_cores
+
+TARGETS: Final = {
+    "savi_step": 2.5,
+    "dynamics_step": 2.5,
+    "rollout_cache": 3.0,
+    "window_sampling": 20.0,
+    "render": 12.0,
+    "render_block_push": 5.0,
+}
+"""Ratios that the project asks of itself (on two CPU cores)."""
+
+Figures = dict[str, Any]
+
+
+def measure(
+    sizes: Sizes, threads: int = 0, quick: bool = False, say: Callable[[str], None] = lambda _: None
+) -> Figures:
+    """Time everything.
+
+    Args:
+        sizes: sizes and repeats.
+        threads: torch threads of each child; 0 leaves torch's choice.
+        quick: recorded in the result: the sizes are not the paper's.
+        say: told what is being timed.
+
+    Returns:
+        For each key of `TARGETS` a dict with `ratio`, `unit` and the medians it was made of; and `machine`.
+
+    Raises:
+        PlaySlotError: a child died. RenderError: no GL backend.
+    """
+    from playslot_rl.allocator import tune_allocator
+    from playslot_rl.speed.drawing import render_block_push_seconds, render_seconds
+    from playslot_rl.speed.race import race
+    from playslot_rl.speed.sampling import sampling_rates
+
+    tune_allocator()  # of this process, which samples windows, as every recipe does; each child sets its own
+    say("SAVi training step, eight variants")
+    savi = race(savi_variants(), sizes, threads)
+    say("dynamics training step")
+    dynamics = race(dynamics_variants(sizes.decoded_frames), sizes, threads)
+    say("rollout, cached against full")
+    rollout = race(rollout_variants(), sizes, threads)
+    say("window sampling against LeRobotDataset + DataLoader")
+    rates = sampling_rates(sizes)
+    say("rendering, fast against default")
+    render = render_seconds(sizes)
+    blocks = render_block_push_seconds(sizes)
+    return {
+        "savi_step": _entry(savi, "plain_fp32_glibc", "collapsed_bf16_allocator"),
+        "dynamics_step": _entry(dynamics, "plain_fp32_glibc", "fast"),
+        "rollout_cache": _entry(rollout, "full", "cached"),
+        "window_sampling": {"ratio": rates["cache"] / rates["lerobot"], "unit": "frames/s", **rates},
+        "render": _entry(render, "full", "fast"),
+        "render_block_push": _entry(blocks, "full", "fast"),
+        "machine": {**machine(), "threads": threads, "repeats": sizes.repeats, "quick": quick},
+    }
+
+
+def _entry(seconds: Mapping[str, float], slow: str, fast: str) -> Figures:
+    return {"ratio": seconds[slow] / seconds[fast], "unit": "s", **seconds}
+
+
+def machine() -> Figures:
+    """What the figures were measured on."""
+    from importlib.metadata import version
+
+    return {
+        "cpu": _cpu(),
+        "cores": available_cores(),
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        "torch": version("torch"),
+        "mujoco": version("mujoco"),
+        "lerobot": version("lerobot"),
+    }
+
+
+def _cpu() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def table(figures: Figures) -> str:
+    """Markdown: one table of ratios, one of the medians behind them."""
+    lines = ["| case | ratio | target |", "|---|---|---|"]
+    lines += [f"| `{key}` | {figures[key]['ratio']:.1f} | {target:g} |" for key, target in TARGETS.items()]
+    lines += ["", "| case | variant | median |", "|---|---|---|"]
+    for key in TARGETS:
+        unit = figures[key]["unit"]
+        for name, value in figures[key].items():
+            if name not in ("ratio", "unit"):
+                shown = f"{value:,.0f} frames/s" if unit == "frames/s" else f"{value * 1000:,.1f} ms"
+                lines.append(f"| `{key}` | `{name}` | {shown} |")
+    m = figures["machine"]
+    versions = f"Python {m['python']}, torch {m['torch']}, mujoco {m['mujoco']}, lerobot {m['lerobot']}"
+    lines += ["", f"{m['cpu']}, {m['cores']} cores, {m['system']}, {versions}; medians of {m['repeats']}"]
+    return "\n".join(lines)

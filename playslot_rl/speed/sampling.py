@@ -1,0 +1,115 @@
+"""Reading training windows: frame cache and `sample_windows` against `LeRobotDataset` and `DataLoader`.
+
+Both deliver batches of float32 frames (B, T, 3, H, W) in [0, 1] of random windows of the same small data set.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import time
+from collections.abc import Callable, Generator
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from playslot_rl import keys
+from playslot_rl.data.quiet import quiet_datasets
+from playslot_rl.data.source import open_source
+from playslot_rl.data.windows import sample_windows
+from playslot_rl.speed.spec import Sizes
+from playslot_rl.threads import available_cores
+
+_FPS = 10
+
+
+def sampling_rates(sizes: Sizes) -> dict[str, float]:
+    """Frames a second: `cache`, and `lerobot` with as many DataLoader workers as there are cores.
+
+    The repeats take turns. Building the cache, which happens once per data set, and starting the workers are not
+    counted; the workers end with their turn, so that none reads ahead while the cache is timed.
+    """
+    rates: dict[str, list[float]] = {"lerobot": [], "cache": []}
+    frames = sizes.window_batch * sizes.window
+    with tempfile.TemporaryDirectory(prefix="playslot-bench-") as folder, quiet_datasets():
+        root = write_dataset(Path(folder) / "data", sizes)
+        cached = cache_batches(root, Path(folder) / "cache", sizes)
+        for _ in range(sizes.repeats + 1):
+            rates["cache"].append(frames / _seconds(cached, sizes.cache_batches, sizes))
+            with contextlib.closing(lerobot_batches(root, sizes)) as batches:
+                for _ in range(2 * available_cores()):  # what the workers read ahead while they start
+                    next(batches)
+                rates["lerobot"].append(frames / _seconds(partial(next, batches), sizes.loader_batches, sizes))
+    return {name: median(found[1:]) for name, found in rates.items()}
+
+
+def _seconds(read: Callable[[], Tensor], batches: int, sizes: Sizes) -> float:
+    """Seconds a batch."""
+    expected = (sizes.window_batch, sizes.window, 3, sizes.image_size, sizes.image_size)
+    begin = time.perf_counter()
+    for _ in range(batches):
+        batch = read()
+        assert tuple(batch.shape) == expected, f"got {tuple(batch.shape)}, expected {expected}"
+    return (time.perf_counter() - begin) / batches
+
+
+def write_dataset(root: Path, sizes: Sizes) -> Path:
+    """A LeRobot v3.0 data set of `image` frames, as the collectors store them: smooth shapes with a little noise."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    side, generator = sizes.image_size, np.random.default_rng(0)
+    feature = {"dtype": "image", "shape": (side, side, 3), "names": ["height", "width", "channels"]}
+    dataset: Any = LeRobotDataset.create(
+        "playslot/bench",
+        fps=_FPS,
+        features={keys.FEATURE_IMAGE: feature},
+        root=root,
+        use_videos=False,
+        video_backend="pyav",
+    )
+    for _ in range(sizes.episodes):
+        coarse = generator.integers(0, 250, (sizes.episode_frames, side // 8, side // 8, 3))
+        frames = coarse.repeat(8, axis=1).repeat(8, axis=2) + generator.integers(0, 4, (side, side, 3))
+        for frame in frames.astype(np.uint8):
+            dataset.add_frame({keys.FEATURE_IMAGE: frame, "task": "bench"})
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def cache_batches(root: Path, cache: Path, sizes: Sizes) -> Callable[[], Tensor]:
+    """Batches as the training stages read them, as floats."""
+    source, generator = open_source(root, cache=cache), np.random.default_rng(0)
+
+    def read() -> Tensor:
+        rows = sample_windows(source.starts, source.lengths, sizes.window, sizes.window_batch, generator)
+        return source.pixels(rows).float().div_(255)
+
+    return read
+
+
+def lerobot_batches(root: Path, sizes: Sizes) -> Generator[Tensor]:
+    """Batches as LeRobot's own training reads them, for ever."""
+    import torch
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from torch.utils.data import DataLoader, RandomSampler
+
+    offsets = {keys.FEATURE_IMAGE: [t / _FPS for t in range(sizes.window)]}
+    # pyav although there is no video: without it LeRobot tries torchcodec and prints why that does not load.
+    dataset: Any = LeRobotDataset("playslot/bench", root=root, delta_timestamps=offsets, video_backend="pyav")
+    sampler = RandomSampler(
+        dataset, replacement=True, num_samples=1_000_000_000, generator=torch.Generator().manual_seed(0)
+    )
+    loader: Any = DataLoader(
+        dataset,
+        batch_size=sizes.window_batch,
+        sampler=sampler,
+        num_workers=available_cores(),
+        multiprocessing_context="fork",
+    )
+    for batch in loader:
+        yield batch[keys.FEATURE_IMAGE]

@@ -1,0 +1,1 @@
+"""The ground floor: atomic writes, tensors, checkpoints, provenance."""

@@ -1,0 +1,232 @@
+"""Finished stages: `weights.safetensors`, `config.json` and `meta.json` in a folder. Never a pickle.
+
+A child names its parents by the fingerprints of their weights and refuses any other. Where the folders lie in a run:
+`playslot_rl.training.runs`.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from playslot_rl.errors import CheckpointError
+from playslot_rl.storage.atomic import explain_write_errors, replace_dir, temporary_name, write_json
+from playslot_rl.storage.provenance import provenance
+from playslot_rl.storage.resume import first_difference
+from playslot_rl.storage.tensors import (
+    load_modules,
+    load_tensors,
+    module_tensors,
+    save_tensors,
+    weights_fingerprint,
+)
+
+FORMAT = "playslot_rl.checkpoint/1"
+STAGES = ("slots", "dynamics", "policy")
+_COMMANDS = {
+    "slots": "train-slots",
+    "dynamics": "train-dynamics",
+    "policy": "train-policy",
+    "lapo_model": "train-baseline method=lapo",
+}
+
+
+def training_command(stage: str) -> str:
+    """The command that trains a stage, or a baseline of that name."""
+    return _COMMANDS.get(stage, f"train-baseline method={stage}")
+
+
+@dataclass(frozen=True)
+class StageCheckpoint:
+    """A finished stage on disk.
+
+    Attributes:
+        path: its folder.
+        stage: `slots`, `dynamics` or `policy`.
+        config: `{"env": ..., "model": ..., STAGE: ...}`, the plain values it was trained with.
+        meta: how it was made: commit, data, parents, metrics, steps, seconds, command.
+        fingerprint: first 16 hex digits of the SHA-256 of its weights.
+    """
+
+    path: Path
+    stage: str
+    config: dict[str, Any]
+    meta: dict[str, Any]
+    fingerprint: str
+
+
+def checkpoint_folder(run: Path, stage: str) -> Path:
+    """`RUN/STAGE/checkpoint`."""
+    return run / stage / "checkpoint"
+
+
+def save_stage(
+    path: Path,
+    *,
+    stage: str,
+    modules: Mapping[str, nn.Module],
+    config: Mapping[str, Any],
+    data: Mapping[str, str],
+    parents: Mapping[str, str],
+    metrics: Mapping[str, float],
+    steps: int,
+    seconds: float,
+    extra: Mapping[str, Any] | None = None,
+) -> StageCheckpoint:
+    """Write a finished stage, atomically.
+
+    Args:
+        path: the folder to make (`checkpoint_folder(run, stage)`); replaced if it exists.
+        stage: `slots`, `dynamics` or `policy`.
+        modules: what to store, by name.
+        config: `{"env": ..., "model": ..., STAGE: ...}`, plain values.
+        data: fingerprints of the data sets, by role (`train`, `demos`).
+        parents: fingerprints of the parents' weights, by stage.
+        metrics: final numbers.
+        steps: optimiser steps.
+        seconds: wall-clock seconds of training.
+        extra: more plain values for `meta.json` (`labelled_demos`, `demos`).
+
+    Raises:
+        OutputError: full disk, or a folder that cannot be written.
+    """
+    temporary = temporary_name(path)
+    with explain_write_errors(path):
+        remove_leftovers(path)
+        temporary.mkdir(parents=True)
+        try:
+            save_tensors(temporary / "weights.safetensors", module_tensors(modules))
+            fingerprint = weights_fingerprint(temporary / "weights.safetensors")
+            meta = {
+                "format": FORMAT,
+                "stage": stage,
+                "fingerprint": fingerprint,
+                "modules": sorted(modules),
+                "data": dict(data),
+                "parents": dict(parents),
+                "metrics": dict(metrics),
+                "steps": steps,
+                "seconds": round(seconds, 1),
+                **provenance(),
+                **(extra or {}),
+            }
+            write_json(temporary / "config.json", dict(config))
+            write_json(temporary / "meta.json", meta)
+            replace_dir(temporary, path)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    return StageCheckpoint(path, stage, dict(config), meta, fingerprint)
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove what a process killed while it wrote this checkpoint has left."""
+    for leftover in path.parent.glob(f".{path.name}.tmp-*"):
+        shutil.rmtree(leftover)
+
+
+def read_stage(path: Path, stage: str) -> StageCheckpoint:
+    """Read config and meta of a finished stage and check that its weights are the ones that were saved.
+
+    Raises:
+        CheckpointError: no checkpoint there, another stage or format, or a damaged file.
+    """
+    if not (path / "meta.json").is_file():
+        raise CheckpointError(
+            f"no {stage} checkpoint at {path}, expected meta.json, config.json and weights.safetensors: "
+            f"run `playslot {training_command(stage)}` first, or check run="
+        )
+    meta, config = read_json(path / "meta.json"), read_json(path / "config.json")
+    if meta.get("format") != FORMAT:
+        raise CheckpointError(
+            f"{path}: got format {meta.get('format')!r}, expected {FORMAT!r}: "
+            "use the version of playslot_rl that wrote it"
+        )
+    if meta.get("stage") != stage:
+        raise CheckpointError(
+            f"{path}: got a checkpoint of stage {meta.get('stage')!r}, expected {stage!r}: check run="
+        )
+    weights = path / "weights.safetensors"
+    if not weights.is_file():
+        raise CheckpointError(f"{weights} is missing, expected the stage's weights: train {stage} again")
+    return StageCheckpoint(path, stage, config, meta, weights_fingerprint(weights))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path} is damaged ({error}), expected a JSON object: train that stage again") from error
+    if not isinstance(values, dict):
+        raise CheckpointError(f"{path}: got {type(values).__name__}, expected a JSON object: train that stage again")
+    return values
+
+
+def load_weights(checkpoint: StageCheckpoint, modules: Mapping[str, nn.Module]) -> None:
+    """Load a finished stage into freshly built modules, in place.
+
+    Raises:
+        CheckpointError: missing, unexpected or misshapen tensors, or a file that is not the one that was saved.
+    """
+    load_modules(modules, load_tensors(checkpoint.path / "weights.safetensors"), str(checkpoint.path))
+    require_whole(checkpoint)
+
+
+def require_whole(checkpoint: StageCheckpoint) -> None:
+    """Check that the weights are the ones that were saved.
+
+    Raises:
+        CheckpointError: they are not.
+    """
+    saved = checkpoint.meta.get("fingerprint")
+    if checkpoint.fingerprint != saved:
+        raise CheckpointError(
+            f"{checkpoint.path / 'weights.safetensors'}: got fingerprint {checkpoint.fingerprint}, expected {saved} "
+            f"from its meta.json: the file was changed or damaged; put it back, or train {checkpoint.stage} again"
+        )
+
+
+def require_parents(child: StageCheckpoint, parents: Mapping[str, StageCheckpoint]) -> None:
+    """Check that a child was trained on exactly these parents.
+
+    Raises:
+        CheckpointError: a parent is another one, or damaged.
+    """
+    for name, parent in parents.items():
+        require_whole(parent)
+        expected = child.meta.get("parents", {}).get(name)
+        if parent.fingerprint != expected:
+            raise CheckpointError(
+                f"{child.path} was trained on {name} {expected}, got {name} {parent.fingerprint} at {parent.path}: "
+                f"run `playslot {training_command(child.stage)}` again on these, or put its parent back"
+            )
+
+
+def require_config(checkpoint: StageCheckpoint, wanted: Mapping[str, Any]) -> None:
+    """Check that the parts of a config in `wanted`, such as `{"model": {"savi": ...}}`, are those of a checkpoint.
+
+    Raises:
+        CheckpointError: names the first key that differs.
+    """
+    difference = first_difference(_restrict(checkpoint.config, wanted), wanted)
+    if difference is not None:
+        key, old, new = difference
+        raise CheckpointError(
+            f"{key}: got {new}, expected {old}, with which {checkpoint.path} was trained: "
+            f"leave {key} as it was, or use another out="
+        )
+
+
+def _restrict(values: Any, pattern: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        key: _restrict(values[key], part)
+        if isinstance(part, Mapping) and isinstance(values[key], Mapping)
+        else values[key]
+        for key, part in pattern.items()
+        if isinstance(values, Mapping) and key in values
+    }

@@ -1,0 +1,188 @@
+"""Training checkpoints: what a stage resumes from. Folders `step_XXXXXXXX` of safetensors and JSON, whole or absent.
+
+A folder appears by one rename after everything in it is on the disk, so the newest one is always good. The newest two
+are kept. No RNG state is stored: every draw is a function of the seed and the step (`seeding`).
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from torch import Tensor, nn
+
+from playslot_rl.errors import CheckpointError, OutputError
+from playslot_rl.storage.atomic import explain_write_errors, replace_dir, temporary_name, write_json
+from playslot_rl.storage.tensors import load_modules, load_tensors, module_tensors, save_tensors
+from playslot_rl.training.optim import adam_tensors, restore_adam
+
+FORMAT = "playslot_rl.training/1"
+KEPT = 2
+
+_ABSENT = "nothing"
+
+
+@dataclass(frozen=True)
+class TrainingState:
+    """Where a stage stands.
+
+    Attributes:
+        step: finished optimiser steps.
+        seconds: wall-clock seconds spent on them, over all processes.
+        metrics: the last validation's numbers.
+    """
+
+    step: int = 0
+    seconds: float = 0.0
+    metrics: dict[str, float] = field(default_factory=dict)
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested dicts as one dict with dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        flat.update(flatten(value, f"{name}.") if isinstance(value, Mapping) else {name: value})
+    return flat
+
+
+ADDED: Final[Mapping[str, Any]] = {"reward_scale": 1.0, "actor_average": 0.0}
+"""Settings that came after the first checkpoints, and what those were trained with."""
+
+
+def first_difference(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> tuple[str, Any, Any] | None:
+    """The first dotted key at which two nested configs differ: (key, stored value, wanted value)."""
+    right = flatten(wanted)
+    added = {key: ADDED[name] for key in right if (name := key.rpartition(".")[-1]) in ADDED}
+    left = {**added, **flatten(stored)}
+    for key in sorted(left.keys() | right.keys()):
+        if left.get(key, _ABSENT) != right.get(key, _ABSENT):
+            return key, left.get(key, _ABSENT), right.get(key, _ABSENT)
+    return None
+
+
+class TrainingCheckpoints:
+    """The `checkpoints` folder of a stage.
+
+    Args:
+        folder: where the `step_XXXXXXXX` folders live.
+        identity: nested plain values that must be equal for a resumed run to be the same run.
+    """
+
+    def __init__(self, folder: Path, identity: Mapping[str, Any]) -> None:
+        self.folder = folder
+        self.identity: dict[str, Any] = json.loads(json.dumps(identity))
+
+    def saved(self) -> list[Path]:
+        """Checkpoint folders, oldest first."""
+        return sorted(self.folder.glob("step_*"))
+
+    def last(self) -> Path | None:
+        """The newest checkpoint, or None."""
+        saved = self.saved()
+        return saved[-1] if saved else None
+
+    def save(
+        self,
+        state: TrainingState,
+        modules: Mapping[str, nn.Module],
+        optimizer: torch.optim.Adam,
+        parameters: Mapping[str, nn.Parameter],
+    ) -> Path:
+        """Write a checkpoint and remove all but the newest two.
+
+        Raises:
+            OutputError: full disk; the earlier checkpoints stay.
+        """
+        tensors = {"modules": module_tensors(modules), "optimizer": adam_tensors(optimizer, parameters)}
+        values = {"step": state.step, "seconds": state.seconds, "metrics": state.metrics}
+        return self._write(state.step, tensors, values)
+
+    def resume(
+        self, modules: Mapping[str, nn.Module], optimizer: torch.optim.Adam, parameters: Mapping[str, nn.Parameter]
+    ) -> TrainingState:
+        """Load the newest checkpoint into the modules and the optimiser; a fresh `TrainingState` if there is none.
+
+        Raises:
+            CheckpointError: the config differs from the stored one, or the checkpoint is damaged.
+            OutputError: a file stands where the folder should be.
+        """
+        newest = self._newest()
+        if newest is None:
+            return TrainingState()
+        last, stored = newest
+        load_modules(modules, load_tensors(last / "modules.safetensors"), str(last))
+        restore_adam(optimizer, parameters, load_tensors(last / "optimizer.safetensors"), str(last))
+        return TrainingState(stored["step"], stored["seconds"], stored["metrics"])
+
+    def _write(self, step: int, files: Mapping[str, Mapping[str, Tensor]], state: Mapping[str, Any]) -> Path:
+        """Write `step_STEP` of tensors `NAME.safetensors` and a `state.json`; keep the newest two.
+
+        Raises:
+            OutputError: full disk; the earlier checkpoints stay.
+        """
+        final = self.folder / f"step_{step:08d}"
+        temporary = temporary_name(final)
+        with explain_write_errors(final):
+            temporary.mkdir(parents=True)
+            try:
+                for name, tensors in files.items():
+                    save_tensors(temporary / f"{name}.safetensors", tensors)
+                write_json(temporary / "state.json", {"format": FORMAT, **state, "identity": self.identity})
+                replace_dir(temporary, final)
+            finally:
+                shutil.rmtree(temporary, ignore_errors=True)
+        for old in self.saved()[:-KEPT]:
+            shutil.rmtree(old)
+        return final
+
+    def _newest(self) -> tuple[Path, dict[str, Any]] | None:
+        """The newest checkpoint and its `state.json`, checked to belong to this run; None if there is none.
+
+        Raises:
+            CheckpointError: the config differs from the stored one, or the checkpoint is damaged.
+            OutputError: a file stands where the folder should be.
+        """
+        self._tidy()
+        last = self.last()
+        if last is None:
+            return None
+        stored = self._read(last)
+        difference = first_difference(stored["identity"], self.identity)
+        if difference is not None:
+            key, old, new = difference
+            raise CheckpointError(
+                f"{key}: got {new}, expected {old}, with which {self.folder.parent} was begun: "
+                f"set {key} back, use another out=, or delete that folder"
+            )
+        return last, stored
+
+    def _tidy(self) -> None:
+        if self.folder.exists() and not self.folder.is_dir():
+            raise OutputError(f"{self.folder} is a file, expected a folder of checkpoints: use another out=")
+        # A killed process leaves its unfinished folder; no one else writes here.
+        for leftover in self.folder.glob(".step_*.tmp-*"):
+            shutil.rmtree(leftover, ignore_errors=True)
+
+    @staticmethod
+    def _read(path: Path) -> dict[str, Any]:
+        try:
+            stored: dict[str, Any] = json.loads((path / "state.json").read_text())
+            if stored["format"] != FORMAT:
+                raise CheckpointError(
+                    f"{path}: got format {stored['format']!r}, expected {FORMAT!r}: "
+                    "use the version of playslot_rl that wrote it, or another out="
+                )
+            if not {"step", "seconds", "metrics", "identity"} <= stored.keys():
+                raise KeyError("step, seconds, metrics or identity")
+        except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
+            raise CheckpointError(
+                f"{path}/state.json is damaged ({error}), expected a whole JSON file: delete {path.name} to resume "
+                "from the checkpoint before it"
+            ) from error
+        return stored

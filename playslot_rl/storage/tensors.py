@@ -1,0 +1,82 @@
+"""Modules to safetensors and back, with errors that name the tensor."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from playslot_rl.errors import CheckpointError
+from playslot_rl.storage.atomic import write_bytes
+
+
+def module_tensors(modules: Mapping[str, nn.Module]) -> dict[str, Tensor]:
+    """Parameters and persistent buffers of all modules as `MODULE.NAME` tensors."""
+    return {f"{name}.{key}": value for name, module in modules.items() for key, value in module.state_dict().items()}
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Write tensors to a safetensors file, atomically.
+
+    Raises:
+        OutputError: full disk.
+    """
+    from safetensors.torch import save
+
+    # Serialised in memory and written by us: safetensors' own writer hides the errno of a full disk. Copies, because
+    # it refuses tensors that share memory.
+    write_bytes(path, save({key: value.detach().to("cpu", copy=True).contiguous() for key, value in tensors.items()}))
+
+
+def load_tensors(path: Path) -> dict[str, Tensor]:
+    """Read a safetensors file onto the CPU.
+
+    Raises:
+        CheckpointError: the file is missing, truncated, or no safetensors file.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    try:
+        return load(path.read_bytes())
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path} is missing, expected a checkpoint's weights: train that stage again") from error
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise CheckpointError(
+            f"{path} is damaged ({str(error).splitlines()[0]}), expected a whole safetensors file: "
+            "delete its folder and run the same command again"
+        ) from error
+
+
+def load_modules(modules: Mapping[str, nn.Module], tensors: Mapping[str, Tensor], where: str) -> None:
+    """Copy `MODULE.NAME` tensors into the modules, in place; nothing is changed unless everything fits.
+
+    Raises:
+        CheckpointError: a tensor is missing, unexpected, or of another shape.
+    """
+    expected = module_tensors(modules)
+    missing, unexpected = sorted(set(expected) - set(tensors)), sorted(set(tensors) - set(expected))
+    if missing or unexpected:
+        kind, names = ("misses", missing) if missing else ("holds the unexpected", unexpected)
+        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        raise CheckpointError(
+            f"{where} {kind} tensor {names[0]}{more}, expected the {len(expected)} tensors of its config: "
+            "train that stage again, or use the version of playslot_rl that wrote it"
+        )
+    for key, value in expected.items():
+        if value.shape != tensors[key].shape:
+            raise CheckpointError(
+                f"{where}: tensor {key} has shape {tuple(tensors[key].shape)}, expected {tuple(value.shape)}: "
+                "the config does not belong to these weights; train that stage again"
+            )
+    with torch.no_grad():
+        for key, value in expected.items():
+            value.copy_(tensors[key])
+
+
+def weights_fingerprint(path: Path) -> str:
+    """First 16 hex digits of the SHA-256 of a weights file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]

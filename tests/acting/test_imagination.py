@@ -1,0 +1,185 @@
+"""The world model as an environment."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs.utils import check_env_specs
+
+from playslot_rl import keys
+from playslot_rl.acting.imagination import ImaginationEnv
+from playslot_rl.config import LatentMode
+from playslot_rl.testing import tiny_agent, tiny_config
+from playslot_rl.world_model import Agent, WorldModel, dynamics_module, latent_policy_module, parser_module
+
+CONTEXT = 4
+
+
+@pytest.fixture(scope="module")
+def agent() -> Agent:
+    return tiny_agent(tiny_config(context=CONTEXT))
+
+
+def slots_of(batch: tuple[int, ...], seed: int = 0) -> Tensor:
+    return torch.randn(*batch, 4, 32, generator=torch.Generator().manual_seed(seed))
+
+
+def imagine(env: ImaginationEnv, agent: Agent, slots: Tensor, steps: int) -> TensorDict:
+    policy = latent_policy_module(agent.policy)
+    return env.rollout(steps, policy, tensordict=env.reset_from_slots(slots), auto_reset=False)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 2)])
+@pytest.mark.parametrize("horizon", [0, 2])
+def test_specs_hold_batched_and_unbatched(agent: Agent, batch: tuple[int, ...], horizon: int) -> None:
+    env = ImaginationEnv(agent.world_model, batch_size=batch, horizon=horizon)
+    check_env_specs(env, break_when_any_done="both")
+
+
+def by_hand(model: WorldModel, agent: Agent, first: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    """Policy, split and predictor called one after the other on a growing, then sliding, window."""
+    frames, latents = [first], []
+    for _ in range(steps):
+        latents.append(agent.policy(frames[-1]))
+        window = torch.stack(frames[-CONTEXT:], 1)
+        p, v = model.inverse_dynamics.split(torch.stack(latents[-CONTEXT:], 1))
+        frames.append(model.predictor(window, p, v)[:, -1])
+    return torch.stack(frames[1:], 1), torch.stack(latents, 1)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("steps", [CONTEXT - 1, CONTEXT, 3 * CONTEXT])
+def test_a_rollout_equals_calling_the_modules_by_hand(agent: Agent, steps: int) -> None:
+    first = slots_of((3,))
+    rollout = imagine(ImaginationEnv(agent.world_model, batch_size=[3]), agent, first, steps)
+    slots, latents = by_hand(agent.world_model, agent, first, steps)
+    assert (slots[:, 1:] - slots[:, :-1]).abs().amax() > 1e-2, "a model that moves nothing proves nothing"
+    torch.testing.assert_close(rollout["next", keys.SLOTS], slots, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(rollout[keys.LATENT_ACTION], latents, atol=1e-5, rtol=1e-5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("mode", ["hybrid", "discrete", "continuous", "ground_truth"])
+@pytest.mark.parametrize("steps", [3, 10])
+def test_given_latents_the_environment_is_the_cached_rollout(mode: LatentMode, steps: int) -> None:
+    model = tiny_agent(tiny_config(mode, context=CONTEXT)).world_model
+    check_against_rollout(model, steps)
+
+
+@torch.no_grad()
+def test_one_latent_action_per_slot_goes_the_same_way() -> None:
+    config = tiny_config(multi=True, context=CONTEXT)
+    torch.manual_seed(0)
+    model = WorldModel(config.model, config.env)
+    model.inverse_dynamics.split(torch.randn(64, 8))
+    assert model.latent_shape == (4, 8)
+    check_against_rollout(model.eval(), 7)
+    check_env_specs(ImaginationEnv(model, batch_size=[2]))
+
+
+def check_against_rollout(model: WorldModel, steps: int) -> None:
+    z = torch.randn(2, steps, *model.latent_shape, generator=torch.Generator().manual_seed(1))
+    env = ImaginationEnv(model, batch_size=[2])
+    first, got = slots_of((2,)), []
+    state = env.reset_from_slots(first)
+    for t in range(steps):
+        state = env.step(state.set(keys.LATENT_ACTION, z[:, t]))["next"]
+        got.append(state[keys.SLOTS])
+    p, v = model.inverse_dynamics.split(z)
+    expected = model.predictor.rollout(first[:, None], p, v)
+    torch.testing.assert_close(torch.stack(got, 1), expected, atol=1e-5, rtol=1e-5)
+
+
+@torch.no_grad()
+def test_episodes_of_unequal_age_do_not_disturb_each_other(agent: Agent) -> None:
+    env = ImaginationEnv(agent.world_model, batch_size=[2])
+    policy = latent_policy_module(agent.policy)
+    old = imagine(env, agent, slots_of((2,), 1), 3)[:, -1]["next"]
+    young = env.reset_from_slots(slots_of((2,), 2))
+    mixed = torch.where(torch.tensor([True, False]), old.select(*young.keys()), young)
+    assert mixed[keys.HISTORY_LENGTH].flatten().tolist() == [4, 1]
+    after = env.step(policy(mixed.clone()))["next", keys.SLOTS]
+    alone = [env.step(policy(part.clone()))["next", keys.SLOTS] for part in (old, young)]
+    torch.testing.assert_close(after[0], alone[0][0], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(after[1], alone[1][1], atol=1e-5, rtol=1e-5)
+
+
+def test_a_reset_takes_slots_pixels_or_the_sampler(agent: Agent) -> None:
+    drawn = slots_of((2,), 5)
+    env = ImaginationEnv(agent.world_model, batch_size=[2], first_slots=lambda n: drawn[:n])
+    assert torch.equal(env.reset()[keys.SLOTS], drawn)
+    given = slots_of((2,), 6)
+    assert torch.equal(env.reset(TensorDict({keys.SLOTS: given}, [2]))[keys.SLOTS], given)
+    pixels = torch.randint(256, (2, 3, 64, 64), dtype=torch.uint8)
+    parsed = parser_module(agent.world_model.savi)(TensorDict({keys.PIXELS: pixels[:, None]}, [2]))
+    start = env.reset(TensorDict({keys.PIXELS: pixels}, [2]))
+    torch.testing.assert_close(start[keys.SLOTS], parsed[keys.SLOTS][:, 0])
+    torch.testing.assert_close(start[keys.SLOT_HISTORY][:, -1], start[keys.SLOTS])
+    assert start[keys.SLOT_HISTORY][:, :-1].abs().max() == 0
+
+
+def test_slots_of_another_shape_are_refused(agent: Agent) -> None:
+    env = ImaginationEnv(agent.world_model, batch_size=[2])
+    with pytest.raises(ValueError, match=r"got shape \(2, 3, 32\), expected \(2, 4, 32\)"):
+        env.reset(TensorDict({keys.SLOTS: torch.zeros(2, 3, 32)}, [2]))
+    with pytest.raises(ValueError, match="horizon: got -1"):
+        ImaginationEnv(agent.world_model, horizon=-1)
+
+
+def test_other_batch_sizes_than_the_declared_one_are_taken(agent: Agent) -> None:
+    rollout = imagine(ImaginationEnv(agent.world_model), agent, slots_of((5,)), 2)
+    assert rollout["next", "done"].shape == (5, 2, 1)
+
+
+def test_the_horizon_truncates_and_nothing_else_ends_an_episode(agent: Agent) -> None:
+    rollout = imagine(ImaginationEnv(agent.world_model, [2], horizon=3), agent, slots_of((2,)), 9)
+    assert rollout.shape == (2, 3)
+    assert rollout["next", "truncated"][..., 0].tolist() == [[False, False, True]] * 2
+    assert not rollout["next", "terminated"].any()
+    endless = imagine(ImaginationEnv(agent.world_model, [2]), agent, slots_of((2,)), 9)
+    assert endless.shape == (2, 9)
+    assert not endless["next", "done"].any()
+
+
+def test_gradients_reach_the_policy_only_when_asked(agent: Agent) -> None:
+    for differentiable in (False, True):
+        env = ImaginationEnv(agent.world_model, [2], differentiable=differentiable)
+        agent.policy.zero_grad()
+        last = imagine(env, agent, slots_of((2,)), 3)["next", keys.SLOTS][:, -1]
+        assert last.requires_grad is differentiable
+        if differentiable:
+            last.square().mean().backward()
+            assert agent.policy.head.weight.grad is not None
+            assert agent.policy.head.weight.grad.abs().sum() > 0
+
+
+def test_imagining_changes_neither_the_model_nor_its_input(agent: Agent) -> None:
+    before = {name: tensor.clone() for name, tensor in agent.state_dict().items()}
+    env = ImaginationEnv(agent.world_model, [2])
+    start = env.reset_from_slots(slots_of((2,)))
+    kept = start.clone()
+    env.rollout(5, latent_policy_module(agent.policy), tensordict=start, auto_reset=False)
+    for key in sorted(kept.keys()):
+        assert torch.equal(start[key], kept[key]), key
+    assert all(torch.equal(before[name], tensor) for name, tensor in agent.state_dict().items())
+    assert not agent.world_model.training
+
+
+@torch.no_grad()
+def test_histories_are_right_aligned_and_slide(agent: Agent) -> None:
+    model = agent.world_model
+    step = dynamics_module(model.inverse_dynamics, model.predictor)
+    env = ImaginationEnv(model, [1])
+    state = env.reset_from_slots(slots_of((1,)))
+    seen = [state[keys.SLOTS]]
+    for t in range(CONTEXT + 2):
+        z = torch.full((1, 8), float(t))
+        state = step(state.clone().set(keys.LATENT_ACTION, z))
+        seen.append(state[keys.SLOTS])
+        length = min(t + 2, CONTEXT)
+        assert state[keys.HISTORY_LENGTH].item() == length
+        torch.testing.assert_close(state[keys.SLOT_HISTORY][:, -length:], torch.stack(seen[-length:], 1))
+        assert state[keys.ACTION_HISTORY][0, -2, 0].item() == t
+        assert state[keys.ACTION_HISTORY][0, -1].abs().max() == 0

@@ -1,0 +1,175 @@
+"""The configuration: every shipped YAML loads, every mistake is one line that names the choices."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from playslot_rl.config import ExperimentConfig, ModelConfig, SAViConfig, fingerprint, from_dict, to_dict
+from playslot_rl.config.compose import choices, compose
+from playslot_rl.errors import ConfigError
+
+PRESETS = ["compact", "paper", "smoke"]
+ENVS = ["block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "grid_shapes", "sketchy"]
+
+
+def store(config: ExperimentConfig, run: Path) -> Path:
+    run.mkdir(parents=True)
+    (run / "config.json").write_text(json.dumps(to_dict(config)))
+    return run
+
+
+def test_the_groups_are_the_shipped_ones() -> None:
+    assert choices("preset") == PRESETS
+    assert choices("env") == ENVS
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("env", ENVS)
+def test_every_shipped_yaml_loads_and_survives_json(preset: str, env: str) -> None:
+    config = compose([f"preset={preset}", f"env={env}"])
+    assert (config.preset, config.env.name) == (preset, env)
+    assert from_dict(ExperimentConfig, json.loads(json.dumps(to_dict(config)))) == config
+
+
+def test_the_default_is_compact_button_press() -> None:
+    assert compose() == compose(["preset=compact", "env=button_press"])
+
+
+def test_the_paper_preset_has_the_papers_sizes_and_schedule() -> None:
+    config = compose(["preset=paper"])
+    assert config.model == ModelConfig()
+    assert config.slots.batch_size == config.dynamics.batch_size == config.behaviour.batch_size == 64
+    assert (config.slots.optim.lr, config.slots.optim.warmup_steps, config.slots.optim.grad_clip) == (1e-4, 4000, 0.05)
+    assert (config.dynamics.optim.lr, config.dynamics.seed_frames, config.dynamics.predicted_frames) == (2e-4, 6, 8)
+    assert (config.behaviour.optim.lr, config.behaviour.optim.schedule) == (2e-4, "constant")
+    assert config.behaviour.decoder_inputs == "inverse_dynamics"
+    assert not config.behaviour.imagined
+
+
+def test_a_command_line_value_beats_the_preset() -> None:
+    config = compose(["slots.optim.lr=5e-4", "preset=smoke", "env.max_steps=9", "model.savi.encoder_channels=[4,4,4]"])
+    assert config.slots.optim.lr == 5e-4
+    assert config.env.max_steps == 9
+    assert config.model.savi.encoder_channels == (4, 4, 4)
+    assert config.slots.steps == compose(["preset=smoke"]).slots.steps
+
+
+def test_a_task_changes_any_preset_and_a_command_line_value_beats_the_task() -> None:
+    for preset in PRESETS:
+        latents = compose([f"preset={preset}", "env=grid_shapes"]).model.inverse_dynamics
+        assert (latents.variant, latents.n_prototypes, latents.latent_dim) == ("multi", 5, 8)
+        assert latents.dim == compose([f"preset={preset}"]).model.inverse_dynamics.dim
+    config = compose(["model.savi.n_slots=7", "env=grid_shapes", "model.inverse_dynamics.variant=single"])
+    assert (config.model.savi.n_slots, config.model.inverse_dynamics.variant) == (7, "single")
+
+
+def test_what_a_task_changes_names_a_task_and_a_preset() -> None:
+    assert set(choices("env_model")) <= set(ENVS)
+    assert set(choices("env_preset")) <= {f"{env}_{preset}" for env in ENVS for preset in PRESETS}
+
+
+def test_the_last_of_equal_keys_wins() -> None:
+    config = compose(["preset=paper", "seed=1", "preset=smoke", "seed=2"])
+    assert (config.preset, config.seed) == ("smoke", 2)
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["a b/c", "x,y", "k=v", "123", "it's", "(1) [2] {3}", "${HOME}", "tail\\", "null-ish", "a/~", "true", "1e5", ""],
+)
+def test_text_reaches_the_config_as_typed(path: str) -> None:
+    assert compose([f"data.root={path}"]).data.root == path
+
+
+def test_a_folder_in_the_home_folder_may_be_written_with_a_tilde(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/someone")
+    config = compose(["out=~/runs", "data.root=~/a,~/b"])
+    assert config.out == "/home/someone/runs"
+    assert config.data.root == "/home/someone/a,/home/someone/b"
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("preset=smol", "unknown preset 'smol': expected one of compact, paper, smoke; did you mean preset=smoke"),
+        ("env=kitchen", "unknown env 'kitchen': expected one of .*button_press"),
+        ("env.name=kitchen", "unknown env 'kitchen'"),
+        ("sed=1", "unknown key sed: expected one of .*did you mean seed"),
+        ("slots.lr=1", "unknown key slots.lr: expected one of .*slots.optim"),
+        ("slots.optm.lr=1", "did you mean slots.optim.lr"),
+        ("seed=x", "seed: got 'x' .*expected int"),
+        ("seed=-1", "seed: got -1, expected a non-negative integer"),
+        ("env.image_size=50", "env.image_size: got 50, expected 32, 64 or 128"),
+        ("protocol=dream", "protocol: got 'dream', expected one of simulation, imagination"),
+        ("slots=3", "slots: got 3, expected a group of keys"),
+        ("model.savi.encoder_channels=[1,2", "cannot read the arguments"),
+        ("seed=1,2", "cannot read the arguments"),
+        ("smoke", "got the argument 'smoke', expected key=value"),
+        ("~seed=1", "expected key=value"),
+        ("=1", "expected key=value"),
+    ],
+)
+def test_a_mistake_is_one_line_that_says_what_was_expected(argument: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        compose([argument])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("command", ["evaluate", "train-dynamics", "train-policy"])
+def test_a_run_brings_its_config_and_only_typed_keys_change(tmp_path: Path, command: str) -> None:
+    made = compose(["preset=smoke", "seed=3", "episodes=7", "workers=5", "out=elsewhere", "dynamics.steps=11"])
+    run = store(made, tmp_path / "run, 1")
+    config = compose([f"run={run}", "behaviour.steps=9"], command)
+    assert config.out == config.run == str(run)
+    assert (config.episodes, config.workers) == (None, 0)
+    assert config.behaviour == dataclasses.replace(made.behaviour, steps=9)
+    assert (config.preset, config.seed, config.dynamics, config.model) == ("smoke", 3, made.dynamics, made.model)
+
+
+def test_out_stays_apart_from_the_run_where_it_is_typed(tmp_path: Path) -> None:
+    run = store(compose(["preset=smoke"]), tmp_path / "run")
+    assert compose([f"run={run}", "out=other"], "train-policy").out == "other"
+
+
+def test_a_run_refuses_another_preset(tmp_path: Path) -> None:
+    run = store(compose(["preset=smoke"]), tmp_path / "run")
+    assert compose([f"run={run}", "preset=smoke"], "evaluate").preset == "smoke"
+    with pytest.raises(ConfigError, match=r"got preset=paper with run=.* made with preset=smoke"):
+        compose([f"run={run}", "preset=paper"], "evaluate")
+
+
+def test_other_commands_do_not_read_the_run(tmp_path: Path) -> None:
+    run = store(compose(["preset=smoke"]), tmp_path / "run")
+    assert compose([f"run={run}"], "collect").preset == "compact"
+    assert compose(["run=pretrained"], "train-policy").preset == "compact"
+
+
+@pytest.mark.parametrize("content", [None, "{", '{"sed": 1}', "[]"])
+def test_a_run_without_a_usable_config_is_refused(tmp_path: Path, content: str | None) -> None:
+    if content is not None:
+        (tmp_path / "config.json").write_text(content)
+    with pytest.raises(ConfigError, match=r"config\.json"):
+        compose([f"run={tmp_path}"], "evaluate")
+
+
+def test_a_config_stored_before_the_collector_had_settings_loads(tmp_path: Path) -> None:
+    stored = to_dict(ExperimentConfig())
+    del stored["collector"]
+    (tmp_path / "config.json").write_text(json.dumps(stored))
+    assert compose([f"run={tmp_path}"], "evaluate").collector == ExperimentConfig().collector
+
+
+def test_equal_configs_have_equal_fingerprints() -> None:
+    assert fingerprint(compose(["preset=smoke"])) == fingerprint(compose(["preset=smoke"]))
+    assert fingerprint(compose(["preset=smoke"])) != fingerprint(compose(["preset=smoke", "seed=1"]))
+
+
+def test_a_config_checks_its_values() -> None:
+    with pytest.raises(ValueError, match="transition_heads: got 5, expected a divisor of slot_dim 128"):
+        SAViConfig(transition_heads=5)
+    with pytest.raises(ValueError, match=r"unknown key nslots.*did you mean n_slots"):
+        from_dict(SAViConfig, {"nslots": 3})

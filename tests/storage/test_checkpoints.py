@@ -1,0 +1,202 @@
+"""Finished stages: what is stored, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from playslot_rl.config import to_dict
+from playslot_rl.errors import CheckpointError
+from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
+from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
+from playslot_rl.testing import tiny_config
+from playslot_rl.training.runs import (
+    link_world_model,
+    load_agent,
+    load_savi,
+    load_world_model,
+    run_folder,
+    world_model_folder,
+)
+from playslot_rl.world_model import Agent, WorldModel
+
+
+def write_run(run: Path, seed: int = 0, oracle: bool = True) -> Agent:
+    """A run with all three stages, untrained."""
+    config = tiny_config()
+    torch.manual_seed(seed)
+    agent = Agent.untrained(WorldModel(config.model, config.env), oracle=oracle)
+    world = agent.world_model
+    values = to_dict(config)
+    common: dict[str, Any] = {"metrics": {"loss": 0.5}, "steps": 3, "seconds": 1.0, "data": {"train": "d" * 16}}
+    stored = {"env": values["env"], "model": values["model"]}
+    parents: dict[str, str] = {}
+    stages = {
+        "slots": {"savi": world.savi},
+        "dynamics": {"inverse_dynamics": world.inverse_dynamics, "predictor": world.predictor},
+        "policy": {"policy": agent.policy, "action_decoder": agent.action_decoder},
+    }
+    if agent.oracle is not None:
+        stages["policy"]["oracle"] = agent.oracle
+    for stage, modules in stages.items():
+        saved = save_stage(
+            checkpoint_folder(run, stage), stage=stage, modules=modules, config=stored, parents=parents, **common
+        )
+        parents[stage] = saved.fingerprint
+    return agent
+
+
+def edit(path: Path, **changes: object) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+@pytest.fixture(scope="module")
+def source_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Agent]:
+    folder = tmp_path_factory.mktemp("run")
+    return folder, write_run(folder)
+
+
+@pytest.fixture
+def run(source_run: tuple[Path, Agent], tmp_path: Path) -> Path:
+    return Path(shutil.copytree(source_run[0], tmp_path / "run"))
+
+
+def one_line(error: pytest.ExceptionInfo[CheckpointError]) -> bool:
+    return "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("oracle", [True, False])
+def test_an_agent_comes_back_equal_and_frozen(tmp_path: Path, oracle: bool) -> None:
+    agent = write_run(tmp_path, oracle=oracle)
+    torch.manual_seed(9)
+    state = torch.get_rng_state()
+    loaded = load_agent(tmp_path)
+    assert torch.equal(torch.get_rng_state(), state)
+    before, after = module_tensors({"agent": agent}), module_tensors({"agent": loaded})
+    assert before.keys() == after.keys()
+    assert all(torch.equal(before[key], after[key]) for key in before)
+    assert not loaded.training
+    assert not any(parameter.requires_grad for parameter in loaded.parameters())
+    assert (loaded.oracle is not None) == oracle
+
+
+def test_a_checkpoint_is_three_files_and_says_how_it_was_made(run: Path) -> None:
+    folder = checkpoint_folder(run, "policy")
+    assert sorted(path.name for path in folder.iterdir()) == ["config.json", "meta.json", "weights.safetensors"]
+    checkpoint = read_stage(folder, "policy")
+    assert checkpoint.meta["fingerprint"] == checkpoint.fingerprint
+    assert checkpoint.meta["parents"].keys() == {"slots", "dynamics"}
+    wanted = {"commit", "version", "command", "data", "metrics", "steps", "seconds", "machine", "torch"}
+    assert wanted <= checkpoint.meta.keys()
+    assert asdict(checkpoint)["config"]["env"]["image_size"] == 64
+
+
+def test_saving_again_replaces_the_folder(run: Path) -> None:
+    first = read_stage(checkpoint_folder(run, "slots"), "slots").fingerprint
+    write_run(run, seed=1)
+    assert read_stage(checkpoint_folder(run, "slots"), "slots").fingerprint != first
+    load_agent(run)
+    assert [path.name for path in (run / "slots").iterdir()] == ["checkpoint"]
+
+
+def test_a_child_refuses_a_parent_it_was_not_trained_on(run: Path, tmp_path: Path) -> None:
+    write_run(tmp_path / "other", seed=1)
+    for stage in ("slots", "dynamics"):
+        shutil.rmtree(checkpoint_folder(run, stage))
+        shutil.copytree(checkpoint_folder(tmp_path / "other", stage), checkpoint_folder(run, stage))
+        with pytest.raises(CheckpointError, match=r"was trained on \w+ [0-9a-f]{16}, got") as caught:
+            load_agent(run)
+        assert one_line(caught)
+
+
+@pytest.mark.parametrize("name", ["weights.safetensors", "meta.json", "config.json"])
+@pytest.mark.parametrize("fault", ["truncated", "missing", "empty"])
+def test_a_damaged_file_is_refused(run: Path, name: str, fault: str) -> None:
+    path = checkpoint_folder(run, "slots") / name
+    if fault == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[:50] if fault == "truncated" else b"")
+    with pytest.raises(CheckpointError) as caught:
+        load_savi(run)
+    assert one_line(caught)
+    assert str(checkpoint_folder(run, "slots")) in str(caught.value)
+
+
+@pytest.mark.parametrize("fault", ["missing", "unexpected", "shape", "value"])
+def test_wrong_tensors_are_refused(run: Path, fault: str) -> None:
+    path = checkpoint_folder(run, "dynamics") / "weights.safetensors"
+    tensors = load_tensors(path)
+    name = "predictor.embed_slots.weight"
+    if fault == "missing":
+        del tensors[name]
+    elif fault == "unexpected":
+        tensors["predictor.more"] = torch.zeros(1)
+    elif fault == "shape":
+        tensors[name] = tensors[name][:, :3].clone()
+    else:
+        tensors[name] = tensors[name] + 1
+    save_tensors(path, tensors)
+    expected = {
+        "missing": rf"misses tensor {name}",
+        "unexpected": r"unexpected tensor predictor\.more",
+        "shape": rf"{name} has shape",
+        "value": "was changed or damaged",
+    }
+    with pytest.raises(CheckpointError, match=expected[fault]) as caught:
+        load_world_model(run)
+    assert one_line(caught)
+
+
+def test_another_stage_or_format_is_refused(run: Path) -> None:
+    with pytest.raises(CheckpointError, match="stage 'slots', expected 'dynamics'"):
+        read_stage(checkpoint_folder(run, "slots"), "dynamics")
+    edit(checkpoint_folder(run, "slots") / "meta.json", format="other/9")
+    with pytest.raises(CheckpointError, match="'other/9'"):
+        load_savi(run)
+
+
+def test_a_missing_stage_names_the_command(run: Path, tmp_path: Path) -> None:
+    shutil.rmtree(run / "policy")
+    with pytest.raises(CheckpointError, match="playslot train-policy"):
+        load_agent(run)
+    with pytest.raises(CheckpointError, match="no such folder"):
+        load_agent(tmp_path / "nowhere")
+    with pytest.raises(CheckpointError, match="no such folder"):
+        run_folder("")
+
+
+def test_a_changed_config_names_the_key(run: Path) -> None:
+    slots = read_stage(checkpoint_folder(run, "slots"), "slots")
+    model = to_dict(tiny_config())["model"]
+    require_config(slots, {"model": {"savi": model["savi"]}})
+    model["savi"]["slot_dim"] = 48
+    with pytest.raises(CheckpointError, match=r"^model\.savi\.slot_dim: got 48, expected 32") as caught:
+        require_config(slots, {"model": {"savi": model["savi"]}})
+    assert one_line(caught)
+
+
+def test_a_config_of_another_version_is_refused(run: Path) -> None:
+    edit(checkpoint_folder(run, "slots") / "config.json", model={"savi": {"slot_dimension": 3}})
+    with pytest.raises(CheckpointError, match="unknown key"):
+        load_savi(run)
+
+
+def test_a_run_may_use_the_world_model_of_another(run: Path, tmp_path: Path) -> None:
+    child = tmp_path / "child"
+    shutil.copytree(run / "policy", child / "policy")
+    with pytest.raises(CheckpointError, match="no slots checkpoint"):
+        load_agent(child)
+    link_world_model(child, run)
+    assert json.loads((child / "world_model.json").read_text()) == {"source": "../run"}
+    assert world_model_folder(child).resolve() == run.resolve()
+    load_agent(child)
+    (child / "world_model.json").write_text("{}")
+    with pytest.raises(CheckpointError, match='no "source"'):
+        load_agent(child)
