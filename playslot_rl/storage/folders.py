@@ -1,0 +1,72 @@
+"""New folders that are either whole or not there: everything is written beside the final name, then renamed once."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from playslot_rl.errors import OutputError
+from playslot_rl.storage.atomic import explain_write_errors, replace_dir, temporary_name
+
+
+def require_free(out: Path, key: str = "out=") -> None:
+    """Refuse to write over something; an empty folder is free.
+
+    Args:
+        out: the folder to make.
+        key: how its user names it, for the message.
+
+    Raises:
+        OutputError: something is there.
+    """
+    if out.is_symlink() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
+        raise OutputError(f"{key}{out}: got something that is there already, expected a new folder: choose another")
+
+
+@contextlib.contextmanager
+def new_folder(final: Path, *, replace: bool = False, create: bool = True, key: str = "out=") -> Iterator[Path]:
+    """Gives a temporary path beside `final`, renamed to it at the end and removed after an error.
+
+    What processes that were killed in here have left is removed first, so one process at a time may make `final`
+    (`playslot_rl.storage.locks` where there can be several).
+
+    Args:
+        final: the folder to make; its parents are made too.
+        replace: whether something at `final` is replaced instead of refused.
+        create: make the temporary folder; False where a library wants to.
+        key: how the user names `final`, for the message.
+
+    Raises:
+        OutputError: `final` is not free, the disk is full, or it cannot be written.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with new_folder(Path(folder) / "made") as temporary:
+        ...         _ = (temporary / "file").write_text("whole")
+        ...     (Path(folder) / "made" / "file").read_text()
+        'whole'
+    """
+    if not replace:
+        require_free(final, key)
+    temporary = temporary_name(final)
+    with explain_write_errors(final):
+        final.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(final)
+        try:
+            if create:
+                temporary.mkdir()
+            yield temporary
+            if not replace and final.is_dir():
+                final.rmdir()  # empty
+            replace_dir(temporary, final)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def remove_leftovers(final: Path) -> None:
+    """Remove what processes that were killed while they made `final` have left."""
+    for leftover in final.parent.glob(f".{final.name}.tmp-*"):
+        shutil.rmtree(leftover, ignore_errors=True)

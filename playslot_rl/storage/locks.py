@@ -1,0 +1,35 @@
+"""Locks between processes. The system drops the lock of a process that ends, however it ends; the file stays."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from playslot_rl.errors import OutputError
+from playslot_rl.storage.atomic import explain_write_errors
+
+
+@contextlib.contextmanager
+def locked(path: Path, busy: str = "") -> Iterator[None]:
+    """Hold the lock of a file, which is made if needed; its folder must exist.
+
+    Args:
+        path: the lock file.
+        busy: one line for the error where another process holds it; empty waits for that process instead.
+
+    Raises:
+        OutputError: `busy`, or the file cannot be written.
+    """
+    lock = FileLock(path, timeout=0 if busy else -1)
+    try:
+        with explain_write_errors(path):
+            lock.acquire()
+    except Timeout:
+        raise OutputError(busy) from None
+    try:
+        yield
+    finally:
+        lock.release()

@@ -1,0 +1,69 @@
+"""New folders appear whole or not at all; a lock keeps others out, and waits or refuses as asked."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from playslot_rl.errors import OutputError
+from playslot_rl.storage.folders import new_folder
+from playslot_rl.storage.locks import locked
+
+
+def test_a_folder_appears_whole_and_leftovers_of_a_kill_go(tmp_path: Path) -> None:
+    final = tmp_path / "deep" / "made"
+    (final.parent / ".made.tmp-0123456789ab").mkdir(parents=True)
+    with new_folder(final) as temporary:
+        (temporary / "file").write_text("whole")
+        assert not final.exists()
+    assert (final / "file").read_text() == "whole"
+    assert [entry.name for entry in final.parent.iterdir()] == ["made"]
+
+
+def test_an_error_leaves_nothing_and_keeps_what_was_there(tmp_path: Path) -> None:
+    final = tmp_path / "made"
+    final.mkdir()
+    (final / "old").touch()
+
+    def fail() -> None:
+        with new_folder(final, replace=True) as temporary:
+            (temporary / "new").touch()
+            raise RuntimeError("half way")
+
+    with pytest.raises(RuntimeError, match="half way"):
+        fail()
+    assert [entry.name for entry in tmp_path.rglob("*")] == ["made", "old"]
+
+
+def test_something_that_is_there_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="expected a new folder"), new_folder(tmp_path):
+        raise AssertionError("not reached")
+    (tmp_path / "empty").mkdir()
+    with new_folder(tmp_path / "empty", create=False) as temporary:
+        assert not temporary.exists()
+        temporary.mkdir()
+        (temporary / "file").touch()
+    assert (tmp_path / "empty" / "file").is_file()
+
+
+def test_a_lock_that_another_process_holds_is_refused_until_it_ends(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    code = (
+        "import sys; from pathlib import Path; from playslot_rl.storage.locks import locked\n"
+        "with locked(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    )
+    holder = subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == "held\n"
+    with pytest.raises(OutputError, match="wait for it"), locked(path, "got another process, wait for it"):
+        raise AssertionError("not reached")
+    holder.kill()
+    holder.wait()
+    with locked(path, "got another process, wait for it"), locked(tmp_path / "other"):
+        pass
