@@ -16,6 +16,7 @@ H W image height and width. "[B,]" may be there or not; "[N,]" is there with one
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,13 +25,18 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.acting.agent import playslot_actor
+from playslot_rl.acting.closed_loop import ClosedLoop
+from playslot_rl.acting.imagination import ImaginationEnv, ImaginationSession, latent_actions
+from playslot_rl.config import ExperimentConfig, RenderConfig
 from playslot_rl.errors import CheckpointError
 from playslot_rl.modules.inverse_dynamics import LatentActions
 from playslot_rl.modules.savi import Decoded
 from playslot_rl.world_model import Agent, WorldModel, module_device
 
 if TYPE_CHECKING:
+    from torchrl.envs import TransformedEnv
+
     from playslot_rl.sharing.config import PolicyConfig
 
 Array = npt.NDArray[Any] | Tensor
@@ -80,7 +86,8 @@ class PlaySlot:
         self.world_model = world_model.eval()
         self.agent = None if agent is None else agent.eval()
         self._seed = seed
-        self._state: Tensor | None = None
+        side = world_model.env.image_size
+        self._loop = None if agent is None else ClosedLoop(playslot_actor(agent), image_size=side, seed=seed)
         self._policy: PolicyConfig | None = None
 
     @classmethod
@@ -235,7 +242,7 @@ class PlaySlot:
             >>> model.imagine(frame, torch.tensor([0, 0, 3, 3])).shape
             torch.Size([4, 4, 32])
         """
-        z = self._latents(actions)
+        z = latent_actions(self.world_model, actions)
         batched = z.ndim == len(self.world_model.latent_shape) + 2
         slots = self.parse(first_frame)
         if slots.ndim not in (2, 3) or (slots.ndim == 3 and not batched):
@@ -289,21 +296,56 @@ class PlaySlot:
             >>> [model.act(torch.rand(3, 64, 64)).shape for _ in range(2)]
             [(4,), (4,)]
         """
-        if self.agent is None:
+        if self._loop is None:
             raise CheckpointError(
                 "act: got a world model without a policy; run `playslot train-policy` and load that run"
             )
         pixels = self._frames(frame)
         if pixels.ndim != 3:
             raise ValueError(f"frame: got shape {tuple(pixels.shape)}, expected one frame, (H, W, 3) or (3, H, W)")
-        slots, self._state = self.world_model.savi(pixels[None, None], self._state, generator=self._generator())
-        action = self.agent.action_decoder(self.agent.policy(slots[:, 0]))[0]
-        out: npt.NDArray[np.float32] = action.float().cpu().numpy()
+        out: npt.NDArray[np.float32] = self._loop.act(pixels[None])[0].float().cpu().numpy()
         return out
 
     def reset(self) -> None:
         """Forget the episode: the next frame `act` gets is a first one."""
-        self._state = None
+        if self._loop is not None:
+            self._loop.reset()
+
+    def imagination(self, batch_size: Sequence[int] = (), horizon: int = 0) -> ImaginationEnv:
+        """The world model as a TorchRL environment (`playslot_rl.acting.imagination`).
+
+        Args:
+            batch_size: episodes imagined at once.
+            horizon: steps after which an episode is truncated; 0 never does.
+
+        Examples:
+            >>> PlaySlot.untrained().imagination([2]).rollout(3)["slots"].shape
+            torch.Size([2, 3, 4, 32])
+        """
+        return ImaginationEnv(self.world_model, batch_size, horizon=horizon, generator=self._generator())
+
+    def session(self) -> ImaginationSession:
+        """Imagination step by step: reset from frames or slots, step by latent actions or prototypes, go back."""
+        return ImaginationSession(self.world_model, self._generator())
+
+    def simulation(self, render: RenderConfig | None = None) -> TransformedEnv:
+        """The simulated task with slots as observation and latent actions as action (`playslot_rl.acting.simulation`).
+
+        Args:
+            render: how frames are drawn; use what the training data were drawn with.
+
+        Raises:
+            CheckpointError: the model has no action decoder.
+            ConfigError: an environment without a simulator.
+        """
+        if self.agent is None:
+            raise CheckpointError(
+                "simulation: got a world model without a policy; run `playslot train-policy` and load that run"
+            )
+        from playslot_rl.acting.simulation import make_simulation_env
+
+        env, decoder = self.world_model.env, self.agent.action_decoder
+        return make_simulation_env(env, render or RenderConfig(), self.world_model, decoder, self._generator())
 
     def _generator(self) -> torch.Generator:
         return torch.Generator(module_device(self.world_model)).manual_seed(self._seed)
@@ -333,21 +375,3 @@ class PlaySlot:
             expected = self.world_model.slot_shape
             raise ValueError(f"slots: got shape {tuple(slots.shape)}, expected (..., {expected[0]}, {expected[1]})")
         return slots.to(module_device(self.world_model))
-
-    def _latents(self, actions: Array) -> Tensor:
-        """Latent actions, or prototypes by number, to float ([B,] P, [N,] Z)."""
-        given = torch.as_tensor(actions).to(module_device(self.world_model))
-        shape, inverse = self.world_model.latent_shape, self.world_model.inverse_dynamics
-        if not given.is_floating_point():
-            numbers, prototypes = given.long(), inverse.prototypes
-            if numbers.numel() and not 0 <= int(numbers.min()) <= int(numbers.max()) < len(prototypes):
-                raise ValueError(
-                    f"actions: got prototypes {given.unique().tolist()}, expected 0 to {len(prototypes) - 1}"
-                )
-            given = prototypes[numbers]
-        steps = given.ndim - len(shape)
-        if steps not in (1, 2) or tuple(given.shape[steps:]) != shape or given.shape[steps - 1] == 0:
-            raise ValueError(
-                f"actions: got shape {tuple(given.shape)}, expected ([B,] P, {', '.join(map(str, shape))})"
-            )
-        return given.float()

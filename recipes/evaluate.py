@@ -5,6 +5,7 @@ Writes `DIR/evaluation/PROTOCOL/eval_info.json` and renews `DIR/report.md` and `
 
 from __future__ import annotations
 
+import importlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from playslot_rl.config.compose import shipped
 from playslot_rl.config.methods import METHODS
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.recipes import baselines, objects
+from playslot_rl.recipes import objects
 
 PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")
 
@@ -23,7 +24,7 @@ PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulatio
 def main(config: ExperimentConfig, report: bool = True) -> None:
     """Evaluate the policy of `config.run` under `config.protocol` and print the result.
 
-    A baseline's run (`method` in its config) is evaluated in simulation: see `recipes.baselines`. Where there is no
+    A baseline's run (`method` in its config) is evaluated in simulation only. Where there is no
     simulator (GridShapes) its slots and latent actions are scored instead: see `recipes.objects`.
 
     Args:
@@ -37,7 +38,7 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
     """
     run = check_run(config)
     if config.method != "playslot":
-        baselines.evaluate(config, run)
+        evaluate_baseline(config, run)
         return
     if config.env.name in PROCEDURAL:
         objects.main(config, run)
@@ -58,6 +59,31 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
             from playslot_rl.visualization.report import write_report
 
             print(f"report: {write_report(run, agent=agent, pool=pool)}")
+
+
+def evaluate_baseline(config: ExperimentConfig, run: Path) -> None:
+    """Evaluate the baseline of `run` in simulation, write `RUN/evaluation/simulation/eval_info.json`, print the result.
+
+    Raises:
+        ConfigError: protocol `imagination`, or an environment other than the run's.
+        CheckpointError: the run has no trained policy, or a damaged one.
+    """
+    from playslot_rl.acting.episodes import TaskPool
+    from playslot_rl.evaluation.success import check_baseline_protocol, evaluate_actor, run_facts
+    from playslot_rl.recipes.run import open_device
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+    from playslot_rl.training.runs import stage_env
+
+    check_baseline_protocol(config)
+    run_facts(run, config.method)  # a run without a policy is refused before anything is loaded
+    env = stage_env(read_stage(checkpoint_folder(run, config.method), config.method))
+    check_environment(config, env.image_size, env.action_dim)
+    device = open_device(config)
+    module, _, function = METHODS[config.method].actor.partition(":")
+    actor = getattr(importlib.import_module(module), function)(run, device)
+    actor.eval()
+    with TaskPool(config.env, config.render) as pool:
+        print(describe(evaluate_actor(run, actor, config, pool), run), flush=True)
 
 
 def main_if_needed(config: ExperimentConfig) -> None:

@@ -180,8 +180,9 @@ def test_a_run_folder_is_loaded_with_what_it_has(model: PlaySlot, video: np.ndar
     "module",
     [
         "api",
-        "imagination",
-        "simulation",
+        "acting.actor",
+        "acting.imagination",
+        "acting.simulation",
         "testing",
         "world_model",
         "losses.slots",

@@ -1,64 +1,171 @@
-"""What every method of a comparison is at test time: an actor, and the controller that lets it act.
+"""What acts: an observation and a memory in, an action and the memory anew out. Every method is an `Actor`.
 
-    (a_t, m_{t+1}) = actor(o_t, m_t),    m_0 = actor.initial(seeds)
+    (a_t, m_{t+1}) = actor(o_t, m_t),    m_0 = actor.reset(seeds)
 
-Shapes: E episodes in lock-step, n of them still running, A action dim, H W image height and width. The memory m is a
-TensorDict of batch size [n], empty for actors without one.
+Shapes: n episodes side by side, T agent steps, N slots, D slot width, A action width, H W image height and width.
 """
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Final, Literal
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from playslot_rl import keys
-from playslot_rl.acting.episodes import Actions, Moment
+from playslot_rl.modules.savi import SAVi
+from playslot_rl.world_model import frame_parser_module
+
+RANDOM_STREAM: Final = 7
+"""Keeps random actions apart from the environment's own stream of the same seed."""
 
 
-class Actor(Protocol):
-    """Frame to real action.
+class Actor(TensorDictModuleBase):
+    """Observation to action, with a memory that travels in the tensordict, never on the module.
 
-    Attributes:
-        module: reads PIXELS uint8 (n, 3, H, W) and the memory's keys, writes ACTION (n, A) in [-1, 1] and the memory's
-            keys anew. In evaluation mode it is a function of its inputs.
-    """
-
-    module: TensorDictModuleBase
-
-    def initial(self, seeds: Sequence[int]) -> TensorDict:
-        """The memory of new episodes, batch size [len(seeds)]; whatever is drawn depends on the seeds alone."""
-
-
-class ActorController:
-    """An actor in closed loop, as `playslot_rl.acting.episodes.Controller`.
+    Reads PIXELS (n, 3, H, W), uint8 [0, 255] or float [0, 1], and the memory's keys; writes ACTION (n, A), in [-1, 1]
+    but for what is clipped by whoever executes it, and the memory's keys anew. In evaluation mode it is a function of
+    these inputs, so that episodes in a batch do not touch each other. `playslot_rl.acting.episodes` runs it.
 
     Args:
-        actor: put into evaluation mode by the caller.
-        device: where it computes.
+        memory: the memory's keys.
+        reads: what it reads of the observation: PIXELS, or EXPERT_ACTION, or nothing.
+
+    Attributes:
+        looks: at which frames: `always`, `first` (it never sees what its actions did) or `never`. Frames that nobody
+            looks at need not be drawn.
+        memory_keys: as given.
     """
 
-    sees_frames = True
+    looks: Literal["always", "first", "never"] = "always"
 
-    def __init__(self, actor: Actor, device: torch.device) -> None:
-        self._actor, self._device = actor, device
-        self._memory: TensorDictBase = TensorDict({}, [0])
+    def __init__(self, memory: Sequence[str] = (), reads: Sequence[str] = (keys.PIXELS,)) -> None:
+        super().__init__()
+        self.memory_keys = tuple(memory)
+        self.in_keys = [*reads, *self.memory_keys]
+        self.out_keys = [keys.ACTION, *(key for key in self.memory_keys if key != keys.ACTION)]
 
-    def begin(self, moment: Moment) -> None:
-        """Forget the last episodes."""
-        self._memory = self._actor.initial(moment.seeds).to(self._device)
+    @property
+    def device(self) -> torch.device:
+        """Where its weights are."""
+        first = next(self.parameters(), None)
+        return torch.device("cpu") if first is None else first.device
 
-    @torch.no_grad()
-    def act(self, moment: Moment) -> Actions:
-        """Actions (n, A) in [-1, 1] of the running episodes."""
-        rows = torch.as_tensor(moment.running, device=self._device)
-        memory = self._memory[rows]
-        pixels = torch.from_numpy(moment.frames).to(self._device).movedim(-1, -3)
-        out = self._actor.module(memory.clone().set(keys.PIXELS, pixels))
-        for key in self._memory.keys(include_nested=True, leaves_only=True):
-            self._memory.set_at_(key, out.get(key), rows)
-        actions: Actions = out.get(keys.ACTION).clamp(-1, 1).cpu().numpy()
-        return actions
+    def reset(self, seeds: Sequence[int]) -> TensorDict:
+        """The memory of new episodes, batch size [len(seeds)]; whatever is drawn depends on the seeds alone."""
+        return TensorDict({}, [len(seeds)], device=self.device)
+
+    @abstractmethod
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """One agent step."""
+
+
+class SlotActor(Actor):
+    """Frame to slots by SAVi, whose recurrent state is the memory; slots to action by the heads.
+
+    Note: initial slots that are sampled (SAVi with `initial: gaussian`) come from one generator, which `reset` seeds
+    with the first episode's seed; learned ones draw nothing.
+
+    Args:
+        savi: in evaluation mode.
+        heads: modules that together read SLOTS (n, N, D) and write ACTION (n, A).
+    """
+
+    def __init__(self, savi: SAVi, *heads: TensorDictModuleBase) -> None:
+        super().__init__((keys.SLOT_STATE, keys.SLOT_AGE))
+        self._slots = (savi.config.n_slots, savi.config.slot_dim)
+        self.parser = frame_parser_module(savi)
+        self.heads = TensorDictSequential(*heads)
+
+    def reset(self, seeds: Sequence[int]) -> TensorDict:
+        """No frame seen: SLOT_STATE (n, N, D) zeros, not read while SLOT_AGE (n, 1) is 0."""
+        self.parser.module.generator = torch.Generator(self.device).manual_seed(seeds[0])
+        memory = super().reset(seeds)
+        memory[keys.SLOT_STATE] = torch.zeros(len(seeds), *self._slots)
+        memory[keys.SLOT_AGE] = torch.zeros(len(seeds), 1, dtype=torch.long)
+        return memory
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Parse, then act."""
+        return self.heads(self.parser(tensordict))
+
+
+class ReactiveActor(Actor):
+    """Observation to action without memory.
+
+    Args:
+        module: reads PIXELS (n, 3, H, W), or whatever its `in_keys` say, writes ACTION (n, A).
+    """
+
+    def __init__(self, module: TensorDictModuleBase) -> None:
+        super().__init__(reads=module.in_keys)
+        self.module = module
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The module's action."""
+        return self.module(tensordict)
+
+
+class ExpertActor(Actor):
+    """The scripted expert, which sees the simulator's state: hands on EXPERT_ACTION (n, A)."""
+
+    looks = "never"
+
+    def __init__(self) -> None:
+        super().__init__(reads=(keys.EXPERT_ACTION,))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The expert's action."""
+        return tensordict.set(keys.ACTION, tensordict.get(keys.EXPERT_ACTION))
+
+
+class PlannedActor(Actor):
+    """Executes a plan, PLANNED_ACTIONS (n, T, A), that lies in its memory beside STEP_COUNT (n, 1).
+
+    Args:
+        steps: T.
+        action_dim: A.
+        memory: further keys of the memory.
+        reads: see `Actor`.
+    """
+
+    looks: Literal["always", "first", "never"] = "never"
+
+    def __init__(self, steps: int, action_dim: int, memory: Sequence[str] = (), reads: Sequence[str] = ()) -> None:
+        super().__init__((keys.PLANNED_ACTIONS, keys.STEP_COUNT, *memory), reads)
+        self.steps, self.action_dim = steps, action_dim
+
+    def reset(self, seeds: Sequence[int]) -> TensorDict:
+        """A plan of zeros at step 0."""
+        memory = super().reset(seeds)
+        memory[keys.PLANNED_ACTIONS] = torch.zeros(len(seeds), self.steps, self.action_dim)
+        memory[keys.STEP_COUNT] = torch.zeros(len(seeds), 1, dtype=torch.long)
+        return memory
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The step's action; past the plan's end, its last one."""
+        step = tensordict.get(keys.STEP_COUNT)
+        rows = torch.arange(len(step), device=step.device)
+        action = tensordict.get(keys.PLANNED_ACTIONS)[rows, step.squeeze(-1).clamp(max=self.steps - 1)]
+        return tensordict.set(keys.ACTION, action).set(keys.STEP_COUNT, step + 1)
+
+
+class RandomActor(PlannedActor):
+    """Uniform actions in [-1, 1]; an episode's actions depend on its seed alone.
+
+    Examples:
+        >>> actor = RandomActor(steps=20, action_dim=4)
+        >>> actor(actor.reset([0, 1]))["action"].shape
+        torch.Size([2, 4])
+    """
+
+    def reset(self, seeds: Sequence[int]) -> TensorDict:
+        """Draw all actions of each episode."""
+        memory, size = super().reset(seeds), (self.steps, self.action_dim)
+        drawn = [np.random.default_rng([seed, RANDOM_STREAM]).uniform(-1, 1, size) for seed in seeds]
+        memory[keys.PLANNED_ACTIONS] = torch.from_numpy(np.stack(drawn).astype(np.float32))
+        return memory

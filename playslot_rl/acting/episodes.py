@@ -1,4 +1,6 @@
-"""Fixed lists of episodes, several in lock-step: one network call a step for all of them.
+"""The one loop over episodes: fixed lists of them, several in lock-step, one call of the actor a step for all.
+
+It serves evaluation (outcomes), learning by acting (rewards, and what the actor made of each frame) and pictures.
 
 Shapes: E episodes in lock-step, n of them still running, T agent steps, A action dim, H W image height and width.
 """
@@ -12,12 +14,16 @@ from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from tensordict import TensorDict, TensorDictBase
 
+from playslot_rl import keys
+from playslot_rl.acting.actor import Actor
+from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config import EnvConfig, RenderConfig
 
 Frames = npt.NDArray[np.uint8]
 Actions = npt.NDArray[np.float32]
-FrameCallback = Callable[[int, int, Frames], None]
 
 LOCKSTEP = 5
 """Episodes run side by side. Making an environment takes most of a second, and a small CPU gains little from more."""
@@ -25,7 +31,7 @@ MAX_REDRAWS = 20
 
 
 class Task(Protocol):
-    """What the evaluation needs of an environment."""
+    """What the loop needs of an environment."""
 
     draw_steps: bool
 
@@ -43,41 +49,28 @@ class Task(Protocol):
 
 
 class Moment(NamedTuple):
-    """What a controller may look at.
+    """Where the running episodes of a lock-step stand, for who looks on.
 
     Attributes:
         step: agent steps taken so far.
-        running: indices of the episodes that still run, of the E of this lock-step.
-        seeds: their seeds.
+        episodes: their places in the list of seeds (n).
         frames: their present frames (n, H, W, 3) uint8 [0, 255].
-        tasks: their environments; only the scripted expert looks at them.
+        rewards: float32 (n,), received on the way to these frames; 0 at step 0.
+        seen: what the actor wrote at these frames, batch size [n]; None after the last step (but see `see_last`).
     """
 
     step: int
-    running: Sequence[int]
-    seeds: Sequence[int]
+    episodes: Sequence[int]
     frames: Frames
-    tasks: Sequence[Task]
+    rewards: npt.NDArray[np.float32]
+    seen: TensorDictBase | None
 
 
-class Controller(Protocol):
-    """Chooses the actions of episodes that run in lock-step.
-
-    Attributes:
-        sees_frames: it looks at the frames after the first; if not, they are not drawn.
-    """
-
-    sees_frames: bool
-
-    def begin(self, moment: Moment) -> None:
-        """New episodes, all running at step 0."""
-
-    def act(self, moment: Moment) -> Actions:
-        """Actions (n, A) in [-1, 1] of the running episodes."""
+LookOn = Callable[[Moment], None]
 
 
 @dataclass(frozen=True)
-class Episode:
+class Outcome:
     """Outcome of one episode.
 
     Attributes:
@@ -129,8 +122,7 @@ def start_episode(task: Task, seed: int, stride: int) -> tuple[Frames, int, int]
     Args:
         task: the environment.
         seed: the episode's seed.
-        stride: distance to the seed tried next; with the number of episodes, redrawn seeds meet no other episode's,
-            and every controller redraws the same ones.
+        stride: distance to the seed tried next.
 
     Returns:
         First frame (H, W, 3), the seed that was used, and how many were passed over.
@@ -147,64 +139,96 @@ def start_episode(task: Task, seed: int, stride: int) -> tuple[Frames, int, int]
 
 def run_episodes(
     pool: TaskPool,
-    controller: Controller,
+    actor: Actor,
     seeds: Sequence[int],
-    on_frame: FrameCallback | None = None,
+    look_on: LookOn | None = None,
+    *,
     stop: bool = True,
-) -> list[Episode]:
+    see_last: bool = False,
+    draw: bool = True,
+    stride: int | None = None,
+    lockstep: int = LOCKSTEP,
+) -> list[Outcome]:
     """Run one episode for each seed, in the order of the list.
 
     Args:
         pool: environments.
-        controller: chooses the actions.
+        actor: in evaluation mode; it begins anew with every lock-step.
         seeds: the fixed list.
-        on_frame: called with (episode index, step, frame); step 0 is the first observation.
+        look_on: called before every agent step, and after the last one.
         stop: end an episode at its first success (its outcome is known); False runs all `max_steps`.
+        see_last: show the actor the last frame too, though it cannot act any more.
+        draw: draw also the frames that the actor does not look at, where there is a `look_on`.
+        stride: distance between the seeds of an episode that is drawn anew because it starts solved. None is the number
+            of episodes: redrawn seeds meet no other episode's, and every actor redraws the same ones.
+        lockstep: episodes side by side.
     """
-    episodes: list[Episode] = []
-    for first in range(0, len(seeds), LOCKSTEP):
-        chunk = seeds[first : first + LOCKSTEP]
-        episodes += _run_chunk(pool, controller, chunk, len(seeds), first, on_frame, stop)
-    return episodes
+    outcomes: list[Outcome] = []
+    for first in range(0, len(seeds), lockstep):
+        chunk = seeds[first : first + lockstep]
+        episodes = _LockStep(pool, actor, chunk, first, stride or len(seeds), look_on, draw)
+        outcomes += episodes.run(stop, see_last)
+    return outcomes
 
 
-def _run_chunk(
-    pool: TaskPool,
-    controller: Controller,
-    seeds: Sequence[int],
-    stride: int,
-    first: int,
-    on_frame: FrameCallback | None,
-    stop: bool,
-) -> list[Episode]:
-    tasks = pool.take(len(seeds))
-    for task in tasks:
-        task.draw_steps = controller.sees_frames or on_frame is not None
-    started = [start_episode(task, seed, stride) for task, seed in zip(tasks, seeds, strict=True)]
-    frames = [frame for frame, _, _ in started]
-    solved: list[int | None] = [None] * len(seeds)
-    for i, frame in enumerate(frames):
-        _show(on_frame, first + i, 0, frame)
-    for step in range(pool.env.max_steps):
-        running = [i for i, s in enumerate(solved) if s is None or not stop]
-        if not running:
-            break
-        used = [started[i][1] for i in running]
-        now = Moment(step, running, used, np.stack([frames[i] for i in running]), [tasks[i] for i in running])
-        if step == 0:
-            controller.begin(now)
-        for i, action in zip(running, controller.act(now), strict=True):
-            observation, _, _, _, info = tasks[i].step(action)
-            frames[i] = observation["pixels"]
-            if info["success"] and solved[i] is None:
-                solved[i] = step + 1
-            _show(on_frame, first + i, step + 1, frames[i])
-    return [
-        Episode(seed, steps is not None, steps, redrawn)
-        for (_, seed, redrawn), steps in zip(started, solved, strict=True)
-    ]
+class _LockStep:
+    """Some episodes side by side."""
 
+    def __init__(
+        self,
+        pool: TaskPool,
+        actor: Actor,
+        seeds: Sequence[int],
+        first: int,
+        stride: int,
+        look_on: LookOn | None,
+        draw: bool,
+    ) -> None:
+        self.tasks, self.max_steps = pool.take(len(seeds)), pool.env.max_steps
+        self.actor, self.first, self.look_on = actor, first, look_on
+        for task in self.tasks:
+            task.draw_steps = actor.looks == "always" or (draw and look_on is not None)
+        self.started = [start_episode(task, seed, stride) for task, seed in zip(self.tasks, seeds, strict=True)]
+        self.frames = [frame for frame, _, _ in self.started]
+        self.rewards = np.zeros(len(seeds), np.float32)
+        self.solved: list[int | None] = [None] * len(seeds)
+        self.loop = ClosedLoop(actor)
+        self.loop.reset([seed for _, seed, _ in self.started])
 
-def _show(on_frame: FrameCallback | None, episode: int, step: int, frame: Frames) -> None:
-    if on_frame is not None:
-        on_frame(episode, step, frame)
+    def run(self, stop: bool, see_last: bool) -> list[Outcome]:
+        """All steps; see `run_episodes`."""
+        for step in range(self.max_steps + 1):
+            running = [i for i, s in enumerate(self.solved) if s is None or not stop]
+            if not running:
+                break
+            last = step == self.max_steps
+            seen = None if last and not see_last else self.loop.step(self._observe(running, step), running)
+            if self.look_on is not None:
+                episodes = [self.first + i for i in running]
+                frames = np.stack([self.frames[i] for i in running])
+                self.look_on(Moment(step, episodes, frames, self.rewards[running].copy(), seen))
+            if seen is not None and not last:
+                self._execute(running, seen, step + 1)
+        return [
+            Outcome(seed, steps is not None, steps, redrawn)
+            for (_, seed, redrawn), steps in zip(self.started, self.solved, strict=True)
+        ]
+
+    def _observe(self, running: Sequence[int], step: int) -> TensorDict:
+        """What the actor reads of the running episodes."""
+        values, device = {}, self.actor.device
+        if self.actor.looks == "always" or (self.actor.looks == "first" and step == 0):
+            frames = torch.from_numpy(np.stack([self.frames[i] for i in running]))
+            values[keys.PIXELS] = frames.to(device).movedim(-1, -3)
+        if keys.EXPERT_ACTION in self.actor.in_keys:
+            actions = np.stack([self.tasks[i].expert_action() for i in running])
+            values[keys.EXPERT_ACTION] = torch.from_numpy(actions).to(device)
+        return TensorDict(values, [len(running)])
+
+    def _execute(self, running: Sequence[int], seen: TensorDictBase, step: int) -> None:
+        actions = seen.get(keys.ACTION).clamp(-1, 1).cpu().numpy()
+        for i, action in zip(running, actions, strict=True):
+            observation, reward, _, _, info = self.tasks[i].step(action)
+            self.frames[i], self.rewards[i] = observation["pixels"], reward
+            if info["success"] and self.solved[i] is None:
+                self.solved[i] = step

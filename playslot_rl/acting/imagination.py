@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy.typing as npt
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -181,3 +182,128 @@ class ImaginationEnv(ModelBasedEnvBase):
         """Imagination is deterministic; only first frames parsed with sampled initial slots are not."""
         if self.generator is not None and seed is not None:
             self.generator.manual_seed(seed)
+
+
+def latent_actions(world_model: WorldModel, given: npt.NDArray[Any] | Tensor) -> Tensor:
+    """Latent actions of some steps, given as they are or as prototypes by number.
+
+    Args:
+        world_model: whose they are.
+        given: float ([B,] P, [N,] Z), or integer ([B,] P, [N]) numbers of prototypes.
+
+    Returns:
+        ([B,] P, [N,] Z), on the world model's device.
+
+    Raises:
+        ValueError: another shape, or a prototype that does not exist.
+    """
+    values = torch.as_tensor(given).to(module_device(world_model))
+    shape = world_model.latent_shape
+    if not values.is_floating_point():
+        numbers, prototypes = values.long(), world_model.inverse_dynamics.prototypes
+        if numbers.numel() and not 0 <= int(numbers.min()) <= int(numbers.max()) < len(prototypes):
+            raise ValueError(f"actions: got prototypes {values.unique().tolist()}, expected 0 to {len(prototypes) - 1}")
+        values = prototypes[numbers]
+    steps = values.ndim - len(shape)
+    if steps not in (1, 2) or tuple(values.shape[steps:]) != shape or values.shape[steps - 1] == 0:
+        expected = ", ".join(map(str, shape))
+        raise ValueError(f"actions: got shape {tuple(values.shape)}, expected ([B,] P, {expected})")
+    return values.float()
+
+
+class ImaginationSession:
+    """Imagination one step at a time, for who plays in it or plans in it.
+
+    Everything there is to know between two steps is `state`, a tensordict: keep it, and `restore` goes back to it.
+
+    Args:
+        world_model: put into evaluation mode.
+        generator: of sampled initial slots where a reset parses frames.
+
+    Examples:
+        >>> from playslot_rl.testing import tiny_agent
+        >>> session = ImaginationSession(tiny_agent().world_model)
+        >>> session.reset(frames=torch.rand(1, 3, 64, 64)).shape
+        torch.Size([1, 4, 32])
+        >>> here = session.state
+        >>> session.step(prototypes=[2]).shape
+        torch.Size([1, 4, 32])
+        >>> session.restore(here)
+        >>> session.branch(6)
+        >>> session.step(torch.randn(6, 8)).shape
+        torch.Size([6, 4, 32])
+    """
+
+    def __init__(self, world_model: WorldModel, generator: torch.Generator | None = None) -> None:
+        self.world_model, self._env = world_model, ImaginationEnv(world_model, generator=generator)
+        self._state: TensorDictBase | None = None
+
+    def reset(self, *, frames: Tensor | None = None, slots: Tensor | None = None) -> Tensor:
+        """Start B episodes, from their frames or from their slots.
+
+        Args:
+            frames: (B, 3, H, W), uint8 [0, 255] or float [0, 1], parsed as first frames.
+            slots: (B, N, D), such as SAVi found in the middle of an episode.
+
+        Returns:
+            (B, N, D).
+
+        Raises:
+            ValueError: neither or both are given, or another shape.
+        """
+        if (frames is None) == (slots is None):
+            raise ValueError("reset: got frames and slots, or neither, expected one of them")
+        first = {keys.PIXELS: frames} if slots is None else {keys.SLOTS: slots}
+        batch = [len(value) for value in first.values() if value is not None]
+        self._state = self._env.reset(TensorDict(first, batch).to(self._env.device))
+        return self.slots
+
+    @property
+    def state(self) -> TensorDictBase:
+        """A copy of where the session stands, batch size [B]: SLOTS, the histories and their length.
+
+        Raises:
+            ValueError: before `reset`.
+        """
+        if self._state is None:
+            raise ValueError("session: got no state, expected one: call reset(frames=...) or reset(slots=...) first")
+        return self._state.clone()
+
+    @property
+    def slots(self) -> Tensor:
+        """Present slots (B, N, D)."""
+        out: Tensor = self.state[keys.SLOTS]
+        return out
+
+    def restore(self, state: TensorDictBase) -> None:
+        """Go back to a `state` of a session of the same world model."""
+        self._state = state.clone()
+
+    def branch(self, candidates: int) -> None:
+        """Repeat each of the B episodes, to go on in as many ways: B * `candidates` rows, an episode's together."""
+        self._state = self.state.repeat_interleave(candidates, dim=0)
+
+    def step(self, latents: Tensor | None = None, *, prototypes: Sequence[int] | Tensor | None = None) -> Tensor:
+        """One step of all episodes.
+
+        Args:
+            latents: latent actions (B, [N,] Z).
+            prototypes: or the numbers of prototypes, (B, [N]).
+
+        Returns:
+            Slots of the next frames (B, N, D).
+
+        Raises:
+            ValueError: neither or both are given, another shape, or no such prototype.
+        """
+        if (latents is None) == (prototypes is None):
+            raise ValueError("step: got latents and prototypes, or neither, expected one of them")
+        state = self.state
+        z = latent_actions(self.world_model, torch.as_tensor(prototypes) if latents is None else latents)
+        if z.shape[: -len(self.world_model.latent_shape)] != state.batch_size:
+            raise ValueError(
+                f"step: got actions of shape {tuple(z.shape)}, expected one for each of {len(state)} episodes"
+            )
+        state = state.set(keys.LATENT_ACTION, z)
+        self._state = self._env.step_mdp(self._env.step(state))
+        return self.slots

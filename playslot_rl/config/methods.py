@@ -28,7 +28,7 @@ class Method:
 
 
 METHODS: Final[dict[str, Method]] = {
-    "playslot": Method("PlaySlot", "train_policy", "playslot_rl.baselines.playslot:load_actor", slots=True),
+    "playslot": Method("PlaySlot", "train_policy", "playslot_rl.acting.agent:load_actor", slots=True),
     "slot_oracle": Method(
         "Slot Oracle", "baselines.slot_oracle", "playslot_rl.baselines.oracles.slot:load_actor", slots=True
     ),

@@ -11,45 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from playslot_rl.acting.episodes import Actions, Controller, Episode, Moment, TaskPool, run_episodes
+from playslot_rl.acting.actor import Actor, ExpertActor, RandomActor
+from playslot_rl.acting.episodes import Outcome, TaskPool, run_episodes
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.storage.atomic import write_json
 
 
-class RandomController:
-    """Uniform actions in [-1, 1]; an episode's actions depend on its seed alone."""
-
-    sees_frames = False
-
-    def __init__(self, action_dim: int) -> None:
-        self._action_dim = action_dim
-        self._streams: list[np.random.Generator] = []
-
-    def begin(self, moment: Moment) -> None:
-        """Seed one stream an episode; 7 keeps it apart from the environment's own streams of the same seed."""
-        self._streams = [np.random.default_rng([seed, 7]) for seed in moment.seeds]
-
-    def act(self, moment: Moment) -> Actions:
-        """Draw (n, A)."""
-        return np.stack([self._streams[i].uniform(-1, 1, self._action_dim).astype(np.float32) for i in moment.running])
-
-
-class ExpertController:
-    """The scripted expert, which sees the simulator's state."""
-
-    sees_frames = False
-
-    def begin(self, moment: Moment) -> None:
-        """Nothing to remember."""
-        del moment
-
-    def act(self, moment: Moment) -> Actions:
-        """Ask each environment: (n, A)."""
-        return np.stack([task.expert_action() for task in moment.tasks])
-
-
-def summary(episodes: Sequence[Episode]) -> dict[str, Any]:
+def summary(episodes: Sequence[Outcome]) -> dict[str, Any]:
     """`success_rate` (0 to 1), `ci95` (Wilson) and `mean_steps_to_success` (agent steps; None without a success)."""
     steps = [e.steps for e in episodes if e.steps is not None]
     return {
@@ -60,7 +29,7 @@ def summary(episodes: Sequence[Episode]) -> dict[str, Any]:
 
 
 def run_references(
-    oracle: Controller | None,
+    oracle: Actor | None,
     config: ExperimentConfig,
     seeds: Sequence[int],
     pool: TaskPool,
@@ -77,19 +46,19 @@ def run_references(
         oracle_fingerprint: names the weights of oracle and SAVi; empty means that the oracle's result is not cached.
         cache: JSON file that both protocols of a run share; None means no cache.
     """
-    controllers: dict[str, Controller] = {
-        "random": RandomController(config.env.action_dim),
-        "expert": ExpertController(),
+    actors: dict[str, Actor] = {
+        "random": RandomActor(config.env.max_steps, config.env.action_dim),
+        "expert": ExpertActor(),
     }
     if oracle is not None:
-        controllers["slot_oracle"] = oracle
+        actors["slot_oracle"] = oracle
     stored = _read_cache(cache)
     results: dict[str, dict[str, Any]] = {}
-    for name, controller in controllers.items():
+    for name, actor in actors.items():
         weights = oracle_fingerprint if name == "slot_oracle" else name
         key = _key(name, weights, config, seeds)
         if not weights or key not in stored:
-            stored[key] = summary(run_episodes(pool, controller, seeds))
+            stored[key] = summary(run_episodes(pool, actor, seeds))
         results[name] = stored[key]
     if oracle is None:
         results["slot_oracle"] = {"success_rate": None, "ci95": None, "mean_steps_to_success": None}
@@ -114,6 +83,6 @@ def _read_cache(path: Path | None) -> dict[str, dict[str, Any]]:
     return stored
 
 
-def episode_records(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
+def episode_records(episodes: Sequence[Outcome]) -> list[dict[str, Any]]:
     """Plain dicts of the episodes, for JSON."""
     return [asdict(e) for e in episodes]

@@ -15,9 +15,9 @@ from typing import Any
 
 import torch
 
-from playslot_rl.acting.actor import Actor, ActorController
-from playslot_rl.acting.controllers import ClosedLoop, OpenLoop
-from playslot_rl.acting.episodes import Controller, TaskPool, run_episodes
+from playslot_rl.acting.actor import Actor
+from playslot_rl.acting.agent import ImaginationActor, oracle_actor, playslot_actor
+from playslot_rl.acting.episodes import TaskPool, run_episodes
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.references import episode_records, run_references, summary
@@ -126,15 +126,15 @@ def evaluate(
     """
     check_protocol(protocol)
     agent.eval()
-    controller: Controller = ClosedLoop(agent) if protocol == "simulation" else OpenLoop(agent, config.env.max_steps)
-    oracle = None if agent.oracle is None else ClosedLoop(agent, oracle=True)
+    actor = playslot_actor(agent) if protocol == "simulation" else ImaginationActor(agent, config.env.max_steps)
+    oracle = None if agent.oracle is None else oracle_actor(agent)
     return measure(
-        controller, config, protocol, episodes, seed, facts=facts or RunFacts(), run=run, pool=pool, oracle=oracle
+        actor, config, protocol, episodes, seed, facts=facts or RunFacts(), run=run, pool=pool, oracle=oracle
     )
 
 
 def measure(
-    controller: Controller,
+    actor: Actor,
     config: ExperimentConfig,
     protocol: str,
     episodes: int,
@@ -143,12 +143,12 @@ def measure(
     facts: RunFacts,
     run: Path | None = None,
     pool: TaskPool | None = None,
-    oracle: Controller | None = None,
+    oracle: Actor | None = None,
 ) -> dict[str, Any]:
-    """Measure any controller; see `evaluate`.
+    """Measure any actor; see `evaluate`.
 
     Args:
-        controller: chooses the actions.
+        actor: in evaluation mode.
         config, protocol, episodes, seed, facts, run, pool: as for `evaluate`.
         oracle: the slot oracle among the references; None gives null values for it.
 
@@ -164,7 +164,7 @@ def measure(
     assert used is not None
     begin = time.perf_counter()
     try:
-        outcome = run_episodes(used, controller, seeds)
+        outcome = run_episodes(used, actor, seeds)
         wall = time.perf_counter() - begin
         references = _references(oracle, config, seeds, used, facts, run)
     finally:
@@ -204,7 +204,7 @@ def task_facts(config: ExperimentConfig, seed: int) -> dict[str, Any]:
 
 
 def _references(
-    oracle: Controller | None,
+    oracle: Actor | None,
     config: ExperimentConfig,
     seeds: list[int],
     pool: TaskPool,
@@ -232,9 +232,7 @@ def evaluate_run(
     return _stored(run, result)
 
 
-def evaluate_actor(
-    run: Path, actor: Actor, config: ExperimentConfig, device: torch.device, pool: TaskPool | None = None
-) -> dict[str, Any]:
+def evaluate_actor(run: Path, actor: Actor, config: ExperimentConfig, pool: TaskPool | None = None) -> dict[str, Any]:
     """Evaluate a baseline's actor in closed loop, as `evaluate_run` does an agent; the same file, the same keys.
 
     Raises:
@@ -244,10 +242,7 @@ def evaluate_actor(
     """
     check_baseline_protocol(config)
     facts, episodes = run_facts(run, config.method), config.episodes or DEFAULT_EPISODES
-    controller = ActorController(actor, device)
-    return _stored(
-        run, measure(controller, config, "simulation", episodes, config.seed, facts=facts, run=run, pool=pool)
-    )
+    return _stored(run, measure(actor, config, "simulation", episodes, config.seed, facts=facts, run=run, pool=pool))
 
 
 def check_baseline_protocol(config: ExperimentConfig) -> None:

@@ -5,17 +5,19 @@ Shapes: E episodes, T agent steps, H W image height and width.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from PIL import Image
+from torch import Tensor
 
-from playslot_rl.acting.controllers import ClosedLoop, OpenLoop
-from playslot_rl.acting.episodes import Controller, Episode, TaskPool, run_episodes
-from playslot_rl.evaluation.references import ExpertController
+from playslot_rl import keys
+from playslot_rl.acting.actor import Actor, ExpertActor
+from playslot_rl.acting.agent import ImaginationActor, playslot_actor
+from playslot_rl.acting.episodes import Moment, Outcome, TaskPool, run_episodes
 from playslot_rl.evaluation.video import VideoMetrics, video_metrics
 from playslot_rl.visualization.animation import side_by_side
 from playslot_rl.visualization.frames import to_float, to_uint8
@@ -40,39 +42,48 @@ class Rollouts:
     imagined: Frames
     executed: Frames
     closed: Frames
-    executed_outcome: list[Episode]
-    closed_outcome: list[Episode]
+    executed_outcome: list[Outcome]
+    closed_outcome: list[Outcome]
 
     def metrics(self) -> VideoMetrics:
         """PSNR and SSIM of the imagined against the executed frames, without the parsed first one."""
         return video_metrics(to_float(self.imagined[:, 1:]), to_float(self.executed[:, 1:]))
 
 
-def record(pool: TaskPool, controller: Controller, seeds: Sequence[int]) -> tuple[Frames, list[Episode]]:
+def record(
+    pool: TaskPool, actor: Actor, seeds: Sequence[int], look_on: Callable[[Moment], None] | None = None
+) -> tuple[Frames, list[Outcome]]:
     """Frames (E, T + 1, H, W, 3) of whole episodes, past success too, and their outcomes."""
     size = pool.env.image_size
     frames = np.zeros((len(seeds), pool.env.max_steps + 1, size, size, 3), np.uint8)
 
-    def keep(episode: int, step: int, frame: Frames) -> None:
-        frames[episode, step] = frame
+    def keep(moment: Moment) -> None:
+        frames[moment.episodes, moment.step] = moment.frames
+        if look_on is not None:
+            look_on(moment)
 
-    return frames, run_episodes(pool, controller, seeds, on_frame=keep, stop=False)
+    return frames, run_episodes(pool, actor, seeds, keep, stop=False)
 
 
 def expert_frames(pool: TaskPool, seed: int) -> Frames:
     """Frames (T + 1, H, W, 3) of one episode of the scripted expert."""
-    frames: Frames = record(pool, ExpertController(), [seed])[0][0]
+    frames: Frames = record(pool, ExpertActor(), [seed])[0][0]
     return frames
 
 
 @torch.no_grad()
 def run_rollouts(agent: Agent, pool: TaskPool, seeds: Sequence[int]) -> Rollouts:
     """Run the episodes of `seeds` both ways."""
-    open_loop = OpenLoop(agent, pool.env.max_steps)
-    executed, executed_outcome = record(pool, open_loop, seeds)
-    slots = torch.cat([rollout.slots for rollout in open_loop.imagined])
+    unfolded: list[Tensor] = []
+
+    def keep_imagined(moment: Moment) -> None:
+        if moment.step == 0 and moment.seen is not None:
+            unfolded.append(moment.seen.get(keys.PREDICTED_SLOTS))
+
+    executed, executed_outcome = record(pool, ImaginationActor(agent, pool.env.max_steps), seeds, keep_imagined)
+    slots = torch.cat(unfolded)
     imagined = np.stack([to_uint8(agent.world_model.savi.decode(s).frames) for s in slots])
-    closed, closed_outcome = record(pool, ClosedLoop(agent), seeds)
+    closed, closed_outcome = record(pool, playslot_actor(agent), seeds)
     return Rollouts(imagined, executed, closed, executed_outcome, closed_outcome)
 
 

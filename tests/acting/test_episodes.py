@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from playslot_rl import keys
+from playslot_rl.acting.actor import ExpertActor, RandomActor
 from playslot_rl.acting.episodes import LOCKSTEP, Actions, Moment, Task, TaskPool, run_episodes
 from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.evaluation.references import ExpertController, RandomController, summary
+from playslot_rl.evaluation.references import summary
 
 
 class Counter:
@@ -28,7 +30,7 @@ class Counter:
     def step(self, action: Actions) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         self.steps += 1
         self.log.append((self.seed, action))
-        return self._observe(), 0.0, False, False, {"success": self.steps == self.seed % 10}
+        return self._observe(), 1.0, False, False, {"success": self.steps == self.seed % 10}
 
     def _observe(self) -> dict[str, Any]:
         return {"pixels": np.full((2, 2, 3), 10 * (self.seed % 10) + self.steps, np.uint8)}
@@ -51,22 +53,9 @@ class CounterPool(TaskPool):
         return list(self.made[:count])
 
 
-class Recorder(ExpertController):
-    """Remembers what it saw."""
-
-    sees_frames = True
-
-    def __init__(self) -> None:
-        self.moments: list[Moment] = []
-
-    def act(self, moment: Moment) -> Actions:
-        self.moments.append(moment)
-        return super().act(moment)
-
-
 def test_each_seed_is_run_once_in_order_and_counts_its_own_steps() -> None:
     seeds = [3, 0, 1, 8, 6, 12, 5]  # more than one chunk
-    episodes = run_episodes(CounterPool(), ExpertController(), seeds)
+    episodes = run_episodes(CounterPool(), ExpertActor(), seeds)
     assert [e.seed for e in episodes] == seeds
     assert [e.steps for e in episodes] == [3, None, 1, None, 6, 2, 5]
     result = summary(episodes)
@@ -75,25 +64,31 @@ def test_each_seed_is_run_once_in_order_and_counts_its_own_steps() -> None:
 
 
 def test_an_episode_that_starts_solved_is_redrawn_and_counted() -> None:
-    episodes = run_episodes(CounterPool(), ExpertController(), [18, 19, 20, 21])
+    episodes = run_episodes(CounterPool(), ExpertActor(), [18, 19, 20, 21])
     assert [(e.seed, e.redrawn) for e in episodes] == [(18, 0), (23, 1), (20, 0), (21, 0)]
     with pytest.raises(RuntimeError, match="start solved"):
-        run_episodes(CounterPool(), ExpertController(), [9] * 10)
+        run_episodes(CounterPool(), ExpertActor(), [9] * 10)
 
 
 def test_solved_episodes_leave_the_batch_and_the_others_keep_their_place() -> None:
-    recorder = Recorder()
-    run_episodes(CounterPool(), recorder, [3, 1, 2])
-    assert [m.running for m in recorder.moments] == [[0, 1, 2], [0, 2], [0]]
-    assert recorder.moments[1].frames[:, 0, 0, 0].tolist() == [31, 21]
-    assert recorder.moments[1].seeds == [3, 2]
+    moments: list[Moment] = []
+    run_episodes(CounterPool(), ExpertActor(), [3, 1, 2], moments.append)
+    assert [m.episodes for m in moments] == [[0, 1, 2], [0, 2], [0]]
+    assert moments[1].frames[:, 0, 0, 0].tolist() == [31, 21]
+    assert moments[1].rewards.tolist() == [1.0, 1.0]
+    assert moments[1].seen is not None
+    assert moments[1].seen[keys.ACTION][:, 0].tolist() == pytest.approx([0.1, 0.1])
 
 
 def test_whole_episodes_run_on_past_success_where_frames_are_wanted() -> None:
     shown: list[tuple[int, int]] = []
     pool = CounterPool()
     episodes = run_episodes(
-        pool, ExpertController(), [1] * (LOCKSTEP + 1), lambda i, t, _: shown.append((i, t)), stop=False
+        pool,
+        ExpertActor(),
+        [1] * (LOCKSTEP + 1),
+        lambda now: shown.extend((i, now.step) for i in now.episodes),
+        stop=False,
     )
     assert all(e.steps == 1 for e in episodes)
     assert sorted(shown) == [(i, t) for i in range(LOCKSTEP + 1) for t in range(7)]
@@ -102,7 +97,7 @@ def test_whole_episodes_run_on_past_success_where_frames_are_wanted() -> None:
 def test_random_actions_depend_on_the_episode_seed_alone() -> None:
     def actions(seeds: list[int], wanted: int) -> list[Any]:
         pool = CounterPool()
-        run_episodes(pool, RandomController(4), seeds)
+        run_episodes(pool, RandomActor(6, 4), seeds)
         return [a.tolist() for task in pool.made for seed, a in task.log if seed == wanted]
 
     alone = actions([10], 10)
@@ -110,3 +105,19 @@ def test_random_actions_depend_on_the_episode_seed_alone() -> None:
     assert len(alone) == 6
     assert np.abs(alone).max() <= 1
     assert alone != actions([20], 20)
+
+
+def test_the_last_frame_is_shown_to_the_actor_only_where_it_is_wanted() -> None:
+    for see_last in (False, True):
+        moments: list[Moment] = []
+        run_episodes(CounterPool(2), ExpertActor(), [0], moments.append, see_last=see_last)
+        assert [m.step for m in moments] == [0, 1, 2]
+        assert [m.seen is not None for m in moments] == [True, True, see_last]
+        assert [float(m.rewards[0]) for m in moments] == [0.0, 1.0, 1.0]
+
+
+def test_frames_that_nobody_looks_at_are_not_drawn() -> None:
+    for look_on, draw, drawn in ((None, True, False), (lambda _: None, True, True), (lambda _: None, False, False)):
+        pool = CounterPool(2)
+        run_episodes(pool, ExpertActor(), [0], look_on, draw=draw)
+        assert pool.made[0].draw_steps is drawn

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 from playslot_rl import keys
-from playslot_rl.acting.imagination import ImaginationEnv
+from playslot_rl.acting.imagination import ImaginationEnv, ImaginationSession
 from playslot_rl.config import LatentMode
 from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.world_model import Agent, WorldModel, dynamics_module, latent_policy_module, parser_module
@@ -183,3 +183,57 @@ def test_histories_are_right_aligned_and_slide(agent: Agent) -> None:
         torch.testing.assert_close(state[keys.SLOT_HISTORY][:, -length:], torch.stack(seen[-length:], 1))
         assert state[keys.ACTION_HISTORY][0, -2, 0].item() == t
         assert state[keys.ACTION_HISTORY][0, -1].abs().max() == 0
+
+
+def test_a_session_is_the_rollout_step_by_step_and_goes_back_where_it_was(agent: Agent) -> None:
+    session, model = ImaginationSession(agent.world_model), agent.world_model
+    z = torch.randn(2, 12, *model.latent_shape, generator=torch.Generator().manual_seed(0))  # past the context of 8
+    session.reset(slots=slots_of((2,)))
+    imagined = []
+    for t in range(12):
+        if t == 3:
+            here = session.state
+        imagined.append(session.step(z[:, t]))
+    with torch.no_grad():
+        expected = model.predictor.rollout(slots_of((2,))[:, None], *model.inverse_dynamics.split(z))
+    torch.testing.assert_close(torch.stack(imagined, 1), expected, atol=1e-5, rtol=1e-4)
+    session.restore(here)
+    assert torch.equal(session.slots, imagined[2])
+    assert torch.equal(session.step(z[:, 3]), imagined[3])
+    session.restore(here)  # the kept state was not changed by going on from it
+    assert torch.equal(session.step(z[:, 3]), imagined[3])
+
+
+def test_a_session_takes_frames_prototypes_and_candidates(agent: Agent) -> None:
+    session, model = ImaginationSession(agent.world_model), agent.world_model
+    frames = torch.randint(256, (2, 3, 64, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        torch.testing.assert_close(session.reset(frames=frames), model.savi(frames[:, None] / 255)[0][:, 0])
+    here = session.state
+    one = session.step(prototypes=[4, 1])
+    session.restore(here)
+    assert torch.equal(session.step(model.inverse_dynamics.prototypes[torch.tensor([4, 1])]), one)
+    session.restore(here)
+    session.branch(3)
+    z = torch.randn(6, *model.latent_shape, generator=torch.Generator().manual_seed(1))
+    many = session.step(z)
+    for episode in range(2):
+        for way in range(3):
+            session.restore(here[episode : episode + 1])
+            alone = session.step(z[3 * episode + way][None])
+            torch.testing.assert_close(alone[0], many[3 * episode + way], atol=1e-5, rtol=1e-4)
+
+
+def test_a_session_refuses_what_does_not_fit_in_one_line(agent: Agent) -> None:
+    session = ImaginationSession(agent.world_model)
+    with pytest.raises(ValueError, match="call reset"):
+        session.step(prototypes=[0])
+    with pytest.raises(ValueError, match="expected one of them"):
+        session.reset()
+    session.reset(slots=slots_of((2,)))
+    with pytest.raises(ValueError, match="got prototypes"):
+        session.step(prototypes=[0, 99])
+    with pytest.raises(ValueError, match="one for each of 2 episodes"):
+        session.step(prototypes=[0])
+    with pytest.raises(ValueError, match="expected one of them"):
+        session.step(torch.zeros(2, 8), prototypes=[0, 1])

@@ -13,12 +13,13 @@ import torch
 from tensordict import TensorDict
 
 from playslot_rl import keys
-from playslot_rl.acting.controllers import ClosedLoop, unfold
-from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
+from playslot_rl.acting.actor import ExpertActor
+from playslot_rl.acting.agent import imagine, playslot_actor
+from playslot_rl.acting.closed_loop import ClosedLoop
+from playslot_rl.acting.episodes import TaskPool, run_episodes
 from playslot_rl.config import EvaluationConfig, ExperimentConfig
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation import references
-from playslot_rl.evaluation.references import ExpertController
 from playslot_rl.evaluation.success import RunFacts, evaluate, evaluate_run, run_facts
 from playslot_rl.testing import tiny_config
 from playslot_rl.world_model import Agent, WorldModel, latent_policy_module
@@ -64,52 +65,25 @@ def test_closed_loop_acts_as_the_torchrl_environment_does(
     task = pool.take(1)[0]
     frame, _ = task.reset(seed=SEED)
     torch.testing.assert_close(torch.from_numpy(frame["pixels"]).movedim(-1, 0), rollout[keys.PIXELS][0])
-    controller = ClosedLoop(agent)
+    loop = ClosedLoop(playslot_actor(agent))
     for step in range(3):
-        moment = Moment(step, [0], [SEED], frame["pixels"][None], [task])
-        if step == 0:
-            controller.begin(moment)
-        action = controller.act(moment)[0]
-        torch.testing.assert_close(torch.from_numpy(action), rollout[keys.ACTION][step])
-        frame, *_ = task.step(action)
+        action = loop.act(torch.from_numpy(frame["pixels"]).movedim(-1, 0)[None])[0]
+        torch.testing.assert_close(action, rollout[keys.ACTION][step])
+        frame, *_ = task.step(action.numpy())
 
 
-def test_unfolding_equals_a_rollout_of_the_imagination_environment_past_its_context() -> None:
-    from playslot_rl.acting.imagination import ImaginationEnv
-
-    agent = _agent(tiny_config(context=4))
+@pytest.mark.parametrize("context", [4, 8])
+def test_imagining_equals_the_modules_called_by_hand_past_the_context_too(context: int) -> None:
+    agent = _agent(tiny_config(context=context))
     slots = torch.randn(2, 4, 32)
-    imagined = unfold(agent, slots, 7)
-    env = ImaginationEnv(agent.world_model, batch_size=[2])
-    start = env.reset(TensorDict({keys.SLOTS: slots}, [2]))
-    with torch.no_grad():
-        rollout = env.rollout(7, latent_policy_module(agent.policy), tensordict=start, auto_reset=False)
-        actions = agent.action_decoder(rollout[keys.LATENT_ACTION])
-    torch.testing.assert_close(imagined.slots[:, 1:], rollout["next", keys.SLOTS])
-    torch.testing.assert_close(imagined.latents, rollout[keys.LATENT_ACTION])
-    torch.testing.assert_close(imagined.actions, actions)
-
-
-def test_unfolding_equals_the_modules_called_by_hand(agent: Agent) -> None:
-    slots = torch.randn(2, 4, 32)
-    imagined = unfold(agent, slots, 4)
+    imagined = imagine(agent, TensorDict({keys.SLOTS: slots}, [2]), 7)
     model = agent.world_model
     with torch.no_grad():
         p, v = model.inverse_dynamics.split(imagined.latents)
-        torch.testing.assert_close(imagined.slots[:, 1:], model.predictor.rollout(slots[:, None], p, v))
+        rollout = model.predictor.rollout(slots[:, None], p, v)
+        torch.testing.assert_close(imagined.slots, torch.cat([slots[:, None], rollout], 1))
         torch.testing.assert_close(imagined.latents, agent.policy(imagined.slots[:, :-1]))
-
-
-def test_lockstep_acts_as_each_episode_alone(agent: Agent) -> None:
-    frames = torch.randint(0, 256, (3, 2, 64, 64, 3), dtype=torch.uint8).numpy()  # three steps of two episodes
-    together, alone = ClosedLoop(agent), ClosedLoop(agent)
-    for step, running in enumerate([[0, 1], [0, 1], [1]]):
-        moment = Moment(step, running, [SEED + i for i in running], frames[step][running], [])
-        single = Moment(step, [0], [SEED + 1], frames[step][1:], [])
-        if step == 0:
-            together.begin(moment)
-            alone.begin(single)
-        torch.testing.assert_close(torch.from_numpy(together.act(moment)[-1]), torch.from_numpy(alone.act(single)[0]))
+        torch.testing.assert_close(imagined.actions, agent.action_decoder(imagined.latents))
 
 
 @pytest.mark.parametrize("protocol", ["simulation", "imagination"])
@@ -139,7 +113,7 @@ def test_references_are_run_once_for_both_protocols(
     assert again["references"] == first["references"]
     other = replace(FACTS, fingerprints={"slots": "a", "policy": "another"})
     evaluate(agent, config, "imagination", 1, 0, facts=other, run=tmp_path, pool=pool)
-    assert calls == ["ClosedLoop"]  # another oracle; random and expert do not depend on weights
+    assert calls == ["SlotActor"]  # another oracle; random and expert do not depend on weights
 
 
 def test_training_seeds_are_never_evaluated(
@@ -155,8 +129,8 @@ def test_training_seeds_are_never_evaluated(
 
 def test_undrawn_frames_change_no_outcome(config: ExperimentConfig) -> None:
     with TaskPool(replace(config.env, max_steps=20), config.render) as pool:
-        blind = run_episodes(pool, ExpertController(), [SEED, SEED + 1])
-        drawn = run_episodes(pool, ExpertController(), [SEED, SEED + 1], on_frame=lambda *_: None)
+        blind = run_episodes(pool, ExpertActor(), [SEED, SEED + 1])
+        drawn = run_episodes(pool, ExpertActor(), [SEED, SEED + 1], lambda _: None)
     assert blind == drawn
     assert all(e.success for e in blind)
 

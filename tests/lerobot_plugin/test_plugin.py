@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from playslot_rl.acting.controllers import ClosedLoop
-from playslot_rl.acting.episodes import Moment
+from playslot_rl.acting.agent import playslot_actor
+from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config import EnvConfig
 from playslot_rl.envs import task_env
 
@@ -117,17 +117,14 @@ def test_select_action_is_the_closed_loop_of_the_evaluation(loaded: tuple[Any, A
     from lerobot.envs import preprocess_observation
 
     policy, before, after = loaded
-    controller = ClosedLoop(tiny_agent())
+    loop = ClosedLoop(playslot_actor(tiny_agent()))
     frames = np.random.default_rng(0).integers(256, size=(3, 2, 64, 64, 3), dtype=np.uint8)
     policy.reset()
-    for step, batch in enumerate(frames):
-        now = Moment(step, [0, 1], [5, 6], batch, [])
-        if step == 0:
-            controller.begin(now)
+    for batch in frames:
         observation = preprocess_observation({"pixels": {"front": batch}, "agent_pos": np.zeros((2, 4), np.float32)})
         actions = after(policy.select_action(before({**observation, "task": ["", ""]})))
         assert actions.shape == (2, 4)
-        torch.testing.assert_close(actions, torch.from_numpy(controller.act(now)), rtol=0, atol=1e-6)
+        torch.testing.assert_close(actions, loop.act(torch.from_numpy(batch).movedim(-1, 1)), rtol=0, atol=1e-6)
 
 
 def test_reset_forgets_the_episode(loaded: tuple[Any, Any, Any]) -> None:

@@ -9,8 +9,7 @@ import pytest
 import torch
 from commands import killed_at_first_checkpoint
 
-from playslot_rl.acting.actor import ActorController
-from playslot_rl.acting.episodes import TaskPool, run_episodes
+from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.baselines.dreamer.load import load_actor
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError
@@ -55,11 +54,11 @@ def test_its_actor_plays_and_repeats_itself(run: Path) -> None:
     with TaskPool(config.env, config.render) as pool:
         for take in shown:
 
-            def on_frame(episode: int, step: int, frame: object, take: list[int] = take) -> None:
-                take.append(hash(frame.tobytes()))  # type: ignore[attr-defined]
+            def look_on(moment: Moment, take: list[int] = take) -> None:
+                take.extend(hash(frame.tobytes()) for frame in moment.frames)
 
             torch.rand(3)  # the global generator is none of its business
-            run_episodes(pool, ActorController(actor, torch.device("cpu")), seeds, on_frame, stop=False)
+            run_episodes(pool, actor, seeds, look_on, stop=False)
     assert len(shown[0]) == 14
     assert shown[0] == shown[1]
 

@@ -12,8 +12,8 @@ import torch
 from commands import killed_at_first_checkpoint, smoke
 from safetensors.torch import load_file
 
-from playslot_rl.acting.actor import ActorController
-from playslot_rl.acting.episodes import TaskPool, run_episodes
+from playslot_rl import keys
+from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.baselines.sold.learner import SOLDLearner
 from playslot_rl.baselines.sold.load import load_actor, prior_steps, slots_checkpoint
 from playslot_rl.config import ExperimentConfig, to_dict
@@ -77,18 +77,15 @@ def test_a_run_leaves_weights_parents_and_a_learning_curve(trained: Path, world:
 def test_the_actor_that_is_loaded_plays_and_repeats(trained: Path) -> None:
     actor = load_actor(trained)
     config = compose(["preset=smoke"])
-    controller = ActorController(actor, torch.device("cpu"))
     chosen: list[np.ndarray] = []
-    original = controller.act
 
-    def noted(moment: object) -> np.ndarray:
-        chosen.append(original(moment))
-        return chosen[-1]
+    def noted(moment: Moment) -> None:
+        if moment.seen is not None:
+            chosen.append(moment.seen[keys.ACTION].numpy())
 
-    controller.act = noted
     with TaskPool(config.env, config.render) as pool:
         for _ in range(2):
-            run_episodes(pool, controller, [7, 8])
+            run_episodes(pool, actor, [7, 8], noted, stop=False)
     assert len(chosen) == 2 * config.env.max_steps
     for first, second in zip(chosen[: config.env.max_steps], chosen[config.env.max_steps :], strict=True):
         assert first.shape == (2, 4)
@@ -97,7 +94,7 @@ def test_the_actor_that_is_loaded_plays_and_repeats(trained: Path) -> None:
 
 def test_the_actor_that_is_loaded_has_the_weights_that_were_saved(trained: Path) -> None:
     saved = load_file(trained / "sold" / "checkpoint" / "weights.safetensors")
-    loaded = {f"actor.{name}": value for name, value in load_actor(trained).module.actor.state_dict().items()}
+    loaded = {f"actor.{name}": value for name, value in load_actor(trained).actor.state_dict().items()}
     assert loaded.keys() == {name for name in saved if name.startswith("actor.")}
     for name, value in loaded.items():
         assert torch.equal(value, saved[name]), name

@@ -9,9 +9,10 @@ from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
 from lerobot_policy_playslot.configuration_playslot import NOT_TRAINED_HERE, PlaySlotConfig
+from playslot_rl.acting.agent import playslot_actor
+from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.sharing.config import WEIGHTS
 from playslot_rl.sharing.folder import build_agent, load_weights, write_weights
-from playslot_rl.sharing.frame_policy import FramePolicy
 
 
 class PlaySlotPolicy(PreTrainedPolicy):
@@ -33,11 +34,12 @@ class PlaySlotPolicy(PreTrainedPolicy):
         super().__init__(config)
         self.policy_config = config.policy_config()
         self.agent = build_agent(self.policy_config)
-        self._frames = FramePolicy(self.agent, self.policy_config.resize)
+        side = self.policy_config.env.image_size
+        self._loop = ClosedLoop(playslot_actor(self.agent), side, self.policy_config.resize)
 
     def reset(self) -> None:
         """Forget the episodes."""
-        self._frames.reset()
+        self._loop.reset()
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Actions (B, A) in [-1, 1] for the present frames.
@@ -56,7 +58,7 @@ class PlaySlotPolicy(PreTrainedPolicy):
             raise ValueError(
                 f'observation: got {had}, expected {camera}: rename yours by --rename_map=\'{{"yours": "{camera}"}}\''
             )
-        return self._frames.act(batch[camera], camera)
+        return self._loop.act(batch[camera], camera)
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """The next action as a chunk of one, (B, 1, A). It is an agent step: the frames are remembered.

@@ -8,9 +8,9 @@ from typing import Final
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 
 from playslot_rl import keys
+from playslot_rl.acting.actor import Actor
 from playslot_rl.baselines.dreamer.learner import act
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
 from playslot_rl.config import EnvConfig, from_dict
@@ -21,42 +21,27 @@ from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, rea
 NAME: Final = "dreamer"
 
 
-class DreamerPolicy(TensorDictModuleBase):
-    """Frame and memory to action and memory, without exploring.
-
-    Args:
-        networks: trained.
-    """
-
-    in_keys: list[str] = [keys.PIXELS, "state", "belief", keys.ACTION]  # noqa: RUF012 (tensordict declares it so)
-    out_keys: list[str] = [keys.ACTION, "state", "belief"]  # noqa: RUF012
-
-    def __init__(self, networks: DreamerNetworks) -> None:
-        super().__init__()
-        self.networks = networks
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """PIXELS uint8 (n, 3, H, W), `state`, `belief`, the last ACTION -> ACTION (n, A), `state`, `belief`."""
-        # The prior draws a sample that is not used here.
-        with torch.random.fork_rng(devices=[]):
-            out = act(self.networks, tensordict, None)
-        return tensordict.update(out.select(*self.out_keys))
-
-
-class DreamerActor:
-    """DreamerV3 as `playslot_rl.acting.actor.Actor`.
+class DreamerActor(Actor):
+    """DreamerV3 without exploring. The memory: `state`, `belief` and the last ACTION.
 
     Args:
         networks: trained, in eval mode.
     """
 
     def __init__(self, networks: DreamerNetworks) -> None:
-        self.module = DreamerPolicy(networks)
-        self._networks = networks
+        super().__init__(("state", "belief", keys.ACTION))
+        self.networks = networks
 
-    def initial(self, seeds: Sequence[int]) -> TensorDict:
+    def reset(self, seeds: Sequence[int]) -> TensorDict:
         """Zero states; nothing is drawn."""
-        return self._networks.blank(len(seeds))
+        return self.networks.blank(len(seeds)).to(self.device)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """PIXELS uint8 (n, 3, H, W) and the memory -> ACTION (n, A) and the memory."""
+        # The prior draws a sample that is not used here.
+        with torch.random.fork_rng(devices=[]):
+            out = act(self.networks, tensordict, None)
+        return tensordict.update(out.select(*self.out_keys))
 
 
 def load_actor(run: Path, device: torch.device | str = "cpu") -> DreamerActor:

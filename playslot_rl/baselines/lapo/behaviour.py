@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.baselines.frame_inputs import FrameInputs
-from playslot_rl.baselines.lapo.load import FramePolicy, stored_config
+from playslot_rl.baselines.lapo.load import LAPOPolicy, stored_config
 from playslot_rl.baselines.lapo.model import InverseModel
 from playslot_rl.baselines.lapo.stage import infer_latents
 from playslot_rl.config import ExperimentConfig
@@ -55,7 +55,7 @@ class LAPOBehaviour:
         self.latents = infer_latents(load_inverse(model, device), source, self.moves, device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(derived_seed(config.seed, 0, "lapo"))
-            self.policy = FramePolicy(self.own, config.env.image_size).to(device)
+            self.policy = LAPOPolicy(self.own, config.env.image_size).to(device)
             width = self.own.latent_dim
             self.decoder = ActionDecoder(config.model.action_decoder, width, config.env.action_dim).to(device)
 

@@ -28,7 +28,7 @@ MODEL: Final = "lapo_model"
 """Stage of the inverse and forward model, the parent of the policy and the decoder."""
 
 
-class FramePolicy(nn.Module):
+class LAPOPolicy(nn.Module):
     """LAPO's latent policy: one frame to a latent action.
 
     Args:
@@ -46,9 +46,9 @@ class FramePolicy(nn.Module):
         return z
 
 
-def lapo_actor(policy: FramePolicy, decoder: ActionDecoder) -> Actor:
+def lapo_actor(policy: LAPOPolicy, decoder: ActionDecoder) -> Actor:
     """The actor of networks in evaluation mode."""
-    from playslot_rl.acting.slot_actor import ReactiveActor
+    from playslot_rl.acting.actor import ReactiveActor
 
     choose = TensorDictModule(policy, in_keys=[keys.PIXELS], out_keys=[keys.LATENT_ACTION])
     return ReactiveActor(TensorDictSequential(choose, action_decoder_module(decoder)))
@@ -107,7 +107,7 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
     require_parents(done, {MODEL: read_stage(checkpoint_folder(run, MODEL), MODEL)})
     config, (model, env) = stored_config(done.config, done.path), stage_model(done)
     with torch.random.fork_rng(devices=[]):
-        policy = FramePolicy(config, env.image_size)
+        policy = LAPOPolicy(config, env.image_size)
         decoder = ActionDecoder(model.action_decoder, config.latent_dim, env.action_dim)
     load_weights(done, {"policy": policy, "action_decoder": decoder})
     freeze_on(policy, device)

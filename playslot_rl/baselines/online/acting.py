@@ -1,4 +1,4 @@
-"""Playing episodes in lock-step, for the replay and for the learning curve.
+"""Playing episodes for the replay and for the learning curve.
 
 All tasks run for `env.max_steps` agent steps and never end before, so that episodes have equal lengths.
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,16 +16,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from playslot_rl import keys
-from playslot_rl.acting.episodes import TaskPool, start_episode
+from playslot_rl.acting.actor import Actor, RandomActor
+from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.baselines.online.learner import Learner
 from playslot_rl.baselines.online.seeds import REDRAW_STRIDE
 
-RANDOM_STREAM: Final = 7
-"""Keeps the random policy's stream apart from the environment's own of the same seed (as in `RandomController`)."""
-
 
 @dataclass(frozen=True)
-class Episodes:
+class PlayedEpisodes:
     """Whole episodes.
 
     Attributes:
@@ -41,6 +38,47 @@ class Episodes:
     successes: tuple[bool, ...]
 
 
+class LearnerActor(Actor):
+    """A learner as it acts now.
+
+    Args:
+        learner: its modules in evaluation mode.
+        device, generator: the learner's, and of what it draws.
+        explore: it samples its actions.
+        start: replaces the actions it chose; it still sees every frame.
+    """
+
+    def __init__(
+        self,
+        learner: Learner,
+        device: torch.device,
+        generator: torch.Generator,
+        explore: bool,
+        start: RandomActor | None = None,
+    ) -> None:
+        own = (str(key) for key in learner.initial(1).keys())  # noqa: SIM118 (a TensorDict iterates over its rows)
+        super().__init__((*own, *(start.memory_keys if start is not None else ())))
+        self._device, self.act, self.explore, self.start = device, learner.act, explore, start
+        self.generator, self.initial = generator, learner.initial
+
+    @property
+    def device(self) -> torch.device:
+        """The learner's."""
+        return self._device
+
+    def reset(self, seeds: Sequence[int]) -> TensorDict:
+        """The learner's memory, and the random actions if there are any."""
+        memory = self.initial(len(seeds)).to(self._device)
+        return memory if self.start is None else memory.update(self.start.reset(seeds).to(self._device))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Look, and choose."""
+        seen = self.act(tensordict, self.generator, self.explore)
+        if self.start is None:
+            return seen
+        return self.start(seen.update(tensordict.select(*self.start.memory_keys)))
+
+
 def play(
     pool: TaskPool,
     seeds: Sequence[int],
@@ -50,8 +88,8 @@ def play(
     *,
     explore: bool = False,
     random: bool = False,
-) -> Episodes:
-    """Play one episode for each seed.
+) -> PlayedEpisodes:
+    """Play one episode for each seed, all side by side.
 
     Args:
         pool: environments.
@@ -61,40 +99,28 @@ def play(
         explore: it samples its actions.
         random: uniform actions in [-1, 1] instead, a function of the episode's seed.
     """
-    tasks = pool.take(len(seeds))
-    for task in tasks:
-        task.draw_steps = learner is not None
-    started = [start_episode(task, seed, REDRAW_STRIDE) for task, seed in zip(tasks, seeds, strict=True)]
-    frames = [frame for frame, _, _ in started]
-    streams = [np.random.default_rng([seed, RANDOM_STREAM]) for _, seed, _ in started]
-    n, width, steps = len(seeds), pool.env.action_dim, pool.env.max_steps
-    memory = (learner.initial(n) if learner is not None else _no_memory(n, width)).to(device)
-    rewards, solved = np.zeros((steps + 1, n), np.float32), np.zeros(n, bool)
+    drawn = RandomActor(pool.env.max_steps, pool.env.action_dim)
+    actor: Actor = drawn
+    if learner is not None:
+        actor = LearnerActor(learner, device, generator, explore, drawn if random else None)
+    stored = () if learner is None else learner.stored
     kept: list[TensorDictBase] = []
-    for step in range(steps + 1):
-        frame = TensorDict({keys.ACTION: memory.get(keys.ACTION).cpu()}, [n])
-        if learner is not None:
-            memory.set(keys.PIXELS, torch.from_numpy(np.stack(frames)).to(device).movedim(-1, -3))
-            with torch.no_grad():
-                seen = learner.act(memory, generator, explore)
-            frame.update(seen.select(*learner.stored).cpu())
-            memory = seen.select(*memory.exclude(keys.PIXELS).keys())
-        kept.append(frame)
-        if step == steps:
-            break
-        if random:
-            drawn = np.stack([stream.uniform(-1, 1, width).astype(np.float32) for stream in streams])
-            memory.set(keys.ACTION, torch.from_numpy(drawn).to(device))
-        for i, (task, action) in enumerate(zip(tasks, memory.get(keys.ACTION).cpu().numpy(), strict=True)):
-            observation, reward, _, _, info = task.step(action)
-            frames[i], rewards[step + 1, i] = observation["pixels"], reward
-            solved[i] |= info["success"]
-    returns = tuple(rewards.sum(axis=0, dtype=np.float64).tolist())
-    return Episodes(_with_rewards(torch.stack(kept, 1), rewards), returns, tuple(solved.tolist()))
+    rewards: list[npt.NDArray[np.float32]] = []
+    action = torch.zeros(len(seeds), pool.env.action_dim)
 
+    def look_on(moment: Moment) -> None:
+        nonlocal action
+        assert moment.seen is not None
+        kept.append(moment.seen.select(*stored).cpu().set(keys.ACTION, action))
+        rewards.append(moment.rewards)
+        action = moment.seen.get(keys.ACTION).cpu()
 
-def _no_memory(n: int, width: int) -> TensorDict:
-    return TensorDict({keys.ACTION: torch.zeros(n, width)}, [n])
+    outcomes = run_episodes(
+        pool, actor, seeds, look_on, stop=False, see_last=True, draw=False, stride=REDRAW_STRIDE, lockstep=len(seeds)
+    )
+    received = np.stack(rewards)
+    returns = tuple(received.sum(axis=0, dtype=np.float64).tolist())
+    return PlayedEpisodes(_with_rewards(torch.stack(kept, 1), received), returns, tuple(o.success for o in outcomes))
 
 
 def _with_rewards(frames: TensorDictBase, rewards: npt.NDArray[np.float32]) -> TensorDict:

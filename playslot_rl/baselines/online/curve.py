@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from playslot_rl.baselines.online.acting import Episodes
+from playslot_rl.baselines.online.acting import PlayedEpisodes
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.storage.atomic import write_bytes, write_json
 
 
-def curve_point(played: Episodes) -> dict[str, Any]:
+def curve_point(played: PlayedEpisodes) -> dict[str, Any]:
     """`return_mean` and its standard error, `success_rate` (0 to 1) and its Wilson interval `ci95`."""
     returns = np.array(played.returns)
     error = float(returns.std(ddof=1) / np.sqrt(len(returns))) if len(returns) > 1 else 0.0

@@ -18,7 +18,7 @@ import torch
 from tensordict import TensorDictBase
 
 from playslot_rl.acting.episodes import LOCKSTEP, TaskPool
-from playslot_rl.baselines.online.acting import Episodes, play
+from playslot_rl.baselines.online.acting import PlayedEpisodes, play
 from playslot_rl.baselines.online.checkpoints import OnlineCheckpoints, OnlineState
 from playslot_rl.baselines.online.curve import curve_point, draw_curve, write_curve
 from playslot_rl.baselines.online.learner import Learner
@@ -230,7 +230,7 @@ class _Run:
                 played.append(play(self.pool, chunk, learner, self.device, generator, random=random))
         returns = tuple(value for part in played for value in part.returns)
         successes = tuple(value for part in played for value in part.successes)
-        return curve_point(Episodes(played[0].frames, returns, successes))
+        return curve_point(PlayedEpisodes(played[0].frames, returns, successes))
 
     def _evaluate(self, logger: MetricLogger) -> None:
         state = self.state

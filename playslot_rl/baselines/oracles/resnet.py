@@ -22,8 +22,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import Actor
-from playslot_rl.acting.slot_actor import ReactiveActor
+from playslot_rl.acting.actor import Actor, ReactiveActor
 from playslot_rl.config import PolicyConfig
 from playslot_rl.errors import CheckpointError
 from playslot_rl.modules.policy import LatentPolicy

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import torch
 
-from playslot_rl.acting.actor import Actor
-from playslot_rl.acting.slot_actor import SlotActor
+from playslot_rl.acting.actor import Actor, SlotActor
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.world_model import oracle_module
 

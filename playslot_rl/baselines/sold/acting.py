@@ -9,17 +9,17 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from playslot_rl import keys
+from playslot_rl.acting.actor import Actor
 from playslot_rl.baselines.sold.heads import ActorHead, action_distribution, sample_action
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.world_model import frame_parser_module, module_device
 
 
-class SlotActing(TensorDictModuleBase):
-    """One step of acting.
+class SOLDActor(Actor):
+    """SOLD: one step of acting, by the most likely action.
 
     Reads PIXELS (n, 3, H, W) uint8, SLOT_STATE, SLOT_AGE, SLOT_HISTORY (n, W, N, D), right-aligned, and
     HISTORY_LENGTH (n, 1); writes these anew but for the frame, SLOTS (n, N, D) and ACTION (n, A) in [-1, 1].
@@ -31,12 +31,13 @@ class SlotActing(TensorDictModuleBase):
         action_dim: A.
     """
 
-    in_keys = (keys.PIXELS, keys.SLOT_STATE, keys.SLOT_AGE, keys.SLOT_HISTORY, keys.HISTORY_LENGTH)
-    out_keys = (keys.SLOT_STATE, keys.SLOT_AGE, keys.SLOT_HISTORY, keys.HISTORY_LENGTH, keys.SLOTS, keys.ACTION)
-
     def __init__(self, savi: SAVi, actor: ActorHead, window: int, action_dim: int) -> None:
-        super().__init__()
+        super().__init__((keys.SLOT_STATE, keys.SLOT_AGE, keys.SLOT_HISTORY, keys.HISTORY_LENGTH, keys.ACTION))
         self.savi, self.actor, self.window, self.action_dim = savi, actor, window, action_dim
+
+    def reset(self, seeds: Sequence[int]) -> TensorDict:
+        """The memory of new episodes; nothing is drawn."""
+        return self.initial(len(seeds))
 
     def initial(self, n: int) -> TensorDict:
         """The memory of n new episodes, batch size [n]."""
@@ -77,18 +78,3 @@ class SlotActing(TensorDictModuleBase):
         rows = torch.arange(len(history), device=history.device)
         location, std, _ = self.actor(history[rows[:, None], source])
         return location[rows, length - 1], std[rows, length - 1]
-
-
-class SOLDActor:
-    """SOLD as `playslot_rl.acting.actor.Actor`: the most likely action.
-
-    Args:
-        module: the acting step.
-    """
-
-    def __init__(self, module: SlotActing) -> None:
-        self.module = module
-
-    def initial(self, seeds: Sequence[int]) -> TensorDict:
-        """The memory of new episodes; nothing is drawn."""
-        return self.module.initial(len(seeds))

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.baselines.online.normaliser import PercentileValueNorm
 from playslot_rl.baselines.sold import losses
-from playslot_rl.baselines.sold.acting import SlotActing
+from playslot_rl.baselines.sold.acting import SOLDActor
 from playslot_rl.baselines.sold.imagination import imagine
 from playslot_rl.baselines.sold.networks import SOLDNetworks, acting_window
 from playslot_rl.config.sold import SOLDConfig
@@ -44,8 +44,8 @@ class SOLDLearner:
         self.mean_actor = copy.deepcopy(networks.actor).requires_grad_(False)
         self.returns = PercentileValueNorm(rate=config.return_rate, min_scale=1.0).to(next(savi.parameters()).device)
         window = acting_window(config)
-        self.exploring = SlotActing(savi, networks.actor, window, action_dim)
-        self.acting = SlotActing(savi, self.mean_actor, window, action_dim)
+        self.exploring = SOLDActor(savi, networks.actor, window, action_dim)
+        self.acting = SOLDActor(savi, self.mean_actor, window, action_dim)
         self.stored: tuple[str, ...] = (keys.SLOTS,) if config.image_weight == 0 else (keys.SLOTS, keys.PIXELS)
         rates = {"actor": config.actor_lr, "critic": config.critic_lr}
         self._adam = {

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from playslot_rl.baselines.sold.acting import SlotActing, SOLDActor
+from playslot_rl.baselines.sold.acting import SOLDActor
 from playslot_rl.baselines.sold.networks import SOLDNetworks, acting_window
 from playslot_rl.config import from_dict
 from playslot_rl.config.sold import SOLDConfig
@@ -88,4 +88,6 @@ def load_actor(run: Path | str, device: torch.device | str = "cpu") -> SOLDActor
         networks = build_networks(config, slots, action_dim, max_steps)
     load_weights(checkpoint, networks.parts)
     networks.to(device).eval().requires_grad_(False)
-    return SOLDActor(SlotActing(load_savi(run, device), networks.actor, acting_window(config), action_dim).eval())
+    actor = SOLDActor(load_savi(run, device), networks.actor, acting_window(config), action_dim)
+    actor.eval()
+    return actor

@@ -46,9 +46,9 @@ def test_actions_are_clamped_and_the_actor_remembers_nothing(policy: ResNetPolic
     with torch.no_grad():
         policy.head.head.bias.fill_(9.0)
     actor = resnet_actor(policy.eval())
-    memory = actor.initial([1, 2])
+    memory = actor.reset([1, 2])
     assert memory.is_empty()
-    actions = actor.module(memory.set(keys.PIXELS, torch.zeros(2, 3, 64, 64, dtype=torch.uint8)))[keys.ACTION]
+    actions = actor(memory.set(keys.PIXELS, torch.zeros(2, 3, 64, 64, dtype=torch.uint8)))[keys.ACTION]
     assert (actions == 1).all()
 
 

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from playslot_rl import keys
-from playslot_rl.baselines.sold.acting import SlotActing, SOLDActor
+from playslot_rl.baselines.sold.acting import SOLDActor
 from playslot_rl.baselines.sold.learner import SOLDLearner
 
 Make = Callable[..., SOLDLearner]
@@ -19,7 +19,7 @@ def _frames(steps: int) -> torch.Tensor:
 
 
 @torch.no_grad()
-def _play(acting: SlotActing, frames: torch.Tensor, **options: object) -> TensorDict:
+def _play(acting: SOLDActor, frames: torch.Tensor, **options: object) -> TensorDict:
     memory, seen = acting.initial(len(frames)), []
     for frame in frames.unbind(1):
         out = acting(memory.set(keys.PIXELS, frame))
@@ -42,7 +42,7 @@ def test_frame_by_frame_equals_the_whole_clip_seen_through_its_window(make_learn
 
 def test_past_the_window_the_actor_sees_its_last_frames(make_learner: Make) -> None:
     learner = make_learner()
-    acting = SlotActing(learner.savi, learner.networks.actor, window=3, action_dim=4).eval()
+    acting = SOLDActor(learner.savi, learner.networks.actor, window=3, action_dim=4).eval()
     played = _play(acting, _frames(5))
     with torch.no_grad():
         location, _, _ = acting.actor(played[keys.SLOTS][:, 2:5])
@@ -83,7 +83,7 @@ def test_memory_holds_what_the_loop_and_the_evaluation_hand_on(make_learner: Mak
     assert torch.equal(memory[keys.ACTION], torch.zeros(3, 4))
     out = learner.act(memory.clone().set(keys.PIXELS, torch.zeros(3, 3, 64, 64, dtype=torch.uint8)), _g(), True)
     assert set(memory.keys()) | set(learner.stored) <= set(out.keys())
-    assert torch.equal(SOLDActor(learner.acting).initial([5, 6]).to_tensordict()[keys.SLOT_AGE], torch.zeros(2, 1))
+    assert torch.equal(learner.acting.reset([5, 6])[keys.SLOT_AGE], torch.zeros(2, 1))
 
 
 def _g() -> torch.Generator:

@@ -1,0 +1,104 @@
+"""One actor acting in episodes side by side, one call an agent step: it remembers, and forgets when told to.
+
+The episode loop, `PlaySlot.act` and LeRobot's policy all act through it.
+
+Shapes: B episodes, n of them still running, A action width, H W image height and width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from playslot_rl import keys
+from playslot_rl.acting.actor import Actor
+
+
+class ClosedLoop:
+    """An actor with its memory.
+
+    Args:
+        actor: in evaluation mode.
+        image_size: side of the frames that `act` takes; 0 takes them as they come.
+        resize: whether `act` resizes frames of another size, by area averaging as in training, or refuses them.
+        seed: of episodes that begin without one.
+    """
+
+    def __init__(self, actor: Actor, image_size: int = 0, resize: bool = False, seed: int = 0) -> None:
+        self.actor, self._side, self._resize, self._seed = actor, image_size, resize, seed
+        self._memory: TensorDictBase | None = None
+
+    def reset(self, seeds: Sequence[int] | None = None) -> None:
+        """Begin episodes with these seeds; None forgets, and the next frames begin as many episodes as they are."""
+        self._memory = None if seeds is None else self.actor.reset(seeds)
+
+    @torch.no_grad()
+    def step(self, observation: TensorDictBase, rows: Sequence[int] | None = None) -> TensorDictBase:
+        """See the present observation of episodes that have begun, and choose.
+
+        Args:
+            observation: batch size [n], on the actor's device.
+            rows: which of the episodes they are; None means all.
+
+        Returns:
+            What the actor writes, batch size [n]: ACTION (n, A), its memory, and whatever it found on the way.
+        """
+        memory = self._memory
+        if memory is None:
+            self.reset([self._seed] * len(observation))
+            return self.step(observation, rows)
+        some = rows is not None and len(rows) < len(memory)
+        index = torch.as_tensor(rows if some else [], dtype=torch.long, device=self.actor.device)
+        seen: TensorDictBase = self.actor((memory[index] if some else memory.copy()).update(observation))
+        for key in self.actor.memory_keys:
+            after = seen.get(key)
+            memory.set(key, memory.get(key).index_copy(0, index, after) if some else after)
+        return seen
+
+    def act(self, frames: Tensor, name: str = "frames") -> Tensor:
+        """Actions for the present frames of all episodes.
+
+        Args:
+            frames: (B, 3, H, W), float in [0, 1] or uint8 [0, 255]; rows keep their place until `reset`.
+            name: of the frames, for messages.
+
+        Returns:
+            (B, A) in [-1, 1], on the actor's device.
+
+        Raises:
+            ValueError: another shape, or another number of episodes than at the last call.
+        """
+        pixels = self._fitted(frames, name).to(self.actor.device)
+        if self._memory is not None and len(self._memory) != len(pixels):
+            raise ValueError(
+                f"{name}: got {len(pixels)} episodes, expected {len(self._memory)} as at the last step: call reset() "
+                "before new episodes"
+            )
+        actions: Tensor = self.step(TensorDict({keys.PIXELS: pixels}, [len(pixels)])).get(keys.ACTION)
+        return actions.clamp(-1, 1)
+
+    def _fitted(self, frames: Tensor, name: str) -> Tensor:
+        """Frames of the model's size."""
+        side = self._side or frames.shape[-1]
+        if frames.ndim != 4 or frames.shape[1] != 3:
+            raise ValueError(f"{name}: got shape {tuple(frames.shape)}, expected (batch, 3, {side}, {side})")
+        if tuple(frames.shape[2:]) == (side, side):
+            return frames
+        if not self._resize:
+            raise ValueError(
+                f"{name}: got frames of {frames.shape[2]}x{frames.shape[3]}, expected {side}x{side}, with which the "
+                "policy was trained: record at that size"
+            )
+        return _resized(frames, side)
+
+
+def _resized(frames: Tensor, side: int) -> Tensor:
+    """(B, 3, H, W) to uint8 (B, 3, side, side), by what the frames of the training went through."""
+    from playslot_rl.data.frame_cache import resize_frames
+
+    bytes_ = frames if frames.dtype == torch.uint8 else frames.mul(255).round().clamp(0, 255).byte()
+    small = resize_frames(bytes_.movedim(1, -1).cpu().numpy(), side)
+    return torch.from_numpy(small).movedim(-1, 1)
