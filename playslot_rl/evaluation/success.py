@@ -6,6 +6,7 @@ loop here runs each seed once. That it acts as the TorchRL environments do is te
 
 from __future__ import annotations
 
+import contextlib
 import json
 import platform
 import time
@@ -159,17 +160,11 @@ def measure(
     seeds = list(range(start, start + episodes))
     training = training_seeds(config, run)
     check_disjoint(seeds, training)
-    own = TaskPool(config.env, config.render) if pool is None else None
-    used = pool or own
-    assert used is not None
     begin = time.perf_counter()
-    try:
+    with TaskPool(config.env, config.render) if pool is None else contextlib.nullcontext(pool) as used:
         outcome = run_episodes(used, actor, seeds)
         wall = time.perf_counter() - begin
         references = _references(oracle, config, seeds, used, facts, run)
-    finally:
-        if own is not None:
-            own.close()
     played = [e.seed for e in outcome]
     check_disjoint(played, training)  # a redrawn episode has another seed
     return {
