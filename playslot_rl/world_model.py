@@ -19,12 +19,12 @@ from playslot_rl.errors import ConfigError
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.policy import LatentPolicy
-from playslot_rl.modules.predictors.cocvp import COCVP
+from playslot_rl.modules.predictors import Predictor, build_predictor
 from playslot_rl.modules.savi import SAVi
 
 
 class WorldModel(nn.Module):
-    """SAVi, InvDyn and cOCVP: parse, infer latent actions, predict (paper, Figure "PlaySlot").
+    """SAVi, InvDyn and the predictor: parse, infer latent actions, predict (paper, Figure "PlaySlot").
 
     Args:
         config: sizes.
@@ -33,6 +33,9 @@ class WorldModel(nn.Module):
     Attributes:
         savi, inverse_dynamics, predictor: the three modules.
         config, env: as given.
+
+    Raises:
+        ConfigError: a predictor that cannot take the latent actions.
 
     Examples:
         >>> import torch
@@ -50,7 +53,9 @@ class WorldModel(nn.Module):
         self.env = env
         self.savi = SAVi(config.savi, env.image_size)
         self.inverse_dynamics = InverseDynamics(config.inverse_dynamics, config.savi.slot_dim, env.action_dim)
-        self.predictor = COCVP(config.predictor, config.savi.slot_dim, self.inverse_dynamics.latent_dim)
+        self.predictor = build_predictor(
+            config.predictor, config.savi.slot_dim, self.inverse_dynamics.latent_dim, self.inverse_dynamics.per_slot
+        )
 
     @property
     def slot_shape(self) -> tuple[int, int]:
@@ -123,17 +128,6 @@ def normalise(pixels: Tensor) -> Tensor:
 # --- parse --------------------------------------------------------------------------------------------------------
 
 
-class _ParseClip(nn.Module):
-    def __init__(self, savi: SAVi, generator: torch.Generator | None) -> None:
-        super().__init__()
-        self.savi = savi
-        self.generator = generator
-
-    def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        slots, state = self.savi(normalise(pixels), generator=self.generator)
-        return slots, state
-
-
 class _ParseFrame(nn.Module):
     def __init__(self, savi: SAVi, generator: torch.Generator | None) -> None:
         super().__init__()
@@ -156,16 +150,6 @@ class _ParseFrame(nn.Module):
         return slots.reshape(*batch, *slots.shape[1:]), after.reshape(*batch, *after.shape[1:]), age + 1
 
 
-def parser_module(savi: SAVi, generator: torch.Generator | None = None) -> TensorDictModule:
-    """PIXELS (B, T, 3, H, W) to SLOTS (B, T, N, D) and SLOT_STATE (B, N, D); each clip starts an episode.
-
-    Args:
-        savi: the parser.
-        generator: of sampled initial slots.
-    """
-    return TensorDictModule(_ParseClip(savi, generator), in_keys=[keys.PIXELS], out_keys=[keys.SLOTS, keys.SLOT_STATE])
-
-
 def frame_parser_module(savi: SAVi, generator: torch.Generator | None = None) -> TensorDictModule:
     """One frame with the recurrent state: PIXELS (..., 3, H, W), SLOT_STATE, SLOT_AGE to SLOTS, SLOT_STATE, SLOT_AGE.
 
@@ -178,50 +162,13 @@ def frame_parser_module(savi: SAVi, generator: torch.Generator | None = None) ->
     )
 
 
-class _Render(nn.Module):
-    def __init__(self, savi: SAVi) -> None:
-        super().__init__()
-        self.savi = savi
-
-    def forward(self, slots: Tensor) -> tuple[Tensor, Tensor]:
-        decoded = self.savi.decode(slots)
-        return decoded.frames, decoded.masks
-
-
-def render_module(savi: SAVi) -> TensorDictModule:
-    """SLOTS (..., N, D) to PREDICTED_PIXELS (..., 3, H, W) and MASKS (..., N, 1, H, W)."""
-    return TensorDictModule(_Render(savi), in_keys=[keys.SLOTS], out_keys=[keys.PREDICTED_PIXELS, keys.MASKS])
-
-
-# --- latent actions -----------------------------------------------------------------------------------------------
-
-
-class _Infer(nn.Module):
-    def __init__(self, inverse_dynamics: InverseDynamics) -> None:
-        super().__init__()
-        self.inverse_dynamics = inverse_dynamics
-
-    def forward(self, slots: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        latent = self.inverse_dynamics(slots)
-        return latent.z, latent.prototype, latent.variability, latent.code
-
-
-def inverse_dynamics_module(inverse_dynamics: InverseDynamics) -> TensorDictModule:
-    """SLOTS (B, T, N, D) to LATENT_ACTION, PROTOTYPE, VARIABILITY (B, T-1, [N,] Z) and CODE (B, T-1, [N])."""
-    return TensorDictModule(
-        _Infer(inverse_dynamics),
-        in_keys=[keys.SLOTS],
-        out_keys=[keys.LATENT_ACTION, keys.PROTOTYPE, keys.VARIABILITY, keys.CODE],
-    )
-
-
 # --- predict ------------------------------------------------------------------------------------------------------
 
 
 class _Step(nn.Module):
-    """One step of cOCVP on right-aligned histories: the arithmetic of the imagination environment."""
+    """One step of the predictor on right-aligned histories: the arithmetic of the imagination environment."""
 
-    def __init__(self, inverse_dynamics: InverseDynamics, predictor: COCVP) -> None:
+    def __init__(self, inverse_dynamics: InverseDynamics, predictor: Predictor) -> None:
         super().__init__()
         self.inverse_dynamics = inverse_dynamics
         self.predictor = predictor
@@ -254,13 +201,13 @@ class _Step(nn.Module):
         return predicted[:, -1]
 
 
-def dynamics_module(inverse_dynamics: InverseDynamics, predictor: COCVP) -> TensorDictSequential:
+def dynamics_module(inverse_dynamics: InverseDynamics, predictor: Predictor) -> TensorDictSequential:
     """One step of the world model, on root keys, as `ModelBasedEnvBase` wants it.
 
     Reads LATENT_ACTION (..., [N,] Z), SLOT_HISTORY (..., C, N, D), ACTION_HISTORY (..., C, [N,] Z) and
     HISTORY_LENGTH (..., 1); writes SLOTS (..., N, D) of the next frame and the histories moved on by one. The newest
     frame is the last of SLOT_HISTORY; its action, LATENT_ACTION, is not in ACTION_HISTORY yet. Past C frames the oldest
-    is dropped and the window is computed anew, frame numbers starting at zero: the semantics of `COCVP.rollout`.
+    is dropped and the window is computed anew, frame numbers starting at zero: the semantics of `Predictor.rollout`.
     """
     return TensorDictSequential(
         TensorDictModule(
@@ -284,16 +231,6 @@ def action_decoder_module(action_decoder: nn.Module) -> TensorDictModule:
     return TensorDictModule(action_decoder, in_keys=[keys.LATENT_ACTION], out_keys=[keys.ACTION])
 
 
-class _Clamped(nn.Module):
-    def __init__(self, policy: nn.Module) -> None:
-        super().__init__()
-        self.policy = policy
-
-    def forward(self, slots: Tensor) -> Tensor:
-        actions: Tensor = self.policy(slots)
-        return actions.clamp(-1, 1)
-
-
-def oracle_module(oracle: nn.Module) -> TensorDictModule:
-    """SLOTS (..., N, D) to ACTION (..., A), clamped to [-1, 1]."""
-    return TensorDictModule(_Clamped(oracle), in_keys=[keys.SLOTS], out_keys=[keys.ACTION])
+def oracle_module(oracle: nn.Module, observation: str = keys.SLOTS) -> TensorDictModule:
+    """SLOTS (..., N, D), or another observation, to ACTION (..., A), clamped to [-1, 1]."""
+    return TensorDictModule(nn.Sequential(oracle, nn.Hardtanh()), in_keys=[observation], out_keys=[keys.ACTION])

@@ -113,14 +113,16 @@ class InverseDynamicsConfig:
 
 @dataclass(frozen=True)
 class PredictorConfig:
-    """Sizes of cOCVP (system.md section 3; paper, appendix A.3).
+    """Kind and sizes of the predictor (paper, appendix A.3).
 
     Attributes:
+        kind: `cocvp` (paper) or `ocvp_seq` (OCVP-Seq with an action token, as in SOLD).
         dim, layers, heads, head_dim, mlp_dim: the transformer.
         residual: predict the change of the slots instead of the slots.
         context: frames it attends to; past them the window slides and is recomputed.
     """
 
+    kind: Literal["cocvp", "ocvp_seq"] = "cocvp"
     dim: int = 256
     layers: int = 4
     heads: int = 8

@@ -19,7 +19,7 @@ from playslot_rl import keys
 from playslot_rl.config import DynamicsStageConfig
 from playslot_rl.losses.common import freeze, psnr
 from playslot_rl.modules.inverse_dynamics import InverseDynamics, LatentActions
-from playslot_rl.modules.predictors.cocvp import COCVP
+from playslot_rl.modules.predictors import Predictor
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.world_model import normalise
@@ -81,7 +81,7 @@ class DynamicsLoss(LossModule):
     out_keys = ("loss_image", "loss_slot", "loss_vq", "mse_image", "mse_slot", "psnr", "usage", "perplexity")
 
     def __init__(
-        self, inverse_dynamics: InverseDynamics, predictor: COCVP, savi: SAVi, config: DynamicsStageConfig
+        self, inverse_dynamics: InverseDynamics, predictor: Predictor, savi: SAVi, config: DynamicsStageConfig
     ) -> None:
         super().__init__()
         self.inverse_dynamics = inverse_dynamics

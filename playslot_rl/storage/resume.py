@@ -51,7 +51,7 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-ADDED: Final[Mapping[str, Any]] = {"reward_scale": 1.0, "actor_average": 0.0}
+ADDED: Final[Mapping[str, Any]] = {"reward_scale": 1.0, "actor_average": 0.0, "kind": "cocvp"}
 """Settings that came after the first checkpoints, and what those were trained with."""
 
 

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from playslot_rl import keys
@@ -26,7 +25,7 @@ from playslot_rl.acting.actor import Actor, ReactiveActor
 from playslot_rl.config import PolicyConfig
 from playslot_rl.errors import CheckpointError
 from playslot_rl.modules.policy import LatentPolicy
-from playslot_rl.world_model import normalise
+from playslot_rl.world_model import normalise, oracle_module
 
 NAME = "resnet_oracle"
 WIDTH = 512
@@ -139,19 +138,9 @@ def _read(path: Path) -> dict[str, Tensor]:
     return state
 
 
-class _Clamped(nn.Module):
-    def __init__(self, policy: ResNetPolicy) -> None:
-        super().__init__()
-        self.policy = policy
-
-    def forward(self, pixels: Tensor) -> Tensor:
-        actions: Tensor = self.policy(pixels)
-        return actions.clamp(-1, 1)
-
-
 def resnet_actor(policy: ResNetPolicy) -> Actor:
     """The actor of a policy in evaluation mode; actions clamped to [-1, 1]."""
-    return ReactiveActor(TensorDictModule(_Clamped(policy), in_keys=[keys.PIXELS], out_keys=[keys.ACTION]))
+    return ReactiveActor(oracle_module(policy, keys.PIXELS))
 
 
 def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:

@@ -57,14 +57,14 @@ def imagine(
     memory = None
     if context.shape[1] > 1:
         with torch.no_grad():  # no action that is judged leads there
-            _, memory = dynamics(context[:, :-1], actions)
+            _, memory = dynamics.step(context[:, :-1], actions)
     location, std, past = actor(context.detach())
     frames, chosen, log_probs, entropies, locations = [context], [], [], [], []
     current = context[:, -1:]
     for step in range(horizon):
         distribution = action_distribution(location[:, -1:], std[:, -1:])
         action = sample_action(distribution, generator)
-        current, memory = dynamics(current, action, memory)
+        current, memory = dynamics.step(current, action, past=memory)
         frames.append(current)
         chosen.append(action)
         log_probs.append(distribution.log_prob(action.detach()))

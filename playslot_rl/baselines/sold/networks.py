@@ -9,6 +9,7 @@ from torch import nn
 from playslot_rl.baselines.sold.aggregation import SlotAggregation
 from playslot_rl.baselines.sold.heads import ActorHead, ScalarHead
 from playslot_rl.baselines.sold.two_hot import SymlogTwoHot
+from playslot_rl.config import PredictorConfig
 from playslot_rl.config.sold import SOLDConfig
 from playslot_rl.modules.predictors.ocvp_seq import OCVPSeq
 
@@ -26,8 +27,17 @@ class SOLDNetworks(nn.Module):
     def __init__(self, config: SOLDConfig, slot_dim: int, action_dim: int, frames: int) -> None:
         super().__init__()
         c = config
-        context = max(frames, c.context + c.horizon)
-        self.dynamics = OCVPSeq(slot_dim, action_dim, c.dim, c.dynamics_layers, c.heads, c.mlp_dim, context)
+        sizes = PredictorConfig(
+            kind="ocvp_seq",
+            dim=c.dim,
+            layers=c.dynamics_layers,
+            heads=c.heads,
+            head_dim=c.dim // c.heads,
+            mlp_dim=c.mlp_dim,
+            residual=True,
+            context=max(frames, c.context + c.horizon),
+        )
+        self.dynamics = OCVPSeq(sizes, slot_dim, action_dim)
         self.reward = ScalarHead(self._backbone(c, slot_dim), c.dim, self._grid(c))
         self.critic = ScalarHead(self._backbone(c, slot_dim), c.dim, self._grid(c))
         self.actor = ActorHead(self._backbone(c, slot_dim), c.dim, action_dim)

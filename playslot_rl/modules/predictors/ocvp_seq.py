@@ -1,11 +1,11 @@
-"""SOLD's dynamics: OCVP-Seq with an action token (Mosbach et al., 2025, section 3.2; OCVP-Seq: Villar-Corrales et al.,
-2023).
+"""OCVP-Seq with an action token (Villar-Corrales et al., 2023), as the dynamics of SOLD (Mosbach et al., 2025, section
+3.2) have it.
 
-    S^_{t+1} = S_t + head(X_t^{1..N}),   X_t^0 = [Lin(S_t), Lin(a_t)] + code(t),   X <- time(objects(X)) in every layer
+    S^_{t+1} = [S_t +] head(X_t^{1..N}),   X_t^0 = [Lin(S_t), Lin(a_t)] + code(t),   X <- time(objects(X)) in every layer
 
-Shapes: slots (B, T, N, D), actions (B, T, A) -> (B, T, N, D). M = N + 1 tokens a step. The first attention of a layer
-sees the tokens of one step, the second one token's own past (causal). No code tells the slots apart, so the model is
-equivariant to their order. Keys and values of the past never change, so a rollout keeps them.
+Shapes: slots (B, T, N, D), actions (B, T, A) -> (B, T, N, D). Several conditions, such as p and v, are one action side
+by side. M = N + 1 tokens a step. The first attention of a layer sees the tokens of one step, the second one token's own
+past (causal). No code tells the slots apart, so the model is equivariant to their order.
 """
 
 from __future__ import annotations
@@ -13,72 +13,51 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.modules.transformer import KeysValues, TransformerBlock, sinusoidal_code
+from playslot_rl.config import PredictorConfig
+from playslot_rl.modules.predictors.predictor import AutoregressivePredictor
+from playslot_rl.modules.transformer import KeysValues, TransformerBlock
 
 
-class OCVPSeq(nn.Module):
+class OCVPSeq(AutoregressivePredictor):
     """Action-conditioned slot predictor.
 
     Args:
+        config: sizes; a layer is one block over objects and one over time.
         slot_dim: D.
-        action_dim: A.
-        dim, layers, heads, mlp_dim: the transformer; a layer is one block over objects and one over time.
-        context: most frames that it can see.
-
-    Raises:
-        ValueError: `dim` is no multiple of `heads`.
+        action_dim: A, of all conditions together.
 
     Example:
         >>> import torch
-        >>> model = OCVPSeq(slot_dim=16, action_dim=4, dim=32, layers=1, heads=4, mlp_dim=64, context=8)
+        >>> from playslot_rl.config import PredictorConfig
+        >>> model = OCVPSeq(PredictorConfig(layers=1), slot_dim=16, action_dim=4)
         >>> model.rollout(torch.randn(2, 3, 5, 16), torch.rand(2, 7, 4)).shape
         torch.Size([2, 7, 5, 16])
     """
 
-    code: Tensor
+    def __init__(self, config: PredictorConfig, slot_dim: int, action_dim: int) -> None:
+        super().__init__(config)
+        c = config
+        self.embed_slots = nn.Linear(slot_dim, c.dim)
+        self.embed_action = nn.Linear(action_dim, c.dim)
+        self.objects = nn.ModuleList(TransformerBlock(c.dim, c.heads, c.head_dim, c.mlp_dim) for _ in range(c.layers))
+        self.time = nn.ModuleList(TransformerBlock(c.dim, c.heads, c.head_dim, c.mlp_dim) for _ in range(c.layers))
+        self.norm = nn.LayerNorm(c.dim)
+        self.head = nn.Linear(c.dim, slot_dim)
+        self._start_still()
 
-    def __init__(
-        self, slot_dim: int, action_dim: int, dim: int, layers: int, heads: int, mlp_dim: int, context: int
-    ) -> None:
-        super().__init__()
-        if dim % heads:
-            raise ValueError(f"heads: got {heads}, expected a divisor of dim {dim}")
-        self.context = context
-        self.embed_slots = nn.Linear(slot_dim, dim)
-        self.embed_action = nn.Linear(action_dim, dim)
-        self.objects = nn.ModuleList(TransformerBlock(dim, heads, dim // heads, mlp_dim) for _ in range(layers))
-        self.time = nn.ModuleList(TransformerBlock(dim, heads, dim // heads, mlp_dim) for _ in range(layers))
-        self.norm = nn.LayerNorm(dim)
-        self.head = nn.Linear(dim, slot_dim)
-        # It starts as "nothing moves", which is nearly right from the first step on.
-        nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.head.bias)
-        self.register_buffer("code", sinusoidal_code(context, dim), persistent=False)
-
-    def forward(
-        self, slots: Tensor, actions: Tensor, past: list[KeysValues] | None = None
+    def _predict(
+        self,
+        slots: Tensor,
+        condition: tuple[Tensor, ...],
+        code: Tensor,
+        mask: Tensor | None,
+        past: list[KeysValues] | None,
     ) -> tuple[Tensor, list[KeysValues]]:
-        """Predict the frame after each of S new frames.
-
-        Args:
-            slots: (B, S, N, D).
-            actions: (B, S, A) in [-1, 1], taken at these frames.
-            past: what the call on the P earlier frames returned.
-
-        Returns:
-            Predicted slots (B, S, N, D), entry t is frame t + 1; and the past of the next call.
-
-        Raises:
-            ValueError: more than `context` frames.
-        """
         b, s, n = slots.shape[:3]
-        first = 0 if past is None else past[0][0].shape[2]
-        if first + s > self.context:
-            raise ValueError(f"frames: got {first + s}, expected at most {self.context} (context + horizon)")
-        tokens = torch.cat((self.embed_slots(slots), self.embed_action(actions).unsqueeze(2)), dim=2)
-        x = tokens + self.code[first : first + s].view(1, s, 1, -1)
-        rows = torch.arange(first, first + s, device=slots.device)
-        mask = rows[:, None] >= torch.arange(first + s, device=slots.device) if s > 1 else None
+        action = self.embed_action(torch.cat(condition, dim=-1)).unsqueeze(2)
+        x = torch.cat((self.embed_slots(slots), action), dim=2) + code
+        if mask is not None and mask.dim() > 2:
+            mask = mask.repeat_interleave(n + 1, dim=0)
         kept: list[KeysValues] = []
         for i, (objects, time) in enumerate(zip(self.objects, self.time, strict=True)):
             y, _ = objects(x.reshape(b * s, n + 1, -1))
@@ -86,23 +65,4 @@ class OCVPSeq(nn.Module):
             y, keys_values = time(y, mask, None if past is None else past[i])
             kept.append(keys_values)
             x = y.view(b, n + 1, s, -1).transpose(1, 2)
-        out: Tensor = slots + self.head(self.norm(x[:, :, :n]))
-        return out, kept
-
-    def rollout(self, seed: Tensor, actions: Tensor) -> Tensor:
-        """Autoregressive rollout: parsed slots inside the seed, its own predictions after it.
-
-        Args:
-            seed: parsed slots (B, S, N, D).
-            actions: (B, T, A) of frames 1..T, S <= T <= `context`.
-
-        Returns:
-            Predicted slots (B, T, N, D) of frames 2..T+1.
-        """
-        s = seed.shape[1]
-        out, past = self(seed, actions[:, :s])
-        predictions = [out]
-        for t in range(s, actions.shape[1]):
-            out, past = self(predictions[-1][:, -1:], actions[:, t : t + 1], past)
-            predictions.append(out)
-        return torch.cat(predictions, dim=1)
+        return self._output(x[:, :, :n], slots), kept
