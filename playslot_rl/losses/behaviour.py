@@ -22,7 +22,15 @@ from playslot_rl import keys
 
 
 class _CloningLoss(LossModule):
-    """Mean squared (or absolute) error of a network's output to an action; the two losses below name the keys."""
+    """Mean squared (or absolute) error of a network's output to an action; the two losses below name the keys.
+
+    Args:
+        network: the one that is trained.
+        loss_function: `l2` (paper) or `l1`.
+
+    Raises:
+        ValueError: another loss function.
+    """
 
     @dataclass
     class _AcceptedKeys:
@@ -58,9 +66,6 @@ class _CloningLoss(LossModule):
     def out_keys(self) -> list[NestedKey]:
         """Keys that are written."""
         return [self.out_name]
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        """There is no value estimator."""
 
     def forward(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDictBase:  # noqa: ARG002
         """Compare.
@@ -99,11 +104,8 @@ class BehaviourLoss(_CloningLoss):
     its functional conversion hides the network from `.train()`, `.eval()` and the checkpoints.
 
     Args:
-        policy: the network that is trained, (..., N, D) to (..., Z).
+        network: the policy that is trained, (..., N, D) to (..., Z).
         loss_function: `l2` (paper) or `l1`.
-
-    Raises:
-        ValueError: another loss function.
 
     Examples:
         >>> import torch
@@ -116,9 +118,6 @@ class BehaviourLoss(_CloningLoss):
 
     out_name = "loss_policy"
 
-    def __init__(self, policy: nn.Module, loss_function: str = "l2") -> None:
-        super().__init__(policy, loss_function)
-
 
 class ActionDecoderLoss(_CloningLoss):
     """Regression of real actions on latent ones, on the labelled demonstrations.
@@ -126,11 +125,8 @@ class ActionDecoderLoss(_CloningLoss):
     Reads LATENT_ACTION (..., Z) and ACTION (..., A) in [-1, 1]; writes `loss_action`.
 
     Args:
-        action_decoder: the network that is trained, (..., Z) to (..., A).
+        network: the action decoder that is trained, (..., Z) to (..., A).
         loss_function: `l2` (paper) or `l1`.
-
-    Raises:
-        ValueError: another loss function.
 
     Examples:
         >>> import torch
@@ -142,21 +138,11 @@ class ActionDecoderLoss(_CloningLoss):
     """
 
     @dataclass
-    class _AcceptedKeys:
-        """Keys that `set_keys` can rename.
-
-        Attributes:
-            observation: the latent action.
-            action: the real action.
-            mask: optional bool (...); False leaves an element's target out. Not read where missing.
-        """
+    class _AcceptedKeys(_CloningLoss._AcceptedKeys):
+        """Keys that `set_keys` can rename: the latent action is observed, the real one is the target."""
 
         observation: NestedKey = keys.LATENT_ACTION
         action: NestedKey = keys.ACTION
-        mask: NestedKey = "mask"
 
     default_keys = _AcceptedKeys
     out_name = "loss_action"
-
-    def __init__(self, action_decoder: nn.Module, loss_function: str = "l2") -> None:
-        super().__init__(action_decoder, loss_function)

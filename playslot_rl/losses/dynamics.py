@@ -102,9 +102,6 @@ class DynamicsLoss(LossModule):
         names = self.tensor_keys
         return [names.slots, names.pixels, *([names.action] if self.needs_actions else [])]
 
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        """There is no value estimator."""
-
     def forward(
         self, tensordict: TensorDictBase, generator: torch.Generator | None = None, teacher: bool = False
     ) -> TensorDictBase:

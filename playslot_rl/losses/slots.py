@@ -64,9 +64,6 @@ class SlotsLoss(LossModule):
         """Keys that are read."""
         return [self.tensor_keys.pixels]
 
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        """There is no value estimator."""
-
     def forward(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDictBase:
         """Parse, render, compare.
 
