@@ -1,4 +1,4 @@
-"""Stage 3: cloning latent actions, and decoding them to real ones (system.md section 4; paper, "Learning behaviours").
+"""Stage 3: cloning latent actions, and decoding them to real ones (paper, "Learning behaviours").
 
     L_pi = mean (f_pi(S_t) - z_t)^2,   L_a = mean (D_a(z_t) - a_t)^2
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 
-def total_loss(losses: TensorDictBase) -> Tensor:
+def total_loss(losses: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
     """Sum of the entries named `loss_*` (scalars, weights included).
 
     Raises:

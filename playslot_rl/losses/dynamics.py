@@ -1,4 +1,4 @@
-"""Stage 2: InvDyn and cOCVP on the slots of a frozen SAVi (system.md section 3; paper, Eq. "full loss").
+"""Stage 2: InvDyn and cOCVP on the slots of a frozen SAVi (paper, Eq. "full loss").
 
     L = lambda_img mean (o_t - o^_t)^2 + lambda_slot mean (S_t - S^_t)^2 + lambda_VQ L_VQ,   t = 2 .. T
 

@@ -1,4 +1,4 @@
-"""Stage 1: SAVi's reconstruction loss (system.md section 1; paper, Eq. "SAVi loss").
+"""Stage 1: SAVi's reconstruction loss (paper, Eq. "SAVi loss").
 
     L = mean (o_t - o^_t)^2,   frames in [0, 1]
 

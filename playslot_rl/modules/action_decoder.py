@@ -1,4 +1,4 @@
-"""The action decoder: a_t = D_a(z_t), a three-layer MLP (system.md section 4; paper, appendix A.4).
+"""The action decoder: a_t = D_a(z_t), a three-layer MLP (paper, appendix A.4).
 
 Shapes: latent actions (..., Z) -> real actions (..., A) in [-1, 1].
 

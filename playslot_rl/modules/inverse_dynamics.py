@@ -1,4 +1,4 @@
-"""InvDyn: latent actions from consecutive slots (system.md section 2; paper, section "InvDyn Module").
+"""InvDyn: latent actions from consecutive slots (paper, section "InvDyn Module").
 
     mu_t, var_t = f(S_t);   z_t ~ N(mu_{t+1} - mu_t, var_{t+1} + var_t);   p_t = VQ(z_t),  v_t = z_t - sg[p_t]
 

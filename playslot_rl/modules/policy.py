@@ -1,4 +1,4 @@
-"""The latent policy: z_t = f_pi(S_t), InvDyn_S's architecture with one head (system.md section 4; paper, A.4).
+"""The latent policy: z_t = f_pi(S_t), InvDyn_S's architecture with one head (paper, appendix A.4).
 
 Shapes: slots (..., N, D) -> (..., Z). On real actions in place of latents it is the slot oracle.
 """

@@ -1,4 +1,4 @@
-"""Action prototypes: the vector quantiser (system.md section 2; van den Oord et al., 2017).
+"""Action prototypes: the vector quantiser (paper, appendix A.2; van den Oord et al., 2017).
 
     p = e_k,  k = argmin_j |z - e_j|;   z = p + v;   L_VQ = |sg[z] - p|^2 + beta |z - sg[p]|^2
 

@@ -3,7 +3,7 @@
     x <- x + O(softmax(Q K^T / sqrt(head_dim)) V),   x <- x + MLP(LN(x))     with Q, K, V = W_{q,k,v} LN(x)
 
 Shapes: x (B, S, dim), S tokens; Q, K, V (B, heads, S, head_dim), inner = heads * head_dim.
-q, k, v have no bias; the output projection and the MLP have one (system.md).
+q, k, v have no bias; the output projection and the MLP have one (paper, appendix A).
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -79,6 +81,16 @@ def test_one_latent_action_per_slot_goes_the_same_way() -> None:
     check_env_specs(ImaginationEnv(model, batch_size=[2]))
 
 
+@torch.no_grad()
+def test_a_world_model_on_ocvp_seq_goes_the_same_way() -> None:
+    config = tiny_config(context=CONTEXT)
+    predictor = replace(config.model.predictor, kind="ocvp_seq")
+    other = tiny_agent(replace(config, model=replace(config.model, predictor=predictor)))
+    check_against_rollout(other.world_model, 7)
+    check_env_specs(ImaginationEnv(other.world_model, batch_size=[2]))
+    check_unequal_ages(other)
+
+
 def check_against_rollout(model: WorldModel, steps: int) -> None:
     z = torch.randn(2, steps, *model.latent_shape, generator=torch.Generator().manual_seed(1))
     env = ImaginationEnv(model, batch_size=[2])
@@ -94,6 +106,10 @@ def check_against_rollout(model: WorldModel, steps: int) -> None:
 
 @torch.no_grad()
 def test_episodes_of_unequal_age_do_not_disturb_each_other(agent: Agent) -> None:
+    check_unequal_ages(agent)
+
+
+def check_unequal_ages(agent: Agent) -> None:
     env = ImaginationEnv(agent.world_model, batch_size=[2])
     policy = latent_policy_module(agent.policy)
     old = imagine(env, agent, slots_of((2,), 1), 3)[:, -1]["next"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import pytest
 import torch
@@ -18,8 +19,10 @@ CONFIG = DynamicsStageConfig(seed_frames=2, predicted_frames=4)
 T = 6
 
 
-def model_of(mode: LatentMode = "hybrid") -> WorldModel:
-    return tiny_agent(tiny_config(mode)).world_model
+def model_of(mode: LatentMode = "hybrid", kind: Literal["cocvp", "ocvp_seq"] = "cocvp") -> WorldModel:
+    config = tiny_config(mode)
+    predictor = replace(config.model.predictor, kind=kind)
+    return tiny_agent(replace(config, model=replace(config.model, predictor=predictor))).world_model
 
 
 def loss_of(model: WorldModel, config: DynamicsStageConfig = CONFIG) -> DynamicsLoss:
@@ -133,6 +136,24 @@ def test_all_latent_action_modes_train(mode: LatentMode) -> None:
     if mode == "ground_truth":
         assert keys.ACTION in loss_of(model).in_keys
         assert out["loss_vq"] == 0
+
+
+@pytest.mark.parametrize("kind", ["cocvp", "ocvp_seq"])
+def test_a_world_model_with_either_predictor_learns_through_p_and_v(kind: Literal["cocvp", "ocvp_seq"]) -> None:
+    model, batch = model_of(kind=kind), clips()
+    loss = loss_of(model, replace(CONFIG, image_weight=0.0, vq_weight=0.0)).train()
+    optimizer = torch.optim.Adam([*model.predictor.parameters(), *model.inverse_dynamics.parameters()], lr=1e-3)
+    errors = []
+    for _ in range(10):
+        error = total_loss(loss(batch, generator=seeded()))
+        optimizer.zero_grad()
+        error.backward()
+        errors.append(float(error))
+        gradient = model.inverse_dynamics.to_mean.weight.grad
+        optimizer.step()
+    assert gradient is not None
+    assert gradient.abs().sum() > 0, "none reached the latent actions"
+    assert errors[-1] < 0.9 * errors[0], errors
 
 
 def test_what_is_missing_is_named() -> None:

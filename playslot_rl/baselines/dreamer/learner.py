@@ -14,6 +14,7 @@ from playslot_rl import keys
 from playslot_rl.baselines.dreamer.losses import build_loss, records
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
 from playslot_rl.config.dreamer import DreamerConfig
+from playslot_rl.losses.common import total_loss
 from playslot_rl.seeding import StepGenerators
 
 
@@ -67,7 +68,7 @@ class DreamerLearner:
         """One step; TorchRL draws from the global generators, which the loop has seeded."""
         values = self._stepper.step(None, records(batch, self.networks))
         numbers = {str(key): value.reshape(()) for key, value in values.items() if value.numel() == 1}
-        return {"loss": sum_of_losses(numbers), **numbers}
+        return {"loss": total_loss(numbers), **numbers}
 
 
 class _Slow(nn.Module):
@@ -77,11 +78,6 @@ class _Slow(nn.Module):
         super().__init__()
         self.critic = loss.value_loss.target_value_model_params
         self.returns = loss.actor_loss.retnorm
-
-
-def sum_of_losses(values: Mapping[str, Tensor]) -> Tensor:
-    """What the optimiser lowers: the terms named `loss_...`."""
-    return torch.stack([value for key, value in values.items() if key.startswith("loss_")]).sum()
 
 
 def act(networks: DreamerNetworks, memory: TensorDictBase, generator: torch.Generator | None) -> TensorDict:

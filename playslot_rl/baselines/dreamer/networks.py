@@ -27,10 +27,10 @@ from torchrl.modules import (
     IndependentNormal,
     RSSMPosteriorV3,
     RSSMPriorV3,
+    SymExpTwoHot,
 )
 
 from playslot_rl import keys
-from playslot_rl.baselines.online.two_hot import SymExpTwoHot
 from playslot_rl.config import EnvConfig
 from playslot_rl.config.dreamer import DreamerConfig
 from playslot_rl.errors import ConfigError

@@ -1,5 +1,13 @@
 """SOLD's reward, value and actor: a slot-aggregation transformer each, and a linear layer
-(Mosbach et al., 2025, section 3.3).
+(Mosbach et al., 2025, section 3.3). Scalars are categories on a symlog grid (Hafner et al., 2023):
+
+    target: two-hot(symlog(x)),   p = softmax(l),   b_k evenly spaced in [-limit, limit]
+    decoded, linear: x^ = sum_k p_k symexp(b_k)      decoded, symlog: x^ = symexp(sum_k p_k b_k)
+
+Note: the linear mean is the source's and unbiased. On its grid of +-20, values of up to 4.9e8, TorchRL's
+`SymExpTwoHot` is the same. But SOLD's actor is trained through decoded rewards and values, where the gradient of a bin
+of 4.9e8 drowns all others. So either the grid ends where returns do, or the mean is taken in symlog, which stays of
+the size of the value and is too low where the head is uncertain (between 10 and 200 it says 46, not 105).
 
 Shapes: slots (B, S, N, D), A action width. All take the past that they returned for the earlier steps, so a step of
 imagination costs one step.
@@ -7,12 +15,14 @@ imagination costs one step.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from torch import Tensor, nn
-from torchrl.modules import TruncatedNormal
+from torchrl.modules import TruncatedNormal, symexp, symlog
+from torchrl.objectives import two_hot_cross_entropy, two_hot_decode
 
 from playslot_rl.baselines.sold.aggregation import SlotAggregation
-from playslot_rl.baselines.sold.two_hot import SymlogTwoHot
 from playslot_rl.modules.transformer import KeysValues
 
 MIN_STD, MAX_STD = 0.1, 1.0
@@ -27,13 +37,30 @@ class ScalarHead(nn.Module):
     Args:
         backbone: the slot-aggregation transformer.
         dim: its width.
-        two_hot: its categories.
+        bins: categories; odd, so that one of them is zero.
+        limit: the grid's ends, in symlog; what lies beyond is encoded as the end.
+        mean: how probabilities become a value.
+
+    Raises:
+        ValueError: bins even, or fewer than 3.
     """
 
-    def __init__(self, backbone: SlotAggregation, dim: int, two_hot: SymlogTwoHot) -> None:
+    grid: Tensor
+
+    def __init__(
+        self,
+        backbone: SlotAggregation,
+        dim: int,
+        bins: int,
+        limit: float = 20.0,
+        mean: Literal["symlog", "linear"] = "symlog",
+    ) -> None:
         super().__init__()
-        self.backbone, self.two_hot = backbone, two_hot
-        self.out = nn.Linear(dim, len(two_hot.grid))
+        if bins < 3 or bins % 2 == 0:
+            raise ValueError(f"bins: got {bins}, expected an odd number from 3 on")
+        self.backbone, self.mean = backbone, mean
+        self.register_buffer("grid", torch.linspace(-limit, limit, bins), persistent=False)
+        self.out = nn.Linear(dim, bins)
         # Zero logits decode to zero: an untrained head promises nothing (DreamerV3).
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
@@ -45,11 +72,17 @@ class ScalarHead(nn.Module):
 
     def decode(self, logits: Tensor) -> Tensor:
         """Logits (..., bins) to values (...)."""
-        return self.two_hot.decode(logits)
+        values: Tensor = (
+            two_hot_decode(logits, symexp(self.grid))
+            if self.mean == "linear"
+            else symexp(two_hot_decode(logits, self.grid))
+        )
+        return values
 
     def cross_entropy(self, logits: Tensor, values: Tensor) -> Tensor:
         """Logits (..., bins) and targets (...) to the loss (...); no gradient runs into the targets."""
-        return self.two_hot.cross_entropy(logits, values.detach())
+        loss: Tensor = two_hot_cross_entropy(logits, symlog(values.detach()), self.grid)
+        return loss
 
 
 class ActorHead(nn.Module):

@@ -15,9 +15,9 @@ from typing import cast
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torchrl.modules import PercentileValueNorm
 
 from playslot_rl import keys
-from playslot_rl.baselines.online.normaliser import PercentileValueNorm
 from playslot_rl.baselines.sold import losses
 from playslot_rl.baselines.sold.acting import SOLDActor
 from playslot_rl.baselines.sold.imagination import imagine
@@ -42,6 +42,7 @@ class SOLDLearner:
         self.savi, self.networks, self.config = savi, networks, config
         self.slow_critic = copy.deepcopy(networks.critic).requires_grad_(False)
         self.mean_actor = copy.deepcopy(networks.actor).requires_grad_(False)
+        # The average of the returns' 5-95 percentile range; it starts at zero, as in DreamerV3.
         self.returns = PercentileValueNorm(rate=config.return_rate, min_scale=1.0).to(next(savi.parameters()).device)
         window = acting_window(config)
         self.exploring = SOLDActor(savi, networks.actor, window, action_dim)

@@ -9,8 +9,8 @@ from typing import Literal
 
 import torch
 from torch import Tensor
+from torchrl.objectives.value.functional import td_lambda_return_estimate
 
-from playslot_rl.baselines.online.returns import lambda_returns
 from playslot_rl.baselines.sold.heads import ScalarHead
 from playslot_rl.baselines.sold.imagination import Imagined
 
@@ -46,8 +46,16 @@ def discounts(gamma: float, horizon: int, like: Tensor) -> Tensor:
 
 
 def imagined_returns(rewards: Tensor, values: Tensor, gamma: float, lmbda: float) -> Tensor:
-    """Lambda returns R_0 ... R_{H-1} (B, H) of rewards r_1 ... r_H and values v_1 ... v_H, each (B, H)."""
-    return lambda_returns(rewards.unsqueeze(-1), values.unsqueeze(-1), gamma, lmbda).squeeze(-1)
+    """Lambda returns R_0 ... R_{H-1} (B, H) of rewards r_1 ... r_H and values v_1 ... v_H, each (B, H).
+
+    R_t = r_{t+1} + gamma ((1 - lambda) v_{t+1} + lambda R_{t+1}), with R_H = v_H (DreamerV3, Eq. "lambda return").
+    Imagined trajectories never end, so there is no continuation flag.
+    """
+    over = torch.zeros_like(rewards, dtype=torch.bool).unsqueeze(-1)
+    returns: Tensor = td_lambda_return_estimate(
+        gamma, lmbda, values.unsqueeze(-1), rewards.unsqueeze(-1), done=over, terminated=over
+    )
+    return returns.squeeze(-1)
 
 
 def actor_loss(

@@ -8,7 +8,6 @@ from torch import nn
 
 from playslot_rl.baselines.sold.aggregation import SlotAggregation
 from playslot_rl.baselines.sold.heads import ActorHead, ScalarHead
-from playslot_rl.baselines.sold.two_hot import SymlogTwoHot
 from playslot_rl.config import PredictorConfig
 from playslot_rl.config.sold import SOLDConfig
 from playslot_rl.modules.predictors.ocvp_seq import OCVPSeq
@@ -38,17 +37,13 @@ class SOLDNetworks(nn.Module):
             context=max(frames, c.context + c.horizon),
         )
         self.dynamics = OCVPSeq(sizes, slot_dim, action_dim)
-        self.reward = ScalarHead(self._backbone(c, slot_dim), c.dim, self._grid(c))
-        self.critic = ScalarHead(self._backbone(c, slot_dim), c.dim, self._grid(c))
+        self.reward = ScalarHead(self._backbone(c, slot_dim), c.dim, c.bins, c.limit, c.mean)
+        self.critic = ScalarHead(self._backbone(c, slot_dim), c.dim, c.bins, c.limit, c.mean)
         self.actor = ActorHead(self._backbone(c, slot_dim), c.dim, action_dim)
 
     @staticmethod
     def _backbone(c: SOLDConfig, slot_dim: int) -> SlotAggregation:
         return SlotAggregation(slot_dim, c.dim, c.head_layers, c.heads, c.mlp_dim)
-
-    @staticmethod
-    def _grid(c: SOLDConfig) -> SymlogTwoHot:
-        return SymlogTwoHot(c.bins, c.limit, c.mean)
 
     @property
     def parts(self) -> Mapping[str, nn.Module]:

@@ -1,11 +1,11 @@
 """OCVP-Seq with an action token (Villar-Corrales et al., 2023), as the dynamics of SOLD (Mosbach et al., 2025, section
 3.2) have it.
 
-    S^_{t+1} = [S_t +] head(X_t^{1..N}),   X_t^0 = [Lin(S_t), Lin(a_t)] + code(t),   X <- time(objects(X)) in every layer
+    S^_{t+1} = S_t + head(X_t^{1..N}),   X_t^0 = [Lin(S_t), Lin(a_t)] + code(t),   X <- time(objects(X)) in every layer
 
 Shapes: slots (B, T, N, D), actions (B, T, A) -> (B, T, N, D). Several conditions, such as p and v, are one action side
 by side. M = N + 1 tokens a step. The first attention of a layer sees the tokens of one step, the second one token's own
-past (causal). No code tells the slots apart, so the model is equivariant to their order.
+past (causal). `residual: false` leaves S_t out. No code tells the slots apart: the model is equivariant to their order.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""SAVi's corrector, Slot Attention (Eq. "slot attention" and "slot update"; system.md section 1).
+"""SAVi's corrector, Slot Attention (Eq. "slot attention" and "slot update"; paper, appendix A.1).
 
     A = softmax_N(q(LN(S)) k(LN(h))^T / sqrt(D)) + 1e-8,   A_{n,l} <- A_{n,l} / sum_i A_{n,i}
     S <- GRU(A v(LN(h)), S),   S <- S + MLP(LN(S))

@@ -1,4 +1,4 @@
-"""SAVi's slot decoders (system.md section 1; Watters et al., 2019): slot -> RGB and mask logit.
+"""SAVi's slot decoders (paper, appendix A.1; Watters et al., 2019): slot -> RGB and mask logit.
 
 Shapes: slots (M, D) -> (M, 4, H, W): three channels of RGB without activation, one mask logit.
 

@@ -1,4 +1,4 @@
-"""SAVi's encoder: frame -> feature tokens (system.md section 1).
+"""SAVi's encoder: frame -> feature tokens (paper, appendix A.1).
 
     h_t = MLP(LN(Conv(o_t) + PositionEmbedding))      frame (B, 3, H, W) -> tokens (B, L, token_dim)
 

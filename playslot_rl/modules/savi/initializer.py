@@ -1,4 +1,4 @@
-"""The initial slots S_0 (system.md section 1; paper, appendix A.1).
+"""The initial slots S_0 (paper, appendix A.1).
 
 gaussian:  S_0,n = mu + sigma * eps_n,  eps ~ N(0, I), mu and sigma learned and shared by all slots (paper)
 learned:   S_0,n = mu_n, one learned vector per slot (SOLD)

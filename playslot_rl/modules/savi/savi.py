@@ -1,4 +1,4 @@
-"""SAVi: frames to slots and back (system.md section 1; paper, section "Object-Centric Representation Learning").
+"""SAVi: frames to slots and back (paper, section "Object-Centric Representation Learning").
 
     S_t = correct(h_t, S_t^init),   S_{t+1}^init = transition(S_t),   o^_t = sum_n softmax_N(m_n) * rgb_n
 

@@ -1,4 +1,4 @@
-"""SAVi's transition: one pre-norm transformer block over the slots of a frame (system.md section 1).
+"""SAVi's transition: one pre-norm transformer block over the slots of a frame (paper, appendix A.1).
 
 S_{t+1}^init = Block(S_t)        slots (B, N, D) -> (B, N, D), no output projection, since heads * head_dim = D
 """

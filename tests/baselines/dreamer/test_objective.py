@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from playslot_rl import keys
 from playslot_rl.baselines.dreamer.losses import records, world_model
-from playslot_rl.baselines.online.returns import lambda_returns
+from playslot_rl.baselines.sold.losses import imagined_returns
 from playslot_rl.seeding import global_seed
 
 MODEL = {"encoder", "prior", "posterior", "decoder", "reward"}
@@ -82,7 +82,7 @@ def test_imagined_returns_are_lambda_returns_of_imagined_rewards(parts: Parts) -
     rewards = imagined["next", keys.REWARD]
     with torch.no_grad():
         values = parts.networks.value(imagined["next", "state"], imagined["next", "belief"])[1]
-    expected = lambda_returns(rewards, values, parts.config.gamma, parts.config.lmbda)
+    expected = imagined_returns(rewards[..., 0], values[..., 0], parts.config.gamma, parts.config.lmbda)[..., None]
     assert imagined["lambda_target"].shape == (B * T, 4, 1)
     assert torch.allclose(imagined["lambda_target"], expected, rtol=1e-3, atol=1e-4)
     weights = imagined["discount_weight"][0].flatten()

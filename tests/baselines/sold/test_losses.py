@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torchrl.modules import PercentileValueNorm
 
-from playslot_rl.baselines.online.normaliser import PercentileValueNorm
 from playslot_rl.baselines.sold import losses
 from playslot_rl.baselines.sold.imagination import Imagined
 
@@ -15,9 +15,10 @@ def _imagined(batch: int = 2, horizon: int = 3) -> Imagined:
     return Imagined(torch.zeros(batch, 1 + horizon, 1, 1), zeros.unsqueeze(-1), zeros, zeros, zeros.unsqueeze(-1))
 
 
-def test_lambda_returns_equal_a_plain_loop() -> None:
+@pytest.mark.parametrize(("gamma", "lmbda"), [(0.9, 0.8), (1.0, 0.0), (0.9, 1.0)])
+def test_lambda_returns_equal_a_plain_loop(gamma: float, lmbda: float) -> None:
     torch.manual_seed(0)
-    rewards, values, gamma, lmbda = torch.randn(4, 6), torch.randn(4, 6), 0.9, 0.8
+    rewards, values = torch.randn(4, 6), torch.randn(4, 6)
     expected = torch.zeros(4, 6)
     following = values[:, -1]
     for t in reversed(range(6)):
