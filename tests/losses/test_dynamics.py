@@ -148,7 +148,7 @@ def test_a_world_model_with_either_predictor_learns_through_p_and_v(kind: Litera
         error = total_loss(loss(batch, generator=seeded()))
         optimizer.zero_grad()
         error.backward()
-        errors.append(float(error))
+        errors.append(error.item())
         gradient = model.inverse_dynamics.to_mean.weight.grad
         optimizer.step()
     assert gradient is not None

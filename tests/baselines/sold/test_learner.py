@@ -148,7 +148,7 @@ def test_imagined_steps_follow_from_the_dynamics_and_the_actors_history(make_lea
     context, taken = batch[keys.SLOTS][:, :3], batch[keys.ACTION][:, 1:3]
     out = imagine(networks.dynamics, networks.actor, context, taken, 3, torch.Generator().manual_seed(0))
     torch.testing.assert_close(out.slots[:, :3], context)
-    whole = networks.dynamics(out.slots[:, :-1], torch.cat((taken, out.actions), dim=1))[0]
+    whole = networks.dynamics(out.slots[:, :-1], torch.cat((taken, out.actions), dim=1))
     torch.testing.assert_close(out.slots[:, 3:], whole[:, 2:])
     location, std, _ = networks.actor(out.slots)
     from playslot_rl.baselines.sold.heads import action_distribution
