@@ -14,6 +14,7 @@ import torch
 from playslot_rl.config import to_dict
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
+from playslot_rl.storage.resume import first_difference
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
 from playslot_rl.testing import tiny_config
 from playslot_rl.training.runs import (
@@ -180,6 +181,14 @@ def test_a_changed_config_names_the_key(run: Path) -> None:
     with pytest.raises(CheckpointError, match=r"^model\.savi\.slot_dim: got 48, expected 32") as caught:
         require_config(slots, {"model": {"savi": model["savi"]}})
     assert one_line(caught)
+
+
+def test_a_world_model_from_before_predictors_had_a_kind_is_cocvps() -> None:
+    wanted = {"model": {"predictor": to_dict(tiny_config())["model"]["predictor"]}}
+    old = {"model": {"predictor": {key: v for key, v in wanted["model"]["predictor"].items() if key != "kind"}}}
+    assert first_difference(old, wanted) is None
+    wanted["model"]["predictor"]["kind"] = "ocvp_seq"
+    assert first_difference(old, wanted) == ("model.predictor.kind", "cocvp", "ocvp_seq")
 
 
 def test_a_config_of_another_version_is_refused(run: Path) -> None:
