@@ -23,9 +23,10 @@ from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_se
 from playslot_rl.evaluation.segmentation import adjusted_rand_index, match_slots
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.evaluation.video import video_metrics
+from playslot_rl.frames import to_float
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.training.runs import world_model_checkpoints
-from playslot_rl.world_model import WorldModel, module_device, normalise
+from playslot_rl.world_model import WorldModel, module_device
 
 DEFAULT_CLIPS: Final = 100
 CLIPS_AT_ONCE: Final = 10
@@ -63,17 +64,12 @@ def seed_frames(steps: int) -> int:
     return min(SEED_FRAMES, max(1, steps // 2))
 
 
-def _pixels(frames: npt.NDArray[np.uint8], device: torch.device) -> Tensor:
-    """(..., H, W, 3) uint8 to (..., 3, H, W) float [0, 1]."""
-    return normalise(torch.from_numpy(frames).to(device).movedim(-1, -3))
-
-
 @torch.no_grad()
 def parse_clips(model: WorldModel, frames: npt.NDArray[np.uint8]) -> Parsed:
     """Parse clips (C, T + 1, H, W, 3), infer their latent actions and predict the frames after the seed frames."""
     device = module_device(model.savi)
     generator = torch.Generator(device).manual_seed(0)
-    slots, _ = model.savi(_pixels(frames, device), generator=generator)
+    slots, _ = model.savi(to_float(frames, device), generator=generator)
     decoded = model.savi.decode(slots)
     latent = model.inverse_dynamics(slots)
     seed = seed_frames(frames.shape[1] - 1)
@@ -113,7 +109,7 @@ def _score(model: WorldModel, clips: Clips, first: int, tally: _Tally) -> None:
     """Add some clips; `first` is the number of the first of them."""
     parsed = parse_clips(model, clips.frames)
     objects, slots = clips.moves.shape[2], parsed.slots.shape[2]
-    real = _pixels(clips.frames, parsed.predicted.device)
+    real = to_float(clips.frames, parsed.predicted.device)
     seed = seed_frames(clips.moves.shape[1])
     again = video_metrics(parsed.reconstructed, real)
     ahead = video_metrics(parsed.predicted, real[:, seed : seed + parsed.predicted.shape[1]])

@@ -16,8 +16,8 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.evaluation.objects import RESULT, parse_clips, seed_frames
 from playslot_rl.evaluation.seeds import first_seed
+from playslot_rl.frames import to_uint8
 from playslot_rl.visualization.document import Block, Document, Missing, Picture, Section, Table, Text
-from playslot_rl.visualization.frames import to_uint8
 from playslot_rl.visualization.grid import image_grid
 from playslot_rl.visualization.sections import (
     ReportInput,
