@@ -22,7 +22,8 @@ from playslot_rl.storage.atomic import write_bytes, write_json, write_text
 from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
 from playslot_rl.storage.provenance import provenance
 from playslot_rl.training.runs import world_model_checkpoints
-from playslot_rl.visualization.comparison import comparison_figure, figure_bytes
+from playslot_rl.visualization.charts import figure_bytes
+from playslot_rl.visualization.comparison import comparison_figure
 from playslot_rl.visualization.palette import LIGHT
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs.grid_shapes import MOVES, Clips, generate
 from playslot_rl.errors import ConfigError
-from playslot_rl.evaluation.move_probe import probe_moves
+from playslot_rl.evaluation.probes import probe_moves
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
 from playslot_rl.evaluation.segmentation import adjusted_rand_index, match_slots
 from playslot_rl.evaluation.success import hardware

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from playslot_rl.speed.spec import Sizes, dynamics_variants, rollout_variants, savi_variants
 from playslot_rl.threads import available_cores
+from playslot_rl.visualization import markdown
 
 TARGETS: Final = {
     "savi_step": 2.5,
@@ -98,16 +99,19 @@ def _cpu() -> str:
 
 def table(figures: Figures) -> str:
     """Markdown: one table of ratios, one of the medians behind them."""
-    lines = ["| case | ratio | target |", "|---|---|---|"]
-    lines += [f"| `{key}` | {figures[key]['ratio']:.1f} | {target:g} |" for key, target in TARGETS.items()]
-    lines += ["", "| case | variant | median |", "|---|---|---|"]
+    ratios = [[f"`{key}`", f"{figures[key]['ratio']:.1f}", f"{target:g}"] for key, target in TARGETS.items()]
+    medians = []
     for key in TARGETS:
         unit = figures[key]["unit"]
         for name, value in figures[key].items():
             if name not in ("ratio", "unit"):
                 shown = f"{value:,.0f} frames/s" if unit == "frames/s" else f"{value * 1000:,.1f} ms"
-                lines.append(f"| `{key}` | `{name}` | {shown} |")
+                medians.append([f"`{key}`", f"`{name}`", shown])
     m = figures["machine"]
     versions = f"Python {m['python']}, torch {m['torch']}, mujoco {m['mujoco']}, lerobot {m['lerobot']}"
-    lines += ["", f"{m['cpu']}, {m['cores']} cores, {m['system']}, {versions}; medians of {m['repeats']}"]
-    return "\n".join(lines)
+    parts = [
+        markdown.table(["case", "ratio", "target"], ratios),
+        markdown.table(["case", "variant", "median"], medians),
+        f"{m['cpu']}, {m['cores']} cores, {m['system']}, {versions}; medians of {m['repeats']}",
+    ]
+    return "\n\n".join(parts)

@@ -24,6 +24,8 @@ from playslot_rl.visualization.rollouts import expert_frames
 from playslot_rl.visualization.sections import (
     STAGES,
     ReportInput,
+    machine_row,
+    model_rows,
     prototype_section,
     read_evaluations,
     rollout_section,
@@ -32,7 +34,6 @@ from playslot_rl.visualization.sections import (
     success_section,
     training_section,
 )
-from playslot_rl.visualization.setting_rows import machine_row, model_rows
 from playslot_rl.world_model import Agent, WorldModel
 
 
