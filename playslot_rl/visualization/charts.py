@@ -34,7 +34,7 @@ def figure_bytes(figure: Figure, theme: Theme, kind: str = "png") -> bytes:
     return buffer.getvalue()
 
 
-def style(axes: Axes, theme: Theme) -> None:
+def style_axes(axes: Axes, theme: Theme) -> None:
     """Colours of the page, a grid behind, and spines on two sides only."""
     axes.set_facecolor("none")
     axes.tick_params(colors=theme.text, labelsize=9, length=3)
@@ -96,7 +96,7 @@ def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], str]], t
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlim(-3, 103)
     axes.set_xlabel("success rate, % (bar: 95 % Wilson interval)")
-    style(axes, theme)
+    style_axes(axes, theme)
     axes.grid(False, axis="y")
     return figure_bytes(figure, theme)
 
@@ -133,7 +133,7 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
                 axes.set_yscale("log")
         axes.set_title(f"{stage}: {name.replace('_', ' ')}", fontsize=10)
         axes.set_xlabel("optimiser step", fontsize=9)
-        style(axes, theme)
+        style_axes(axes, theme)
         axes.tick_params(axis="y", which="minor", labelsize=7, colors=theme.text)
     legend(figure, theme, ncols=2)
     return figure_bytes(figure, theme)
@@ -180,7 +180,7 @@ def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Ma
     for axes in (left, right):
         axes.set_xlabel("agent steps", fontsize=9)
         step_axis(axes)
-        style(axes, theme)
+        style_axes(axes, theme)
     legend(figure, theme, ncols=4, fontsize=9)
     return figure_bytes(figure, theme)
 
@@ -208,7 +208,7 @@ def curve_chart(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[A
             axes.plot(np.arange(len(values)), values, color=colour, linewidth=1.3, label=label)
         axes.set_title(name, fontsize=10)
         axes.set_xlabel("frame", fontsize=9)
-        style(axes, theme)
+        style_axes(axes, theme)
         if 1 < len(lines) <= len(theme.series):
             axes.legend(frameon=False, labelcolor=theme.text, fontsize=7, ncols=2)
     return figure_bytes(figure, theme)
@@ -248,7 +248,7 @@ def usage_chart(counts: Mapping[str, Sequence[int]], theme: Theme) -> bytes:
     axes.set_xticks(range(k))
     axes.set_xlabel("code")
     axes.set_ylabel("transitions, %")
-    style(axes, theme)
+    style_axes(axes, theme)
     axes.grid(False, axis="x")
     if len(counts) > 1:
         legend(figure, theme, ncols=4, fontsize=9)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from playslot_rl.visualization.charts import legend, new_figure, step_axis, style
+from playslot_rl.visualization.charts import legend, new_figure, step_axis, style_axes
 from playslot_rl.visualization.palette import METHOD_STYLES, Theme
 
 if TYPE_CHECKING:
@@ -106,4 +106,4 @@ def _finish(axes: Axes, result: Result, theme: Theme) -> None:
             axes.axhline(100 * rate, color=theme.series[7], linestyle=line, linewidth=1.2, label=f"{name} actions")
     axes.set_ylim(-3, 103)
     axes.set_ylabel("success rate, %")
-    style(axes, theme)
+    style_axes(axes, theme)
