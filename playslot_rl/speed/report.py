@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+from playslot_rl.config import BlocksConfig, EnvConfig
 from playslot_rl.speed.spec import Sizes, dynamics_variants, rollout_variants, savi_variants
 from playslot_rl.threads import available_cores
 from playslot_rl.visualization import markdown
@@ -42,7 +44,8 @@ def measure(
         PlaySlotError: a child died. RenderError: no GL backend.
     """
     from playslot_rl.allocator import tune_allocator
-    from playslot_rl.speed.drawing import render_block_push_seconds, render_seconds
+    from playslot_rl.envs.block_ids import block_config
+    from playslot_rl.speed.drawing import render_seconds
     from playslot_rl.speed.race import race
     from playslot_rl.speed.sampling import sampling_rates
 
@@ -56,8 +59,9 @@ def measure(
     say("window sampling against LeRobotDataset + DataLoader")
     rates = sampling_rates(sizes)
     say("rendering, fast against default")
-    render = render_seconds(sizes)
-    blocks = render_block_push_seconds(sizes)
+    render = render_seconds(EnvConfig(image_size=sizes.image_size, warmup_steps=1), sizes)
+    block_push = replace(block_config("block_push", BlocksConfig()), image_size=sizes.image_size)
+    blocks = render_seconds(block_push, sizes)
     return {
         "savi_step": _entry(savi, "plain_fp32_glibc", "collapsed_bf16_allocator"),
         "dynamics_step": _entry(dynamics, "plain_fp32_glibc", "fast"),
