@@ -101,13 +101,12 @@ def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], str]], t
     return figure_bytes(figure, theme)
 
 
-def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Theme, columns: int = 3) -> bytes:
+def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Theme) -> bytes:
     """Loss against the optimiser step, one panel a stage and loss term, logarithmic.
 
     Args:
         histories: stage -> rows of its `metrics.jsonl` (`step`, `split`, numbers).
         theme: page.
-        columns: panels side by side.
 
     Returns:
         PNG.
@@ -118,7 +117,7 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
     panels = [(stage, name) for stage, rows in histories.items() for name in loss_names(rows)]
     if not panels:
         raise ValueError("loss_chart: got no loss in the histories, expected at least one")
-    columns = min(columns, len(panels))
+    columns = min(3, len(panels))
     height = -(-len(panels) // columns)
     figure = new_figure(3.1 * columns, 2.3 * height)
     for index, (stage, name) in enumerate(panels):
