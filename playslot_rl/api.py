@@ -30,6 +30,7 @@ from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.acting.imagination import ImaginationEnv, ImaginationSession, latent_actions
 from playslot_rl.config import ExperimentConfig, RenderConfig
 from playslot_rl.errors import CheckpointError
+from playslot_rl.frames import normalise
 from playslot_rl.modules.inverse_dynamics import LatentActions
 from playslot_rl.modules.savi import Decoded
 from playslot_rl.world_model import Agent, WorldModel, module_device
@@ -362,7 +363,7 @@ class PlaySlot:
             )
         pixels = pixels.to(module_device(self.world_model))
         if pixels.dtype == torch.uint8:
-            return pixels.float().div(255)
+            return normalise(pixels)
         if not pixels.is_floating_point() or not bool(((pixels >= 0) & (pixels <= 1)).all()):
             low, high = pixels.min().item(), pixels.max().item()
             raise ValueError(

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig, ModelConfig
 from playslot_rl.errors import ConfigError
+from playslot_rl.frames import normalise
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.policy import LatentPolicy
@@ -118,11 +119,6 @@ class Agent(nn.Module):
 def module_device(module: nn.Module) -> torch.device:
     """Device of a module's parameters."""
     return next(module.parameters()).device
-
-
-def normalise(pixels: Tensor) -> Tensor:
-    """uint8 [0, 255] to float [0, 1]; floats pass through."""
-    return pixels if pixels.is_floating_point() else pixels.float().div(255)
 
 
 # --- parse --------------------------------------------------------------------------------------------------------

@@ -63,7 +63,7 @@ def _run_due(config: ExperimentConfig, report: Comparison) -> None:
         PlaySlotError: the launcher itself failed.
         KeyboardInterrupt: Ctrl-C. In both cases what there is has been written.
     """
-    from playslot_rl.comparison.launch import run_in_sequence, run_process, run_sweep
+    from playslot_rl.comparison.launch import run_process, run_sweep
     from playslot_rl.comparison.status import read_status
     from playslot_rl.storage.atomic import write_json
 
@@ -79,8 +79,10 @@ def _run_due(config: ExperimentConfig, report: Comparison) -> None:
     try:
         if due and config.compare.launcher:
             run_sweep(list(due), config.compare.launcher, config.compare.hydra)
-        elif due:
-            run_in_sequence(list(due), run_process, lambda file: report.ended(due[file]))
+        else:
+            for file, job in due.items():
+                run_process(file)
+                report.ended(job)
     except KeyboardInterrupt:
         report.write()
         raise KeyboardInterrupt(f"compare interrupted; the same command carries on in {report.out}") from None

@@ -50,13 +50,14 @@ def prepare(config: ExperimentConfig, out: Path) -> ExperimentConfig:
     from playslot_rl.comparison.plan import uses_demos, uses_slots
     from playslot_rl.recipes import train_dynamics, train_slots
     from playslot_rl.recipes.baselines import lapo
+    from playslot_rl.recipes.pipeline import collect_videos
 
     methods = config.compare.methods
     world = uses_slots(config) and not config.run
     if uses_demos(config) or (world and config.collect.learn_from_demos):
         config = replace(config, data=_demos(config, out))
     if (world or "lapo" in methods) and not config.data.root:
-        config = replace(config, data=_videos(config, out))
+        config = replace(config, data=collect_videos(config, out))
     if world:
         model = out / "world_model"
         for stage in (train_slots, train_dynamics):
@@ -107,12 +108,6 @@ def _demos(config: ExperimentConfig, out: Path) -> DataConfig:
     there = _episodes(out / RECORDED) if not config.data.demos and _recorded(out) else 0
     most = there or max(config.collect.expert_episodes, *config.compare.demos)
     return collect_demos(replace(config, collect=replace(config.collect, expert_episodes=most)), out)
-
-
-def _videos(config: ExperimentConfig, out: Path) -> DataConfig:
-    from playslot_rl.recipes.pipeline import collect_videos
-
-    return collect_videos(config, out)
 
 
 class Parents:

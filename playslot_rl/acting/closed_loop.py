@@ -15,6 +15,7 @@ from torch import Tensor
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
+from playslot_rl.frames import quantise
 
 
 class ClosedLoop:
@@ -99,6 +100,5 @@ def _resized(frames: Tensor, side: int) -> Tensor:
     """(B, 3, H, W) to uint8 (B, 3, side, side), by what the frames of the training went through."""
     from playslot_rl.data.frame_cache import resize_frames
 
-    bytes_ = frames if frames.dtype == torch.uint8 else frames.mul(255).round().clamp(0, 255).byte()
-    small = resize_frames(bytes_.movedim(1, -1).cpu().numpy(), side)
+    small = resize_frames(quantise(frames).movedim(1, -1).cpu().numpy(), side)
     return torch.from_numpy(small).movedim(-1, 1)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from playslot_rl.comparison.status import Status, log_file, read_status, write_status
@@ -45,19 +45,6 @@ def settle(job_file: Path, code: int) -> Status:
         status = Status("failed", status.fingerprint, died, status.seconds)
         write_status(job_file, status)
     return status
-
-
-def run_in_sequence(files: Sequence[Path], run: Callable[[Path], Status], after: Callable[[Path], None]) -> None:
-    """Run jobs one after the other.
-
-    Args:
-        files: of the jobs.
-        run: runs one of them.
-        after: called with each that ended.
-    """
-    for file in files:
-        run(file)
-        after(file)
 
 
 def sweep_command(files: Sequence[Path], launcher: str, overrides: Sequence[str]) -> list[str]:

@@ -108,10 +108,11 @@ def check_comparison(config: ExperimentConfig) -> None:
         raise ConfigError(
             f"baselines.resnet_oracle.weights: got {weights}, expected a file, auto, download or scratch: check it"
         )
-    if wanted.launcher and importlib.util.find_spec(LAUNCHERS[wanted.launcher].split(".")[0]) is None:
-        raise _no_launcher(wanted.launcher)
-    if wanted.launcher and importlib.util.find_spec(LAUNCHERS[wanted.launcher]) is None:
-        raise _no_launcher(wanted.launcher)
+    if wanted.launcher and not _installed(LAUNCHERS[wanted.launcher]):
+        raise ConfigError(
+            f"hydra.launcher: got {wanted.launcher}, expected an installed launcher: install it by `uv pip install -e "
+            "'.[launchers]'`"
+        )
     if uses_slots(config) and config.run:
         from playslot_rl.storage.checkpoints import require_config
         from playslot_rl.training.runs import world_model_checkpoints
@@ -126,10 +127,11 @@ def check_comparison(config: ExperimentConfig) -> None:
                 )
 
 
-def _no_launcher(name: str) -> ConfigError:
-    return ConfigError(
-        f"hydra.launcher: got {name}, expected an installed launcher: install it by `uv pip install -e '.[launchers]'`"
-    )
+def _installed(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # of the package it is in
+        return False
 
 
 def check_demos(config: ExperimentConfig, episodes: int, where: str) -> None:

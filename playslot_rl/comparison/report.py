@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.comparison.plan import Job, uses_slots
-from playslot_rl.comparison.results import failures, job_rows, summarise
+from playslot_rl.comparison.results import failures, job_rows, read_json, summarise
 from playslot_rl.comparison.status import read_status
 from playslot_rl.comparison.table import comparison_page
 from playslot_rl.config import ExperimentConfig
@@ -22,7 +21,8 @@ from playslot_rl.storage.atomic import write_bytes, write_json, write_text
 from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
 from playslot_rl.storage.provenance import provenance
 from playslot_rl.training.runs import world_model_checkpoints
-from playslot_rl.visualization.comparison import comparison_figure, figure_bytes
+from playslot_rl.visualization.charts import figure_bytes
+from playslot_rl.visualization.comparison import comparison_figure
 from playslot_rl.visualization.palette import LIGHT
 
 
@@ -40,15 +40,8 @@ class Comparison:
         self, config: ExperimentConfig, out: Path, jobs: Mapping[Job, Mapping[str, Any]], began: float
     ) -> None:
         self.config, self.out, self.jobs, self._began = config, out, jobs, began
-        self._spent = float(self._before().get("seconds", 0.0))
+        self._spent = float(read_json(out / "comparison.json").get("seconds", 0.0))
         self._references: dict[str, dict[str, Any]] = {}
-
-    def _before(self) -> dict[str, Any]:
-        try:
-            stored: dict[str, Any] = json.loads((self.out / "comparison.json").read_text())
-        except (OSError, ValueError):
-            return {}
-        return stored
 
     def references(self) -> None:
         """Run the random policy and the scripted expert on the evaluation episodes, or read what they did.

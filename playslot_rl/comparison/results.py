@@ -31,10 +31,10 @@ def job_rows(job: Job, frame_skip: int, fingerprint: str | None = None) -> list[
     status = read_status(job.file)
     if fingerprint is not None and status.fingerprint != fingerprint:
         status = Status()
-    meta = _read(job.run / job.stage / "checkpoint" / "meta.json") if status.status == "done" else {}
+    meta = read_json(job.run / job.stage / "checkpoint" / "meta.json") if status.status == "done" else {}
     rows = []
     for protocol in job.protocols:
-        info = _read(job.run / "evaluation" / protocol / "eval_info.json") if status.status == "done" else {}
+        info = read_json(job.run / "evaluation" / protocol / "eval_info.json") if status.status == "done" else {}
         episodes, rate = info.get("episodes"), info.get("success_rate")
         rows.append(
             {
@@ -67,7 +67,7 @@ def job_rows(job: Job, frame_skip: int, fingerprint: str | None = None) -> list[
 
 def learning_curve(job: Job, frame_skip: int) -> list[dict[str, Any]] | None:
     """Rows of `RUN/METHOD/curve.json`, there before the job is done too; None without one."""
-    rows = _read(job.run / job.stage / "curve.json").get("rows") or []
+    rows = read_json(job.run / job.stage / "curve.json").get("rows") or []
     return [
         {**row, "agent_steps": row["env_steps"], "env_steps": row["env_steps"] * frame_skip} for row in rows
     ] or None
@@ -75,7 +75,7 @@ def learning_curve(job: Job, frame_skip: int) -> list[dict[str, Any]] | None:
 
 def count_samples(job: Job, meta: Mapping[str, Any]) -> int | None:
     """Examples a method's policy was trained on, repeats included: optimiser steps times batch."""
-    config = _read(job.run / job.stage / "checkpoint" / "config.json").get(job.stage, {})
+    config = read_json(job.run / job.stage / "checkpoint" / "config.json").get(job.stage, {})
     batch = config.get("batch_size", config.get("policy", {}).get("batch_size"))
     return None if batch is None or METHODS[job.method].online or not meta else int(meta.get("steps", 0)) * int(batch)
 
@@ -85,7 +85,7 @@ def count_parameters(run: Path, stage: str) -> int:
     from playslot_rl.storage.checkpoints import checkpoint_folder
     from playslot_rl.training.runs import world_model_folder
 
-    parents = _read(checkpoint_folder(run, stage) / "meta.json").get("parents", {})
+    parents = read_json(checkpoint_folder(run, stage) / "meta.json").get("parents", {})
     folders = [checkpoint_folder(run, stage)]
     for name in parents:
         own = checkpoint_folder(run, name)
@@ -101,7 +101,7 @@ def _numbers(path: Path) -> int:
         return sum(math.prod(part.get_shape()) for part in slices if part.get_dtype().startswith(("F", "BF")))
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
     """A JSON file, or nothing where it is missing or damaged: a row then has nulls."""
     try:
         values: dict[str, Any] = json.loads(path.read_text())

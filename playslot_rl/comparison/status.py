@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import json
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final, Literal
 
 from playslot_rl.config.plain import from_dict
-from playslot_rl.errors import OutputError
-from playslot_rl.storage.atomic import write_json
+from playslot_rl.storage.atomic import explain_write_errors, write_json
+from playslot_rl.storage.locks import locked
 
 LOCK: Final = "comparison.lock"
 
@@ -61,32 +59,21 @@ def write_status(job_file: Path, status: Status) -> None:
     write_json(status_file(job_file), asdict(status))
 
 
-@contextlib.contextmanager
-def comparison_lock(out: Path) -> Iterator[None]:
+def comparison_lock(out: Path) -> AbstractContextManager[None]:
     """Keep other commands out of a comparison's folder; `OUT/comparison.lock` also marks it as one.
 
     Raises:
         OutputError: another command works on it, or the folder cannot be written.
     """
-    try:
+    with explain_write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
-        file = (out / LOCK).open("w")
-    except OSError as error:
-        raise OutputError(f"out={out}: got {error}, expected a folder to write into: choose another out=") from error
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise OutputError(
-                f"out={out}: got a folder that another `playslot compare` works on, expected one of its own: wait for "
-                "it, or use another out="
-            ) from None
-        yield
+    busy = (
+        f"out={out}: got a folder that another `playslot compare` works on, expected one of its own: wait for it, or "
+        "use another out="
+    )
+    return locked(out / LOCK, busy)
 
 
-@contextlib.contextmanager
-def job_lock(job_file: Path) -> Iterator[None]:
-    """Wait until no other process works on the job. The lock ends with its process, however that ends."""
-    with job_file.with_suffix(".lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
+def job_lock(job_file: Path) -> AbstractContextManager[None]:
+    """Wait until no other process works on the job."""
+    return locked(job_file.with_suffix(".lock"))

@@ -7,6 +7,7 @@ from typing import Any
 
 from playslot_rl.comparison.results import failures
 from playslot_rl.config.methods import METHODS
+from playslot_rl.visualization.markdown import table
 
 Result = Mapping[str, Any]
 
@@ -207,13 +208,6 @@ def _jobs(rows: Sequence[Result]) -> str:
         for row in rows
     ]
     return table(headers, body)
-
-
-def table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = ["| " + " | ".join(headers) + " |", "|" + " --- |" * len(headers)]
-    lines += ["| " + " | ".join(value.replace("|", "\\|") for value in row) + " |" for row in rows]
-    return "\n".join(lines)
 
 
 def _number(value: object) -> str:

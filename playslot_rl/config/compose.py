@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
+from playslot_rl.config.methods import MethodName, canonical_method
 from playslot_rl.errors import ConfigError
 
 CONF_MODULE: Final = "playslot_rl.recipes.conf"
@@ -88,11 +89,25 @@ def _parse(overrides: Sequence[str]) -> dict[str, str]:
         key = key.strip().lstrip("+")
         if not equals or not key or key.startswith("~"):
             raise ConfigError(f"got the argument {argument!r}, expected key=value, such as preset=compact")
-        if _hint(key) is None:
+        hint = _hint(key)
+        if hint is None:
             raise ConfigError(_unknown_key(key))
+        if hint in (MethodName, tuple[MethodName, ...]):
+            value = _method_names(key, value)
         pairs.pop(key, None)  # the order of the arguments is kept: a later one wins
         pairs[key] = _unquote(value) if key in GROUPS else value
     return pairs
+
+
+def _method_names(key: str, value: str) -> str:
+    """A method, or some in brackets, by the names that the config knows."""
+    text = _unquote(value.strip())
+    words = text.removeprefix("[").removesuffix("]").split(",")
+    try:
+        names = ",".join(canonical_method(_unquote(word.strip())) for word in words if word.strip())
+    except ConfigError as error:
+        raise ConfigError(f"{key}: {error}") from None
+    return f"[{names}]" if text.startswith("[") else names
 
 
 def _compare_keys(overrides: Sequence[str]) -> list[str]:

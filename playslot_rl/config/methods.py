@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
+import re
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, get_args
+
+from playslot_rl.errors import ConfigError
 
 MethodName = Literal["playslot", "slot_oracle", "resnet_oracle", "lapo", "dreamer", "sold"]
 
@@ -18,6 +22,7 @@ class Method:
         actor: `module:function` of `load_actor(run, device) -> Actor`.
         online: it learns by acting (environment steps on the axis, needs a reward) instead of from demonstrations.
         slots: it builds on a world model's slots.
+        aliases: what people call it besides its name and its title.
     """
 
     title: str
@@ -25,6 +30,7 @@ class Method:
     actor: str
     online: bool = False
     slots: bool = False
+    aliases: tuple[str, ...] = ()
 
 
 METHODS: Final[dict[str, Method]] = {
@@ -33,9 +39,35 @@ METHODS: Final[dict[str, Method]] = {
         "Slot Oracle", "baselines.slot_oracle", "playslot_rl.baselines.oracles.slot:load_actor", slots=True
     ),
     "resnet_oracle": Method(
-        "ResNet Oracle", "baselines.resnet_oracle", "playslot_rl.baselines.oracles.resnet:load_actor"
+        "ResNet Oracle",
+        "baselines.resnet_oracle",
+        "playslot_rl.baselines.oracles.resnet:load_actor",
+        aliases=("ResNet",),
     ),
     "lapo": Method("LAPO", "baselines.lapo", "playslot_rl.baselines.lapo.load:load_actor"),
     "dreamer": Method("DreamerV3", "baselines.dreamer", "playslot_rl.baselines.dreamer.load:load_actor", online=True),
     "sold": Method("SOLD", "baselines.sold", "playslot_rl.baselines.sold.load:load_actor", online=True, slots=True),
 }
+
+
+def canonical_method(text: str) -> MethodName:
+    """The method that somebody names, by its name, title or alias; case, spaces, `-` and `_` do not matter.
+
+    Raises:
+        ConfigError: there is no such method.
+
+    Examples:
+        >>> canonical_method("DreamerV3"), canonical_method("slot-oracle")
+        ('dreamer', 'slot_oracle')
+    """
+    names: tuple[MethodName, ...] = get_args(MethodName)
+    known = {_plain(word): name for name in names for word in (name, METHODS[name].title, *METHODS[name].aliases)}
+    if _plain(text) in known:
+        return known[_plain(text)]
+    near = difflib.get_close_matches(_plain(text), known, n=1)
+    hint = f"; did you mean {known[near[0]]}?" if near else ""
+    raise ConfigError(f"got {text!r}, expected one of {', '.join(names)}{hint}")
+
+
+def _plain(word: str) -> str:
+    return re.sub(r"[\s_-]", "", word.lower())

@@ -18,6 +18,7 @@ import torch
 
 from playslot_rl.data.cache import ArrayWriter, build_once, cache_folder, load_cached
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.frames import normalise
 from playslot_rl.seeding import step_generator
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ def parse_episodes(
         generator = step_generator(0, first, "slot_cache", device)
         pieces, state = [], None
         for begin in range(0, rows.shape[1], FRAMES_A_PASS):
-            frames = source.pixels(rows[:, begin : begin + FRAMES_A_PASS]).to(device).float() / 255
+            frames = normalise(source.pixels(rows[:, begin : begin + FRAMES_A_PASS]).to(device))
             slots, state = savi(frames, state, generator)
             pieces.append(slots.float().cpu().numpy())
         parsed = np.concatenate(pieces, axis=1)

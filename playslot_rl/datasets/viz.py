@@ -206,16 +206,16 @@ def _caption(contents: Contents, clip: Clip) -> str:
 def _camera_pictures(contents: Contents, clip: Clip, camera: str, frames: npt.NDArray[np.uint8]) -> list[Any]:
     from playslot_rl.visualization.animation import animation
     from playslot_rl.visualization.document import Picture
-    from playslot_rl.visualization.grid import image_grid
+    from playslot_rl.visualization.grid import image_grid, png
 
     step = max(1, max(frames.shape[1:3]) // SHOWN_SIDE)
     small = frames[:, ::step, ::step]
     scale = max(1, SHOWN_SIDE // max(small.shape[1:3]))
     every = -(-len(small) // ANIMATED)
     moving = [image_grid(frame[None, None], scale=scale) for frame in small[::every]]
-    still = _png(moving[0])
+    still = png(moving[0])
     at = spread(len(small), STRIP)
-    strip = _png(image_grid(small[at][None], columns=[str(t) for t in at], scale=max(1, scale // 2)))
+    strip = png(image_grid(small[at][None], columns=[str(t) for t in at], scale=max(1, scale // 2)))
     name, rate = f"episode-{clip.span.index}-{camera}", contents.fps / every
     shown = f"{contents.fps:g} fps" if every == 1 else f"every {every}th frame"
     alt = f"Episode {clip.span.index} from {camera}"
@@ -224,14 +224,6 @@ def _camera_pictures(contents: Contents, clip: Clip, camera: str, frames: npt.ND
         Picture(name, animation(moving, rate), alt, f"`{camera}`, {shown}", still=still),
         Picture(f"{name}-strip", strip, alt_strip, "Frames by number"),
     ]
-
-
-def _png(picture: Any) -> bytes:
-    import io
-
-    buffer = io.BytesIO()
-    picture.save(buffer, format="PNG")
-    return buffer.getvalue()
 
 
 def _curve_picture(contents: Contents, clip: Clip) -> Any:

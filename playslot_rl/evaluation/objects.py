@@ -18,14 +18,15 @@ from torch import Tensor
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs.grid_shapes import MOVES, Clips, generate
 from playslot_rl.errors import ConfigError
-from playslot_rl.evaluation.move_probe import probe_moves
+from playslot_rl.evaluation.probes import probe_moves
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
 from playslot_rl.evaluation.segmentation import adjusted_rand_index, match_slots
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.evaluation.video import video_metrics
+from playslot_rl.frames import to_float
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.training.runs import world_model_checkpoints
-from playslot_rl.world_model import WorldModel, module_device, normalise
+from playslot_rl.world_model import WorldModel, module_device
 
 DEFAULT_CLIPS: Final = 100
 CLIPS_AT_ONCE: Final = 10
@@ -63,17 +64,12 @@ def seed_frames(steps: int) -> int:
     return min(SEED_FRAMES, max(1, steps // 2))
 
 
-def _pixels(frames: npt.NDArray[np.uint8], device: torch.device) -> Tensor:
-    """(..., H, W, 3) uint8 to (..., 3, H, W) float [0, 1]."""
-    return normalise(torch.from_numpy(frames).to(device).movedim(-1, -3))
-
-
 @torch.no_grad()
 def parse_clips(model: WorldModel, frames: npt.NDArray[np.uint8]) -> Parsed:
     """Parse clips (C, T + 1, H, W, 3), infer their latent actions and predict the frames after the seed frames."""
     device = module_device(model.savi)
     generator = torch.Generator(device).manual_seed(0)
-    slots, _ = model.savi(_pixels(frames, device), generator=generator)
+    slots, _ = model.savi(to_float(frames, device), generator=generator)
     decoded = model.savi.decode(slots)
     latent = model.inverse_dynamics(slots)
     seed = seed_frames(frames.shape[1] - 1)
@@ -98,37 +94,27 @@ def parse_clips(model: WorldModel, frames: npt.NDArray[np.uint8]) -> Parsed:
     )
 
 
-@dataclass
-class _Tally:
-    """Scores of the clips so far, and the transitions of their matched objects."""
-
-    ari: list[float]
-    foreground: list[float]
-    pixels: list[tuple[float, float, float, float]]
-    unmatched: int
-    transitions: list[tuple[npt.NDArray[Any], ...]]
-
-
-def _score(model: WorldModel, clips: Clips, first: int, tally: _Tally) -> None:
-    """Add some clips; `first` is the number of the first of them."""
+def _score(
+    model: WorldModel, clips: Clips, first: int
+) -> tuple[list[tuple[float, ...]], list[tuple[npt.NDArray[Any], ...]]]:
+    """Scores of some clips, of which the first has the number `first`, and the transitions of their matched objects."""
+    scores: list[tuple[float, ...]] = []
+    transitions: list[tuple[npt.NDArray[Any], ...]] = []
     parsed = parse_clips(model, clips.frames)
     objects, slots = clips.moves.shape[2], parsed.slots.shape[2]
-    real = _pixels(clips.frames, parsed.predicted.device)
+    real = to_float(clips.frames, parsed.predicted.device)
     seed = seed_frames(clips.moves.shape[1])
     again = video_metrics(parsed.reconstructed, real)
     ahead = video_metrics(parsed.predicted, real[:, seed : seed + parsed.predicted.shape[1]])
-    tally.pixels += [(again.psnr, again.ssim, ahead.psnr, ahead.ssim)] * len(clips.frames)
-    for c in range(len(clips.frames)):
-        tally.ari.append(adjusted_rand_index(clips.masks[c], parsed.labels[c]))
-        tally.foreground.append(adjusted_rand_index(clips.masks[c], parsed.labels[c], foreground=True))
-        chosen = match_slots(clips.masks[c], parsed.labels[c], objects, slots)
-        tally.unmatched += int((chosen < 0).sum())
+    for c, (masks, labels) in enumerate(zip(clips.masks, parsed.labels, strict=True)):
+        ari, foreground = adjusted_rand_index(masks, labels), adjusted_rand_index(masks, labels, foreground=True)
+        scores.append((ari, foreground, again.psnr, again.ssim, ahead.psnr, ahead.ssim))
+        chosen = match_slots(masks, labels, objects, slots)
         for o in np.flatnonzero(chosen >= 0):
             n, moves = chosen[o], clips.moves[c, :, o]
             of = np.full(len(moves), first + c, np.int64)
-            tally.transitions.append(
-                (parsed.prototypes[c, :, n], parsed.latents[c, :, n], parsed.codes[c, :, n], moves, of)
-            )
+            transitions.append((parsed.prototypes[c, :, n], parsed.latents[c, :, n], parsed.codes[c, :, n], moves, of))
+    return scores, transitions
 
 
 def evaluate_objects(model: WorldModel, config: ExperimentConfig, clips: int, seeds: list[int]) -> dict[str, Any]:
@@ -145,21 +131,23 @@ def evaluate_objects(model: WorldModel, config: ExperimentConfig, clips: int, se
         `probes` (`prototype`, `latent`: see `probe_moves`), `codes` (K rows of counts by move; None without
         prototypes), `unmatched` (objects without a slot).
     """
-    tally = _Tally([], [], [], 0, [])
+    scores, transitions = [], []
     for first in range(0, clips, CLIPS_AT_ONCE):
         drawn = generate(seeds[first : first + CLIPS_AT_ONCE], config.env.max_steps, config.env)
-        _score(model, drawn, first, tally)
-    prototypes, latents, codes, moves, of = (np.concatenate(part) for part in zip(*tally.transitions, strict=True))
+        of_clips, of_objects = _score(model, drawn, first)
+        scores += of_clips
+        transitions += of_objects
+    prototypes, latents, codes, moves, of = (np.concatenate(part) for part in zip(*transitions, strict=True))
     k = model.inverse_dynamics.n_prototypes
     probes = {"latent": probe_moves(latents, moves, of, len(MOVES), config.seed)}
     if k:
         probes = {"prototype": probe_moves(prototypes, moves, of, len(MOVES), config.seed), **probes}
     table = np.bincount(codes * len(MOVES) + moves, minlength=k * len(MOVES)).reshape(k, -1).tolist() if k else None
-    psnr, ssim, ahead_psnr, ahead_ssim = np.mean(tally.pixels, 0).tolist()
+    ari, foreground, psnr, ssim, ahead_psnr, ahead_ssim = np.mean(scores, 0).tolist()
     seed = seed_frames(config.env.max_steps)
     return {
-        "ari": float(np.mean(tally.ari)),
-        "foreground_ari": float(np.mean(tally.foreground)),
+        "ari": ari,
+        "foreground_ari": foreground,
         "reconstruction": {"psnr": psnr, "ssim": ssim},
         "prediction": {
             "psnr": ahead_psnr,
@@ -171,7 +159,7 @@ def evaluate_objects(model: WorldModel, config: ExperimentConfig, clips: int, se
         "moves": list(MOVES),
         "codes": table,
         "objects": config.env.grid.objects,
-        "unmatched": tally.unmatched,
+        "unmatched": clips * config.env.grid.objects - len(transitions),
     }
 
 

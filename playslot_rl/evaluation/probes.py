@@ -1,6 +1,9 @@
-"""What the latent actions carry: probes of the real action, codebook usage, one row per code.
+"""What the latent actions carry: probes of real actions and of known moves, codebook usage, one row per code.
 
-Shapes: M transitions, Z latent-action dim (N * Z with one latent per slot), A action dim, K prototypes.
+Probes are tested on whole episodes or clips held out: transitions of one are too alike to stand on both sides.
+
+Shapes: M transitions, Z latent-action dim (N * Z with one latent per slot), A action dim, K prototypes, D width of what
+a probe sees.
 """
 
 from __future__ import annotations
@@ -13,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from playslot_rl.evaluation.hold_out import hold_out
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 
 Floats = npt.NDArray[np.float32]
@@ -60,6 +62,30 @@ def infer_latents(
     return np.concatenate(z), np.concatenate(codes), np.concatenate(episodes)
 
 
+def _hold_out(groups: Ints, fraction: float, seed: int, what: str) -> tuple[npt.NDArray[np.bool_], int]:
+    """Choose groups (episodes, clips) at random.
+
+    Args:
+        groups: (M,) group of each row.
+        fraction: of the groups, to hold out; at least one is held out and at least one kept.
+        seed: of the choice.
+        what: who asks and what a group is, for the error: `probe_moves: clip`.
+
+    Returns:
+        (M,) mask of the rows held out, and how many groups they are.
+
+    Raises:
+        ValueError: there are fewer than two groups.
+    """
+    names = np.unique(groups)
+    if len(names) < 2:
+        who, _, group = what.partition(": ")
+        raise ValueError(f"{who}: got {len(names)} {group}, expected at least 2 to hold some out")
+    shuffled = np.random.default_rng(seed).permutation(names)
+    held = shuffled[: min(len(names) - 1, max(1, round(fraction * len(names))))]
+    return np.isin(groups, held), len(held)
+
+
 def probe_actions(
     z: Floats, actions: Floats, episodes: Ints, seed: int = 0, held_out: float = 0.25, codes: Ints | None = None
 ) -> dict[str, Any]:
@@ -82,7 +108,7 @@ def probe_actions(
     """
     if not len(z) == len(actions) == len(episodes):
         raise ValueError(f"probe_actions: got {len(z)}, {len(actions)} and {len(episodes)} rows, expected as many each")
-    test, test_episodes = hold_out(episodes, held_out, seed, "probe_actions: episode")
+    test, test_episodes = _hold_out(episodes, held_out, seed, "probe_actions: episode")
     result: dict[str, Any] = {"train": int((~test).sum()), "test": int(test.sum()), "test_episodes": test_episodes}
     for name in ("linear", "mlp"):
         result[name] = _score(name, z[~test], actions[~test], z[test], actions[test], seed)
@@ -93,6 +119,8 @@ def probe_actions(
 
 
 def _score(kind: str, x: Floats, y: Floats, x_test: Floats, y_test: Floats, seed: int) -> dict[str, Any]:
+    import warnings
+
     from sklearn.linear_model import RidgeCV
     from sklearn.neural_network import MLPRegressor
     from sklearn.pipeline import make_pipeline
@@ -103,17 +131,10 @@ def _score(kind: str, x: Floats, y: Floats, x_test: Floats, y_test: Floats, seed
     else:
         # Adam with a fixed number of passes: early stopping would need a split by episodes that sklearn does not make.
         net = MLPRegressor(
-            hidden_layer_sizes=(64, 64),
-            alpha=1e-3,
-            learning_rate_init=2e-3,
-            batch_size=128,
-            max_iter=60,
-            random_state=seed,
-        )
-        net.set_params(tol=0.0, n_iter_no_change=60)
+            hidden_layer_sizes=(64, 64), alpha=1e-3, learning_rate_init=2e-3, batch_size=128, max_iter=60,
+            random_state=seed, tol=0.0, n_iter_no_change=60,
+        )  # fmt: skip
         model = make_pipeline(StandardScaler(), net)
-    import warnings
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # "did not converge" is the fixed number of passes
         model.fit(x, y)
@@ -123,6 +144,54 @@ def _score(kind: str, x: Floats, y: Floats, x_test: Floats, y_test: Floats, seed
     r2 = [None if s < 1e-8 else float(1 - e / s) for e, s in zip(residual, spread, strict=True)]
     known = [v for v in r2 if v is not None]
     return {"r2": r2, "mean_r2": float(np.mean(known)) if known else None}
+
+
+def probe_moves(
+    features: Floats,
+    moves: Ints,
+    clips: Ints,
+    classes: int,
+    seed: int = 0,
+    held_out: float = 0.3,
+) -> dict[str, Any]:
+    """Accuracy of multinomial logistic regression on clips that it was not fitted on.
+
+    Args:
+        features: (M, D) what the probe sees, such as the prototype of the object's slot.
+        moves: (M,) labels from 0 to `classes` - 1.
+        clips: (M,) clip of each transition; whole clips are held out.
+        classes: number of moves.
+        seed: of the split.
+        held_out: fraction of clips held out.
+
+    Returns:
+        `accuracy` (0 to 1); beside it `chance` (1 / classes) and `majority` (always the most frequent move of the
+        fitted clips); `train` and `test` count transitions, `test_clips` clips.
+
+    Raises:
+        ValueError: sizes differ, or there are fewer than two clips.
+    """
+    if not len(features) == len(moves) == len(clips):
+        raise ValueError(f"probe_moves: got {len(features)}, {len(moves)} and {len(clips)} rows, expected as many each")
+    test, test_clips = _hold_out(clips, held_out, seed, "probe_moves: clip")
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    common = int(np.bincount(moves[~test], minlength=classes).argmax())
+    if len(np.unique(moves[~test])) > 1:
+        probe = make_pipeline(StandardScaler(), LogisticRegression(C=10.0, max_iter=500))
+        predicted = probe.fit(features[~test], moves[~test]).predict(features[test])
+    else:
+        predicted = np.full(int(test.sum()), common)
+    return {
+        "accuracy": float((predicted == moves[test]).mean()),
+        "majority": float((moves[test] == common).mean()),
+        "chance": 1.0 / classes,
+        "train": int((~test).sum()),
+        "test": int(test.sum()),
+        "test_clips": test_clips,
+    }
 
 
 def codebook_usage(codes: Ints, n_prototypes: int) -> dict[str, Any]:

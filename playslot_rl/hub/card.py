@@ -14,6 +14,7 @@ import yaml
 from playslot_rl import keys
 from playslot_rl.data.lerobot_files import LeRobotFiles
 from playslot_rl.hub.record import HubRecord
+from playslot_rl.visualization.markdown import table
 
 MARK = "<!-- made by `playslot dataset push`; remove this line to keep your own text -->"
 META_NAME = "meta/playslot.json"
@@ -174,7 +175,4 @@ def _description(files: LeRobotFiles, facts: CardFacts, record: HubRecord) -> di
 
 
 def _table(rows: dict[str, str]) -> list[str]:
-    def cell(text: str) -> str:
-        return " ".join(text.split()).replace("|", "\\|")
-
-    return ["| | |", "|---|---|", *(f"| {cell(name)} | {cell(value)} |" for name, value in rows.items()), ""]
+    return [table(("", ""), rows.items()), ""]

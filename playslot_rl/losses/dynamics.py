@@ -17,12 +17,12 @@ from torchrl.objectives import LossModule
 
 from playslot_rl import keys
 from playslot_rl.config import DynamicsStageConfig
+from playslot_rl.frames import normalise
 from playslot_rl.losses.common import freeze, psnr
 from playslot_rl.modules.inverse_dynamics import InverseDynamics, LatentActions
 from playslot_rl.modules.predictors import Predictor
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.world_model import normalise
 
 
 class DynamicsLoss(LossModule):

@@ -15,9 +15,9 @@ from tensordict.utils import NestedKey
 from torchrl.objectives import LossModule
 
 from playslot_rl import keys
+from playslot_rl.frames import normalise
 from playslot_rl.losses.common import psnr
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.world_model import normalise
 
 
 class SlotsLoss(LossModule):

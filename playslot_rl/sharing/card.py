@@ -12,6 +12,7 @@ from playslot_rl.config import EvaluationConfig, ExperimentConfig
 from playslot_rl.sharing.commands import reproduce
 from playslot_rl.sharing.config import LICENCE, TAGS, PolicyConfig
 from playslot_rl.sharing.source import Result
+from playslot_rl.visualization.markdown import table
 
 MARK: Final = "<!-- made by `playslot export`; remove this line to keep your own text -->"
 PAPER: Final = (
@@ -134,25 +135,27 @@ def _count(value: Any) -> str:
 def _results(given: CardInput) -> list[str]:
     if not given.results:
         return ["Not evaluated yet. `playslot evaluate`, then `playslot export` again, puts success rates here.", ""]
-    lines = ["| | success | 95 % interval | mean agent steps to success | episodes | seed |", "|---" * 6 + "|"]
+    rows = []
     for result in given.results:
         steps = "–" if result.mean_steps is None else f"{result.mean_steps:.1f}"
-        lines.append(
-            f"| this policy, {PROTOCOL_NAMES[result.protocol]} | {_share(result.success_rate)} | "
-            f"{_interval(result.ci95)} | {steps} | {result.episodes} | {result.seed} |"
-        )
+        title = f"this policy, {PROTOCOL_NAMES[result.protocol]}"
+        rows.append([title, _share(result.success_rate), _interval(result.ci95), steps, *_played(result)])
     first = given.results[0]
     for name, (rate, ci95) in first.references.items():
         title = REFERENCES.get(name, name.replace("_", " "))
-        lines.append(f"| {title} | {_share(rate)} | {_interval(ci95)} | – | {first.episodes} | {first.seed} |")
+        rows.append([title, _share(rate), _interval(ci95), "–", *_played(first)])
     return [
-        *lines,
+        table(["", "success", "95 % interval", "mean agent steps to success", "episodes", "seed"], rows),
         "",
         "Held-out episodes, one for each seed; Wilson intervals, which cover the choice of episodes and not that of",
         "the training run. In imagination only the first frame is seen, and the imagined actions are executed without",
         "looking.",
         "",
     ]
+
+
+def _played(result: Result) -> list[str]:
+    return [str(result.episodes), str(result.seed)]
 
 
 def _share(rate: float) -> str:
@@ -229,7 +232,4 @@ def _numbers(versions: dict[str, str]) -> str:
 
 
 def _table(rows: dict[str, str]) -> list[str]:
-    def cell(text: str) -> str:
-        return " ".join(text.split()).replace("|", "\\|")
-
-    return ["| | |", "|---|---|", *(f"| {cell(name)} | {cell(value)} |" for name, value in rows.items()), ""]
+    return [table(("", ""), rows.items()), ""]

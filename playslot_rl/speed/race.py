@@ -27,8 +27,7 @@ def serve(pipe: Connection[Any, Any], variant: Variant, sizes: Sizes, threads: i
     """Body of a child: says that it is ready, then computes one step for each request, until the pipe closes."""
     try:
         # Before torch allocates anything.
-        allocator = tune_allocator() if variant.allocator else False
-        ready = {"threads": set_threads(threads), "allocator": allocator}
+        ready = {"allocator": variant.allocator and tune_allocator(), "threads": set_threads(threads)}
         from playslot_rl.speed.cases import build_step
 
         step = build_step(variant, sizes)
@@ -36,8 +35,8 @@ def serve(pipe: Connection[Any, Any], variant: Variant, sizes: Sizes, threads: i
         while True:
             pipe.recv()
             begin = time.perf_counter()
-            value = float(step())
-            pipe.send({"seconds": time.perf_counter() - begin, "value": value})
+            float(step())
+            pipe.send({"seconds": time.perf_counter() - begin})
     except (EOFError, KeyboardInterrupt):
         return
     except (RuntimeError, ValueError) as error:  # told to the parent, which stops with it; torch raises these
@@ -52,15 +51,12 @@ class Child:
     process: ForkServerProcess
     pipe: Connection[Any, Any]
     seconds: list[float] = field(default_factory=list)
-    value: float = float("nan")
 
     def ask(self) -> None:
         """Have one step computed, wait for its end, and keep its seconds."""
         with suppress(BrokenPipeError):  # `answer` says why
             self.pipe.send("go")
-        answer = self.answer()
-        self.seconds.append(answer["seconds"])
-        self.value = answer["value"]
+        self.seconds.append(self.answer()["seconds"])
 
     def answer(self) -> dict[str, Any]:
         """What the child sends next.

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+from playslot_rl.config import BlocksConfig, EnvConfig
 from playslot_rl.speed.spec import Sizes, dynamics_variants, rollout_variants, savi_variants
 from playslot_rl.threads import available_cores
+from playslot_rl.visualization import markdown
 
 TARGETS: Final = {
     "savi_step": 2.5,
@@ -41,7 +44,8 @@ def measure(
         PlaySlotError: a child died. RenderError: no GL backend.
     """
     from playslot_rl.allocator import tune_allocator
-    from playslot_rl.speed.drawing import render_block_push_seconds, render_seconds
+    from playslot_rl.envs.block_ids import block_config
+    from playslot_rl.speed.drawing import render_seconds
     from playslot_rl.speed.race import race
     from playslot_rl.speed.sampling import sampling_rates
 
@@ -55,8 +59,9 @@ def measure(
     say("window sampling against LeRobotDataset + DataLoader")
     rates = sampling_rates(sizes)
     say("rendering, fast against default")
-    render = render_seconds(sizes)
-    blocks = render_block_push_seconds(sizes)
+    render = render_seconds(EnvConfig(image_size=sizes.image_size, warmup_steps=1), sizes)
+    block_push = replace(block_config("block_push", BlocksConfig()), image_size=sizes.image_size)
+    blocks = render_seconds(block_push, sizes)
     return {
         "savi_step": _entry(savi, "plain_fp32_glibc", "collapsed_bf16_allocator"),
         "dynamics_step": _entry(dynamics, "plain_fp32_glibc", "fast"),
@@ -98,16 +103,19 @@ def _cpu() -> str:
 
 def table(figures: Figures) -> str:
     """Markdown: one table of ratios, one of the medians behind them."""
-    lines = ["| case | ratio | target |", "|---|---|---|"]
-    lines += [f"| `{key}` | {figures[key]['ratio']:.1f} | {target:g} |" for key, target in TARGETS.items()]
-    lines += ["", "| case | variant | median |", "|---|---|---|"]
+    ratios = [[f"`{key}`", f"{figures[key]['ratio']:.1f}", f"{target:g}"] for key, target in TARGETS.items()]
+    medians = []
     for key in TARGETS:
         unit = figures[key]["unit"]
         for name, value in figures[key].items():
             if name not in ("ratio", "unit"):
                 shown = f"{value:,.0f} frames/s" if unit == "frames/s" else f"{value * 1000:,.1f} ms"
-                lines.append(f"| `{key}` | `{name}` | {shown} |")
+                medians.append([f"`{key}`", f"`{name}`", shown])
     m = figures["machine"]
     versions = f"Python {m['python']}, torch {m['torch']}, mujoco {m['mujoco']}, lerobot {m['lerobot']}"
-    lines += ["", f"{m['cpu']}, {m['cores']} cores, {m['system']}, {versions}; medians of {m['repeats']}"]
-    return "\n".join(lines)
+    parts = [
+        markdown.table(["case", "ratio", "target"], ratios),
+        markdown.table(["case", "variant", "median"], medians),
+        f"{m['cpu']}, {m['cores']} cores, {m['system']}, {versions}; medians of {m['repeats']}",
+    ]
+    return "\n\n".join(parts)

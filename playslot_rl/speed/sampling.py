@@ -21,6 +21,7 @@ from playslot_rl import keys
 from playslot_rl.data.quiet import quiet_datasets
 from playslot_rl.data.source import open_source
 from playslot_rl.data.windows import sample_windows
+from playslot_rl.frames import normalise
 from playslot_rl.speed.spec import Sizes
 from playslot_rl.threads import available_cores
 
@@ -87,7 +88,7 @@ def cache_batches(root: Path, cache: Path, sizes: Sizes) -> Callable[[], Tensor]
 
     def read() -> Tensor:
         rows = sample_windows(source.starts, source.lengths, sizes.window, sizes.window_batch, generator)
-        return source.pixels(rows).float().div_(255)
+        return normalise(source.pixels(rows))
 
     return read
 

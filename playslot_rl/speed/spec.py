@@ -5,6 +5,7 @@ Symbols: B batch, T frames, N slots.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -99,15 +100,11 @@ def plain(case: Case) -> Variant:
 
 def savi_variants() -> dict[str, Variant]:
     """First layer, precision (fp32 in PyTorch's own memory format, bf16 in channels_last) and allocator: eight."""
+    precisions: tuple[Precision, ...] = ("fp32", "bf16")
     found = {}
-    for collapse in (False, True):
-        for precision in ("fp32", "bf16"):
-            for allocator in (False, True):
-                name = f"{'collapsed' if collapse else 'plain'}_{precision}_{'allocator' if allocator else 'glibc'}"
-                bf16 = precision == "bf16"
-                found[name] = Variant(
-                    "savi_step", collapse, "bf16" if bf16 else "fp32", channels_last=bf16, allocator=allocator
-                )
+    for collapse, precision, allocator in itertools.product((False, True), precisions, (False, True)):
+        name = f"{'collapsed' if collapse else 'plain'}_{precision}_{'allocator' if allocator else 'glibc'}"
+        found[name] = Variant("savi_step", collapse, precision, precision == "bf16", allocator)
     return found
 
 

@@ -1,4 +1,4 @@
-"""Charts: success rates with intervals, loss curves, codebook usage. Each is drawn for a light and for a dark page."""
+"""Charts, each for a light or a dark page: success rates with intervals, loss and learning curves, codebook usage."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from playslot_rl.config.methods import METHODS
 from playslot_rl.visualization.palette import METHOD_STYLES, Theme
 
 if TYPE_CHECKING:
@@ -15,17 +16,26 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def _figure(width: float, height: float) -> Figure:
-    # Figure without pyplot: no global state, no display needed.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+def new_figure(width: float, height: float) -> Figure:
+    """A figure of so many inches, without pyplot: no global state, no display needed."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=(width, height), layout="constrained")
 
 
-def _style(axes: Axes, theme: Theme) -> None:
+def figure_bytes(figure: Figure, theme: Theme, kind: str = "png") -> bytes:
+    """A figure as `png` or `svg`, the same bytes for the same figure."""
+    import matplotlib as mpl
+
+    buffer = io.BytesIO()
+    metadata = {"Date": None} if kind == "svg" else {}
+    with mpl.rc_context({"svg.hashsalt": "playslot_rl", "svg.fonttype": "none"}):
+        figure.savefig(buffer, format=kind, dpi=144, facecolor=theme.ground, metadata=metadata)
+    return buffer.getvalue()
+
+
+def style_axes(axes: Axes, theme: Theme) -> None:
+    """Colours of the page, a grid behind, and spines on two sides only."""
     axes.set_facecolor("none")
     axes.tick_params(colors=theme.text, labelsize=9, length=3)
     axes.xaxis.label.set_color(theme.text)
@@ -38,16 +48,20 @@ def _style(axes: Axes, theme: Theme) -> None:
         spine.set_color(theme.grid)
 
 
-def _step_axis(axes: Axes) -> None:
+def step_axis(axes: Axes) -> None:
     """Few ticks, thousands separated: long numbers side by side run into each other."""
     axes.locator_params(axis="x", nbins=6)
     axes.xaxis.set_major_formatter("{x:,.0f}")
 
 
-def _png(figure: Figure, theme: Theme) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=144, facecolor=theme.ground)
-    return buffer.getvalue()
+def legend(figure: Figure, theme: Theme, **options: Any) -> None:
+    """A legend outside the panels, with one entry for each label, however many of them have it."""
+    entries: dict[str, Any] = {}
+    for axes in figure.axes:
+        entries |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    if entries:
+        options = {"loc": "outside upper right", "frameon": False, "labelcolor": theme.text, **options}
+        figure.legend(entries.values(), entries.keys(), **options)
 
 
 def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], str]], theme: Theme) -> bytes:
@@ -60,7 +74,7 @@ def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], str]], t
     Returns:
         PNG.
     """
-    figure = _figure(6.4, 0.6 + 0.42 * len(rows))
+    figure = new_figure(6.4, 0.6 + 0.42 * len(rows))
     axes = figure.add_subplot()
     for y, (_, rate, (low, high), method) in enumerate(rows):
         style = METHOD_STYLES.get(method)
@@ -82,18 +96,17 @@ def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], str]], t
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlim(-3, 103)
     axes.set_xlabel("success rate, % (bar: 95 % Wilson interval)")
-    _style(axes, theme)
+    style_axes(axes, theme)
     axes.grid(False, axis="y")
-    return _png(figure, theme)
+    return figure_bytes(figure, theme)
 
 
-def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Theme, columns: int = 3) -> bytes:
+def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Theme) -> bytes:
     """Loss against the optimiser step, one panel a stage and loss term, logarithmic.
 
     Args:
         histories: stage -> rows of its `metrics.jsonl` (`step`, `split`, numbers).
         theme: page.
-        columns: panels side by side.
 
     Returns:
         PNG.
@@ -104,10 +117,9 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
     panels = [(stage, name) for stage, rows in histories.items() for name in loss_names(rows)]
     if not panels:
         raise ValueError("loss_chart: got no loss in the histories, expected at least one")
-    columns = min(columns, len(panels))
+    columns = min(3, len(panels))
     height = -(-len(panels) // columns)
-    figure = _figure(3.1 * columns, 2.3 * height)
-    handles: dict[str, Any] = {}
+    figure = new_figure(3.1 * columns, 2.3 * height)
     for index, (stage, name) in enumerate(panels):
         axes = figure.add_subplot(height, columns, index + 1)
         for split, colour, marker in (("train", theme.series[0], ""), ("validation", theme.series[1], "o")):
@@ -120,13 +132,56 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
                 axes.set_yscale("log")
         axes.set_title(f"{stage}: {name.replace('_', ' ')}", fontsize=10)
         axes.set_xlabel("optimiser step", fontsize=9)
-        _style(axes, theme)
+        style_axes(axes, theme)
         axes.tick_params(axis="y", which="minor", labelsize=7, colors=theme.text)
-        handles |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
-    figure.legend(
-        handles.values(), handles.keys(), loc="outside upper right", ncols=2, frameon=False, labelcolor=theme.text
-    )
-    return _png(figure, theme)
+    legend(figure, theme, ncols=2)
+    return figure_bytes(figure, theme)
+
+
+def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Mapping[str, Any], theme: Theme) -> bytes:
+    """Two panels: mean return with its standard error, and success rate with its 95 % interval.
+
+    Args:
+        curves: method, by its name in `playslot_rl.config.methods` (others in a colour of no method) -> points
+            with `env_steps`, `return_mean`, `return_error`, `success_rate`, `ci95`.
+        random: the random policy's point.
+        theme: page.
+
+    Returns:
+        PNG.
+
+    Raises:
+        ValueError: there is no point.
+    """
+    if not any(curves.values()):
+        raise ValueError("learning_chart: got no points, expected at least one")
+    figure = new_figure(6.8, 2.8)
+    left, right = figure.subplots(1, 2)
+    for method, rows in curves.items():
+        style = METHOD_STYLES.get(method)
+        colour = theme.series[6] if style is None else theme.series[style.colour]
+        name = METHODS[method].title if method in METHODS else method
+        steps = np.array([row["env_steps"] for row in rows])
+        mean = np.array([row["return_mean"] for row in rows])
+        error = np.array([row["return_error"] for row in rows])
+        left.plot(steps, mean, color=colour, marker="o", markersize=3.5, linewidth=1.5, label=name)
+        left.fill_between(steps, mean - error, mean + error, color=colour, alpha=0.2, linewidth=0)
+        low, high = (100 * np.array([row["ci95"][side] for row in rows]) for side in (0, 1))
+        rate = 100 * np.array([row["success_rate"] for row in rows])
+        right.plot(steps, rate, color=colour, marker="o", markersize=3.5, linewidth=1.5)
+        right.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
+    grey = theme.series[-1]
+    left.axhline(random["return_mean"], color=grey, linestyle="--", linewidth=1.3, label="random policy")
+    right.axhline(100 * random["success_rate"], color=grey, linestyle="--", linewidth=1.3)
+    left.set_ylabel("return of an episode", fontsize=9)
+    right.set_ylabel("success rate, %", fontsize=9)
+    right.set_ylim(-3, 103)
+    for axes in (left, right):
+        axes.set_xlabel("agent steps", fontsize=9)
+        step_axis(axes)
+        style_axes(axes, theme)
+    legend(figure, theme, ncols=4, fontsize=9)
+    return figure_bytes(figure, theme)
 
 
 def curve_chart(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[Any, Any]]], theme: Theme) -> bytes:
@@ -144,7 +199,7 @@ def curve_chart(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[A
     """
     if not panels:
         raise ValueError("curve_chart: got no feature, expected at least one")
-    figure = _figure(3.1 * len(panels), 2.2)
+    figure = new_figure(3.1 * len(panels), 2.2)
     for index, (name, lines) in enumerate(panels.items()):
         axes = figure.add_subplot(1, len(panels), index + 1)
         for number, (label, values) in enumerate(lines.items()):
@@ -152,10 +207,10 @@ def curve_chart(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[A
             axes.plot(np.arange(len(values)), values, color=colour, linewidth=1.3, label=label)
         axes.set_title(name, fontsize=10)
         axes.set_xlabel("frame", fontsize=9)
-        _style(axes, theme)
+        style_axes(axes, theme)
         if 1 < len(lines) <= len(theme.series):
             axes.legend(frameon=False, labelcolor=theme.text, fontsize=7, ncols=2)
-    return _png(figure, theme)
+    return figure_bytes(figure, theme)
 
 
 def loss_names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -176,7 +231,7 @@ def usage_chart(counts: Mapping[str, Sequence[int]], theme: Theme) -> bytes:
     Returns:
         PNG.
     """
-    figure = _figure(6.4, 2.4)
+    figure = new_figure(6.4, 2.4)
     axes = figure.add_subplot()
     k = max(len(c) for c in counts.values())
     width = 0.8 / len(counts)
@@ -192,8 +247,8 @@ def usage_chart(counts: Mapping[str, Sequence[int]], theme: Theme) -> bytes:
     axes.set_xticks(range(k))
     axes.set_xlabel("code")
     axes.set_ylabel("transitions, %")
-    _style(axes, theme)
+    style_axes(axes, theme)
     axes.grid(False, axis="x")
     if len(counts) > 1:
-        figure.legend(loc="outside upper right", ncols=4, frameon=False, labelcolor=theme.text, fontsize=9)
-    return _png(figure, theme)
+        legend(figure, theme, ncols=4, fontsize=9)
+    return figure_bytes(figure, theme)

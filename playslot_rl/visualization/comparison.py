@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from playslot_rl.visualization.charts import _figure, _step_axis, _style
+from playslot_rl.visualization.charts import legend, new_figure, step_axis, style_axes
 from playslot_rl.visualization.palette import METHOD_STYLES, Theme
 
 if TYPE_CHECKING:
@@ -30,41 +29,18 @@ def comparison_figure(result: Result, theme: Theme) -> Figure:
     curves = [row for row in result["rows"] if row["curve"]]
     final = [row for row in result["summary"] if row["demos"] is None]
     online = bool(curves or final)
-    figure = _figure(9.6 if offline and online else 6.4, 3.9)
+    figure = new_figure(9.6 if offline and online else 6.4, 3.9)
     panels = int(bool(offline)) + int(online) or 1
-    handles: dict[str, Any] = {}
     if offline or not online:
         axes = figure.add_subplot(1, panels, 1)
         _demonstrations(axes, offline, result["rows"], theme)
         _finish(axes, result, theme)
-        handles |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
     if online:
         axes = figure.add_subplot(1, panels, panels)
         _steps(axes, curves, final, theme)
         _finish(axes, result, theme)
-        handles |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
-    if handles:
-        figure.legend(
-            handles.values(),
-            handles.keys(),
-            loc="outside lower center",
-            ncols=3,
-            frameon=False,
-            labelcolor=theme.text,
-            fontsize=9,
-        )
+    legend(figure, theme, loc="outside lower center", ncols=3, fontsize=9)
     return figure
-
-
-def figure_bytes(figure: Figure, theme: Theme, kind: str) -> bytes:
-    """A figure as `png` or `svg`, the same bytes for the same figure."""
-    import matplotlib as mpl
-
-    buffer = io.BytesIO()
-    metadata = {"Date": None} if kind == "svg" else {}
-    with mpl.rc_context({"svg.hashsalt": "playslot_rl", "svg.fonttype": "none"}):
-        figure.savefig(buffer, format=kind, dpi=144, facecolor=theme.ground, metadata=metadata)
-    return buffer.getvalue()
 
 
 def _demonstrations(axes: Axes, summary: Sequence[Result], rows: Sequence[Result], theme: Theme) -> None:
@@ -119,7 +95,7 @@ def _steps(axes: Axes, curves: Sequence[Result], final: Sequence[Result], theme:
             axes.plot([r["env_steps"] for r in dots], rates, ".", color=colour, markersize=4, alpha=0.5)
         if not any(row["method"] == method and row["env_steps"] is not None for row in final):
             axes.plot([], [], color=colour, marker=style.marker, label=(own or list(final))[0]["title"])
-    _step_axis(axes)
+    step_axis(axes)
     axes.set_xlabel("environment steps (lines: development episodes)")
 
 
@@ -130,4 +106,4 @@ def _finish(axes: Axes, result: Result, theme: Theme) -> None:
             axes.axhline(100 * rate, color=theme.series[7], linestyle=line, linewidth=1.2, label=f"{name} actions")
     axes.set_ylim(-3, 103)
     axes.set_ylabel("success rate, %")
-    _style(axes, theme)
+    style_axes(axes, theme)

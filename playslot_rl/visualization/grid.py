@@ -5,6 +5,7 @@ Shapes: R rows, C columns, H W frame height and width. Frames are uint8 [0, 255]
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 
 import numpy as np
@@ -52,3 +53,10 @@ def image_grid(cells: Frames, rows: Sequence[str] = (), columns: Sequence[str] =
     for j, label in enumerate(columns):
         draw.text((left + j * step_x + w * scale // 2, 9), label, fill=LABEL, font=font, anchor="mm")
     return picture
+
+
+def png(picture: Image.Image) -> bytes:
+    """Bytes of a picture."""
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG")
+    return buffer.getvalue()

@@ -16,19 +16,19 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.evaluation.objects import RESULT, parse_clips, seed_frames
 from playslot_rl.evaluation.seeds import first_seed
+from playslot_rl.frames import to_uint8
 from playslot_rl.visualization.document import Block, Document, Missing, Picture, Section, Table, Text
-from playslot_rl.visualization.frames import to_uint8
-from playslot_rl.visualization.grid import image_grid
+from playslot_rl.visualization.grid import image_grid, png
 from playslot_rl.visualization.sections import (
     ReportInput,
+    machine_row,
+    model_rows,
     percent,
-    png,
     prototype_section,
     seconds,
     slots_section,
     training_section,
 )
-from playslot_rl.visualization.setting_rows import machine_row, model_rows
 from playslot_rl.world_model import WorldModel
 
 WORLD_MODEL_STAGES = ("slots", "dynamics")

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch
 from PIL import Image
 
-from playslot_rl.visualization.frames import to_float, to_uint8
+from playslot_rl.frames import to_float, to_uint8
 from playslot_rl.visualization.grid import image_grid
 from playslot_rl.world_model import WorldModel
 

@@ -24,6 +24,8 @@ from playslot_rl.visualization.rollouts import expert_frames
 from playslot_rl.visualization.sections import (
     STAGES,
     ReportInput,
+    machine_row,
+    model_rows,
     prototype_section,
     read_evaluations,
     rollout_section,
@@ -32,7 +34,6 @@ from playslot_rl.visualization.sections import (
     success_section,
     training_section,
 )
-from playslot_rl.visualization.setting_rows import machine_row, model_rows
 from playslot_rl.world_model import Agent, WorldModel
 
 
@@ -176,7 +177,10 @@ def settings_section(given: ReportInput) -> Section:
     ]
     rows += model_rows(model)
     if model is not None:
-        rows.append(["parameters", ", ".join(f"{name} {count(module):,}" for name, module in _parts(given).items())])
+        sizes = {
+            name: sum(p.numel() for p in module.parameters()) for name, module in _parts(model, given.agent).items()
+        }
+        rows.append(["parameters", ", ".join(f"{name} {size:,}" for name, size in sizes.items())])
     for protocol, result in read_evaluations(given.run).items():
         seeds = result["seeds"]
         what = f"{len(seeds)} seeds from {min(seeds)} to {max(seeds)}, {seconds(result.get('wall_seconds'))}"
@@ -186,18 +190,11 @@ def settings_section(given: ReportInput) -> Section:
     return Section("Settings and notes", blocks)
 
 
-def _parts(given: ReportInput) -> dict[str, Any]:
-    model, agent = given.world_model, given.agent
-    assert model is not None
+def _parts(model: WorldModel, agent: Agent | None) -> dict[str, Any]:
     parts: dict[str, Any] = {"SAVi": model.savi, "InvDyn": model.inverse_dynamics, "cOCVP": model.predictor}
     if agent is not None:
         parts |= {"policy": agent.policy, "action decoder": agent.action_decoder}
     return parts
-
-
-def count(module: Any) -> int:
-    """Number of parameters."""
-    return sum(p.numel() for p in module.parameters())
 
 
 def notes(given: ReportInput) -> list[str]:

@@ -19,8 +19,8 @@ from playslot_rl.acting.actor import Actor, ExpertActor
 from playslot_rl.acting.agent import ImaginationActor, playslot_actor
 from playslot_rl.acting.episodes import Moment, Outcome, TaskPool, run_episodes
 from playslot_rl.evaluation.video import VideoMetrics, video_metrics
+from playslot_rl.frames import to_float, to_uint8
 from playslot_rl.visualization.animation import side_by_side
-from playslot_rl.visualization.frames import to_float, to_uint8
 from playslot_rl.visualization.grid import image_grid
 from playslot_rl.world_model import Agent
 

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.seeds import first_seed
-from playslot_rl.evaluation.success import PROTOCOLS
+from playslot_rl.evaluation.success import PROTOCOLS, hardware
 from playslot_rl.visualization.charts import loss_chart, loss_names, success_chart
 from playslot_rl.visualization.document import Block, Missing, Picture, Section, Table, Text
+from playslot_rl.visualization.grid import png
 from playslot_rl.visualization.palette import DARK, LIGHT, Theme
 from playslot_rl.world_model import Agent, WorldModel
 
@@ -57,13 +55,6 @@ class ReportInput:
     def command(self, name: str, rest: str = "") -> str:
         """A `playslot` command on this run."""
         return f"playslot {name} run={self.shown}{' ' + rest if rest else ''}"
-
-
-def png(picture: Image.Image) -> bytes:
-    """Bytes of a picture."""
-    buffer = io.BytesIO()
-    picture.save(buffer, format="PNG")
-    return buffer.getvalue()
 
 
 def chart(name: str, draw: Callable[[Theme], bytes], alt: str, caption: str) -> Picture:
@@ -274,3 +265,25 @@ def training_section(given: ReportInput, stages: Sequence[str] = STAGES) -> Sect
     if elsewhere:
         blocks.append(Text(f"No loss curves here for {', '.join(elsewhere)}: trained outside this run folder."))
     return Section("Training", blocks)
+
+
+# --- settings -----------------------------------------------------------------------------------------------------
+
+
+def model_rows(model: WorldModel | None) -> list[list[str]]:
+    """Slots, latent actions and prototypes of a world model; nothing without one."""
+    if model is None:
+        return []
+    savi, inverse = model.config.savi, model.config.inverse_dynamics
+    return [
+        ["slots", f"{savi.n_slots} of width {savi.slot_dim}"],
+        ["latent actions", f"{inverse.mode}, {inverse.variant}, width {model.latent_shape[-1]}"],
+        ["prototypes", str(model.inverse_dynamics.n_prototypes)],
+    ]
+
+
+def machine_row() -> list[str]:
+    """The machine that makes the report."""
+    machine = hardware()
+    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
+    return ["report made on", f"{machine['machine']}, {machine['cores']} cores{gpu}, torch {machine['torch']}"]

@@ -12,8 +12,8 @@ import numpy.typing as npt
 import torch
 from PIL import Image
 
+from playslot_rl.frames import to_float, to_uint8
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.visualization.frames import to_float, to_uint8
 from playslot_rl.visualization.grid import image_grid
 from playslot_rl.visualization.palette import OKABE_ITO, rgb
 

@@ -13,8 +13,9 @@ from torchrl.envs.utils import check_env_specs
 from playslot_rl import keys
 from playslot_rl.acting.imagination import ImaginationEnv, ImaginationSession
 from playslot_rl.config import LatentMode
+from playslot_rl.frames import normalise
 from playslot_rl.testing import tiny_agent, tiny_config
-from playslot_rl.world_model import Agent, WorldModel, dynamics_module, latent_policy_module, normalise
+from playslot_rl.world_model import Agent, WorldModel, dynamics_module, latent_policy_module
 
 CONTEXT = 4
 

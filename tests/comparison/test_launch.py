@@ -51,13 +51,6 @@ def test_what_a_job_prints_goes_to_its_log(job: Path, monkeypatch: pytest.Monkey
     assert "working" in log_file(job).read_text()
 
 
-def test_jobs_run_in_their_order(job: Path) -> None:
-    seen: list[str] = []
-    files = [job.with_name(f"{name}.json") for name in "cab"]
-    launch.run_in_sequence(files, lambda file: seen.append(file.stem) or Status(), lambda file: seen.append("ended"))
-    assert seen == ["c", "ended", "a", "ended", "b", "ended"]
-
-
 def _hold(file: Path, started: str, seconds: float) -> None:
     import time
 

@@ -14,7 +14,8 @@ from playslot_rl.comparison.results import count_parameters, failures, job_rows,
 from playslot_rl.comparison.table import cell, comparison_page
 from playslot_rl.config import MethodName
 from playslot_rl.evaluation.intervals import wilson
-from playslot_rl.visualization.comparison import comparison_figure, figure_bytes
+from playslot_rl.visualization.charts import figure_bytes
+from playslot_rl.visualization.comparison import comparison_figure
 from playslot_rl.visualization.palette import LIGHT, METHOD_STYLES
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from playslot_rl.evaluation.move_probe import probe_moves
+from playslot_rl.evaluation.probes import probe_moves
 
 CLIPS = np.repeat(np.arange(40), 25)
 MOVES = np.random.default_rng(0).integers(5, size=len(CLIPS))

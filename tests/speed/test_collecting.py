@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
 from playslot_rl.config import ExperimentConfig, from_dict
-from playslot_rl.speed.collecting import Stopwatch, measure, table
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+from collect import Stopwatch, measure, table
 
 pytestmark = pytest.mark.slow  # together they take a minute; make test-all runs them
 

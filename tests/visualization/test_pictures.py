@@ -9,9 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
+from playslot_rl.frames import to_float
 from playslot_rl.testing import tiny_config
 from playslot_rl.visualization.animation import animation, side_by_side
-from playslot_rl.visualization.frames import to_float, to_uint8
 from playslot_rl.visualization.grid import GAP, image_grid
 from playslot_rl.visualization.prototypes import change_map, draw_prototypes, prototype_frames
 from playslot_rl.visualization.slots import segmentation, slot_cells
@@ -44,12 +44,6 @@ def test_pixels_survive_the_grid_unchanged() -> None:
 def test_grid_refuses_a_wrong_number_of_labels() -> None:
     with pytest.raises(ValueError, match="1 row and 0 column labels, expected 2 and 3"):
         image_grid(_frames(2, 3, 4, 5), ["one"])
-
-
-def test_frames_survive_the_way_to_tensors_and_back() -> None:
-    frames = _frames(2, 8, 8)
-    assert to_float(frames).shape == (2, 3, 8, 8)
-    np.testing.assert_array_equal(to_uint8(to_float(frames)), frames)
 
 
 def test_animation_plays_all_its_pictures() -> None:

@@ -17,8 +17,9 @@ from playslot_rl.acting.actor import Actor
 from playslot_rl.baselines.lapo.encoder import EncoderMLP
 from playslot_rl.config.lapo import LAPOConfig
 from playslot_rl.config.plain import to_dict
+from playslot_rl.frames import normalise
 from playslot_rl.modules.action_decoder import ActionDecoder
-from playslot_rl.world_model import action_decoder_module, normalise
+from playslot_rl.world_model import action_decoder_module
 
 if TYPE_CHECKING:
     from playslot_rl.storage.checkpoints import StageCheckpoint

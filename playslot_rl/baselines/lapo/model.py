@@ -23,8 +23,8 @@ from torch.nn import functional as F
 
 from playslot_rl.baselines.lapo.encoder import ConvEncoder, EncoderMLP, ResidualBlock
 from playslot_rl.config.lapo import LAPOConfig
+from playslot_rl.frames import normalise
 from playslot_rl.modules.quantizer import ActionQuantizer
-from playslot_rl.world_model import normalise
 
 
 class Inferred(NamedTuple):

@@ -23,9 +23,9 @@ from playslot_rl.config import StageConfig
 from playslot_rl.data.demonstrations import Transitions
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import sample_windows, split_episodes, spread_windows
+from playslot_rl.frames import normalise
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.seeding import StepGenerators
-from playslot_rl.world_model import normalise
 
 VALIDATION_PAIRS = 256
 BATCH = 64

@@ -64,7 +64,7 @@ def draw_curve(folder: Path, name: str, rows: Sequence[Mapping[str, Any]], rando
     Raises:
         OutputError: full disk.
     """
-    from playslot_rl.visualization.learning import learning_chart
+    from playslot_rl.visualization.charts import learning_chart
     from playslot_rl.visualization.palette import DARK, LIGHT
 
     for theme in (LIGHT, DARK):

@@ -24,8 +24,9 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import Actor, ReactiveActor
 from playslot_rl.config import PolicyConfig
 from playslot_rl.errors import CheckpointError
+from playslot_rl.frames import normalise
 from playslot_rl.modules.policy import LatentPolicy
-from playslot_rl.world_model import normalise, oracle_module
+from playslot_rl.world_model import oracle_module
 
 NAME = "resnet_oracle"
 WIDTH = 512

@@ -1,0 +1,32 @@
+"""Frames as bytes and as numbers: the only place where one becomes the other.
+
+Shapes: H W frame height and width. Bytes are uint8 [0, 255], numbers float [0, 1].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+
+def normalise(pixels: Tensor) -> Tensor:
+    """uint8 [0, 255] to float32 [0, 1], of any shape; floats pass through."""
+    return pixels if pixels.is_floating_point() else pixels.float().div_(255)
+
+
+def quantise(pixels: Tensor) -> Tensor:
+    """Floats of about [0, 1] to the nearest uint8 [0, 255], of any shape; values outside are clamped, bytes pass."""
+    return pixels if pixels.dtype == torch.uint8 else pixels.detach().clamp(0, 1).mul(255).round().to(torch.uint8)
+
+
+def to_float(frames: npt.NDArray[np.uint8], device: torch.device | str = "cpu") -> Tensor:
+    """Pictures (..., H, W, 3) uint8 to what networks take: (..., 3, H, W) float32."""
+    return normalise(torch.from_numpy(np.array(frames)).to(device).movedim(-1, -3))
+
+
+def to_uint8(frames: Tensor) -> npt.NDArray[np.uint8]:
+    """What networks draw, (..., 3, H, W) float, to pictures (..., H, W, 3) uint8."""
+    array: npt.NDArray[np.uint8] = quantise(frames).movedim(-3, -1).cpu().numpy()
+    return array

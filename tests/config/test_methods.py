@@ -1,0 +1,45 @@
+"""Methods are taken by the names people type."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+
+from playslot_rl.config.compose import compose
+from playslot_rl.config.methods import METHODS, MethodName, canonical_method
+from playslot_rl.errors import ConfigError
+
+
+def spellings(name: str) -> list[str]:
+    words = [name, METHODS[name].title, *METHODS[name].aliases]
+    return [form for w in words for form in (w, w.upper(), w.lower(), w.replace(" ", "-"), w.replace("_", " "))]
+
+
+def test_every_method_is_in_the_table() -> None:
+    assert tuple(METHODS) == get_args(MethodName)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_spelling_of_a_method_is_that_method(name: str) -> None:
+    assert {canonical_method(text) for text in spellings(name)} == {name}
+    assert compose([f"method={METHODS[name].title}"], "train-baseline").method == name
+    assert compose([f"methods='{METHODS[name].title}'"], "compare").compare.methods == (name,)
+
+
+def test_no_spelling_is_that_of_two_methods() -> None:
+    plain = [{text.lower().translate({ord(c): None for c in " -_"}) for text in spellings(name)} for name in METHODS]
+    assert sum(map(len, plain)) == len(set().union(*plain))
+
+
+def test_lists_may_mix_spellings() -> None:
+    wanted = compose(["methods=[dreamerv3, Slot Oracle,'ResNet', lapo]"], "compare").compare
+    assert wanted.methods == ("dreamer", "slot_oracle", "resnet_oracle", "lapo")
+    assert compose(["compare.methods=[DreamerV3]"], "compare").compare.methods == ("dreamer",)
+    with pytest.raises(ConfigError, match=r"methods: got .*, expected each one once"):
+        compose(["methods=dreamer,DreamerV3"], "compare")
+
+
+def test_an_unknown_method_is_one_line_with_the_nearest() -> None:
+    with pytest.raises(ConfigError, match=r"^method: got 'dreamerv2', expected one of playslot, .*mean dreamer\?$"):
+        compose(["method=dreamerv2"], "train-baseline")
