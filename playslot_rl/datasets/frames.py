@@ -16,7 +16,7 @@ import numpy.typing as npt
 from playslot_rl.data.video import decoded_at
 from playslot_rl.datasets.contents import Array, Contents, Span
 from playslot_rl.datasets.problems import Problems
-from playslot_rl.datasets.statistics import is_depth, of_frames, sampled, thinned
+from playslot_rl.datasets.statistics import is_depth, of_frames, rounded, sampled, thinned
 from playslot_rl.errors import DataError
 
 ROWS_A_PIECE = 256
@@ -30,10 +30,12 @@ class CameraScan:
     Attributes:
         digests: of the decoded pixels of each row (F); empty where a frame cannot be decoded.
         stats: of each span, from the frames that LeRobot would sample; None for depth maps and damaged episodes.
+        theirs: the same with LeRobot's rounding of mean and standard deviation.
     """
 
     digests: list[bytes]
     stats: list[dict[str, Array] | None] = field(default_factory=list)
+    theirs: list[dict[str, Array] | None] = field(default_factory=list)
 
 
 def scan_frames(contents: Contents, problems: Problems) -> dict[str, CameraScan]:
@@ -52,7 +54,8 @@ Decoded = tuple[int, bytes, "npt.NDArray[np.uint8] | None"]
 
 
 def _scan(contents: Contents, frames: Iterator[Decoded]) -> CameraScan:
-    scan = CameraScan([b""] * contents.rows, [None] * len(contents.spans))
+    spans = len(contents.spans)
+    scan = CameraScan([b""] * contents.rows, [None] * spans, [None] * spans)
     wanted = _wanted(contents.spans)
     kept: dict[int, list[npt.NDArray[np.uint8]]] = {}
     for row, digest, pixels in frames:
@@ -62,7 +65,12 @@ def _scan(contents: Contents, frames: Iterator[Decoded]) -> CameraScan:
             continue
         kept.setdefault(number, []).append(thinned(pixels))
         if len(kept[number]) == len(sampled(contents.spans[number].length)):
-            scan.stats[number] = of_frames(kept.pop(number))
+            taken = kept.pop(number)
+            exact = scan.stats[number] = of_frames(taken)
+            scan.theirs[number] = exact | {
+                name: value.reshape(-1, 1, 1) / 255.0
+                for name, value in rounded(frame.reshape(-1, frame.shape[-1]) for frame in taken).items()
+            }
     return scan
 
 

@@ -204,7 +204,7 @@ def _statistics(contents: Contents, scans: Mapping[str, CameraScan], number: int
     """Those of numbers anew; those of cameras as they were taken before compression, where they are there."""
     fresh = episode_statistics(contents, scans, number)
     stored = {name: stats for name, stats in episode.stats.items() if name in contents.videos and name in fresh}
-    sound = {name: stats for name, stats in stored.items() if not differing(stats, fresh[name], LOOSE_CAMERA)}
+    sound = {name: stats for name, stats in stored.items() if not differing(stats, fresh[name], loose=LOOSE_CAMERA)}
     depth = {name: stats for name, stats in episode.stats.items() if name in scans and name not in fresh}
     return {**depth, **fresh, **sound}
 
