@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from playslot_rl.datasets.contents import (
+from playslot_rl.data.contents import (
     DATA_PATH,
     EPISODES_PATH,
     INFO_NAME,

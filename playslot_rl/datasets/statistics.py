@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.datasets.contents import Array, Stats
+from playslot_rl.data.contents import Array, Stats
 
 QUANTILES: Final = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 BASIC: Final = ("min", "max", "mean", "std", "count")
@@ -28,12 +28,6 @@ THINNED_SIDE: Final = 150
 def has_statistics(feature: dict[str, Any]) -> bool:
     """Whether LeRobot keeps statistics of such a feature."""
     return feature["dtype"] not in ("string", "language")
-
-
-def is_depth(feature: dict[str, Any]) -> bool:
-    """Whether a camera feature is a depth map, whose values are not scaled to [0, 1]."""
-    info = {**(feature.get("video_info") or {}), **(feature.get("info") or {})}
-    return bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
 
 
 def sampled(length: int) -> list[int]:
@@ -64,7 +58,8 @@ def rounded(pieces: Iterable[Array]) -> dict[str, Array]:
         `mean` and `std`, (K,).
     """
     count = 0
-    total = squares = None
+    total: Any = None
+    squares: Any = None
     for piece in pieces:
         rows = piece.astype(np.result_type(piece.dtype, np.float32), copy=False)
         count += len(rows)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from playslot_rl.datasets.contents import (
+from playslot_rl.data.contents import (
     PLACE,
     RECORD_NAME,
     REQUIRED,
@@ -20,13 +20,14 @@ from playslot_rl.datasets.contents import (
     Episode,
     Span,
     Stats,
+    is_depth,
     read_contents,
 )
+from playslot_rl.data.problems import Problems
 from playslot_rl.datasets.fingerprint import fingerprint_of
 from playslot_rl.datasets.frames import CameraScan, scan_frames
-from playslot_rl.datasets.problems import Problems
 from playslot_rl.datasets.rows import check_rows
-from playslot_rl.datasets.statistics import aggregate, differing, has_statistics, is_depth, of_numbers, rounded
+from playslot_rl.datasets.statistics import aggregate, differing, has_statistics, of_numbers, rounded
 from playslot_rl.errors import DataError
 
 LOOSE_CAMERA = 0.05
@@ -85,6 +86,23 @@ def verify(root: str | Path) -> Verification:
     return Verification(
         str(root), not errors, errors, tuple(problems.warnings), len(contents.spans), contents.rows, fingerprint
     )
+
+
+def require_verified(root: Path, sources: Sequence[Path]) -> Verification:
+    """Verify a data set that has just been written.
+
+    Raises:
+        DataError: it is not sound; then a source was damaged in its frames or statistics.
+    """
+    result = verify(root)
+    if not result.ok:
+        names = " ".join(map(str, sources))
+        reason = result.errors[0].replace(f"{root}/", "")
+        raise DataError(
+            f"{names}: the data set made from it is not sound ({reason}), expected sound episodes; nothing was "
+            "written: run `playslot dataset verify` and `playslot dataset repair` on it first"
+        )
+    return result
 
 
 def require_sound(root: str | Path) -> Contents:
