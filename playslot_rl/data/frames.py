@@ -94,9 +94,7 @@ def _image_frames(
             for batch in file.iter_batches(ROWS_A_PIECE, columns=[camera]):
                 here = [i for i in range(len(batch)) if row + i in wanted]
                 cells = batch.column(0).take(here).to_pylist()
-                for i, result in zip(
-                    here, pool.map(functools.partial(_decode_image, contents.root), cells), strict=True
-                ):
+                for i, result in zip(here, pool.map(decode, cells), strict=True):
                     fault = _image_fault(result, stated_size(contents.features[camera]))
                     if fault:
                         problems.error(DAMAGED, f"{path}: row {row + i - begin}, {camera}: {fault}")
