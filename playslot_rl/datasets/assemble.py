@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -303,8 +303,3 @@ def read_record(contents: Contents) -> dict[str, Any] | None:
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return record if usable else None
-
-
-def with_statistics(episode: Episode, stats: Stats) -> Episode:
-    """An episode with other statistics."""
-    return replace(episode, stats=stats)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from playslot_rl.data.contents import UNREADABLE, Contents, Episode, Span, Stats, read_contents
 from playslot_rl.data.problems import Problems
-from playslot_rl.datasets.assemble import Choice, assemble, with_statistics
+from playslot_rl.datasets.assemble import Choice, assemble
 from playslot_rl.datasets.frames import CameraScan, scan_frames
 from playslot_rl.datasets.rows import length_fault, row_faults
 from playslot_rl.datasets.statistics import differing
@@ -151,7 +151,8 @@ def _whole_episodes(contents: Contents, lost: list[str]) -> Choice:
     known = {episode.index: episode for episode in contents.episodes}
     located = _locate_videos(contents, [span for span in contents.spans if span.file not in stale], known)
     if set(located) != set(known):  # frames of episodes without metadata are found only now
-        contents = _with_episodes(contents, {**known, **located})
+        found = {**known, **located}
+        contents = replace(contents, episodes=[found[index] for index in sorted(found)])
         scans = scan_frames(contents, Problems())
     spans, episodes, seen = [], [], set()
     for number, span in enumerate(contents.spans):
@@ -164,7 +165,7 @@ def _whole_episodes(contents: Contents, lost: list[str]) -> Choice:
             continue
         seen.add(span.index)
         spans.append(span)
-        episodes.append(with_statistics(episode, _statistics(contents, scans, number, episode)))
+        episodes.append(replace(episode, stats=_statistics(contents, scans, number, episode)))
     gone = sorted(set(known) - {span.index for span in contents.spans})
     stated = int(contents.info["total_episodes"])
     gone += sorted(set(range(stated)) - set(known) - {span.index for span in contents.spans})
@@ -289,10 +290,6 @@ def _advance(contents: Contents, camera: str, files: list[Place], position: list
     numbers = [number for number, file in enumerate(files) if file[:2] == place]
     if numbers:
         position[:] = [numbers[0], end]
-
-
-def _with_episodes(contents: Contents, episodes: Mapping[int, Episode]) -> Contents:
-    return replace(contents, episodes=[episodes[index] for index in sorted(episodes)])
 
 
 def _ranges(numbers: list[int]) -> str:

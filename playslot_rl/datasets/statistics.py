@@ -76,7 +76,9 @@ def of_numbers(values: Array) -> dict[str, Array]:
     """Statistics of one episode's values, (n,) or (n, ...): float64 of the shape of one, at least (1,)."""
     rows = np.asarray(values, np.float64)
     rows = rows.reshape(len(rows), -1) if rows.ndim == 1 else rows
-    return _summary(rows, len(rows))
+    stats = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
+    quantiles = np.quantile(rows, list(QUANTILES.values()), axis=0, method="inverted_cdf")  # no interpolation: theirs
+    return {**stats, "count": np.array([len(rows)]), **dict(zip(QUANTILES, quantiles, strict=True))}
 
 
 def of_frames(frames: Sequence[npt.NDArray[np.uint8]]) -> dict[str, Array]:
@@ -95,12 +97,6 @@ def _of_levels(counts: Array) -> dict[str, float]:
     stats = {"min": values[present[0]], "max": values[present[-1]], "mean": mean}
     stats["std"] = float(np.sqrt(counts @ (values - mean) ** 2 / total))
     return {**stats, **{name: values[np.searchsorted(below, share * total)] for name, share in QUANTILES.items()}}
-
-
-def _summary(rows: Array, count: int) -> dict[str, Array]:
-    stats = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
-    quantiles = np.quantile(rows, list(QUANTILES.values()), axis=0, method="inverted_cdf")  # no interpolation: theirs
-    return {**stats, "count": np.array([count]), **dict(zip(QUANTILES, quantiles, strict=True))}
 
 
 def aggregate(episodes: Sequence[Stats]) -> Stats:
