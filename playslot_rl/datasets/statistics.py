@@ -4,8 +4,8 @@ Numbers: per component. Cameras: per channel, scaled to [0, 1], from some evenly
 Quantiles of the whole are the weighted means of those of the episodes, as LeRobot makes them.
 
 Note: exact quantiles; LeRobot reads them off a histogram of 5000 bins. Exact means and deviations, too: LeRobot's
-running float32 sums (`rounded`) are off by a part that grows with the number of pixels, up to a quarter of the
-deviation of bright frames. A data set may have either; `tests/datasets` compares them with LeRobot's own.
+running float32 sums (`rounded`) are off by a part that grows with the number of pixels: of 100 bright frames of 64x64
+the deviation by a quarter. A data set may have either; `tests/datasets` compares them with LeRobot's own.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def differing(
     Args:
         stored: as the data set has them.
         actual: recomputed, exact.
-        theirs: the same with LeRobot's rounding; a value between the two is not wrong.
+        theirs: the same with LeRobot's rounding; a value no further from `actual` than these is not wrong.
         loose: tolerance of mean and standard deviation; with one, count, min and max are not compared.
     """
     found = []
