@@ -22,7 +22,8 @@ from playslot_rl.collectors.journal import Journal
 from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.data.quiet import quiet_datasets
 from playslot_rl.errors import OutputError
-from playslot_rl.storage.atomic import explain_write_errors, replace_dir, write_json
+from playslot_rl.storage.atomic import write_json
+from playslot_rl.storage.folders import new_folder
 
 META_NAME = "meta/playslot.json"
 PACKAGES = ("metaworld", "gymnasium-robotics", "mujoco", "gymnasium", "torchrl", "lerobot", "playslot_rl")
@@ -248,21 +249,14 @@ def export(journal: Journal, out: Path) -> None:
         OutputError: full disk, a damaged journal, or a data set that reads back otherwise.
     """
     spec = journal.spec
-    temporary = out.with_name(f".{out.name}.export")
-    with explain_write_errors(out), quiet_datasets():
-        try:
-            shutil.rmtree(temporary, ignore_errors=True)  # of an export that was killed
+    try:
+        with new_folder(out, create=False) as temporary, quiet_datasets():
             records = _write(temporary, spec, journal)
             _check(temporary, spec, journal)
             write_json(temporary / META_NAME, _collection_record(spec, records))
-            if out.is_dir():
-                out.rmdir()  # empty, or it would have been refused
-            replace_dir(temporary, out)
-        except Exception as error:
-            _explain_full_disk(out, error)
-            raise
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+    except Exception as error:
+        _explain_full_disk(out, error)
+        raise
 
 
 def _explain_full_disk(out: Path, error: Exception) -> None:

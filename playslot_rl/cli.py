@@ -221,10 +221,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     name = arguments[0]
     if name == "dataset":
-        from playslot_rl.datasets import command
+        from playslot_rl.recipes import dataset
 
-        options = command.parser(_Parser).parse_args(arguments[1:])
-        return _guarded(f"{name} {options.action}", lambda: command.run(options))
+        options = dataset.parser(_Parser).parse_args(arguments[1:])
+        return _guarded(f"{name} {options.action}", lambda: dataset.run(options))
     if name not in COMMANDS:
         # Ends here unless it is --help or --version: the rest of the line belongs to no known command.
         _top_parser().parse_args(arguments[:1])

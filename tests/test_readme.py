@@ -12,7 +12,7 @@ import pytest
 
 from playslot_rl import cli
 from playslot_rl.config.compose import compose
-from playslot_rl.datasets.command import parser as dataset_parser
+from playslot_rl.recipes.dataset import parser as dataset_parser
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]

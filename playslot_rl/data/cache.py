@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import os
-import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -14,7 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.errors import DataError
-from playslot_rl.storage.atomic import explain_write_errors, replace_dir
+from playslot_rl.storage.atomic import explain_write_errors
+from playslot_rl.storage.folders import new_folder
+from playslot_rl.storage.locks import locked
 
 
 def cache_folder(cache: str | Path = "") -> Path:
@@ -33,18 +32,10 @@ def require_outside(cache: Path, root: Path) -> None:
         raise DataError(f"data.cache={cache}: got a folder inside the data set {root}, expected one outside: move it")
 
 
-@contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    with path.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
 def build_once(folder: Path, build: Callable[[Path], None]) -> Path:
     """Return `folder`, made by `build(temporary)` if it does not exist.
 
-    A lock lets one process build while others wait; the system drops the lock of a killed process, so what lies in the
-    temporary folder under the lock is always a leftover.
+    A lock lets one process build while others wait.
 
     Raises:
         OutputError: full disk; nothing is left behind.
@@ -53,17 +44,10 @@ def build_once(folder: Path, build: Callable[[Path], None]) -> Path:
         return folder
     with explain_write_errors(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with _locked(folder.with_name(f".{folder.name}.lock")):
-            if folder.is_dir():
-                return folder
-            temporary = folder.with_name(f".{folder.name}.tmp")
-            shutil.rmtree(temporary, ignore_errors=True)
-            temporary.mkdir()
-            try:
+    with locked(folder.with_name(f".{folder.name}.lock")):
+        if not folder.is_dir():
+            with new_folder(folder) as temporary:
                 build(temporary)
-                replace_dir(temporary, folder)
-            finally:
-                shutil.rmtree(temporary, ignore_errors=True)
     return folder
 
 
@@ -92,11 +76,14 @@ class ArrayWriter:
         self._file: IO[bytes] = path.open("wb")
         header = {"descr": np.lib.format.dtype_to_descr(self.dtype), "fortran_order": False, "shape": self.shape}
         np.lib.format.write_array_header_1_0(self._file, header)
+        self._begin = self._file.tell()
 
-    def write(self, rows: npt.NDArray[np.generic]) -> None:
-        """Append rows (n, *shape[1:])."""
+    def write(self, rows: npt.NDArray[np.generic], first: int | None = None) -> None:
+        """Write rows (n, *shape[1:]) from row `first` on; None goes on where the last ones ended."""
         if rows.shape[1:] != self.shape[1:]:
             raise ValueError(f"{self.path}: got rows of shape {rows.shape[1:]}, expected {self.shape[1:]}")
+        if first is not None:
+            self._file.seek(self._begin + first * int(np.prod(self.shape[1:])) * self.dtype.itemsize)
         self._file.write(np.ascontiguousarray(rows, self.dtype).data)
         self.rows += len(rows)
 

@@ -15,14 +15,15 @@ import numpy.typing as npt
 
 from playslot_rl import keys
 from playslot_rl.data.cache import ArrayWriter, build_once, cache_folder, require_outside
-from playslot_rl.data.lerobot_files import LeRobotFiles
+from playslot_rl.data.contents import Contents
+from playslot_rl.data.frames import rgb_frames
 from playslot_rl.errors import DataError
 from playslot_rl.storage.atomic import write_json
 
 _FORMAT = "1"
 
 
-def cached_fingerprint(files: LeRobotFiles, camera: str, cache: Path) -> str:
+def cached_fingerprint(files: Contents, camera: str, cache: Path) -> str:
     """Content hash of a data set, remembered by the names, sizes and times of its files: hashing videos is slow."""
     listing = sorted(
         (str(path.relative_to(files.root)), path.stat().st_size, path.stat().st_mtime_ns)
@@ -34,12 +35,12 @@ def cached_fingerprint(files: LeRobotFiles, camera: str, cache: Path) -> str:
     note = cache / "fingerprints" / f"{key}.json"
     if note.is_file():
         return str(json.loads(note.read_text())["fingerprint"])
-    fingerprint = files.fingerprint(camera)
+    fingerprint = files.file_hash(camera)
     write_json(note, {"fingerprint": fingerprint})
     return fingerprint
 
 
-def frame_cache(files: LeRobotFiles, camera: str, cache: str | Path, size: int | None) -> tuple[Path, str]:
+def frame_cache(files: Contents, camera: str, cache: str | Path, size: int | None) -> tuple[Path, str]:
     """The cache folder of a data set's camera, made if needed, and the data set's fingerprint.
 
     It holds `frames.npy` uint8 (F, H, W, 3), `columns.npz` and `meta.json`.
@@ -61,23 +62,19 @@ def frame_cache(files: LeRobotFiles, camera: str, cache: str | Path, size: int |
     return build_once(folder / "frames" / key, lambda tmp: _build(files, camera, size, tmp)), fingerprint
 
 
-def _build(files: LeRobotFiles, camera: str, size: int | None, folder: Path) -> None:
+def _build(files: Contents, camera: str, size: int | None, folder: Path) -> None:
     writer: ArrayWriter | None = None
-    for piece in files.pieces(camera):
-        frames = piece if size is None or piece.shape[1:3] == (size, size) else resize_frames(piece, size)
+    for row, frame in rgb_frames(files, camera):
+        pixels = frame if size is None or frame.shape[:2] == (size, size) else resize_frames(frame[None], size)[0]
         if writer is None:
-            writer = ArrayWriter(folder / "frames.npy", (files.frames, *frames.shape[1:]), np.uint8)
-        if frames.shape[1:] != writer.shape[1:]:
-            raise DataError(
-                f"{files.root}: got frames of {frames.shape[1:3]} after ones of {writer.shape[1:3]}, expected one "
-                "size: the data set is damaged, collect or pull it again"
-            )
-        writer.write(frames)
+            writer = ArrayWriter(folder / "frames.npy", (files.rows, *pixels.shape), np.uint8)
+        writer.write(pixels[None], row)
     if writer is None:
-        raise DataError(f"{files.root}: got no frames of {camera}, expected {files.frames}: collect or pull it again")
+        raise DataError(f"{files.root}: got no frames of {camera}, expected {files.rows}: collect or pull it again")
     writer.close()
     np.savez(folder / "columns.npz", **_columns(files))  # type: ignore[arg-type]
-    write_json(folder / "meta.json", {"camera": camera, "fps": files.fps, "task": files.task})
+    tasks = files.episodes[0].tasks
+    write_json(folder / "meta.json", {"camera": camera, "fps": files.fps, "task": tasks[0] if tasks else ""})
 
 
 def resize_frames(frames: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.uint8]:
@@ -88,16 +85,14 @@ def resize_frames(frames: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.ui
     return np.stack(resized)
 
 
-def _columns(files: LeRobotFiles) -> dict[str, npt.NDArray[Any]]:
-    lengths = np.array([row["length"] for row in files.episodes], np.int64)
+def _columns(files: Contents) -> dict[str, npt.NDArray[Any]]:
+    lengths = np.array([episode.length for episode in files.episodes], np.int64)
     starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
-    columns: dict[str, npt.NDArray[Any]] = {"starts": starts, "lengths": lengths}
-    actions, success = files.column(keys.FEATURE_ACTION), files.column(keys.FEATURE_SUCCESS)
-    seeds = files.column(keys.FEATURE_SEED)
-    if actions is not None:
-        columns["actions"] = actions.astype(np.float32).reshape(files.frames, -1)
-    if success is not None:
-        columns["success"] = success.astype(bool)
-    if seeds is not None:
-        columns["seeds"] = seeds[starts].astype(np.int64)
-    return columns
+    found: dict[str, npt.NDArray[Any]] = {"starts": starts, "lengths": lengths}
+    if keys.FEATURE_ACTION in files.columns:
+        found["actions"] = files.columns[keys.FEATURE_ACTION].astype(np.float32).reshape(files.rows, -1)
+    if keys.FEATURE_SUCCESS in files.columns:
+        found["success"] = files.columns[keys.FEATURE_SUCCESS].astype(bool)
+    if keys.FEATURE_SEED in files.columns:
+        found["seeds"] = files.columns[keys.FEATURE_SEED][starts].astype(np.int64)
+    return found

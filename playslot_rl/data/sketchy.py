@@ -14,7 +14,6 @@ Shapes: H W image height and width.
 from __future__ import annotations
 
 import io
-import shutil
 import sqlite3
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -28,7 +27,8 @@ from playslot_rl import keys
 from playslot_rl.data.quiet import quiet_datasets
 from playslot_rl.data.tfrecord import Value, parse_example, read_records
 from playslot_rl.errors import ConfigError, DataError, OutputError
-from playslot_rl.storage.atomic import explain_write_errors, replace_dir, write_json
+from playslot_rl.storage.atomic import write_json
+from playslot_rl.storage.folders import new_folder, require_free
 
 CAMERAS: Final = {
     "front_left": "pixels/basket_front_left",
@@ -251,20 +251,11 @@ def convert_sketchy(
     """
     source, out = Path(source).expanduser(), Path(out).expanduser().absolute()
     check_cameras(cameras)
-    if out.is_file() or (out.is_dir() and any(out.iterdir())):
-        raise OutputError(f"out={out}: got a file or a folder with something in it, expected none: choose another out=")
+    require_free(out)
     found = find_demonstrations(source, tags)[:episodes]
     train, held_out = split_episodes(len(found))
-    temporary = out.with_name(f".{out.name}.converting")
-    with explain_write_errors(out), quiet_datasets():
-        try:
-            shutil.rmtree(temporary, ignore_errors=True)  # of a conversion that was killed
-            _write(temporary / "train", found[:train], cameras, image_size, storage)
-            if held_out:
-                _write(temporary / "eval", found[train:], cameras, image_size, storage)
-            if out.is_dir():
-                out.rmdir()
-            replace_dir(temporary, out)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+    with new_folder(out) as temporary, quiet_datasets():
+        _write(temporary / "train", found[:train], cameras, image_size, storage)
+        if held_out:
+            _write(temporary / "eval", found[train:], cameras, image_size, storage)
     return {"train": train, "eval": held_out}

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.data.cache import load_cached
+from playslot_rl.data.contents import Contents, open_files, stated_size
 from playslot_rl.data.frame_cache import frame_cache
-from playslot_rl.data.lerobot_files import LeRobotFiles, open_files
 from playslot_rl.errors import DataError
 
 if TYPE_CHECKING:
@@ -239,18 +239,14 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
     )
 
 
-def _check_size(files: LeRobotFiles, camera: str, image_size: int | None, resize: bool) -> None:
+def _check_size(files: Contents, camera: str, image_size: int | None, resize: bool) -> None:
     """Refuse a wrong size before decoding everything, where the metadata say it."""
-    shape, names = files.info["features"][camera].get("shape"), files.info["features"][camera].get("names")
-    if image_size is None or resize or not isinstance(shape, list) or len(shape) != 3:
-        return
-    channels_first = (names or [""])[0] in ("channel", "channels")
-    height, width = shape[1:] if channels_first else shape[:2]
-    if (height, width) != (image_size, image_size):
-        raise _wrong_size(files, camera, (height, width), image_size)
+    got = stated_size(files.features[camera])
+    if image_size is not None and not resize and got != (image_size, image_size):
+        raise _wrong_size(files, camera, got, image_size)
 
 
-def _wrong_size(files: LeRobotFiles, camera: str, got: tuple[int, int], expected: int) -> DataError:
+def _wrong_size(files: Contents, camera: str, got: tuple[int, int], expected: int) -> DataError:
     return DataError(
         f"{files.root}: got frames of {got[0]}x{got[1]} from {camera}, expected {expected}x{expected}: "
         "set env.image_size, resize them by data.resize=true, or record at that size"

@@ -53,24 +53,6 @@ def sample_windows(
     return rows
 
 
-def all_windows(
-    starts: npt.ArrayLike,
-    lengths: npt.ArrayLike,
-    window: int,
-    stride: int = 1,
-    episodes: Sequence[int] | IntArray | None = None,
-) -> IntArray:
-    """Every window in order, first frames `stride` apart within an episode: row indices (B, T).
-
-    Raises:
-        DataError: no episode has `window` frames.
-    """
-    first, valid = _valid_starts(starts, lengths, window, episodes)
-    begins = np.concatenate([s + np.arange(0, n, stride) for s, n in zip(first, valid, strict=True)])
-    rows: IntArray = begins[:, None].astype(np.int64) + np.arange(window)
-    return rows
-
-
 def spread_windows(
     starts: npt.ArrayLike, lengths: npt.ArrayLike, window: int, count: int, episodes: Sequence[int] | IntArray
 ) -> IntArray:
@@ -82,7 +64,9 @@ def spread_windows(
     Raises:
         DataError: no episode has `window` frames.
     """
-    windows = all_windows(starts, lengths, window, window, episodes)
+    first, valid = _valid_starts(starts, lengths, window, episodes)
+    begins = np.concatenate([s + np.arange(0, n, window) for s, n in zip(first, valid, strict=True)])
+    windows: IntArray = begins[:, None].astype(np.int64) + np.arange(window)
     return windows[:: max(1, len(windows) // count)][:count]
 
 

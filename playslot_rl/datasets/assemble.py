@@ -13,13 +13,13 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from playslot_rl.datasets.contents import (
+from playslot_rl.data.contents import (
     DATA_PATH,
     EPISODES_PATH,
     INFO_NAME,
@@ -303,8 +303,3 @@ def read_record(contents: Contents) -> dict[str, Any] | None:
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return record if usable else None
-
-
-def with_statistics(episode: Episode, stats: Stats) -> Episode:
-    """An episode with other statistics."""
-    return replace(episode, stats=stats)

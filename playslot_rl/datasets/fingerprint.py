@@ -6,7 +6,7 @@ features. It does not cover statistics, the sizes and number of files, compressi
 `episode_index`, `task_index`). So it stays the same when shards are merged anew or metadata are rewritten, and an
 episode keeps its own when data sets are merged or split. Encoding a video again changes it, as its frames change.
 
-Note: `playslot_rl.data.lerobot_files.LeRobotFiles.fingerprint` is another one: a hash of the files' bytes, quick to
+Note: `playslot_rl.data.contents.Contents.file_hash` is another one: a hash of the files' bytes, quick to
 compute and the key of the caches.
 """
 
@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from playslot_rl.datasets.contents import PLACE, Array, Contents, Span, read_contents
+from playslot_rl.data.contents import PLACE, Array, Contents, Span, read_contents
+from playslot_rl.data.problems import Problems
 from playslot_rl.datasets.frames import CameraScan, scan_frames
-from playslot_rl.datasets.problems import Problems
 from playslot_rl.errors import DataError
 
 DIGITS = 32

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from playslot_rl import keys
+from playslot_rl.data.contents import REQUIRED, Contents
 from playslot_rl.datasets.assemble import read_record
-from playslot_rl.datasets.contents import REQUIRED, Contents
 from playslot_rl.datasets.verify import require_sound
 
 MEBIBYTE = 2**20

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from playslot_rl.data.contents import Contents
 from playslot_rl.datasets.assemble import assemble, choose
-from playslot_rl.datasets.contents import Contents
-from playslot_rl.datasets.transaction import new_folder, require_free, require_verified
-from playslot_rl.datasets.verify import Verification, require_sound
+from playslot_rl.datasets.verify import Verification, require_sound, require_verified
 from playslot_rl.errors import DataError
+from playslot_rl.storage.folders import new_folder, require_free
 
 
 @dataclass(frozen=True)
@@ -55,11 +55,11 @@ def merge(roots: Sequence[str | Path], out: str | Path) -> MergeResult:
     resolved = [folder.resolve() for folder in folders]
     if len(set(resolved)) < len(resolved):
         raise DataError("merge: got the same data set twice, expected different ones; its episodes would be double")
-    require_free(target)
+    require_free(target, "--out ")
     contents = [require_sound(folder) for folder in folders]
     for other in contents[1:]:
         require_same_kind(contents[0], other)
-    with new_folder(target) as temporary:
+    with new_folder(target, create=False, key="--out ") as temporary:
         choices = [choose(each, [span.index for span in each.spans]) for each in contents]
         assemble(choices, temporary, "playslot dataset merge")
         result = require_verified(temporary, folders)

@@ -11,17 +11,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from playslot_rl.datasets.assemble import Choice, assemble, with_statistics
-from playslot_rl.datasets.contents import Contents, Episode, Span, Stats, read_contents
+from playslot_rl.data.contents import UNREADABLE, Contents, Episode, Span, Stats, read_contents
+from playslot_rl.data.problems import Problems
+from playslot_rl.datasets.assemble import Choice, assemble
 from playslot_rl.datasets.frames import CameraScan, scan_frames
-from playslot_rl.datasets.problems import Problems
 from playslot_rl.datasets.rows import length_fault, row_faults
 from playslot_rl.datasets.statistics import differing
-from playslot_rl.datasets.transaction import new_folder, require_free
 from playslot_rl.datasets.verify import LOOSE_CAMERA, Verification, episode_statistics, verify
 from playslot_rl.datasets.video_copy import frame_count
 from playslot_rl.errors import DataError, OutputError
 from playslot_rl.storage.atomic import explain_write_errors, fsync_folder
+from playslot_rl.storage.folders import new_folder, require_free
 
 JOURNAL_SUFFIX = ".journal"
 
@@ -78,27 +78,26 @@ def repair(root: str | Path, out: str | Path | None = None) -> RepairResult:
     if out is None:
         _undo_half_rename(folder)
     else:
-        require_free(Path(out))
+        require_free(Path(out), "--out ")
     before = verify(folder)
     journal = folder.with_name(folder.name + JOURNAL_SUFFIX)
     beside = journal if journal.is_dir() else None
     if before.ok:
         return RepairResult(folder, before, None, (), None, None)
-    lost: list[str] = []
     problems = Problems()
     contents = read_contents(folder, problems)
-    lost += [line for line in problems.errors if "cannot be read" in line]
+    lost = [*problems.of(UNREADABLE)]
     choice = _whole_episodes(contents, lost)
     if not choice.spans:
         more = f"; {_journal_note(beside)}" if beside else "; record it again"
         raise DataError(f"{folder}: got no whole episode to restore ({(lost or before.errors)[0]}), expected one{more}")
     stated = int(contents.info["total_episodes"])
     if out is not None:
-        with new_folder(Path(out)) as temporary:
+        with new_folder(Path(out), create=False, key="--out ") as temporary:
             result = _write(choice, temporary)
         return RepairResult(Path(out), result, stated, tuple(lost), None, beside)
     repaired = folder.with_name(f"{folder.name}.repaired")
-    with new_folder(repaired) as temporary:
+    with new_folder(repaired, create=False, key="--out ") as temporary:
         result = _write(choice, temporary)
     damaged = _free_name(folder)
     with explain_write_errors(folder):
@@ -152,7 +151,8 @@ def _whole_episodes(contents: Contents, lost: list[str]) -> Choice:
     known = {episode.index: episode for episode in contents.episodes}
     located = _locate_videos(contents, [span for span in contents.spans if span.file not in stale], known)
     if set(located) != set(known):  # frames of episodes without metadata are found only now
-        contents = _with_episodes(contents, {**known, **located})
+        found = {**known, **located}
+        contents = replace(contents, episodes=[found[index] for index in sorted(found)])
         scans = scan_frames(contents, Problems())
     spans, episodes, seen = [], [], set()
     for number, span in enumerate(contents.spans):
@@ -165,7 +165,7 @@ def _whole_episodes(contents: Contents, lost: list[str]) -> Choice:
             continue
         seen.add(span.index)
         spans.append(span)
-        episodes.append(with_statistics(episode, _statistics(contents, scans, number, episode)))
+        episodes.append(replace(episode, stats=_statistics(contents, scans, number, episode)))
     gone = sorted(set(known) - {span.index for span in contents.spans})
     stated = int(contents.info["total_episodes"])
     gone += sorted(set(range(stated)) - set(known) - {span.index for span in contents.spans})
@@ -204,7 +204,7 @@ def _statistics(contents: Contents, scans: Mapping[str, CameraScan], number: int
     """Those of numbers anew; those of cameras as they were taken before compression, where they are there."""
     fresh = episode_statistics(contents, scans, number)
     stored = {name: stats for name, stats in episode.stats.items() if name in contents.videos and name in fresh}
-    sound = {name: stats for name, stats in stored.items() if not differing(stats, fresh[name], LOOSE_CAMERA)}
+    sound = {name: stats for name, stats in stored.items() if not differing(stats, fresh[name], loose=LOOSE_CAMERA)}
     depth = {name: stats for name, stats in episode.stats.items() if name in scans and name not in fresh}
     return {**depth, **fresh, **sound}
 
@@ -290,10 +290,6 @@ def _advance(contents: Contents, camera: str, files: list[Place], position: list
     numbers = [number for number, file in enumerate(files) if file[:2] == place]
     if numbers:
         position[:] = [numbers[0], end]
-
-
-def _with_episodes(contents: Contents, episodes: Mapping[int, Episode]) -> Contents:
-    return replace(contents, episodes=[episodes[index] for index in sorted(episodes)])
 
 
 def _ranges(numbers: list[int]) -> str:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from playslot_rl.datasets.contents import INFO_NAME, TASKS_NAME, Contents, Episode, Span
-from playslot_rl.datasets.problems import Problems
+from playslot_rl.data.contents import INFO_NAME, TASKS_NAME, Contents, Episode, Span
+from playslot_rl.data.problems import Problems
 
 TIME_TOLERANCE_S = 1e-4
 """As LeRobot's default; float32 holds it up to about half an hour."""

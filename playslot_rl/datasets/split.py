@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from playslot_rl.datasets.assemble import assemble, choose
-from playslot_rl.datasets.transaction import new_folder, require_free, require_verified
-from playslot_rl.datasets.verify import Verification, require_sound
+from playslot_rl.datasets.verify import Verification, require_sound, require_verified
 from playslot_rl.errors import DataError
+from playslot_rl.storage.folders import new_folder, require_free
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,11 @@ def split(root: str | Path, out: str | Path, fractions: Mapping[str, float], *, 
     """
     target = Path(out)
     check_fractions(fractions)
-    require_free(target)
+    require_free(target, "--out ")
     contents = require_sound(root)
     parts = draw(len(contents.spans), fractions, seed)
     made = {}
-    with new_folder(target) as temporary:
+    with new_folder(target, create=False, key="--out ") as temporary:
         for name, indices in parts.items():
             assemble([choose(contents, indices)], temporary / name, "playslot dataset split")
             made[name] = require_verified(temporary / name, [contents.root])

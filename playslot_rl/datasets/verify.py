@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from playslot_rl.datasets.contents import (
+from playslot_rl.data.contents import (
     PLACE,
     RECORD_NAME,
     REQUIRED,
@@ -20,13 +20,14 @@ from playslot_rl.datasets.contents import (
     Episode,
     Span,
     Stats,
+    is_depth,
     read_contents,
 )
+from playslot_rl.data.problems import Problems
 from playslot_rl.datasets.fingerprint import fingerprint_of
 from playslot_rl.datasets.frames import CameraScan, scan_frames
-from playslot_rl.datasets.problems import Problems
 from playslot_rl.datasets.rows import check_rows
-from playslot_rl.datasets.statistics import aggregate, differing, has_statistics, is_depth, of_numbers
+from playslot_rl.datasets.statistics import aggregate, differing, has_statistics, of_numbers, rounded
 from playslot_rl.errors import DataError
 
 LOOSE_CAMERA = 0.05
@@ -87,6 +88,23 @@ def verify(root: str | Path) -> Verification:
     )
 
 
+def require_verified(root: Path, sources: Sequence[Path]) -> Verification:
+    """Verify a data set that has just been written.
+
+    Raises:
+        DataError: it is not sound; then a source was damaged in its frames or statistics.
+    """
+    result = verify(root)
+    if not result.ok:
+        names = " ".join(map(str, sources))
+        reason = result.errors[0].replace(f"{root}/", "")
+        raise DataError(
+            f"{names}: the data set made from it is not sound ({reason}), expected sound episodes; nothing was "
+            "written: run `playslot dataset verify` and `playslot dataset repair` on it first"
+        )
+    return result
+
+
 def require_sound(root: str | Path) -> Contents:
     """Read a data set whose rows and metadata agree; frames and statistics are not looked at.
 
@@ -107,29 +125,41 @@ def require_sound(root: str | Path) -> Contents:
 def check_statistics(contents: Contents, scans: Mapping[str, CameraScan], problems: Problems) -> None:
     """Recompute the statistics of every episode and of all, and compare."""
     by_index = {episode.index: episode for episode in contents.episodes}
-    actual: list[Stats] = []
-    for number, span in enumerate(contents.spans):
-        computed = episode_statistics(contents, scans, number)
-        actual.append(computed)
+    actual, theirs = (
+        [episode_statistics(contents, scans, number, as_lerobot=rounds) for number in range(len(contents.spans))]
+        for rounds in (False, True)
+    )
+    for span, exact, rounded_ones in zip(contents.spans, actual, theirs, strict=True):
         episode = by_index.get(span.index)
         if episode is not None and episode.length == span.length:
-            _check_episode(contents, episode, computed, problems)
-    _check_all(contents, actual, problems)
+            _check_episode(contents, episode, exact, rounded_ones, problems)
+    _check_all(contents, actual, theirs, problems)
 
 
-def episode_statistics(contents: Contents, scans: Mapping[str, CameraScan], number: int) -> Stats:
-    """Statistics of the episode of span `number`; cameras whose frames cannot be decoded are left out."""
+def episode_statistics(
+    contents: Contents, scans: Mapping[str, CameraScan], number: int, *, as_lerobot: bool = False
+) -> Stats:
+    """Statistics of the episode of span `number`; cameras whose frames cannot be decoded are left out.
+
+    Args:
+        contents: the data set.
+        scans: its frames.
+        number: of the span.
+        as_lerobot: means and standard deviations with LeRobot's rounding, not exact.
+    """
     span: Span = contents.spans[number]
     stats: Stats = {}
     for name, feature in contents.features.items():
         if name in scans:
-            camera = scans[name].stats[number]
+            camera = (scans[name].theirs if as_lerobot else scans[name].stats)[number]
             if camera is not None:
                 stats[name] = camera
         elif has_statistics(feature) and name in contents.columns:
             values = contents.columns[name][span.start : span.stop]
             if values.dtype.kind in "fiub":
                 stats[name] = of_numbers(values)
+                if as_lerobot:
+                    stats[name] |= rounded([values.reshape(len(values), -1) if values.ndim == 1 else values])
     return stats
 
 
@@ -141,23 +171,23 @@ def _looseness(contents: Contents, name: str, stored: dict[str, Array], actual: 
     return LOOSE_CAMERA if other and not np.array_equal(stored["count"].reshape(-1), actual["count"]) else 0.0
 
 
-def _check_episode(contents: Contents, episode: Episode, actual: Stats, problems: Problems) -> None:
+def _check_episode(contents: Contents, episode: Episode, actual: Stats, theirs: Stats, problems: Problems) -> None:
     for name, computed in actual.items():
         stored = episode.stats.get(name)
         if stored is None:
             problems.warning("no statistics", f"episode {episode.index}: got no statistics of {name} in meta/episodes")
             continue
-        wrong = differing(stored, computed, _looseness(contents, name, stored, computed))
+        wrong = differing(stored, computed, theirs[name], _looseness(contents, name, stored, computed))
         if wrong:
             _report(problems, name, f"episode {episode.index}: got {', '.join(wrong)} of {name}")
 
 
-def _check_all(contents: Contents, actual: list[Stats], problems: Problems) -> None:
+def _check_all(contents: Contents, actual: list[Stats], theirs: list[Stats], problems: Problems) -> None:
     path = contents.root / STATS_NAME
     stored = read_statistics(path, problems)
     if stored is None or not actual:
         return
-    total = aggregate(actual)
+    total, their_total = aggregate(actual), aggregate(theirs)
     for name, feature in contents.features.items():
         if name not in total or is_depth(feature):
             continue
@@ -165,7 +195,7 @@ def _check_all(contents: Contents, actual: list[Stats], problems: Problems) -> N
             problems.error("wrong statistics", f"{path}: got no statistics of {name}, expected those of every feature")
             continue
         loose = _looseness(contents, name, stored[name], total[name])
-        wrong = differing(stored[name], total[name], loose)
+        wrong = differing(stored[name], total[name], their_total[name], loose)
         if wrong:
             _report(problems, name, f"{path}: got {', '.join(wrong)} of {name}")
 

@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.datasets.contents import Array, Contents, Episode, Span
+from playslot_rl.data.contents import Array, Contents, Episode, Span, is_depth
+from playslot_rl.data.frames import rgb_frames
 from playslot_rl.datasets.info import info
-from playslot_rl.datasets.statistics import is_depth
 from playslot_rl.datasets.verify import require_sound
-from playslot_rl.errors import ConfigError, DataError
+from playslot_rl.errors import ConfigError
 
 STRIP: Final = 8
 """Frames of the strip: the first, the last, and some between."""
@@ -151,25 +151,7 @@ def episode_frames(contents: Contents, camera: str, number: int) -> npt.NDArray[
     Raises:
         DataError: one cannot be decoded.
     """
-    span = contents.spans[number]
-    if camera in contents.videos:
-        from playslot_rl.data.video import frames_at
-
-        row = contents.episodes[number].row
-        begin = float(row[f"videos/{camera}/from_timestamp"])
-        times = [begin + i / contents.fps for i in range(span.length)]
-        return np.stack(list(frames_at(contents.video_file(camera, row), times, 0.25 / contents.fps)))
-    import pyarrow.parquet as pq
-
-    from playslot_rl.datasets.frames import decode_image
-
-    skipped = span.start - sum(contents.file_rows[: span.file])
-    column = pq.read_table(contents.data_files[span.file], columns=[camera]).column(0)
-    frames = [decode_image(contents.root, cell) for cell in column.slice(skipped, span.length).to_pylist()]
-    for frame in frames:
-        if isinstance(frame, str):
-            raise DataError(f"{contents.root}: episode {span.index}: {camera} cannot be decoded ({frame}); run verify")
-    return np.stack(frames)
+    return np.stack([frame for _, frame in rgb_frames(contents, camera, [contents.spans[number]])])
 
 
 def _feature_table(features: dict[str, str]) -> Any:

@@ -12,7 +12,8 @@ from typing import Any
 import yaml
 
 from playslot_rl import keys
-from playslot_rl.data.lerobot_files import LeRobotFiles
+from playslot_rl.data.contents import Contents, stated_size
+from playslot_rl.datasets.info import success_rate
 from playslot_rl.hub.record import HubRecord
 from playslot_rl.visualization.markdown import table
 
@@ -49,7 +50,7 @@ def is_ours(card: str) -> bool:
     return MARK in card
 
 
-def facts_of(files: LeRobotFiles) -> CardFacts:
+def facts_of(files: Contents) -> CardFacts:
     """Read the facts from a checked data set and from what the collectors noted."""
     path = files.root / META_NAME
     note: dict[str, Any] = {}
@@ -59,7 +60,7 @@ def facts_of(files: LeRobotFiles) -> CardFacts:
     spec = note.get("spec") if isinstance(note.get("spec"), dict) else {}
     assert isinstance(spec, dict)
     env = spec.get("env") or {}
-    cameras = tuple((name, *_size(files.info["features"][name])) for name in files.cameras)
+    cameras = tuple((name, *stated_size(files.features[name])) for name in files.cameras)
     skip = env.get("frame_skip")
     success = note.get("success_rate")
     return CardFacts(
@@ -67,33 +68,13 @@ def facts_of(files: LeRobotFiles) -> CardFacts:
         cameras=cameras,
         fps=files.fps,
         control_hz=files.fps * skip if skip else None,
-        success=float(success) if success is not None else _success(files),
+        success=float(success) if success is not None else success_rate(files),
         made=_made(spec, env, note.get("versions") or {}),
     )
 
 
-def _tasks(files: LeRobotFiles) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(str(task) for row in files.episodes for task in row.get("tasks") or () if str(task)))
-
-
-def _size(feature: dict[str, Any]) -> tuple[int, int]:
-    shape, names = list(feature["shape"]), list(feature.get("names") or ())
-    if names and str(names[0]).startswith("channel"):
-        return int(shape[1]), int(shape[2])
-    return int(shape[0]), int(shape[1])
-
-
-def _success(files: LeRobotFiles) -> float | None:
-    """Share of episodes with a solved step, where the data set has such a column."""
-    column = files.column(keys.FEATURE_SUCCESS)
-    if column is None:
-        return None
-    ends = 0
-    solved = 0
-    for row in files.episodes:
-        begin, ends = ends, ends + int(row["length"])
-        solved += bool(column[begin:ends].any())
-    return solved / len(files.episodes)
+def _tasks(files: Contents) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(task for episode in files.episodes for task in episode.tasks if task))
 
 
 def _made(spec: dict[str, Any], env: dict[str, Any], versions: dict[str, Any]) -> dict[str, str]:
@@ -112,7 +93,7 @@ def _made(spec: dict[str, Any], env: dict[str, Any], versions: dict[str, Any]) -
     return {name: str(value) for name, value in rows.items() if value not in (None, "")}
 
 
-def make_card(files: LeRobotFiles, repo_id: str, record: HubRecord) -> str:
+def make_card(files: Contents, repo_id: str, record: HubRecord) -> str:
     """The card as Markdown with a YAML header.
 
     Args:
@@ -146,16 +127,16 @@ def make_card(files: LeRobotFiles, repo_id: str, record: HubRecord) -> str:
     return "\n".join(lines)
 
 
-def _summary(files: LeRobotFiles, facts: CardFacts) -> str:
+def _summary(files: Contents, facts: CardFacts) -> str:
     task = f" of the task “{facts.tasks[0]}”" if len(facts.tasks) == 1 else ""
-    return f"{len(files.episodes)} episodes{task}, {files.frames} frames, in LeRobot's format {_version(files)}."
+    return f"{len(files.episodes)} episodes{task}, {files.rows} frames, in LeRobot's format {_version(files)}."
 
 
-def _version(files: LeRobotFiles) -> str:
+def _version(files: Contents) -> str:
     return str(files.info["codebase_version"])
 
 
-def _description(files: LeRobotFiles, facts: CardFacts, record: HubRecord) -> dict[str, str]:
+def _description(files: Contents, facts: CardFacts, record: HubRecord) -> dict[str, str]:
     features = files.info["features"]
     more = f"; and {len(facts.tasks) - TASKS_SHOWN} more" if len(facts.tasks) > TASKS_SHOWN else ""
     action = features.get(keys.FEATURE_ACTION, {}).get("shape") or []
@@ -165,7 +146,7 @@ def _description(files: LeRobotFiles, facts: CardFacts, record: HubRecord) -> di
         "frames a second": f"{facts.fps:g}",
         "control rate": f"{facts.control_hz:g} Hz" if facts.control_hz else "not recorded",
         "episodes": str(len(files.episodes)),
-        "frames": str(files.frames),
+        "frames": str(files.rows),
         "success": "not recorded" if facts.success is None else f"{100 * facts.success:.1f} % of the episodes",
         "action": f"{action[0]} numbers" if action else "none",
         "robot": str(files.info.get("robot_type") or "not named"),

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from playslot_rl.datasets.contents import read_contents
+from playslot_rl.data.contents import read_contents
+from playslot_rl.data.problems import Problems
 from playslot_rl.datasets.fingerprint import fingerprint_of
 from playslot_rl.datasets.frames import scan_frames
-from playslot_rl.datasets.problems import Problems
 from playslot_rl.datasets.rows import check_rows
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError

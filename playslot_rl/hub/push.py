@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from playslot_rl.data.lerobot_files import open_files
+from playslot_rl.data.contents import open_files
 from playslot_rl.errors import HubError
 from playslot_rl.hub.card import is_ours, make_card
 from playslot_rl.hub.checks import check_before_push

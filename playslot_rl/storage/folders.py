@@ -22,7 +22,9 @@ def require_free(out: Path, key: str = "out=") -> None:
         OutputError: something is there.
     """
     if out.is_symlink() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
-        raise OutputError(f"{key}{out}: got something that is there already, expected a new folder: choose another")
+        raise OutputError(
+            f"{key}{out}: got something that is there already, expected none; choose another {key.strip()}"
+        )
 
 
 @contextlib.contextmanager

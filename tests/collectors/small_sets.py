@@ -51,7 +51,7 @@ def assert_whole(out: Path, episodes: int, reference: list[Any] | None = None) -
     assert [e["seed"] for e in record_file["episodes"]] == list(range(episodes))
     assert json.loads((out / "meta" / "info.json").read_text())["total_episodes"] == episodes
     assert not journal_path(out).exists()
-    assert not out.with_name(f".{out.name}.export").exists()
+    assert not list(out.parent.glob(f".{out.name}.tmp-*"))
     for index, images in enumerate(reference or []):
         assert [row["observation.images.front"]["bytes"] for row in rows[index * each : (index + 1) * each]] == images
 

@@ -339,15 +339,14 @@ def test_kill_during_export_leaves_nothing_half_made(made: Path, tmp_path: Path)
     out = tmp_path / "data"
     restore(made, out)
     process = start(tmp_path, out, episodes=2, workers=1)
-    temporary = tmp_path / ".data.export"
-    wait_for(process, lambda: (temporary / "meta").exists())
+    wait_for(process, lambda: any(tmp_path.glob(".data.tmp-*/meta")))
     process.kill()
     process.wait()
     assert not out.exists()
     assert len(list(journal_path(out).glob("episode_*.npz"))) == 2
     small(out)
     np.testing.assert_array_equal(frames_of(out), frames_of(made))
-    assert not temporary.exists()
+    assert not list(tmp_path.glob(".data.tmp-*"))
     assert not journal_path(out).exists()
 
 

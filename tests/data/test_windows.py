@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from playslot_rl.data.windows import all_windows, sample_windows, split_episodes
+from playslot_rl.data.windows import sample_windows, split_episodes, spread_windows
 from playslot_rl.errors import DataError
 
 STARTS, LENGTHS = [0, 5, 7, 17], [5, 2, 10, 3]
@@ -44,9 +44,11 @@ def test_windows_longer_than_every_episode_are_refused(episodes: list[int] | Non
         sample_windows(STARTS, LENGTHS, 11, 2, np.random.default_rng(0), episodes=episodes)
 
 
-def test_all_windows_lists_each_once() -> None:
-    assert all_windows(STARTS, LENGTHS, 5).tolist() == [[s + i for i in range(5)] for s in (0, 7, 8, 9, 10, 11, 12)]
-    assert all_windows(STARTS, LENGTHS, 5, stride=4)[:, 0].tolist() == [0, 7, 11]
+def test_spread_windows_are_disjoint_and_cover_the_episodes_evenly() -> None:
+    every = spread_windows(STARTS, LENGTHS, 2, 100, [0, 1, 2, 3])
+    assert every.tolist() == [[s, s + 1] for s in (0, 2, 5, 7, 9, 11, 13, 15, 17)]
+    assert spread_windows(STARTS, LENGTHS, 2, 3, [0, 1, 2, 3])[:, 0].tolist() == [0, 7, 13]
+    assert spread_windows(STARTS, LENGTHS, 5, 100, [0, 2])[:, 0].tolist() == [0, 7, 12]
 
 
 def test_a_split_is_disjoint_complete_and_repeats() -> None:

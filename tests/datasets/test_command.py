@@ -15,10 +15,10 @@ import pytest
 from damage import CAMERA, ROWS, edit_json, frames_of, keep_rows
 
 from playslot_rl import cli
-from playslot_rl.datasets import command
-from playslot_rl.datasets.contents import read_contents
-from playslot_rl.datasets.problems import Problems
+from playslot_rl.data.contents import read_contents
+from playslot_rl.data.problems import Problems
 from playslot_rl.datasets.viz import episode_frames, spread
+from playslot_rl.recipes import dataset as command
 
 pytestmark = pytest.mark.slow  # together they take a minute; make test-all runs them
 

@@ -40,7 +40,7 @@ def test_an_error_leaves_nothing_and_keeps_what_was_there(tmp_path: Path) -> Non
 
 def test_something_that_is_there_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="expected a new folder"), new_folder(tmp_path):
+    with pytest.raises(OutputError, match="is there already, expected none; choose another out="), new_folder(tmp_path):
         raise AssertionError("not reached")
     (tmp_path / "empty").mkdir()
     with new_folder(tmp_path / "empty", create=False) as temporary:

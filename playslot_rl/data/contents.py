@@ -1,13 +1,16 @@
-"""What the files of a LeRobot v3.0 data set hold, read as far as they can be read.
+"""Reading LeRobot v3.0 data sets from their files, as far as they can be read; `data/frames.py` decodes the frames.
+
+LeRobot's own reader turns a missing root into a Hub request and copies the parquet into an Arrow cache.
 
 Shapes: F rows (frames), E episodes.
 """
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.datasets.problems import Problems
+from playslot_rl.data.problems import Problems
 from playslot_rl.errors import DataError
 
 INFO_NAME: Final = "meta/info.json"
@@ -29,6 +32,8 @@ EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:0
 PLACE: Final = ("index", "episode_index", "task_index")
 """Columns that say where a row stands in its data set: they change when data sets are merged or split."""
 REQUIRED: Final = ("timestamp", "frame_index", *PLACE)
+
+UNREADABLE: Final = "unreadable parquet"
 
 Array = npt.NDArray[Any]
 Stats = dict[str, dict[str, Array]]
@@ -116,6 +121,26 @@ class Contents:
         """Features whose frames are in mp4 files."""
         return [name for name, feature in self.features.items() if feature["dtype"] == "video"]
 
+    @property
+    def cameras(self) -> list[str]:
+        """Names of the image and video features."""
+        return [name for name, feature in self.features.items() if feature["dtype"] in ("image", "video")]
+
+    def camera(self, wanted: str) -> str:
+        """The camera to read: the wanted one, or the only one.
+
+        Raises:
+            DataError: there is no such camera, none at all, or several and none was named.
+        """
+        names = ", ".join(self.cameras) or "none"
+        if not wanted and len(self.cameras) == 1:
+            return self.cameras[0]
+        if not wanted:
+            raise DataError(f"{self.root}: got {len(self.cameras)} cameras ({names}), expected one: set data.camera=")
+        if wanted not in self.cameras:
+            raise DataError(f"data.camera={wanted}: {self.root} has no such camera, expected one of: {names}")
+        return wanted
+
     @cached_property
     def spans(self) -> list[Span]:
         """Runs of rows with one `episode_index`, in order; an episode never crosses a file."""
@@ -146,6 +171,40 @@ class Contents:
         place = {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
         return self.root / str(self.info.get("data_path") or DATA_PATH).format(**place)
 
+    def file_hash(self, camera: str) -> str:
+        """Hash of the metadata, the rows and the camera's videos as they are stored: 16 hex digits."""
+        digest = hashlib.sha256()
+        paths = [self.root / INFO_NAME, *_episode_files(self.root), *_data_files(self.root)]
+        paths += sorted((self.root / "videos" / camera).rglob("*.mp4"))
+        for path in paths:
+            digest.update(str(path.relative_to(self.root)).encode())
+            with path.open("rb") as file:
+                while piece := file.read(8 << 20):
+                    digest.update(piece)
+        return digest.hexdigest()[:16]
+
+
+def _data_files(root: Path) -> list[Path]:
+    return sorted((root / "data").glob("*/*.parquet"))
+
+
+def _episode_files(root: Path) -> list[Path]:
+    return sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+
+
+def is_depth(feature: dict[str, Any]) -> bool:
+    """Whether a camera feature is a depth map, whose values are not scaled to [0, 1]."""
+    info = {**(feature.get("video_info") or {}), **(feature.get("info") or {})}
+    return bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
+
+
+def stated_size(feature: dict[str, Any]) -> tuple[int, int]:
+    """(H, W) that a camera feature states, whichever way round its shape is."""
+    shape, names = feature["shape"], feature.get("names") or [""]
+    channels_first = names[0] in ("channel", "channels") or (len(shape) == 3 and shape[2] not in (1, 3, 4))
+    height, width = shape[1:3] if channels_first else shape[:2]
+    return int(height), int(width)
+
 
 def read_info(root: Path) -> dict[str, Any]:
     """`meta/info.json`, after a check of the keys that everything else needs.
@@ -166,7 +225,9 @@ def read_info(root: Path) -> dict[str, Any]:
         fps, _ = float(info["fps"]), (int(info["total_frames"]), int(info["total_episodes"]))
         cells = [(str(f["dtype"]), tuple(int(n) for n in f["shape"])) for f in info["features"].values()]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DataError(f"{path}: got {error!r}, expected LeRobot's metadata; pull or collect it again") from error
+        raise DataError(
+            f"{path}: got {error!r}, a damaged file, expected LeRobot's metadata; pull or collect it again"
+        ) from error
     if not version.startswith("v3."):
         cure = "convert it by LeRobot's convert_dataset_v21_to_v30" if version.startswith("v2") else "see LeRobot"
         raise DataError(f"{root}: got LeRobot format {version}, expected v3.0; {cure}")
@@ -176,8 +237,13 @@ def read_info(root: Path) -> dict[str, Any]:
     return info
 
 
-def read_contents(root: str | Path, problems: Problems) -> Contents:
+def read_contents(root: str | Path, problems: Problems, *, statistics: bool = True) -> Contents:
     """Read all but the frames. What cannot be read is left out and noted in `problems`.
+
+    Args:
+        root: folder of the data set.
+        problems: what is wrong with it.
+        statistics: read those of each episode.
 
     Raises:
         DataError: as `read_info`; without it nothing else can be understood.
@@ -186,15 +252,15 @@ def read_contents(root: str | Path, problems: Problems) -> Contents:
     info = read_info(folder)
     tasks = _read_tasks(folder, problems)
     episodes: list[Episode] = []
-    for path in sorted((folder / "meta" / "episodes").glob("*/*.parquet")):
-        table = read_table(path, problems)
+    for path in _episode_files(folder):
+        table = _read_table(path, problems, lambda name: statistics or not name.startswith("stats/"))
         if table is not None:
             episodes += _episodes(path, table, problems)
     episodes.sort(key=lambda episode: episode.index)
     names = [name for name, feature in info["features"].items() if feature["dtype"] not in ("image", "video")]
     files, counts = [], []
     pieces: dict[str, list[Array]] = {name: [] for name in names}
-    for path in sorted((folder / "data").glob("*/*.parquet")):
+    for path in _data_files(folder):
         rows = _columns(path, names, info["features"], problems)
         if rows is not None:
             files.append(path)
@@ -205,22 +271,60 @@ def read_contents(root: str | Path, problems: Problems) -> Contents:
     return Contents(folder, info, episodes, tasks, files, counts, columns)
 
 
-def read_table(path: Path, problems: Problems, columns: Sequence[str] | None = None) -> Any:
-    """A parquet file as a table, or None (noted) where it has no footer or lacks a column."""
+def open_files(root: str | Path) -> Contents:
+    """Read a data set for training, without statistics, after a check that its files are all there and agree.
+
+    Raises:
+        DataError: it is missing, foreign, of another format version, unfinalised, truncated or empty.
+    """
+    folder, expected = Path(root).expanduser(), "expected a LeRobot"
+    if not str(root):
+        raise DataError(f"data.root is empty, {expected} data set's folder: set data.root=")
+    if not folder.is_dir():
+        raise DataError(f"data.root={root}: no such folder, {expected} data set: run `playslot collect` first")
+    if not (folder / INFO_NAME).is_file():
+        raise DataError(f"data.root={root}: got no {INFO_NAME}, {expected} v3.0 data set: check data.root=")
+    problems = Problems()
+    contents = read_contents(folder, problems, statistics=False)
+    unfinished = (
+        "it was never finalised, or is truncated: collect it again (the same `playslot collect` command carries on), "
+        "or call finalize() on the LeRobotDataset that wrote it"
+    )
+    if not _data_files(folder) or not _episode_files(folder):
+        raise DataError(f"{root}: got no rows under data/ and meta/episodes/, expected parquet files; {unfinished}")
+    unreadable = problems.of(UNREADABLE)
+    if unreadable:
+        raise DataError(f"{unreadable[0]}; {unfinished}")
+    lengths, info = sum(episode.length for episode in contents.episodes), contents.info
+    stated = int(info["total_frames"]), int(info["total_episodes"])
+    if stated != (contents.rows, len(contents.episodes)) or lengths != contents.rows:
+        raise DataError(
+            f"{root}: got {contents.rows} rows and {len(contents.episodes)} episodes of {lengths} frames, expected "
+            f"{stated[0]} frames in {stated[1]} episodes as in {INFO_NAME}; {unfinished}"
+        )
+    if not contents.rows:
+        raise DataError(f"{root}: got an empty data set, expected episodes: collect some first")
+    return contents
+
+
+def _read_table(path: Path, problems: Problems, wanted: Callable[[str], bool] = bool) -> Any:
+    """The wanted columns of a parquet file as a table, or None (noted) where it has no footer."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        return pq.ParquetFile(path).read(columns=None if columns is None else list(columns))
+        file = pq.ParquetFile(path)
+        return file.read(columns=[name for name in file.schema_arrow.names if wanted(name)])
     except (pa.ArrowException, OSError) as error:
         reason = " ".join(str(error).split())[:120]
         problems.error(
-            "unreadable parquet", f"{path}: cannot be read ({reason}), expected a whole parquet file with a footer"
+            UNREADABLE,
+            f"{path}: cannot be read ({reason}): got a parquet file without a footer, expected a whole one",
         )
         return None
 
 
-def to_array(column: Any, shape: Sequence[int]) -> Array:
+def _to_array(column: Any, shape: Sequence[int]) -> Array:
     """A table's column as (n, *shape); the shape (1,) gives (n,). Text and records come as objects.
 
     Raises:
@@ -249,7 +353,7 @@ def to_array(column: Any, shape: Sequence[int]) -> Array:
 def _columns(
     path: Path, names: Sequence[str], features: dict[str, dict[str, Any]], problems: Problems
 ) -> dict[str, Array] | None:
-    table = read_table(path, problems, names)
+    table = _read_table(path, problems, names.__contains__)
     if table is None:
         return None
     rows = {}
@@ -258,7 +362,7 @@ def _columns(
             problems.error("missing column", f"{path}: got no column {name}, expected every feature of {INFO_NAME}")
             return None
         try:
-            rows[name] = to_array(table.column(name), features[name]["shape"])
+            rows[name] = _to_array(table.column(name), features[name]["shape"])
         except ValueError as error:
             expected = tuple(features[name]["shape"])
             problems.error(
@@ -273,7 +377,7 @@ def _read_tasks(root: Path, problems: Problems) -> dict[int, str]:
     if not path.is_file():
         problems.error("missing tasks", f"{path}: got no such file, expected the tasks in words")
         return {}
-    table = read_table(path, problems)
+    table = _read_table(path, problems)
     if table is None:
         return {}
     words = next((name for name in table.column_names if name in ("task", "__index_level_0__")), None)

@@ -21,6 +21,10 @@ class Problems:
         """Untidy, but every frame and number can be trusted."""
         self._warnings.setdefault(kind, []).append(message)
 
+    def of(self, kind: str) -> list[str]:
+        """Errors of one kind."""
+        return self._errors.get(kind, [])
+
     @property
     def errors(self) -> list[str]:
         """One line each."""

@@ -1,0 +1,191 @@
+"""Decoding the frames of a LeRobot data set, each file once and from its beginning to its end.
+
+LeRobot's own reader decodes one row at a time, opens and seeks a video for every query, and its import looks for a
+system FFmpeg and prints a long warning without one; PyAV brings its own. `tests/data` checks that the frames are those
+of `LeRobotDataset`.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.data.contents import Array, Contents, Span, stated_size
+from playslot_rl.data.problems import Problems
+from playslot_rl.errors import DataError
+
+ROWS_A_PIECE = 256
+DAMAGED = "damaged frame"
+
+Decoded = Any
+"""Pixels of an image, uint8 (H, W, 3), or (H, W) of a depth map; or PyAV's `VideoFrame`."""
+
+
+def decoded_frames(
+    contents: Contents, camera: str, problems: Problems, spans: Sequence[Span] | None = None
+) -> Iterator[tuple[int, Decoded]]:
+    """Frames of a camera with their row numbers, ascending within a file.
+
+    Args:
+        contents: the data set.
+        camera: image or video feature.
+        problems: notes what cannot be decoded or has another size than stated; such frames are left out.
+        spans: episodes to read; None means all.
+    """
+    chosen = contents.spans if spans is None else spans
+    read = _video_frames if camera in contents.videos else _image_frames
+    yield from read(contents, camera, chosen, problems)
+
+
+def rgb_frames(
+    contents: Contents, camera: str, spans: Sequence[Span] | None = None
+) -> Iterator[tuple[int, npt.NDArray[np.uint8]]]:
+    """Frames as pixels, uint8 (H, W, 3), with their row numbers; arguments of `decoded_frames`.
+
+    Raises:
+        DataError: a frame cannot be decoded, or has another size than stated.
+    """
+    problems = Problems()
+    for row, frame in decoded_frames(contents, camera, problems, spans):
+        if problems.errors:
+            break
+        yield row, to_rgb(frame)
+    if problems.errors:
+        raise DataError(
+            f"a frame of {camera} cannot be decoded: {problems.errors[0]}; the data set is damaged, collect or pull "
+            "it again"
+        )
+
+
+def to_rgb(frame: Decoded) -> npt.NDArray[np.uint8]:
+    """Pixels of a decoded frame, uint8 (H, W, 3)."""
+    from PIL import Image
+
+    if not isinstance(frame, np.ndarray):
+        frame = frame.to_ndarray(format="rgb24")
+    pixels: npt.NDArray[np.uint8] = frame if frame.ndim == 3 else np.asarray(Image.fromarray(frame).convert("RGB"))
+    return pixels
+
+
+def _image_frames(
+    contents: Contents, camera: str, spans: Sequence[Span], problems: Problems
+) -> Iterator[tuple[int, Decoded]]:
+    import pyarrow.parquet as pq
+
+    wanted = {row for span in spans for row in range(span.start, span.stop)}
+    decode = functools.partial(_decode_image, contents.root)
+    row = 0
+    # Decoding PNG releases the interpreter lock; two threads suffice to keep one core busy with it.
+    with ThreadPoolExecutor(2) as pool:
+        for path, rows in zip(contents.data_files, contents.file_rows, strict=True):
+            file = pq.ParquetFile(path)
+            if camera not in file.schema_arrow.names:
+                problems.error("missing column", f"{path}: got no column {camera}, expected the camera's frames")
+                row += rows
+                continue
+            begin = row
+            for batch in file.iter_batches(ROWS_A_PIECE, columns=[camera]):
+                here = [i for i in range(len(batch)) if row + i in wanted]
+                cells = batch.column(0).take(here).to_pylist()
+                for i, result in zip(here, pool.map(decode, cells), strict=True):
+                    fault = _image_fault(result, stated_size(contents.features[camera]))
+                    if fault:
+                        problems.error(DAMAGED, f"{path}: row {row + i - begin}, {camera}: {fault}")
+                    else:
+                        yield row + i, result
+                row += len(batch)
+
+
+def _decode_image(root: Path, cell: dict[str, Any] | None) -> Array | str:
+    """Pixels of a stored image, (H, W, 3) uint8 for colours, or why it cannot be decoded."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        if cell is None:
+            return "no image"
+        content = cell["bytes"] if cell.get("bytes") else (root / str(cell["path"])).read_bytes()
+        with Image.open(io.BytesIO(content)) as image:
+            depth = image.mode.startswith(("I", "F"))
+            return np.asarray(image if depth else image.convert("RGB"))
+    except UnidentifiedImageError:
+        return "not an image"
+    except (OSError, ValueError, SyntaxError, KeyError, TypeError, AttributeError) as error:
+        return " ".join(str(error).split())[:80] or type(error).__name__
+
+
+def _image_fault(result: Array | str, size: tuple[int, int]) -> str:
+    if isinstance(result, str):
+        return f"cannot be decoded ({result}), expected a PNG or JPEG image"
+    return "" if result.shape[:2] == size else f"got {result.shape[:2]}, expected {size} as stated"
+
+
+def _video_frames(
+    contents: Contents, camera: str, spans: Sequence[Span], problems: Problems
+) -> Iterator[tuple[int, Decoded]]:
+    rows = {span.index: span for span in spans}
+    files: dict[Path, list[tuple[float, Span]]] = {}
+    for episode in contents.episodes:
+        if episode.index not in rows:
+            continue
+        try:
+            path = contents.video_file(camera, episode.row)
+            begin = float(episode.row[f"videos/{camera}/from_timestamp"])
+        except (KeyError, TypeError, ValueError):
+            problems.error(DAMAGED, f"episode {episode.index}: got no place of {camera} in meta/episodes, expected one")
+            continue
+        files.setdefault(path, []).append((begin, rows[episode.index]))
+    size = stated_size(contents.features[camera])
+    for path, places in files.items():
+        if not path.is_file():
+            problems.error("missing video", f"{path}: got no such file, expected the frames of {len(places)} episodes")
+            continue
+        places.sort(key=lambda place: place[0])
+        numbers = (span.start + i for _, span in places for i in range(span.length))
+        times = [begin + i / contents.fps for begin, span in places for i in range(span.length)]
+        try:
+            for row, frame in zip(numbers, _frames_at(path, times, 0.25 / contents.fps), strict=False):
+                got = (frame.height, frame.width)
+                if got != size:
+                    problems.error(DAMAGED, f"{path}: {camera}: got frames of {got}, expected {size} as stated")
+                    break
+                yield row, frame
+        except DataError as error:
+            problems.error(DAMAGED, str(error))
+
+
+def _frames_at(path: Path, times: Sequence[float], tolerance: float) -> Iterator[Any]:
+    """Frames of a video at ascending times, seconds.
+
+    Raises:
+        DataError: the video cannot be opened or decoded, or has no frame at one of the times.
+    """
+    import av
+
+    wanted = iter(times)
+    due = next(wanted, None)
+    reason = "it ends too early"
+    try:
+        with av.open(str(path)) as container:
+            stream: Any = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            for frame in container.decode(stream):
+                now = float(frame.pts * stream.time_base) if frame.pts is not None else -1.0
+                if due is None or now > due + tolerance:
+                    break
+                if now >= due - tolerance:
+                    yield frame
+                    due = next(wanted, None)
+    except (av.FFmpegError, OSError, IndexError) as error:
+        reason = str(error).splitlines()[0]
+    if due is not None:
+        raise DataError(
+            f"{path}: cannot decode the frame at {due:.3f} s ({reason}), expected a whole video of {len(times)} "
+            "frames: the data set is damaged, collect or pull it again"
+        )
