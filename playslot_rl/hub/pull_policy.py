@@ -6,8 +6,7 @@ import shutil
 from pathlib import Path
 
 from playslot_rl.data.cache import build_once, cache_folder
-from playslot_rl.errors import CheckpointError, HubError
-from playslot_rl.hub.layout import same_content
+from playslot_rl.errors import CheckpointError
 from playslot_rl.hub.session import open_repository
 from playslot_rl.sharing.config import CONFIG, WEIGHTS
 from playslot_rl.sharing.folder import FILES
@@ -39,13 +38,7 @@ def pull_policy(repo_id: str, revision: str = "", cache: str | Path = "", token:
             for name in (CONFIG, WEIGHTS):
                 if name not in wanted:
                     raise CheckpointError(f"{hub.name}: got no {name}, expected a PlaySlot policy: check the name")
-            hub.download(list(wanted), commit, folder)
+            hub.download(wanted, commit, folder)
             shutil.rmtree(folder / ".cache", ignore_errors=True)
-            damaged = [path for path, file in wanted.items() if not same_content(folder / path, file)]
-            if damaged:
-                raise HubError(
-                    f"{hub.name}: got {len(damaged)} damaged files ({damaged[0]}), expected what the Hub lists: run "
-                    "the same command again"
-                )
 
         return build_once(home / commit, fetch)

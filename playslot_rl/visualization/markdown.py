@@ -1,6 +1,8 @@
-"""A report as Markdown, its pictures as files beside it."""
+"""Markdown: tables, and a report with its pictures as files beside it."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
 
 from playslot_rl.visualization.document import Block, Document, Missing, Picture, Table, Text
 
@@ -18,8 +20,11 @@ def to_markdown(document: Document, figures: str = "figures") -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", " ")
+def table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table; bars are escaped, and runs of white space, line breaks too, become one space."""
+    lines = [[" ".join(text.split()).replace("|", "\\|") for text in row] for row in (headers, *rows)]
+    lines.insert(1, ["---"] * len(headers))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _block(block: Block, figures: str) -> str:
@@ -30,6 +35,4 @@ def _block(block: Block, figures: str) -> str:
     if isinstance(block, Picture):
         return f"![{block.alt}]({figures}/{block.name}.png)\n\n*{block.caption}*"
     assert isinstance(block, Table)
-    lines = ["| " + " | ".join(_cell(h) for h in block.headers) + " |", "|" + " --- |" * len(block.headers)]
-    lines += ["| " + " | ".join(_cell(c) for c in row) + " |" for row in block.rows]
-    return "\n".join(lines) + (f"\n\n*{block.caption}*" if block.caption else "")
+    return table(block.headers, block.rows) + (f"\n\n*{block.caption}*" if block.caption else "")

@@ -13,13 +13,13 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from playslot_rl.errors import CheckpointError, OutputError
-from playslot_rl.sharing.config import PolicyConfig, is_model_folder, read_config
+from playslot_rl.sharing.config import SharedPolicyConfig, is_model_folder, read_config
 from playslot_rl.sharing.folder import FILES, load_pretrained, save_pretrained
 from playslot_rl.world_model import Agent
 
 
 def test_a_saved_policy_comes_back_with_equal_weights_and_config(
-    agent: Agent, config: PolicyConfig, folder: Path
+    agent: Agent, config: SharedPolicyConfig, folder: Path
 ) -> None:
     before = torch.random.get_rng_state()
     loaded, read = load_pretrained(folder)
@@ -45,7 +45,7 @@ def test_a_folder_holds_what_lerobot_looks_for_and_no_oracle(folder: Path) -> No
     assert values["output_features"] == {"action": {"type": "ACTION", "shape": [4]}}
 
 
-def test_saving_twice_gives_equal_files(agent: Agent, config: PolicyConfig, folder: Path, tmp_path: Path) -> None:
+def test_saving_twice_gives_equal_files(agent: Agent, config: SharedPolicyConfig, folder: Path, tmp_path: Path) -> None:
     save_pretrained(agent, tmp_path / "again", config, lambda _: "card\n")
     assert all((folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes() for name in FILES)
 
@@ -124,7 +124,7 @@ def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
         load_pretrained(tmp_path / "none")
 
 
-def test_what_is_there_already_is_never_replaced(agent: Agent, config: PolicyConfig, tmp_path: Path) -> None:
+def test_what_is_there_already_is_never_replaced(agent: Agent, config: SharedPolicyConfig, tmp_path: Path) -> None:
     (tmp_path / "policy").mkdir()
     with pytest.raises(OutputError, match="there already"):
         save_pretrained(agent, tmp_path / "policy", config, lambda _: "")
@@ -132,9 +132,9 @@ def test_what_is_there_already_is_never_replaced(agent: Agent, config: PolicyCon
 
 
 def test_a_failed_save_leaves_nothing_and_the_next_removes_what_a_kill_left(
-    agent: Agent, config: PolicyConfig, tmp_path: Path
+    agent: Agent, config: SharedPolicyConfig, tmp_path: Path
 ) -> None:
-    def fail(_: PolicyConfig) -> str:
+    def fail(_: SharedPolicyConfig) -> str:
         raise RuntimeError("in the card")
 
     with pytest.raises(RuntimeError, match="in the card"):
