@@ -124,7 +124,7 @@ class PlaySlot:
 
         folder = Path(name)
         if not folder.is_dir():
-            from playslot_rl.hub.pull_policy import pull_policy
+            from playslot_rl.hub.policy import pull_policy
 
             folder = pull_policy(str(name), revision, token=token)
         agent, policy = load_pretrained(folder, device or ("cuda" if torch.cuda.is_available() else "cpu"))

@@ -19,6 +19,15 @@ META_NAME = "meta/playslot.json"
 """Settings and outcome of a recorded data set; written by the collectors."""
 
 TASKS_SHOWN = 8
+USE = """\
+## Use it
+
+```python
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+dataset = LeRobotDataset("{repo_id}")
+```
+"""
 
 
 def make_card(data: DatasetSummary, repo_id: str, fingerprint: str) -> str:
@@ -51,17 +60,7 @@ def make_card(data: DatasetSummary, repo_id: str, fingerprint: str) -> str:
     ]
     if made:
         lines += ["## How it was made", "", "Recorded by `playslot collect` of playslot_rl.", "", facts_table(made), ""]
-    lines += [
-        "## Use it",
-        "",
-        "```python",
-        "from lerobot.datasets.lerobot_dataset import LeRobotDataset",
-        "",
-        f'dataset = LeRobotDataset("{repo_id}")',
-        "```",
-        "",
-    ]
-    return "\n".join(lines)
+    return "\n".join([*lines, USE.format(repo_id=repo_id)])
 
 
 def _note(root: Path) -> dict[str, Any]:
@@ -71,15 +70,10 @@ def _note(root: Path) -> dict[str, Any]:
     return note if isinstance(note, dict) else {}
 
 
-def _parts(note: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Settings of the collection, and of its environment."""
-    spec = note.get("spec") or {}
-    return spec, spec.get("env") or {}
-
-
 def _made(note: dict[str, Any]) -> dict[str, str]:
     """How it was recorded: settings of the collection, then versions."""
-    spec, env = _parts(note)
+    spec = note.get("spec") or {}
+    env = spec.get("env") or {}
     rows = {
         "environment": env.get("name"),
         "policy": spec.get("policy"),
@@ -99,7 +93,7 @@ def _description(data: DatasetSummary, note: dict[str, Any], fingerprint: str) -
     more = f"; and {len(tasks) - TASKS_SHOWN} more" if len(tasks) > TASKS_SHOWN else ""
     cameras = {name: kind.split()[1] for name, kind in data.features.items() if kind.startswith(("image ", "video "))}
     action = data.features.get(keys.FEATURE_ACTION, "").split()
-    skip = _parts(note)[1].get("frame_skip")
+    skip = ((note.get("spec") or {}).get("env") or {}).get("frame_skip")
     success = note.get("success_rate", data.success_rate)
     return {
         "task": "; ".join(tasks[:TASKS_SHOWN]) + more if tasks else "not named",

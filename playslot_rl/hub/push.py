@@ -12,7 +12,7 @@ from playslot_rl.errors import DataError, HubError
 from playslot_rl.hub.card import MARK, make_card
 from playslot_rl.hub.layout import CARD_NAME, REMOTE_RECORD, is_data, local_files
 from playslot_rl.hub.record import HubRecord
-from playslot_rl.hub.sending import MAIN, Parcel, Pushed, few, send
+from playslot_rl.hub.sending import MAIN, Pushed, few, send
 from playslot_rl.hub.session import open_repository
 
 _VERSION = re.compile(r"v?\d+(\.\d+)*")
@@ -72,9 +72,10 @@ def push(
         files[REMOTE_RECORD] = record.to_bytes()
         files[CARD_NAME] = make_card(summary, hub.name, record.fingerprint).encode()
         message = f"{record.episodes} episodes, {record.frames} frames, fingerprint {record.fingerprint}"
-        version = summary.format if target == MAIN else ""
-        parcel = Parcel(files, MARK, message, version, is_data)
-        sent = send(hub, root, parcel, private=private, branch=target, tag=tag)
+        sent = send(
+            hub, root, files, mark=MARK, message=message, private=private, branch=target, tag=tag,
+            version=summary.format if target == MAIN else "", owned=is_data,
+        )  # fmt: skip
     return PushResult(**vars(sent), record=record, left=tuple(left))
 
 

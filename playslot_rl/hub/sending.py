@@ -13,6 +13,8 @@ from playslot_rl.hub.layout import CARD_NAME, same_content, size_of
 from playslot_rl.hub.session import Repository
 
 MAIN: Final = "main"
+Owned = Callable[[str], bool]
+"""Whether a path belongs to what is pushed."""
 
 
 @dataclass(frozen=True)
@@ -66,35 +68,32 @@ def few(paths: tuple[str, ...]) -> str:
     return ", ".join(paths[:3]) + more
 
 
-@dataclass(frozen=True)
-class Parcel:
-    """What is pushed.
-
-    Attributes:
-        files: by path, with the card as it is made here.
-        mark: line of a card by which those made here are known.
-        message: of the commit.
-        version: tag that moves with main; empty for none.
-        owned: which paths there must be part of `files`; others are left alone.
-    """
-
-    files: Mapping[str, Path | bytes]
-    mark: str
-    message: str
-    version: str = ""
-    owned: Callable[[str], bool] = lambda _: False
-
-
-def send(hub: Repository, root: Path, parcel: Parcel, *, private: bool, branch: str, tag: str | None) -> Pushed:
+def send(
+    hub: Repository,
+    root: Path,
+    files: dict[str, Path | bytes],
+    *,
+    mark: str,
+    message: str,
+    private: bool,
+    branch: str,
+    tag: str | None,
+    version: str = "",
+    owned: Owned = lambda _: False,
+) -> Pushed:
     """Push, or find that everything is there already. Nothing is visible on the Hub before the one commit.
 
     Args:
         hub: opened for writing.
         root: local folder, which may hold a card written by hand.
-        parcel: what to send.
+        files: what to send, by path, with the card as it is made here.
+        mark: line of a card by which those made here are known.
+        message: of the commit.
         private: make it private; refused where it is public.
         branch: made from main if it is not there.
         tag: one more tag for the commit; never moved.
+        version: tag that moves to the commit; empty for none.
+        owned: which paths there must be part of `files`; others are left alone.
 
     Raises:
         HubError: what the Hub then lists is not what was sent, or the tag is on something else.
@@ -106,27 +105,26 @@ def send(hub: Repository, root: Path, parcel: Parcel, *, private: bool, branch: 
         hub.make_branch(branch)
     head = hub.commit_of(branch)
     remote = hub.tree(head)
-    files = dict(parcel.files)
     local = root / CARD_NAME
-    by_hand = local.is_file() and parcel.mark not in local.read_text(errors="replace")
+    by_hand = local.is_file() and mark not in local.read_text(errors="replace")
     if by_hand:
-        files[CARD_NAME] = local
-    elif CARD_NAME in remote and parcel.mark not in _read(hub, CARD_NAME, head):
+        files = {**files, CARD_NAME: local}
+    elif CARD_NAME in remote and mark not in _read(hub, CARD_NAME, head):
         by_hand = True
-        del files[CARD_NAME]
+        files = {path: item for path, item in files.items() if path != CARD_NAME}
     if tag is not None and tag in tags:
-        _check_tag(hub, tag, tags[tag], parcel, files)
-    stale = tuple(sorted(path for path in remote if parcel.owned(path) and path not in files))
+        _check_tag(hub, tag, tags[tag], files, owned)
+    stale = tuple(sorted(path for path in remote if owned(path) and path not in files))
     sizes = {path: size_of(item) for path, item in files.items()}
-    commit = hub.commit(files, stale, parcel.message, branch, head)
-    _check_remote(hub, commit, sizes, parcel.owned)
-    if parcel.version and tags.get(parcel.version) != commit:
-        hub.set_tag(parcel.version, commit, replace=parcel.version in tags)
+    commit = hub.commit(files, stale, message, branch, head)
+    _check_remote(hub, commit, sizes, owned)
+    if version and tags.get(version) != commit:
+        hub.set_tag(version, commit, replace=version in tags)
     if tag is not None and tag not in tags:
         hub.set_tag(tag, commit, replace=False)
     return Pushed(
         hub.name, hub.address, branch, commit, commit != head, is_private,
-        tuple(name for name in (parcel.version, tag) if name), len(sizes), sum(sizes.values()), stale, by_hand,
+        tuple(name for name in (version, tag) if name), len(sizes), sum(sizes.values()), stale, by_hand,
     )  # fmt: skip
 
 
@@ -135,10 +133,10 @@ def _read(hub: Repository, path: str, commit: str) -> str:
         return hub.read(path, commit, Path(folder)).decode(errors="replace")
 
 
-def _check_tag(hub: Repository, tag: str, commit: str, parcel: Parcel, files: Mapping[str, Path | bytes]) -> None:
+def _check_tag(hub: Repository, tag: str, commit: str, files: Mapping[str, Path | bytes], owned: Owned) -> None:
     """A tag never moves: it may be there already only where it names exactly what is pushed."""
     tagged = hub.tree(commit)
-    same = {path for path in tagged if parcel.owned(path)} <= files.keys() and all(
+    same = {path for path in tagged if owned(path)} <= files.keys() and all(
         path in tagged and same_content(item, tagged[path]) for path, item in files.items()
     )
     if not same:
@@ -148,7 +146,7 @@ def _check_tag(hub: Repository, tag: str, commit: str, parcel: Parcel, files: Ma
         )
 
 
-def _check_remote(hub: Repository, commit: str, sizes: Mapping[str, int], owned: Callable[[str], bool]) -> None:
+def _check_remote(hub: Repository, commit: str, sizes: Mapping[str, int], owned: Owned) -> None:
     """Compare the commit's tree with what was sent: bytes by path, and no further path that is owned."""
     listed = hub.tree(commit)
     wrong = [path for path, size in sizes.items() if path not in listed or listed[path].size != size]

@@ -115,8 +115,7 @@ class Repository:
         from huggingface_hub import RepoFile
 
         def listed() -> list[Any]:
-            entries = self.api.list_repo_tree(repo_id=self.name, repo_type=self.kind, revision=commit, recursive=True)
-            return list(entries)
+            return list(self.api.list_repo_tree(self.name, repo_type=self.kind, revision=commit, recursive=True))
 
         return {entry.path: entry for entry in self.call(listed) if isinstance(entry, RepoFile)}
 
