@@ -38,7 +38,7 @@ from playslot_rl.world_model import Agent, WorldModel, module_device
 if TYPE_CHECKING:
     from torchrl.envs import TransformedEnv
 
-    from playslot_rl.sharing.config import PolicyConfig
+    from playslot_rl.sharing.config import SharedPolicyConfig
 
 Array = npt.NDArray[Any] | Tensor
 
@@ -89,7 +89,7 @@ class PlaySlot:
         self._seed = seed
         side = world_model.env.image_size
         self._loop = None if agent is None else ClosedLoop(playslot_actor(agent), image_size=side, seed=seed)
-        self._policy: PolicyConfig | None = None
+        self._policy: SharedPolicyConfig | None = None
 
     @classmethod
     def untrained(cls, config: ExperimentConfig | None = None, seed: int = 0) -> PlaySlot:
@@ -125,7 +125,7 @@ class PlaySlot:
 
         folder = Path(name)
         if not folder.is_dir():
-            from playslot_rl.hub.pull_policy import pull_policy
+            from playslot_rl.hub.policy import pull_policy
 
             folder = pull_policy(str(name), revision, token=token)
         agent, policy = load_pretrained(folder, device or ("cuda" if torch.cuda.is_available() else "cpu"))
@@ -140,17 +140,17 @@ class PlaySlot:
         `playslot export` reads it from the run, with the results for the card.
 
         Args:
-            folder: must not exist.
+            folder: must not exist, or be empty.
 
         Raises:
             CheckpointError: the model has no policy.
-            OutputError: `folder` exists, or cannot be written.
+            OutputError: `folder` holds something, or cannot be written.
         """
         from dataclasses import replace
 
-        from playslot_rl.sharing.config import PolicyConfig
+        from playslot_rl.sharing.card import make_card
+        from playslot_rl.sharing.config import SharedPolicyConfig
         from playslot_rl.sharing.folder import save_pretrained
-        from playslot_rl.sharing.run import plain_card
         from playslot_rl.sharing.source import versions
 
         if self.agent is None:
@@ -158,10 +158,10 @@ class PlaySlot:
                 "save_pretrained: got a world model without a policy; run `playslot train-policy` and load that run"
             )
         path, agent = Path(folder), self.agent
-        known = self._policy or PolicyConfig()
+        known = self._policy or SharedPolicyConfig()
         source = {**known.source, "versions": versions()}
         config = replace(known, env=agent.world_model.env, model=agent.world_model.config, source=source)
-        save_pretrained(agent, path, config, lambda written: plain_card(written, agent, path.name))
+        save_pretrained(agent, path, config, lambda written: make_card(path.name, written, agent))
 
     @torch.no_grad()
     def parse(self, frames: Array) -> Tensor:

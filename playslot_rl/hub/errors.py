@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from playslot_rl.errors import HubError, OutputError, PlaySlotError
-from playslot_rl.hub.secrets import chain
+from playslot_rl.errors import DEBUG, HubError, OutputError, PlaySlotError
 from playslot_rl.storage.atomic import explain_write_errors
 
 LOG_IN = "run `hf auth login` once, or set HF_TOKEN"
@@ -35,58 +34,59 @@ class Place:
     what: str = "data set"
 
 
-def offline(place: Place) -> HubError:
-    """Offline mode is on."""
-    return HubError(
-        f"{place.repo_id}: got offline mode (HF_HUB_OFFLINE is set), expected access to the Hub: unset HF_HUB_OFFLINE "
-        "and run the same command again"
-    )
-
-
-def no_token(place: Place) -> HubError:
-    """There is nothing to log in with."""
-    return HubError(f"{place.repo_id}: got no token, expected one with write access to push: {LOG_IN}")
-
-
-def translate(error: BaseException, place: Place) -> PlaySlotError | None:
-    """One line about an error of the Hub's client; None if it is not known.
+def translate(error: BaseException, place: Place) -> PlaySlotError:
+    """One line about an error of the Hub's client.
 
     The error itself is looked at first, then what caused it: uploads and downloads wrap the errors of their threads.
     """
-    for link in chain(error):
+    link: BaseException | None = error
+    while link is not None:
         known = _one(link, place)
         if known is not None:
             return known
-    return None
+        link = link.__cause__ or link.__context__
+    return HubError(
+        f"{place.repo_id}: got {type(error).__name__}: {' '.join(str(error).split())} (unexpected; {DEBUG}=1 shows "
+        f"where), expected the {'push' if place.writing else 'pull'} to go on"
+    )
 
 
 def _one(error: BaseException, place: Place) -> PlaySlotError | None:
     import httpx
     from huggingface_hub import errors as hub
 
+    name = place.repo_id
+    if isinstance(error, PlaySlotError):
+        return error
     if isinstance(error, hub.OfflineModeIsEnabled):
-        return offline(place)
+        return HubError(
+            f"{name}: got offline mode (HF_HUB_OFFLINE is set), expected access to the Hub: unset HF_HUB_OFFLINE and "
+            "run the same command again"
+        )
     if isinstance(error, hub.LocalTokenNotFoundError):
-        return no_token(place)
+        return HubError(f"{name}: got no token, expected one with write access to push: {LOG_IN}")
     if isinstance(error, hub.HfHubHTTPError):
         return _http(error, place)
     if isinstance(error, hub.HFValidationError | hub.HfUriError):
-        return bad_name(place)
+        return HubError(
+            f"got the {place.what} name {name!r}, expected user/name of letters, digits, '-', '_' and '.': your name "
+            f"on the Hub, a slash, and a name for the {place.what}"
+        )
     if isinstance(error, httpx.UnsupportedProtocol | httpx.InvalidURL):
         return HubError(
             f"got HF_ENDPOINT={place.endpoint}, expected the address of a Hub: unset HF_ENDPOINT or mend it"
         )
     if isinstance(error, httpx.TransportError | ConnectionError | TimeoutError):
         return HubError(
-            f"{place.repo_id}: got no connection to {place.endpoint} ({type(error).__name__}), expected the network: "
-            "check it and run the same command again, it carries on"
+            f"{name}: got no connection to {place.endpoint} ({type(error).__name__}), expected the network: check it "
+            "and run the same command again, it carries on"
         )
     if isinstance(error, OSError):
         return _disk(error, place.root)
     if "xet" in f"{type(error).__module__}.{type(error).__name__}".lower():
         return HubError(
-            f"{place.repo_id}: got a failed transfer ({error}), expected the files to be moved: run the same command "
-            "again, with HF_HUB_DISABLE_XET=1 if it fails again"
+            f"{name}: got a failed transfer ({error}), expected the files to be moved: run the same command again, "
+            "with HF_HUB_DISABLE_XET=1 if it fails again"
         )
     return None
 
@@ -106,71 +106,39 @@ def _http(error: BaseException, place: Place) -> HubError:
 
     status = int(error.response.status_code)  # type: ignore[attr-defined]
     if isinstance(error, hub.RevisionNotFoundError):
-        return no_revision(place)
-    if isinstance(error, hub.GatedRepoError):
-        return HubError(
-            f"{place.repo_id}: got a gated {place.what}, expected access to it: ask for access on its page, then "
-            f"{LOG_IN}"
+        said = (
+            f"no revision {place.revision or 'main'!r}, expected a branch, a tag or a commit: see its page on the Hub, "
+            "or leave the revision out"
         )
-    if status == 401:
-        return _unauthorised(error, place)
-    if status == 403:
-        what = "write to it" if place.writing else "read it"
-        return HubError(
-            f"{place.repo_id}: got 403, the token may not {what}; expected one with that right: check the owner's "
-            "name, and the token's rights in the Hub's settings/tokens"
+    elif isinstance(error, hub.GatedRepoError):
+        said = f"a gated {place.what}, expected access to it: ask for access on its page, then {LOG_IN}"
+    elif status == 401 and place.has_token and not isinstance(error, hub.RepositoryNotFoundError):
+        said = (
+            "401, a bad token (invalid or expired), expected a valid one: make a new one in the Hub's "
+            f"settings/tokens, then {LOG_IN}"
         )
-    if status == 404:
-        return no_repository(place)
-    if status == 412:
-        return HubError(
-            f"{place.repo_id}: got another push in between, expected to be the only one: run the same command again"
+    elif status in (401, 404):
+        # 401 also stands for a repository that is not there, for those who sent no token.
+        who = "your token" if place.has_token else "you: no token was sent"
+        said = (
+            f"no such {place.what} on {place.endpoint}, or one hidden from {who}; expected user/name of a {place.what}:"
+            " check the name" + ("" if place.has_token else f"; if it is private, {LOG_IN}")
         )
-    if status == 429:
-        return HubError(
-            f"{place.repo_id}: got 429, too many requests, expected fewer: run the same command again in some minutes"
+    elif status == 403:
+        said = (
+            f"403, the token may not {'write to' if place.writing else 'read'} it; expected one with that right: check "
+            "the owner's name, and the token's rights in the Hub's settings/tokens"
         )
-    if status >= 500:
-        return HubError(
-            f"{place.repo_id}: got {status}, an error of the Hub's own, also after retries; expected an answer: run "
-            "the same command again later, it carries on"
+    elif status == 412:
+        said = "another push in between, expected to be the only one: run the same command again"
+    elif status == 429:
+        said = "429, too many requests, expected fewer: run the same command again in some minutes"
+    elif status >= 500:
+        said = (
+            f"{status}, an error of the Hub's own, also after retries; expected an answer: run the same command again "
+            "later, it carries on"
         )
-    said = " ".join(str(getattr(error, "server_message", None) or error).split())[:300]
-    return HubError(f"{place.repo_id}: got {status} from the Hub ({said}), expected the request to be taken")
-
-
-def _unauthorised(error: BaseException, place: Place) -> HubError:
-    """401 stands for a bad token, and for a repository that is not there for those who sent none."""
-    from huggingface_hub import errors as hub
-
-    if place.has_token and not isinstance(error, hub.RepositoryNotFoundError):
-        return HubError(
-            f"{place.repo_id}: got 401, a bad token (invalid or expired), expected a valid one: make a new one in the "
-            f"Hub's settings/tokens, then {LOG_IN}"
-        )
-    return no_repository(place)
-
-
-def no_repository(place: Place) -> HubError:
-    """Nothing of that name, or private."""
-    who = "your token" if place.has_token else "you: no token was sent"
-    return HubError(
-        f"{place.repo_id}: got no such {place.what} on {place.endpoint}, or one hidden from {who}; expected user/name "
-        f"of a {place.what}: check the name" + ("" if place.has_token else f"; if it is private, {LOG_IN}")
-    )
-
-
-def no_revision(place: Place) -> HubError:
-    """The repository exists, the revision does not."""
-    return HubError(
-        f"{place.repo_id}: got no revision {place.revision or 'main'!r}, expected a branch, a tag or a commit: see its "
-        "page on the Hub, or leave the revision out"
-    )
-
-
-def bad_name(place: Place) -> HubError:
-    """Not `user/name`."""
-    return HubError(
-        f"got the {place.what} name {place.repo_id!r}, expected user/name of letters, digits, '-', '_' and '.': your "
-        f"name on the Hub, a slash, and a name for the {place.what}"
-    )
+    else:
+        reason = " ".join(str(getattr(error, "server_message", None) or error).split())[:300]
+        said = f"{status} from the Hub ({reason}), expected the request to be taken"
+    return HubError(f"{place.repo_id}: got {said}")

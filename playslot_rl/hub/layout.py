@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import io
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from huggingface_hub import RepoFile
 
 FORMAT_TAG = "v3.0"
 """Tag that LeRobot looks for on the Hub; equal to its CODEBASE_VERSION, whose import costs seconds."""
@@ -18,21 +21,6 @@ LOCAL_RECORD = "meta/playslot_pull.json"
 _SUFFIXES = {"data": {".parquet"}, "meta": {".parquet", ".json", ".jsonl"}, "videos": {".mp4"}}
 _GENERATED = {REMOTE_RECORD, LOCAL_RECORD}
 _PIECE = 8 << 20
-
-
-@dataclass(frozen=True)
-class RemoteFile:
-    """What the Hub says about a file.
-
-    Attributes:
-        size: bytes.
-        sha256: of the content, for files in large-file storage; else None.
-        blob: git's object id, for the others.
-    """
-
-    size: int
-    sha256: str | None
-    blob: str
 
 
 def is_data(path: str) -> bool:
@@ -52,36 +40,34 @@ def is_pulled(path: str) -> bool:
     return (is_data(path) and path != LOCAL_RECORD) or path == CARD_NAME or _is_licence(path)
 
 
-def local_files(root: Path) -> tuple[dict[str, int], list[str]]:
-    """Files below `root` that a push uploads, and those that it leaves.
+def local_files(root: Path) -> tuple[list[str], list[str]]:
+    """Paths of the files below `root` that a push uploads, and of those that it leaves, in order.
 
     Left are caches, journals, lock and temporary files, images/ that LeRobot did not clean up, hidden files, and the
     two records this package writes itself. The card and the record are made by the push.
-
-    Returns:
-        Sizes in bytes by path, in order; and the paths that stay here.
     """
-    sizes: dict[str, int] = {}
-    left: list[str] = []
-    for file in sorted(root.rglob("*")):
-        if not file.is_file():
-            continue
-        path = file.relative_to(root).as_posix()
-        if (is_data(path) and path not in _GENERATED) or _is_licence(path):
-            sizes[path] = file.stat().st_size
-        elif path != CARD_NAME and path not in _GENERATED:
-            left.append(path)
-    return sizes, left
+    paths = sorted(file.relative_to(root).as_posix() for file in root.rglob("*") if file.is_file())
+    others = [path for path in paths if path != CARD_NAME and path not in _GENERATED]
+    sent = [path for path in others if is_data(path) or _is_licence(path)]
+    return sent, [path for path in others if path not in set(sent)]
 
 
-def same_content(item: Path | bytes, remote: RemoteFile) -> bool:
-    """Whether a file, or bytes, has the size and the hash that the Hub names."""
+def same_content(item: Path | bytes, remote: RepoFile) -> bool:
+    """Whether a file, or bytes, has the size and the hash that the Hub names.
+
+    Those are the SHA-256 of the content in large-file storage, and git's object id of other files.
+    """
     if isinstance(item, Path) and not item.is_file():
         return False
-    if (len(item) if isinstance(item, bytes) else item.stat().st_size) != remote.size:
+    if size_of(item) != remote.size:
         return False
-    digest = hashlib.sha256() if remote.sha256 else hashlib.sha1(b"blob %d\0" % remote.size, usedforsecurity=False)
+    digest = hashlib.sha256() if remote.lfs else hashlib.sha1(b"blob %d\0" % remote.size, usedforsecurity=False)
     with io.BytesIO(item) if isinstance(item, bytes) else item.open("rb") as stream:
         while piece := stream.read(_PIECE):
             digest.update(piece)
-    return digest.hexdigest() == (remote.sha256 or remote.blob)
+    return digest.hexdigest() == (remote.lfs.sha256 if remote.lfs else remote.blob_id)
+
+
+def size_of(item: Path | bytes) -> int:
+    """Bytes of a file's content."""
+    return len(item) if isinstance(item, bytes) else item.stat().st_size

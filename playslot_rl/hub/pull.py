@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import json
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, HubError, OutputError
-from playslot_rl.hub.checks import Content, check_after_pull
-from playslot_rl.hub.layout import FORMAT_TAG, RemoteFile, is_pulled, same_content
-from playslot_rl.hub.record import SCHEME, read_origin, read_record, write_origin
+from playslot_rl.hub.layout import FORMAT_TAG, LOCAL_RECORD, is_pulled
+from playslot_rl.hub.record import SCHEME, HubRecord, read_record
 from playslot_rl.hub.session import Repository, open_repository
-from playslot_rl.storage.atomic import explain_write_errors, replace_dir
+from playslot_rl.storage.atomic import explain_write_errors, replace_dir, write_json
+from playslot_rl.storage.locks import locked
+
+if TYPE_CHECKING:
+    from huggingface_hub import RepoFile
 
 INFO = "meta/info.json"
 SPARE = 64 << 20
@@ -88,14 +91,21 @@ def pull(repo_id: str, root: Path, *, revision: str | None = None, token: str | 
         wanted = {path: file for path, file in hub.tree(commit).items() if is_pulled(path)}
         if INFO not in wanted:
             raise DataError(f"{hub.name}: got no {INFO} at {name}, expected a LeRobot data set: check the name")
-        with explain_write_errors(root), _alone(root):
-            _refuse_existing(root)
-            partial = _partial(root, commit)
-            _check_version(hub, partial, commit)
-            _check_room(root, partial, wanted)
-            hub.download(list(wanted), commit, partial)
-            _check_files(hub, partial, wanted)
-            result = _finish(hub, partial, root, name, why, commit, wanted)
+        with explain_write_errors(root):
+            root.parent.mkdir(parents=True, exist_ok=True)
+        lock = root.with_name(f".{root.name}.pull.lock")
+        with locked(lock, f"{root}: got another pull into it running, expected one at a time: wait"):
+            try:
+                with explain_write_errors(root):
+                    record, compared = _fetch(hub, root, commit, wanted)
+                    size = sum(file.size for file in wanted.values())
+                    result = PullResult(
+                        hub.name, str(root), name, why, commit, record.episodes, record.frames, len(wanted), size,
+                        record.fingerprint, compared,
+                    )  # fmt: skip
+                    _finish(_partial(root, commit), root, result, hub.place.endpoint)
+            finally:
+                lock.unlink(missing_ok=True)
     return result
 
 
@@ -103,8 +113,11 @@ def _refuse_existing(root: Path) -> None:
     if root.is_dir() and not any(root.iterdir()):
         return
     if root.exists() or root.is_symlink():
-        origin = read_origin(root)
-        held = f", commit {str(origin['commit'])[:12]} of {origin.get('repo_id')}" if origin.get("commit") else ""
+        try:
+            origin = json.loads((root / LOCAL_RECORD).read_text())
+            held = f", commit {origin['commit'][:12]} of {origin['repo_id']}"
+        except (OSError, ValueError, KeyError, TypeError):
+            held = ""  # not pulled, or nobody can tell from where
         raise OutputError(f"{root}: got a folder that holds something{held}, expected none: choose another, or move it")
 
 
@@ -124,24 +137,18 @@ def _choose(hub: Repository, revision: str | None) -> tuple[str, str, str]:
 
 
 def _partial(root: Path, commit: str) -> Path:
-    """Where the files of a commit gather; those of another commit are never mixed in."""
+    """Where the files of a commit gather, also over several calls; those of another commit are never mixed in."""
     return root.with_name(f".{root.name}.pull-{commit[:16]}")
 
 
-@contextlib.contextmanager
-def _alone(root: Path) -> Iterator[None]:
-    """Refuse two pulls into one folder. The system drops the lock of a killed process."""
-    root.parent.mkdir(parents=True, exist_ok=True)
-    path = root.with_name(f".{root.name}.pull.lock")
-    with path.open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise OutputError(f"{root}: got another pull into it running, expected one at a time: wait") from error
-        try:
-            yield
-        finally:
-            path.unlink(missing_ok=True)
+def _fetch(hub: Repository, root: Path, commit: str, wanted: Mapping[str, RepoFile]) -> tuple[HubRecord, bool]:
+    """What has arrived, checked; and whether the Hub named a fingerprint to compare it with."""
+    _refuse_existing(root)
+    partial = _partial(root, commit)
+    _check_version(hub, partial, commit)
+    _check_room(root, partial, wanted)
+    hub.download(wanted, commit, partial)
+    return _check_content(hub, partial, commit)
 
 
 def _check_version(hub: Repository, partial: Path, commit: str) -> None:
@@ -159,7 +166,7 @@ def _check_version(hub: Repository, partial: Path, commit: str) -> None:
         )
 
 
-def _check_room(root: Path, partial: Path, wanted: dict[str, RemoteFile]) -> None:
+def _check_room(root: Path, partial: Path, wanted: Mapping[str, RepoFile]) -> None:
     size = sum(file.size for path, file in wanted.items() if not (partial / path).is_file())
     free = shutil.disk_usage(root.parent).free
     if size + SPARE > free:
@@ -169,65 +176,49 @@ def _check_room(root: Path, partial: Path, wanted: dict[str, RemoteFile]) -> Non
         )
 
 
-def _check_files(hub: Repository, partial: Path, wanted: dict[str, RemoteFile]) -> None:
-    """Compare every file's size and hash with what the Hub lists."""
-    damaged = [path for path, file in wanted.items() if not same_content(partial / path, file)]
-    for path in damaged:
-        (partial / path).unlink(missing_ok=True)
-        (partial / ".cache" / "huggingface" / "download" / f"{path}.metadata").unlink(missing_ok=True)
-    if damaged:
-        raise HubError(
-            f"{hub.name}: got {len(damaged)} damaged files ({', '.join(damaged[:3])}), expected what the Hub lists: "
-            "run the same command again, it fetches these anew"
-        )
+def _check_content(hub: Repository, partial: Path, commit: str) -> tuple[HubRecord, bool]:
+    """What has arrived; and whether the Hub named a fingerprint to compare it with.
 
-
-def _finish(
-    hub: Repository, partial: Path, root: Path, name: str, why: str, commit: str, wanted: dict[str, RemoteFile]
-) -> PullResult:
-    """Check counts and fingerprint, note the origin, and put the folder in its place."""
+    What is whole and wrong is removed: fetching it again would not help.
+    """
     shutil.rmtree(partial / ".cache", ignore_errors=True)
     try:
-        found, compared = _check_content(hub, partial, commit)
+        found = _read_content(hub, partial, commit)
+        record = read_record(partial)
+        if record is None or record.scheme != SCHEME:
+            return found, False
+        if found != record:
+            raise HubError(
+                f"{hub.name}: got {found.episodes} episodes, {found.frames} frames, fingerprint {found.fingerprint}, "
+                f"expected {record.episodes}, {record.frames}, {record.fingerprint} as pushed: the data set was "
+                "changed on the Hub by something else; ask its owner to push it again"
+            )
     except (DataError, HubError):
-        shutil.rmtree(partial, ignore_errors=True)  # whole and wrong: fetching it again would not help
+        shutil.rmtree(partial, ignore_errors=True)
         raise
-    size = sum(file.size for file in wanted.values())
-    result = PullResult(
-        hub.name, str(root), name, why, commit, found.episodes, found.frames, len(wanted), size, found.fingerprint,
-        compared,
-    )  # fmt: skip
-    endpoint = {"endpoint": hub.place.endpoint, "pulled": datetime.now(UTC).isoformat(timespec="seconds")}
-    write_origin(
-        partial, {key: value for key, value in asdict(result).items() if key not in ("root", "why")} | endpoint
-    )
+    return found, True
+
+
+def _read_content(hub: Repository, partial: Path, commit: str) -> HubRecord:
+    """Counts, indices and every frame. Statistics are not compared: others' may be made in another way."""
+    found = verify(partial, statistics=False)
+    if not found.ok:
+        first = found.errors[0].replace(f"{partial}/", "").partition(";")[0]
+        raise DataError(
+            f"{hub.name}: got a data set at commit {commit[:12]} whose files disagree ({first}), expected a sound one: "
+            "an earlier push may have left files behind; ask its owner to push it by `playslot dataset push`"
+        )
+    return HubRecord.of(found.fingerprint, found.episodes, found.frames)
+
+
+def _finish(partial: Path, root: Path, result: PullResult, endpoint: str) -> None:
+    """Note the origin, and put the folder in its place."""
+    origin = {key: value for key, value in asdict(result).items() if key not in ("root", "why")}
+    origin |= {"endpoint": endpoint, "pulled": datetime.now(UTC).isoformat(timespec="seconds")}
+    write_json(partial / LOCAL_RECORD, origin)
     if root.is_dir():
         root.rmdir()  # empty, or it would have been refused
     replace_dir(partial, root)
     for old in root.parent.iterdir():  # of commits that have been superseded
         if re.fullmatch(re.escape(f".{root.name}.pull-") + "[0-9a-f]{16}", old.name):
             shutil.rmtree(old, ignore_errors=True)
-    return result
-
-
-def _check_content(hub: Repository, partial: Path, commit: str) -> tuple[Content, bool]:
-    """What has arrived; and whether the Hub named a fingerprint to compare it with."""
-    try:
-        found = check_after_pull(partial)
-    except DataError as error:
-        first = str(error).replace(f"{partial}/", "").partition(";")[0]
-        raise DataError(
-            f"{hub.name}: got a data set at commit {commit[:12]} whose files disagree ({first}), expected a sound one: "
-            "an earlier push may have left files behind; ask its owner to push it by `playslot dataset push`"
-        ) from error
-    record = read_record(partial)
-    if record is None or record.scheme != SCHEME:
-        return found, False
-    expected = Content(record.episodes, record.frames, record.fingerprint)
-    if found != expected:
-        raise HubError(
-            f"{hub.name}: got {found.episodes} episodes, {found.frames} frames, fingerprint {found.fingerprint}, "
-            f"expected {expected.episodes}, {expected.frames}, {expected.fingerprint} as pushed: the data set was "
-            "changed on the Hub by something else; ask its owner to push it again"
-        )
-    return found, True

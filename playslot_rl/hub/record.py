@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
+from playslot_rl import __version__
 from playslot_rl.errors import HubError
-from playslot_rl.hub.checks import Content
-from playslot_rl.hub.layout import LOCAL_RECORD, REMOTE_RECORD
-from playslot_rl.storage.atomic import write_json
+from playslot_rl.hub.layout import REMOTE_RECORD
 
 SCHEME = 1
 """Version of `datasets/fingerprint.py`, to be raised when that changes: those of another version are not compared."""
@@ -18,7 +16,7 @@ SCHEME = 1
 
 @dataclass(frozen=True)
 class HubRecord:
-    """What was pushed.
+    """What was pushed; equal to another record of the same content.
 
     Attributes:
         fingerprint: content hash of the data set, as `playslot dataset verify` prints it.
@@ -30,15 +28,13 @@ class HubRecord:
     fingerprint: str
     episodes: int
     frames: int
-    scheme: int
-    playslot_rl: str
+    scheme: int = field(compare=False)
+    playslot_rl: str = field(compare=False)
 
     @classmethod
-    def of(cls, content: Content) -> HubRecord:
-        """The record of a checked data set."""
-        from playslot_rl import __version__
-
-        return cls(content.fingerprint, content.episodes, content.frames, SCHEME, __version__)
+    def of(cls, fingerprint: str, episodes: int, frames: int) -> HubRecord:
+        """The record of a checked data set, made by this version."""
+        return cls(fingerprint, episodes, frames, SCHEME, __version__)
 
     def to_bytes(self) -> bytes:
         """As a file."""
@@ -61,17 +57,3 @@ def read_record(root: Path) -> HubRecord | None:
             f"{REMOTE_RECORD}: got a damaged record ({type(error).__name__}), expected what `playslot dataset push` "
             "writes: ask its owner to push again"
         ) from error
-
-
-def write_origin(root: Path, origin: dict[str, Any]) -> None:
-    """Note where a pulled data set came from."""
-    write_json(root / LOCAL_RECORD, origin)
-
-
-def read_origin(root: Path) -> dict[str, Any]:
-    """Where a data set was pulled from; empty if it was not, or if nobody can tell."""
-    try:
-        origin = json.loads((root / LOCAL_RECORD).read_text())
-    except (OSError, ValueError):
-        return {}
-    return origin if isinstance(origin, dict) else {}

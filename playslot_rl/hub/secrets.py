@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import logging
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Any
 
 from playslot_rl.errors import HubError
 
@@ -33,68 +32,31 @@ def checked_token(token: str | None) -> str | None:
     return token or None
 
 
-@dataclass(frozen=True)
-class Redactor:
-    """Replaces tokens in texts, errors and log records.
-
-    Attributes:
-        token: the one in use; anything shaped like a token is replaced as well.
-    """
-
-    token: str | None = field(default=None, repr=False)
-
-    def text(self, text: str) -> str:
-        """`text` without tokens."""
-        if self.token:
-            text = text.replace(self.token, MASK)
-        text = _SHAPED.sub(MASK, text)
-        return _IN_ADDRESS.sub(f"{MASK}@", _BEARER.sub(rf"\1\2{MASK}", text))
-
-    def error(self, error: BaseException) -> None:
-        """Clean an error in place, with its causes and contexts: servers may repeat what they were sent."""
-        for link in chain(error):
-            link.args = tuple(self._value(arg) for arg in link.args)
-            for name, value in vars(link).items():
-                with contextlib.suppress(AttributeError, TypeError):
-                    setattr(link, name, self._value(value))
-
-    def _value(self, value: Any) -> Any:
-        if isinstance(value, str) and type(value) is str:
-            return self.text(value)
-        if isinstance(value, bytes):
-            return self.text(value.decode("latin-1")).encode("latin-1")
-        if isinstance(value, list | tuple) and type(value) in (list, tuple):
-            return type(value)(self._value(item) for item in value)
-        return value
-
-    @contextlib.contextmanager
-    def logs(self) -> Iterator[None]:
-        """Clean every log record made inside, whatever its logger and level."""
-        previous = logging.getLogRecordFactory()
-
-        def make(*args: Any, **kwargs: Any) -> logging.LogRecord:
-            record = previous(*args, **kwargs)
-            record.msg, record.args = self.text(record.getMessage()), ()
-            if record.exc_info and record.exc_info[1] is not None:
-                self.error(record.exc_info[1])
-            return record
-
-        logging.setLogRecordFactory(make)
-        try:
-            yield
-        finally:
-            if logging.getLogRecordFactory() is make:
-                logging.setLogRecordFactory(previous)
+def mask(text: str, token: str | None = None) -> str:
+    """`text` without `token`, and without anything shaped like a token or a password."""
+    if token:
+        text = text.replace(token, MASK)
+    text = _SHAPED.sub(MASK, text)
+    return _IN_ADDRESS.sub(f"{MASK}@", _BEARER.sub(rf"\1\2{MASK}", text))
 
 
-def chain(error: BaseException) -> Iterator[BaseException]:
-    """An error, then what caused it, then what was being handled; each once."""
-    waiting: list[BaseException | None] = [error]
-    seen: set[int] = set()
-    while waiting:
-        link = waiting.pop(0)
-        if link is None or id(link) in seen:
-            continue
-        seen.add(id(link))
-        yield link
-        waiting += [link.__cause__, link.__context__]
+@contextlib.contextmanager
+def masked_logs(token: str | None) -> Iterator[None]:
+    """Mask what the handlers of the root and of the Hub's client write inside; the log records stay as they are."""
+
+    def masked(record: logging.LogRecord) -> logging.LogRecord:
+        shown = copy.copy(record)
+        shown.msg, shown.args = mask(record.getMessage(), token), ()
+        if record.exc_info:
+            shown.exc_info, text = None, logging.Formatter().formatException(record.exc_info)
+            shown.exc_text = mask(text, token)
+        return shown
+
+    handlers = [*logging.getLogger().handlers, *logging.getLogger("huggingface_hub").handlers]
+    for handler in handlers:
+        handler.addFilter(masked)
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            handler.removeFilter(masked)

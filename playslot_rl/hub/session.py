@@ -7,17 +7,22 @@ before, because it reads HF_ENDPOINT, HF_HOME, HF_TOKEN and HF_HUB_OFFLINE when 
 from __future__ import annotations
 
 import contextlib
+import glob
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
-from playslot_rl.errors import HubError, PlaySlotError
-from playslot_rl.hub.errors import Place, bad_name, no_token, offline, translate
-from playslot_rl.hub.layout import RemoteFile
-from playslot_rl.hub.secrets import Redactor, checked_token
+from playslot_rl.errors import HubError
+from playslot_rl.hub.errors import Place, translate
+from playslot_rl.hub.layout import same_content
+from playslot_rl.hub.secrets import checked_token, mask, masked_logs
+
+if TYPE_CHECKING:
+    from huggingface_hub import RepoFile
 
 WAITS = (1.0, 2.0, 4.0)
 """Seconds before each further attempt after a server error."""
@@ -105,20 +110,14 @@ class Repository:
         info = self.call(self.api.repo_info, repo_id=self.name, repo_type=self.kind, revision=revision)
         return str(info.sha)
 
-    def tree(self, commit: str) -> dict[str, RemoteFile]:
+    def tree(self, commit: str) -> dict[str, RepoFile]:
         """All files of a commit, by path."""
+        from huggingface_hub import RepoFile
 
         def listed() -> list[Any]:
-            entries = self.api.list_repo_tree(repo_id=self.name, repo_type=self.kind, revision=commit, recursive=True)
-            return list(entries)
+            return list(self.api.list_repo_tree(self.name, repo_type=self.kind, revision=commit, recursive=True))
 
-        files: dict[str, RemoteFile] = {}
-        for entry in self.call(listed):
-            if not hasattr(entry, "blob_id"):
-                continue  # a folder
-            sha256 = entry.lfs.sha256 if entry.lfs else None
-            files[entry.path] = RemoteFile(int(entry.size), sha256, str(entry.blob_id))
-        return files
+        return {entry.path: entry for entry in self.call(listed) if isinstance(entry, RepoFile)}
 
     def make_branch(self, branch: str) -> None:
         """A branch from main."""
@@ -156,20 +155,26 @@ class Repository:
                         revision=commit, local_dir=folder)  # fmt: skip
         return Path(got).read_bytes()
 
-    def download(self, paths: Sequence[str], commit: str, folder: Path) -> None:
-        """Fetch files; those already there and whole stay.
+    def download(self, files: Mapping[str, RepoFile], commit: str, folder: Path) -> None:
+        """Fetch files and compare each with what the Hub lists; those already there and whole stay.
 
         `commit` has to be a full commit: for a name the client takes what lies in `folder` where the Hub does not
         answer, and says nothing.
+
+        Raises:
+            HubError: the size or hash of a file is another; such files are removed.
         """
-        pattern = [_literal(path) for path in paths]
         self.call(self.api.snapshot_download, repo_id=self.name, repo_type=self.kind, revision=commit, local_dir=folder,
-                  allow_patterns=pattern)  # fmt: skip
-
-
-def _literal(path: str) -> str:
-    """A path as a pattern that matches only it."""
-    return re.sub(r"([*?[])", r"[\1]", path)
+                  allow_patterns=[glob.escape(path) for path in files])  # fmt: skip
+        damaged = [path for path, file in files.items() if not same_content(folder / path, file)]
+        for path in damaged:
+            (folder / path).unlink(missing_ok=True)
+            (folder / ".cache" / "huggingface" / "download" / f"{path}.metadata").unlink(missing_ok=True)
+        if damaged:
+            raise HubError(
+                f"{self.name}: got {len(damaged)} damaged files ({', '.join(damaged[:3])}), expected what the Hub "
+                "lists: run the same command again, it fetches these anew"
+            )
 
 
 def _passing(error: BaseException) -> bool:
@@ -210,30 +215,30 @@ def open_repository(
 
     Raises:
         HubError: a bad name, offline mode, no token, or anything that goes wrong inside, in one line without tokens.
-        OutputError: full disk or a folder that cannot be written.
+        PlaySlotError: another error from inside, its message without tokens.
     """
-    from huggingface_hub import HfApi, constants, get_token, is_offline_mode
+    from huggingface_hub import HfApi, constants, errors, get_token, is_offline_mode
 
     token = checked_token(token) or checked_token(get_token())
-    redactor = Redactor(token)
-    name, endpoint = redactor.text(repo_id), redactor.text(constants.ENDPOINT)
+    name, endpoint = mask(repo_id, token), mask(constants.ENDPOINT, token)
     place = Place(name, endpoint, root, writing, token is not None, revision, WORDS[kind])
-    if not _NAME.fullmatch(repo_id):
-        raise bad_name(place)
-    if is_offline_mode():
-        raise offline(place)
-    if writing and token is None:
-        raise no_token(place)
-    with redactor.logs():
-        try:
+    try:
+        if not _NAME.fullmatch(repo_id):
+            raise errors.HFValidationError(repo_id)
+        if is_offline_mode():
+            raise errors.OfflineModeIsEnabled
+        if writing and token is None:
+            raise errors.LocalTokenNotFoundError
+        with masked_logs(token):
             yield Repository(place, HfApi(token=token or False, library_name="playslot_rl"), kind)
-        except PlaySlotError as error:
-            redactor.error(error)
-            raise
-        except Exception as error:
-            redactor.error(error)
-            known = translate(error, place)
-            if known is None:
-                raise
-            redactor.error(known)
-            raise known from error
+        return
+    except Exception as error:  # noqa: BLE001 - nothing that may hold a token goes on as it is
+        known = translate(error, place)
+        failure = type(known)(mask(str(known), token))
+        failure.add_note(mask("".join(traceback.format_exception(error)), token))
+    # A server may repeat the token it was sent, and the client's errors hold its answer: their masked text goes along
+    # as a note, they themselves do not.
+    try:
+        raise failure
+    finally:
+        failure.__context__ = None

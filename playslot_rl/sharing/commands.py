@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.sharing.source import Result
+from playslot_rl.storage.resume import flatten
 
 RUN: Final = "runs/again"
 WORLD: Final = "runs/world"
@@ -67,10 +68,10 @@ def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
     from playslot_rl.config.compose import compose
     from playslot_rl.training.fit import FREE_KEYS
 
-    preset = dict(_leaves(to_dict(compose([f"env={config.env.name}", f"preset={config.preset}"]))))
+    preset = flatten(to_dict(compose([f"env={config.env.name}", f"preset={config.preset}"])))
     return [
         f"{key}={_value(value)}"
-        for key, value in _leaves(to_dict(config))
+        for key, value in flatten(to_dict(config)).items()
         if any(key.startswith(f"{group}.") for group in groups)
         and key.rpartition(".")[2] not in FREE_KEYS
         and (key not in preset or preset[key] != value)
@@ -79,14 +80,6 @@ def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
 
 def _of(assignments: list[str], *groups: str) -> list[str]:
     return [text for text in assignments if text.startswith(tuple(f"{group}." for group in groups))]
-
-
-def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def _value(value: Any) -> str:

@@ -22,11 +22,12 @@ WEIGHTS: Final = "model.safetensors"
 LICENCE: Final = "apache-2.0"
 TAGS: Final = ("robotics", "lerobot", TYPE)
 
-_OURS = ("env", "model", "resize", "fingerprint", "source")
+OURS: Final = ("env", "model", "resize", "fingerprint", "source")
+"""Keys of `config.json` that LeRobot does not know."""
 
 
 @dataclass(frozen=True)
-class PolicyConfig:
+class SharedPolicyConfig:
     """A shared policy.
 
     Attributes:
@@ -72,7 +73,7 @@ class PolicyConfig:
         }
 
     @classmethod
-    def of(cls, camera: str, ours: dict[str, Any]) -> PolicyConfig:
+    def of(cls, camera: str, ours: dict[str, Any]) -> SharedPolicyConfig:
         """The config of `env`, `model`, `resize`, `fingerprint` and `source` as plain values.
 
         Raises:
@@ -109,7 +110,7 @@ def is_model_folder(folder: Path) -> bool:
     return isinstance(values, dict) and values.get("type") == TYPE
 
 
-def read_config(folder: Path) -> PolicyConfig:
+def read_config(folder: Path) -> SharedPolicyConfig:
     """Read `config.json` of a model folder.
 
     Raises:
@@ -126,7 +127,7 @@ def read_config(folder: Path) -> PolicyConfig:
     if kind != TYPE:
         raise CheckpointError(f"{path}: got a policy of type {kind!r}, expected {TYPE!r}: check the folder")
     try:
-        return PolicyConfig.of(camera_of(values["input_features"]), {key: values[key] for key in _OURS})
+        return SharedPolicyConfig.of(camera_of(values["input_features"]), {key: values[key] for key in OURS})
     except (KeyError, TypeError, ValueError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise CheckpointError(

@@ -11,9 +11,7 @@ The slot oracle of a run stays behind: it was trained on every real action, and 
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -21,9 +19,10 @@ from typing import TYPE_CHECKING, Any, Final
 import torch
 from torch import nn
 
-from playslot_rl.errors import CheckpointError, OutputError
-from playslot_rl.sharing.config import CONFIG, WEIGHTS, PolicyConfig, read_config
-from playslot_rl.storage.atomic import explain_write_errors, replace_dir, temporary_name, write_json, write_text
+from playslot_rl.errors import CheckpointError
+from playslot_rl.sharing.config import CONFIG, WEIGHTS, SharedPolicyConfig, read_config
+from playslot_rl.storage.atomic import write_json, write_text
+from playslot_rl.storage.folders import new_folder
 from playslot_rl.storage.tensors import (
     load_modules,
     load_tensors,
@@ -44,7 +43,7 @@ ROOT: Final = "agent"
 """First part of every tensor's name, as of a LeRobot policy whose attribute `agent` is the agent."""
 
 
-def build_agent(config: PolicyConfig) -> Agent:
+def build_agent(config: SharedPolicyConfig) -> Agent:
     """Networks of a config with fresh weights, without a slot oracle; the global random state stays as it was.
 
     Raises:
@@ -95,35 +94,14 @@ def load_weights(agent: nn.Module, path: Path, fingerprint: str) -> None:
         )
 
 
-@contextmanager
-def new_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder that becomes `folder` if all goes well, and is removed otherwise.
-
-    Raises:
-        OutputError: there is something at `folder`, the disk is full, or it cannot be written.
-    """
-    if folder.exists() or folder.is_symlink():
-        raise OutputError(f"out={folder}: got something that is there already, expected a new folder: choose another")
-    temporary = temporary_name(folder)
-    with explain_write_errors(folder):
-        for leftover in folder.parent.glob(f".{folder.name}.tmp-*"):  # of a process that was killed
-            shutil.rmtree(leftover)
-        temporary.mkdir(parents=True)
-        try:
-            yield temporary
-            replace_dir(temporary, folder)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-
-
 def save_pretrained(
-    agent: Agent, folder: Path, config: PolicyConfig, card: Callable[[PolicyConfig], str]
-) -> PolicyConfig:
+    agent: Agent, folder: Path, config: SharedPolicyConfig, card: Callable[[SharedPolicyConfig], str]
+) -> SharedPolicyConfig:
     """Write a model folder, whole or not at all.
 
     Args:
         agent: what to store, without its slot oracle.
-        folder: must not exist.
+        folder: must not exist, or be empty.
         config: its fingerprint is set here.
         card: gives the text of README.md for the config with its fingerprint.
 
@@ -131,7 +109,7 @@ def save_pretrained(
         The config with the fingerprint of the weights.
 
     Raises:
-        OutputError: `folder` exists, the disk is full, or it cannot be written.
+        OutputError: `folder` holds something, the disk is full, or it cannot be written.
     """
     with new_folder(folder) as temporary:
         config = replace(config, fingerprint=write_weights(agent, temporary / WEIGHTS))
@@ -142,7 +120,7 @@ def save_pretrained(
     return config
 
 
-def load_pretrained(folder: Path, device: torch.device | str = "cpu") -> tuple[Agent, PolicyConfig]:
+def load_pretrained(folder: Path, device: torch.device | str = "cpu") -> tuple[Agent, SharedPolicyConfig]:
     """Agent and config of a model folder; the agent in evaluation mode, without gradients for its weights.
 
     Raises:

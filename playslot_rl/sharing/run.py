@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.envs import ENVIRONMENTS, task_metadata
 from playslot_rl.errors import ConfigError
-from playslot_rl.sharing.card import CardInput, make_card
-from playslot_rl.sharing.config import PolicyConfig
+from playslot_rl.sharing.card import make_card
+from playslot_rl.sharing.config import SharedPolicyConfig
 from playslot_rl.sharing.folder import save_pretrained
-from playslot_rl.sharing.source import Result, read_results, read_source
+from playslot_rl.sharing.source import read_results, read_source
 from playslot_rl.training.runs import load_agent
 
-if TYPE_CHECKING:
-    from playslot_rl.world_model import Agent
 
-
-def export_run(run: Path, folder: Path, config: ExperimentConfig, source: dict[str, Any] | None = None) -> PolicyConfig:
+def export_run(
+    run: Path, folder: Path, config: ExperimentConfig, source: dict[str, Any] | None = None
+) -> SharedPolicyConfig:
     """Write the policy of a run to a new folder.
 
     Args:
@@ -37,44 +35,16 @@ def export_run(run: Path, folder: Path, config: ExperimentConfig, source: dict[s
     source = source or read_source(run)
     results = read_results(run, source)
     agent = load_agent(run)
-    policy = PolicyConfig(
+    policy = SharedPolicyConfig(
         env=agent.world_model.env,
         model=agent.world_model.config,
         camera=camera(config),
         resize=config.data.resize,
         source=source,
     )
-
-    def card(written: PolicyConfig) -> str:
-        return make_card(card_input(written, config, results, agent, folder.name))
-
-    return save_pretrained(agent, folder, policy, card)
-
-
-def card_input(
-    policy: PolicyConfig, config: ExperimentConfig | None, results: list[Result], agent: Agent, name: str
-) -> CardInput:
-    """What the card of a policy says."""
-    from playslot_rl.envs.lerobot import frames_a_second
-
-    simulated = policy.env.name in ENVIRONMENTS
-    described = task_metadata(policy.env) if simulated else {}
-    oracle = 0 if agent.oracle is None else sum(p.numel() for p in agent.oracle.parameters())
-    return CardInput(
-        name=name,
-        policy=policy,
-        experiment=config,
-        task=str(described.get("task", "")),
-        action=str(described.get("action", "")),
-        fps=frames_a_second(policy.env) if simulated else None,
-        results=results,
-        parameters=sum(p.numel() for p in agent.parameters()) - oracle,
+    return save_pretrained(
+        agent, folder, policy, lambda written: make_card(folder.name, written, agent, config, results)
     )
-
-
-def plain_card(policy: PolicyConfig, agent: Agent, name: str) -> str:
-    """The card of a policy whose run is not known."""
-    return make_card(card_input(policy, None, [], agent, name))
 
 
 def camera(config: ExperimentConfig) -> str:

@@ -65,10 +65,9 @@ def _faults(patches: dict[str, Any]) -> Iterator[None]:
 
 
 def _run(request: dict[str, Any]) -> dict[str, Any]:
+    from playslot_rl.hub.policy import pull_policy, push_policy
     from playslot_rl.hub.pull import pull
-    from playslot_rl.hub.pull_policy import pull_policy
     from playslot_rl.hub.push import push
-    from playslot_rl.hub.push_policy import push_policy
 
     arguments = dict(request["arguments"])
     for name in {"root", "folder"} & arguments.keys():

@@ -10,7 +10,7 @@ import pytest
 from fake_hub import READ_TOKEN, FakeHub, Fault
 
 from playslot_rl.sharing.card import MARK
-from playslot_rl.sharing.config import PolicyConfig
+from playslot_rl.sharing.config import SharedPolicyConfig
 from playslot_rl.sharing.folder import FILES, load_pretrained, save_pretrained
 from playslot_rl.testing import tiny_agent
 
@@ -29,7 +29,7 @@ def folder(tmp_path: Path) -> Path:
 
 def write(folder: Path, seed: int) -> Path:
     agent = tiny_agent(seed=seed)
-    config = PolicyConfig(env=agent.world_model.env, model=agent.world_model.config)
+    config = SharedPolicyConfig(env=agent.world_model.env, model=agent.world_model.config)
     save_pretrained(agent, folder, config, lambda written: f"{HEADER}{MARK}\nweights {written.fingerprint}\n")
     return folder
 

@@ -189,7 +189,7 @@ def test_a_card_written_by_hand_is_kept(pushed: Repository, client: Client, data
     mine = b"---\nlicense: mit\n---\nMy words.\n"
     pushed.commit("main", pushed.files() | {"README.md": mine})
     other = write_small(tmp_path / "other", seed=3)
-    assert push(client, other)["result"]["card"] == "kept"
+    assert push(client, other)["result"]["card_kept"]
     assert pushed.files()["README.md"] == mine
     (data / "README.md").write_bytes(mine + b"Local.\n")
     push(client, data)

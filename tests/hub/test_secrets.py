@@ -5,11 +5,11 @@ Every answer of every client in these tests is searched for tokens too (see conf
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import subprocess
 import sys
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,9 @@ from typing import Any
 import pytest
 from fake_hub import PLAIN_TOKEN, WRITE_TOKEN, FakeHub, Fault, Repository
 
-from playslot_rl.errors import HubError
-from playslot_rl.hub.secrets import MASK, Redactor, checked_token
+from playslot_rl.errors import DataError, HubError
+from playslot_rl.hub.secrets import MASK, checked_token, mask, masked_logs
+from playslot_rl.hub.session import open_repository
 
 pytestmark = pytest.mark.slow  # together they take a minute; make test-all runs them
 
@@ -64,28 +65,45 @@ def test_the_command_line_prints_no_token_even_with_a_traceback(hub: FakeHub, da
     assert "MARKER" not in done.stdout + done.stderr
 
 
-def test_errors_are_cleaned_with_their_causes_contexts_and_notes() -> None:
+@pytest.fixture
+def online(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This process may open a conversation; it asks nothing."""
+    monkeypatch.setattr("huggingface_hub.is_offline_mode", lambda: False)
+
+
+def fail(token: str) -> None:
+    """As the client may: the Hub's answer in texts, values, attributes, notes and causes."""
+    try:
+        raise ValueError(f"inner {token}", (token, token.encode()))
+    except ValueError as inner:
+        inner.add_note(f"note {token}")
+        outer = RuntimeError(f"outer {token}")
+        outer.detail = f"attribute {token}"  # type: ignore[attr-defined]
+        raise outer from inner
+
+
+@pytest.mark.usefixtures("online")
+def test_an_error_goes_on_as_one_line_with_its_masked_traceback_and_nothing_else(tmp_path: Path) -> None:
     token = "plain-MARKER"
+    with pytest.raises(HubError) as raised, open_repository("me/press", tmp_path, token=token, writing=True):
+        fail(token)
+    error = raised.value
+    assert str(error).startswith("me/press: got RuntimeError: outer <token> (unexpected")
+    assert (error.__cause__, error.__context__) == (None, None)
+    (note,) = error.__notes__
+    assert "MARKER" not in note
+    assert note.count(MASK) >= 5
+    assert "Traceback" in note
 
-    def fail() -> None:
-        try:
-            try:
-                raise ValueError(f"inner {token}", (token, b"bytes plain-MARKER"))
-            except ValueError as inner:
-                inner.add_note(f"note {token}")
-                raise KeyError(token) from inner
-        except KeyError:
-            outer = RuntimeError(f"outer {token}")
-            outer.detail = f"attribute {token}"  # type: ignore[attr-defined]
-            raise outer  # noqa: B904
 
-    with pytest.raises(RuntimeError) as raised:
-        fail()
-    Redactor(token).error(raised.value)
-    text = "".join(traceback.format_exception(raised.value)) + repr(vars(raised.value))
-    shown = [line for line in text.splitlines() if "MARKER" in line and "raise ValueError" not in line]
-    assert shown == []
-    assert text.count(MASK) >= 6
+@pytest.mark.usefixtures("online")
+def test_our_own_errors_keep_their_kind_and_lose_tokens(tmp_path: Path) -> None:
+    with (
+        pytest.raises(DataError) as raised,
+        open_repository("me/press", tmp_path, token="plain-MARKER", writing=False),
+    ):
+        raise DataError("got plain-MARKER, expected none")
+    assert str(raised.value) == "got <token>, expected none"
 
 
 @pytest.mark.parametrize(
@@ -98,21 +116,42 @@ def test_errors_are_cleaned_with_their_causes_contexts_and_notes() -> None:
     ],
 )
 def test_tokens_are_found_by_shape_header_address_and_value(text: str) -> None:
-    assert "MARKER" not in Redactor("the.MARKER").text(text)
+    assert "MARKER" not in mask(text, "the.MARKER")
 
 
 def test_ordinary_text_stays() -> None:
     text = "owner/press at https://hub.example/datasets/owner/press: hf_hub_download of hf auth login failed"
-    assert Redactor("the.MARKER").text(text) == text
+    assert mask(text, "the.MARKER") == text
 
 
 def test_log_records_are_cleaned_with_their_arguments(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.DEBUG), Redactor("the.MARKER").logs():
+    with caplog.at_level(logging.DEBUG), masked_logs("the.MARKER"):
         logging.getLogger("some.library").debug("headers %s", {"a": "the.MARKER"})
+        try:
+            raise ValueError("hf_MARKERabcdefghijklmnop")
+        except ValueError:
+            logging.getLogger("some.library").exception("failed")
     logging.getLogger("some.library").warning("after: %s", "untouched")
     assert "MARKER" not in caplog.text
     assert MASK in caplog.text
+    assert "ValueError: <token>" in caplog.text
     assert caplog.records[-1].args == ("untouched",)
+
+
+def test_what_the_clients_own_handler_prints_is_masked_and_the_records_are_left_alone() -> None:
+    logger, stream, seen = logging.getLogger("huggingface_hub.x"), io.StringIO(), []
+    handler = logging.StreamHandler(stream)
+    logging.getLogger("huggingface_hub").addHandler(handler)
+    logger.addFilter(lambda record: seen.append(record) or True)  # type: ignore[func-returns-value]
+    try:
+        with masked_logs("the.MARKER"):
+            logger.warning("503 of %s", "https://me:secret.MARKER@hub.example/x")
+        logger.warning("after %s", "the.MARKER")
+    finally:
+        logging.getLogger("huggingface_hub").removeHandler(handler)
+        logger.filters.clear()
+    assert stream.getvalue() == "503 of https://<token>@hub.example/x\nafter the.MARKER\n"
+    assert [record.args for record in seen] == [("https://me:secret.MARKER@hub.example/x",), ("the.MARKER",)]
 
 
 @pytest.mark.parametrize("token", ["with space MARKER", "line\nbreak", "quote'", "café"])

@@ -21,7 +21,7 @@ from playslot_rl.envs import task_env
 # The evaluation's imports first: MuJoCo has to find its GL backend before LeRobot imports anything that imports it.
 from playslot_rl.envs.lerobot import LeRobotTask, frames_a_second
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.sharing.config import PolicyConfig
+from playslot_rl.sharing.config import SharedPolicyConfig
 from playslot_rl.sharing.folder import FILES, save_pretrained
 from playslot_rl.testing import tiny_agent
 
@@ -32,7 +32,7 @@ SEED = 1_000_000_000
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An untrained agent's model folder."""
     agent = tiny_agent()
-    config = PolicyConfig(env=agent.world_model.env, model=agent.world_model.config, source={"demos": 3})
+    config = SharedPolicyConfig(env=agent.world_model.env, model=agent.world_model.config, source={"demos": 3})
     save_pretrained(agent, tmp_path_factory.mktemp("shared") / "policy", config, lambda _: "card\n")
     return next(tmp_path_factory.getbasetemp().glob("shared*/policy"))
 

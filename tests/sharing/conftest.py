@@ -10,7 +10,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 
-from playslot_rl.sharing.config import PolicyConfig
+from playslot_rl.sharing.config import SharedPolicyConfig
 from playslot_rl.sharing.folder import save_pretrained
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.testing import tiny_agent
@@ -26,13 +26,13 @@ def agent() -> Agent:
 
 
 @pytest.fixture(scope="session")
-def config(agent: Agent) -> PolicyConfig:
+def config(agent: Agent) -> SharedPolicyConfig:
     """Of that agent."""
-    return PolicyConfig(env=agent.world_model.env, model=agent.world_model.config, source={"demos": 3})
+    return SharedPolicyConfig(env=agent.world_model.env, model=agent.world_model.config, source={"demos": 3})
 
 
 @pytest.fixture
-def folder(agent: Agent, config: PolicyConfig, tmp_path: Path) -> Path:
+def folder(agent: Agent, config: SharedPolicyConfig, tmp_path: Path) -> Path:
     """That agent's model folder, to break."""
     save_pretrained(agent, tmp_path / "policy", config, lambda _: "card\n")
     return tmp_path / "policy"

@@ -8,18 +8,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 from playslot_rl.errors import CheckpointError, OutputError
-from playslot_rl.sharing.config import PolicyConfig, is_model_folder, read_config
+from playslot_rl.sharing.config import SharedPolicyConfig, is_model_folder, read_config
 from playslot_rl.sharing.folder import FILES, load_pretrained, save_pretrained
 from playslot_rl.world_model import Agent
 
+OLD = Path(__file__).parents[1] / "assets" / "policy_of_0_1"
+
 
 def test_a_saved_policy_comes_back_with_equal_weights_and_config(
-    agent: Agent, config: PolicyConfig, folder: Path
+    agent: Agent, config: SharedPolicyConfig, folder: Path
 ) -> None:
     before = torch.random.get_rng_state()
     loaded, read = load_pretrained(folder)
@@ -45,7 +48,7 @@ def test_a_folder_holds_what_lerobot_looks_for_and_no_oracle(folder: Path) -> No
     assert values["output_features"] == {"action": {"type": "ACTION", "shape": [4]}}
 
 
-def test_saving_twice_gives_equal_files(agent: Agent, config: PolicyConfig, folder: Path, tmp_path: Path) -> None:
+def test_saving_twice_gives_equal_files(agent: Agent, config: SharedPolicyConfig, folder: Path, tmp_path: Path) -> None:
     save_pretrained(agent, tmp_path / "again", config, lambda _: "card\n")
     assert all((folder / name).read_bytes() == (tmp_path / "again" / name).read_bytes() for name in FILES)
 
@@ -119,22 +122,40 @@ def test_a_damaged_folder_is_refused_in_one_line(folder: Path, name: str) -> Non
     assert "expected" in str(raised.value)
 
 
+def test_a_policy_exported_by_the_first_version_loads_and_acts_as_then(tmp_path: Path) -> None:
+    """Written, and the actions noted, by commit b5f0a66 (version 0.1.0)."""
+    import playslot_rl
+
+    assert is_model_folder(OLD)
+    assert read_config(OLD).source == {"demos": 3}
+    assert read_config(OLD).resize
+    model = playslot_rl.PlaySlot.from_pretrained(OLD, device="cpu")
+    frame = (np.indices((64, 64)).sum(0)[..., None] * np.array([1, 2, 3]) % 256).astype(np.uint8)
+    actions = np.stack([model.act(frame) for _ in range(2)])
+    expected = [[0.18600053, 0.04836159, 0.05992724, 0.07526358], [0.18471639, 0.04473947, 0.06127634, 0.07174256]]
+    np.testing.assert_allclose(actions, expected, atol=1e-5)
+    model.save_pretrained(tmp_path / "again")
+    weights = "model.safetensors"
+    assert (tmp_path / "again" / weights).read_bytes() == (OLD / weights).read_bytes()
+
+
 def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="no such folder"):
         load_pretrained(tmp_path / "none")
 
 
-def test_what_is_there_already_is_never_replaced(agent: Agent, config: PolicyConfig, tmp_path: Path) -> None:
+def test_what_is_there_already_is_never_replaced(agent: Agent, config: SharedPolicyConfig, tmp_path: Path) -> None:
     (tmp_path / "policy").mkdir()
+    (tmp_path / "policy" / "mine").write_text("x")
     with pytest.raises(OutputError, match="there already"):
         save_pretrained(agent, tmp_path / "policy", config, lambda _: "")
-    assert list((tmp_path / "policy").iterdir()) == []
+    assert [(path.name, path.read_text()) for path in (tmp_path / "policy").iterdir()] == [("mine", "x")]
 
 
 def test_a_failed_save_leaves_nothing_and_the_next_removes_what_a_kill_left(
-    agent: Agent, config: PolicyConfig, tmp_path: Path
+    agent: Agent, config: SharedPolicyConfig, tmp_path: Path
 ) -> None:
-    def fail(_: PolicyConfig) -> str:
+    def fail(_: SharedPolicyConfig) -> str:
         raise RuntimeError("in the card")
 
     with pytest.raises(RuntimeError, match="in the card"):

@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 
 from playslot_rl.config import EnvConfig, ModelConfig, to_dict
-from playslot_rl.sharing.config import LICENCE, TYPE, PolicyConfig, camera_of
+from playslot_rl.sharing.config import LICENCE, OURS, TYPE, SharedPolicyConfig, camera_of
 
 NOT_TRAINED_HERE = (
     "playslot: got a call to train, expected one to act: its three stages are trained from videos by `playslot "
@@ -50,12 +50,11 @@ class PlaySlotConfig(PreTrainedConfig):
         self.output_features = self.output_features or _features(outputs)
         self.validate_features()
 
-    def policy_config(self) -> PolicyConfig:
+    def policy_config(self) -> SharedPolicyConfig:
         """The same values as playslot_rl's own dataclass."""
         inputs = {name: {"type": feature.type.value} for name, feature in (self.input_features or {}).items()}
-        camera = camera_of(inputs) if inputs else PolicyConfig().camera
-        ours = ("env", "model", "resize", "fingerprint", "source")
-        return PolicyConfig.of(camera, {name: getattr(self, name) for name in ours})
+        camera = camera_of(inputs) if inputs else SharedPolicyConfig().camera
+        return SharedPolicyConfig.of(camera, {name: getattr(self, name) for name in OURS})
 
     def validate_features(self) -> None:
         """Check that frames and actions have the sizes of `env`.
@@ -73,18 +72,10 @@ class PlaySlotConfig(PreTrainedConfig):
 
     @property
     def observation_delta_indices(self) -> None:
-        """The present frame only: the past is in SAVi's state."""
+        """The present frame and one action a step: the past is in SAVi's state. Rewards are not used."""
         return
 
-    @property
-    def action_delta_indices(self) -> None:
-        """One action a step."""
-        return
-
-    @property
-    def reward_delta_indices(self) -> None:
-        """Rewards are not used."""
-        return
+    action_delta_indices = reward_delta_indices = observation_delta_indices
 
     def get_optimizer_preset(self) -> NoReturn:
         """Refuse `lerobot-train` before it reads any data.
@@ -94,13 +85,7 @@ class PlaySlotConfig(PreTrainedConfig):
         """
         raise NotImplementedError(NOT_TRAINED_HERE)
 
-    def get_scheduler_preset(self) -> NoReturn:
-        """Refuse `lerobot-train`.
-
-        Raises:
-            NotImplementedError: always.
-        """
-        raise NotImplementedError(NOT_TRAINED_HERE)
+    get_scheduler_preset = get_optimizer_preset
 
 
 def _features(plain: dict[str, dict[str, Any]]) -> dict[str, PolicyFeature]:

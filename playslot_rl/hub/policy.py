@@ -1,0 +1,99 @@
+"""Policies to and from the Hub: loaded before they go, sent in one commit, and every file compared on both ways."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from playslot_rl.data.cache import build_once, cache_folder
+from playslot_rl.errors import CheckpointError
+from playslot_rl.hub.sending import MAIN, Pushed, send
+from playslot_rl.hub.session import open_repository
+from playslot_rl.sharing.card import MARK
+from playslot_rl.sharing.config import CONFIG, WEIGHTS
+from playslot_rl.sharing.folder import FILES, load_pretrained
+
+
+@dataclass(frozen=True)
+class PolicyPushResult(Pushed):
+    """What a push of a policy did.
+
+    Attributes:
+        fingerprint: of the weights.
+    """
+
+    fingerprint: str
+
+    def lines(self) -> list[str]:
+        """For people."""
+        return self.report(f"{self.size / 1e6:.1f} MB, weights {self.fingerprint}")
+
+
+def push_policy(
+    folder: Path,
+    repo_id: str,
+    *,
+    private: bool,
+    branch: str | None = None,
+    tag: str | None = None,
+    token: str | None = None,
+) -> PolicyPushResult:
+    """Upload a policy. An interrupted push changes nothing there; the same command carries on.
+
+    Other files of the repository, such as videos or results of others, stay as they are.
+
+    Args:
+        folder: made by `playslot export`; nothing is written into it.
+        repo_id: `user/name`; made if it is not there.
+        private: make it private; refused where it is public.
+        branch: made from main if it is not there; None means main.
+        tag: a name for the commit; never moved.
+        token: None takes HF_TOKEN or what `hf auth login` stored.
+
+    Raises:
+        CheckpointError: the folder is not whole, or its files do not belong together.
+        HubError: bad names, no or bad token, offline, no network, an error of the Hub, or a tag that is taken.
+    """
+    _, config = load_pretrained(folder)
+    missing = [name for name in FILES if not (folder / name).is_file()]
+    if missing:
+        raise CheckpointError(f"{folder}: {missing[0]} is missing, expected a whole policy: export it again")
+    files: dict[str, Path | bytes] = {name: folder / name for name in FILES}
+    message = f"PlaySlot policy, weights {config.fingerprint}"
+    target = branch or MAIN
+    with open_repository(repo_id, folder, token=token, writing=True, revision=target, kind="model") as hub:
+        sent = send(hub, folder, files, mark=MARK, message=message, private=private, branch=target, tag=tag)
+    return PolicyPushResult(**vars(sent), fingerprint=config.fingerprint)
+
+
+def pull_policy(repo_id: str, revision: str = "", cache: str | Path = "", token: str | None = None) -> Path:
+    """Download a policy, unless that commit of it is in the cache.
+
+    Args:
+        repo_id: `user/name`.
+        revision: branch, tag or commit; empty means main.
+        cache: folder of the caches; empty means `$PLAYSLOT_CACHE`, or else `~/.cache/playslot_rl`.
+        token: None takes HF_TOKEN or what `hf auth login` stored; not needed for public models.
+
+    Returns:
+        The model folder.
+
+    Raises:
+        CheckpointError: the repository holds no policy.
+        HubError: no such repository or revision, a bad token, offline, no network, damaged files, an error of the Hub.
+        OutputError: full disk.
+    """
+    home = cache_folder(cache) / "policies" / repo_id.replace("/", "--")
+    with open_repository(repo_id, home, token=token, writing=False, revision=revision, kind="model") as hub:
+        commit = hub.commit_of(revision or MAIN)
+
+        def fetch(folder: Path) -> None:
+            wanted = {path: file for path, file in hub.tree(commit).items() if path in FILES}
+            for name in (CONFIG, WEIGHTS):
+                if name not in wanted:
+                    raise CheckpointError(f"{hub.name}: got no {name}, expected a PlaySlot policy: check the name")
+            hub.download(wanted, commit, folder)
+            shutil.rmtree(folder / ".cache", ignore_errors=True)
+
+        return build_once(home / commit, fetch)
