@@ -31,34 +31,33 @@ FirstSlots = Callable[[int], Tensor]
 class ImaginationEnv(ModelBasedEnvBase):
     """cOCVP as a TorchRL environment whose action is LATENT_ACTION and whose observation is SLOTS.
 
-        A reset takes the first slots from SLOTS (..., N, D) in the tensordict it gets, else parses PIXELS (..., 3, H, W) in
-        it, else asks `first_slots`, else parses a mid-grey frame (which is there so that the specs can be checked, not to
-        be learned from). The reward is zero: PlaySlot has no reward model.
+    A reset takes the first slots from SLOTS (..., N, D) in the tensordict it gets, else parses PIXELS (..., 3, H, W) in
+    it, else asks `first_slots`, else parses a mid-grey frame (which is there so that the specs can be checked, not to
+    be learned from). The reward is zero: PlaySlot has no reward model.
 
-        The histories are part of the state, so a rollout stores them at every step: `rollout.select(keys.SLOTS,
-        keys.LATENT_ACTION, ("next", keys.SLOTS))` keeps what is wanted.
+    The histories are part of the state, so a rollout stores them at every step: `rollout.select(keys.SLOTS,
+    keys.LATENT_ACTION, ("next", keys.SLOTS))` keeps what is wanted.
 
-        Args:
-            world_model: put into evaluation mode; its device is the environment's.
-            batch_size: episodes imagined at once; tensordicts of other batch sizes are taken too.
-            first_slots: draws first slots, e.g. from a data set.
-            horizon: steps after which an episode is truncated; 0 never does.
-            differentiable: keep the graph, for learning through imagination.
-            generator: of sampled initial slots where a reset parses frames.
+    Args:
+        world_model: put into evaluation mode; its device is the environment's.
+        batch_size: episodes imagined at once; tensordicts of other batch sizes are taken too.
+        first_slots: draws first slots, e.g. from a data set.
+        horizon: steps after which an episode is truncated; 0 never does.
+        differentiable: keep the graph, for learning through imagination.
+        generator: of sampled initial slots where a reset parses frames.
 
-        Examples:
-            >>> import torch
-            >>> from tensordict import TensorDict
-            >>> from playslot_rl.testing import tiny_config
-            >>> from playslot_rl.frames import normalise
-    from playslot_rl.world_model import Agent, WorldModel, latent_policy_module
-            >>> config = tiny_config()
-            >>> agent = Agent.untrained(WorldModel(config.model, config.env)).eval()
-            >>> env = ImaginationEnv(agent.world_model, batch_size=[2])
-            >>> start = env.reset(TensorDict({"pixels": torch.rand(2, 3, 64, 64)}, [2]))
-            >>> rollout = env.rollout(5, latent_policy_module(agent.policy), tensordict=start, auto_reset=False)
-            >>> rollout["next", "slots"].shape, rollout["latent_action"].shape
-            (torch.Size([2, 5, 4, 32]), torch.Size([2, 5, 8]))
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from playslot_rl.testing import tiny_config
+        >>> from playslot_rl.world_model import Agent, WorldModel, latent_policy_module
+        >>> config = tiny_config()
+        >>> agent = Agent.untrained(WorldModel(config.model, config.env)).eval()
+        >>> env = ImaginationEnv(agent.world_model, batch_size=[2])
+        >>> start = env.reset(TensorDict({"pixels": torch.rand(2, 3, 64, 64)}, [2]))
+        >>> rollout = env.rollout(5, latent_policy_module(agent.policy), tensordict=start, auto_reset=False)
+        >>> rollout["next", "slots"].shape, rollout["latent_action"].shape
+        (torch.Size([2, 5, 4, 32]), torch.Size([2, 5, 8]))
     """
 
     def __init__(
