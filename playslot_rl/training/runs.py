@@ -14,7 +14,6 @@ to RUN. A child names its parents by the fingerprints of their weights and refus
 from __future__ import annotations
 
 import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,16 +23,16 @@ from torch import nn
 
 from playslot_rl.config import EnvConfig, ModelConfig, from_dict
 from playslot_rl.errors import CheckpointError
-from playslot_rl.storage.atomic import explain_write_errors, replace_dir, temporary_name, write_bytes, write_json
+from playslot_rl.storage.atomic import write_bytes, write_json
 from playslot_rl.storage.checkpoints import (
     StageCheckpoint,
     checkpoint_folder,
     load_weights,
     read_json,
     read_stage,
-    remove_leftovers,
     require_parents,
 )
+from playslot_rl.storage.folders import new_folder
 
 if TYPE_CHECKING:
     from playslot_rl.modules.savi import SAVi
@@ -92,16 +91,9 @@ def adopt_stage(checkpoint: StageCheckpoint, run: Path) -> None:
     require_adoptable(checkpoint, run)
     if target.exists():
         return
-    temporary = temporary_name(target)
-    with explain_write_errors(target):
-        remove_leftovers(target)
-        try:
-            temporary.mkdir(parents=True)
-            for file in sorted(checkpoint.path.iterdir()):
-                write_bytes(temporary / file.name, file.read_bytes())
-            replace_dir(temporary, target)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+    with new_folder(target, replace=True) as temporary:
+        for file in sorted(checkpoint.path.iterdir()):
+            write_bytes(temporary / file.name, file.read_bytes())
 
 
 def require_adoptable(checkpoint: StageCheckpoint, run: Path) -> None:
