@@ -15,7 +15,7 @@ from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeding import StepGenerators
 from playslot_rl.testing import tiny_config
-from playslot_rl.training.fit import fit
+from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.stage_behaviour import CloneStage, oracle_stage
 from playslot_rl.training.stage_regression import RegressionStage, TensorInputs, unexplained
 
@@ -32,7 +32,7 @@ def test_a_linear_map_is_found(tmp_path: Path) -> None:
     y = x @ torch.randn(3, 2)
     network = nn.Linear(3, 2)
     config = StageConfig(steps=200, batch_size=16, optim=OptimConfig(lr=3e-2))
-    result = fit(_stage(network, x, y), config, tmp_path, name="toy", seed=0)
+    result = fit(Part("toy", _stage(network, x, y), config), tmp_path, seed=0)
     assert result.metrics["unexplained"] < 0.01
 
 
