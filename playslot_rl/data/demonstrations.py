@@ -90,6 +90,50 @@ def first_demonstrations(source: EpisodeFrames, demos: int | None) -> EpisodeFra
     )
 
 
+def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames:
+    """Episodes `first` to `last` (exclusive) as a data set of their own, rows counted anew."""
+    begin, end = int(source.starts[first]), int(source.starts[last - 1] + source.lengths[last - 1])
+    return replace(
+        source,
+        frames=source.frames[begin:end],
+        starts=source.starts[first:last] - begin,
+        lengths=source.lengths[first:last],
+        actions=None if source.actions is None else source.actions[begin:end],
+        success=None if source.success is None else source.success[begin:end],
+        seeds=None if source.seeds is None else source.seeds[first:last],
+        fingerprint=hashlib.sha256(f"{source.fingerprint}/episodes {first} {last}".encode()).hexdigest()[:16],
+    )
+
+
+@dataclass(frozen=True)
+class DemonstrationSplit:
+    """Which demonstrations of a data set are trained on, and which only measure.
+
+    Attributes:
+        trained: the first ones.
+        parsed: all but the held-out ones; SAVi parses them at once, so that one cache serves every number of them.
+        held_out: the last ones; None where nothing is beyond those that are trained on.
+    """
+
+    trained: EpisodeFrames
+    parsed: EpisodeFrames
+    held_out: EpisodeFrames | None
+
+
+def split_demonstrations(source: EpisodeFrames, demos: int | None, held_out: int) -> DemonstrationSplit:
+    """Train on the first `demos` episodes (None: on all), and hold out at most `held_out` of the last ones beyond them.
+
+    Raises:
+        DataError: there are fewer episodes than `demos`.
+    """
+    trained = first_demonstrations(source, demos)
+    rest = source.episodes - min(held_out, source.episodes - trained.episodes)
+    if not (source.lengths[rest:] >= 2).any():
+        return DemonstrationSplit(trained, source, None)
+    last = episode_range(source, rest, source.episodes)
+    return DemonstrationSplit(trained, first_demonstrations(source, rest), last)
+
+
 @dataclass(frozen=True)
 class Transitions:
     """Row numbers of the transitions of some episodes, in order.

@@ -14,6 +14,7 @@ to RUN. A child names its parents by the fingerprints of their weights and refus
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -226,6 +227,16 @@ def load_savi(run: Path | str, device: torch.device | str = "cpu") -> SAVi:
     return savi
 
 
+def world_model_config(stages: Mapping[str, StageCheckpoint]) -> tuple[ModelConfig, EnvConfig]:
+    """The model and environment config of a world model's `slots` and `dynamics`.
+
+    Raises:
+        CheckpointError: a config.json is not one of this version.
+    """
+    model, env = stage_model(stages["dynamics"])
+    return replace(model, savi=stage_model(stages["slots"])[0].savi), env
+
+
 def load_world_model(run: Path | str, device: torch.device | str = "cpu") -> WorldModel:
     """World model of a run or the shipped one (`pretrained`), in eval mode, without gradients for its weights.
 
@@ -235,10 +246,8 @@ def load_world_model(run: Path | str, device: torch.device | str = "cpu") -> Wor
     from playslot_rl.world_model import WorldModel
 
     stages = world_model_checkpoints(run)
-    model, env = stage_model(stages["dynamics"])
-    model = replace(model, savi=stage_model(stages["slots"])[0].savi)
     with torch.random.fork_rng(devices=[]):
-        world = WorldModel(model, env)
+        world = WorldModel(*world_model_config(stages))
     load_weights(stages["slots"], {"savi": world.savi})
     load_weights(stages["dynamics"], {"inverse_dynamics": world.inverse_dynamics, "predictor": world.predictor})
     freeze_on(world, device)

@@ -122,8 +122,7 @@ class _Run:
         self.name, self.title, self.device, self.prior_steps = name, title, device, prior_steps
         self.replay = Replay(online, config.env.max_steps + 1)
         own = {name: fixed_keys(to_dict(online)), "seed": config.seed}
-        env = {"env": to_dict(config.env), "render": to_dict(config.render)}
-        self.checkpoints = OnlineCheckpoints(folder, {**own, **env, **identity})
+        self.checkpoints = OnlineCheckpoints(folder, {**own, **identity})
         cure = f"lower its learning rate (baselines.{name}.*)"
         self.watch = Watch(name, folder, self.checkpoints, cure)
         self.state = self.checkpoints.resume_online(learner.modules, learner.optimizers, self.replay)
