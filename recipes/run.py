@@ -124,9 +124,8 @@ def open_demonstrations(config: ExperimentConfig, what: str) -> DemonstrationSpl
     """
     from playslot_rl.data.demonstrations import split_demonstrations
 
-    videos, kept = open_videos(config, demo_root(config), what), config.data.held_out
-    demos = max(1, videos.episodes - kept) if kept and config.demos is None else config.demos
-    return split_demonstrations(videos, demos, max(kept, config.collect.validation_episodes))
+    videos = open_videos(config, demo_root(config), what)
+    return split_demonstrations(videos, config.demos, config.data.held_out, config.collect.validation_episodes)
 
 
 def demonstration_views(

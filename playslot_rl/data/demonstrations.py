@@ -111,7 +111,7 @@ class DemonstrationSplit:
 
     Attributes:
         trained: the first ones.
-        parsed: all but the held-out ones; SAVi parses them at once, so that one cache serves every number of them.
+        parsed: what SAVi parses at once, so that one cache serves every number of them.
         held_out: the last ones; None where nothing is beyond those that are trained on.
     """
 
@@ -120,18 +120,24 @@ class DemonstrationSplit:
     held_out: EpisodeFrames | None
 
 
-def split_demonstrations(source: EpisodeFrames, demos: int | None, held_out: int) -> DemonstrationSplit:
-    """Train on the first `demos` episodes (None: on all), and hold out at most `held_out` of the last ones beyond them.
+def split_demonstrations(source: EpisodeFrames, demos: int | None, kept: int, measured: int) -> DemonstrationSplit:
+    """Train on the first demonstrations, and measure on the last ones.
+
+    Args:
+        source: the data set.
+        demos: how many are trained on; None for all that are not kept.
+        kept: the last ones, which were recorded to measure (`data.held_out`).
+        measured: at most so many of the last ones beyond those that are trained on measure, if more than `kept`.
 
     Raises:
         DataError: there are fewer episodes than `demos`.
     """
-    trained = first_demonstrations(source, demos)
-    rest = source.episodes - min(held_out, source.episodes - trained.episodes)
-    if not (source.lengths[rest:] >= 2).any():
-        return DemonstrationSplit(trained, source, None)
-    last = episode_range(source, rest, source.episodes)
-    return DemonstrationSplit(trained, first_demonstrations(source, rest), last)
+    free = max(1, source.episodes - kept)
+    trained = first_demonstrations(source, free if demos is None else demos)
+    parsed = first_demonstrations(source, max(free, trained.episodes))
+    rest = source.episodes - min(max(kept, measured), source.episodes - trained.episodes)
+    usable = bool((source.lengths[rest:] >= 2).any())
+    return DemonstrationSplit(trained, parsed, episode_range(source, rest, source.episodes) if usable else None)
 
 
 @dataclass(frozen=True)

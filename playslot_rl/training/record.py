@@ -91,7 +91,7 @@ class StageRecord:
         require_parents(done, self.parents)
         own = (self.name,) if self.settings is None else self.settings
         require_config(done, fixed_keys(self._of_stored(*self.counts, *own)))
-        facts = [("seed", self.config.seed, done.meta.get("seed", self.config.seed))]
+        facts: list[tuple[str, object, object]] = [("seed", self.config.seed, done.meta.get("seed", self.config.seed))]
         if self.open_data is not None and self.named:
             facts.append(("data", self.data.fingerprint, next(iter(done.meta["data"].values()), "none")))
         for name, got, old in facts:

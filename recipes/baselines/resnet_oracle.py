@@ -68,7 +68,9 @@ def _training(config: ExperimentConfig, record: StageRecord, opened: Callable[[]
 
     own, device, split = config.baselines.resnet_oracle, open_device(config), opened()
     inputs, actions = demonstrated_frames(split.trained, config.env.action_dim, device, own.shift)
-    held_out = split.held_out and demonstrated_frames(split.held_out, config.env.action_dim, device)
+    held_out = None
+    if split.held_out is not None:
+        held_out = demonstrated_frames(split.held_out, config.env.action_dim, device)
     with global_seed(config.seed, 0, NAME):
         policy = ResNetPolicy(config.model.policy, config.env.image_size, config.env.action_dim)
     pretraining = load_pretrained(policy, own.weights)
