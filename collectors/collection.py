@@ -53,6 +53,15 @@ def is_complete(out: Path, spec: CollectionSpec) -> bool:
     return True
 
 
+def begun_episodes(out: Path) -> int | None:
+    """Episodes of the collection that `out` holds, or that was begun there; None where there is none."""
+    for record in (out / META_NAME, journal_path(out.absolute()) / "collection.json"):
+        if record.is_file():
+            spec = read_spec(record).get("spec")
+            return int(spec["episodes"]) if isinstance(spec, dict) and "episodes" in spec else None
+    return None
+
+
 @contextlib.contextmanager
 def progress(name: str, done: int, total: int, enabled: bool) -> Iterator[Callable[[], None]]:
     """Show episodes, rate and remaining time; gives a function to call after each episode."""

@@ -105,8 +105,10 @@ def _demos(config: ExperimentConfig, out: Path) -> DataConfig:
     """Enough demonstrations for the largest number; at least the preset's, so that the first ones stay the same."""
     from playslot_rl.recipes.pipeline import collect_demos
 
+    most, more = max(config.collect.expert_episodes, *config.compare.demos), config.collect.validation_episodes
     there = _episodes(out / RECORDED) if not config.data.demos and _recorded(out) else 0
-    most = there or max(config.collect.expert_episodes, *config.compare.demos)
+    if there not in (0, most + more):
+        most = there  # recorded for other numbers, or without ones to hold out
     return collect_demos(replace(config, collect=replace(config.collect, expert_episodes=most)), out)
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from pathlib import Path
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.recipes import evaluate, train_policy
+from playslot_rl.recipes.pipeline import collect_demos
 from playslot_rl.recipes.run import open_run, parent_run, store_config
 
 FIRST_SEED = 7
@@ -16,7 +16,6 @@ FIRST_SEED = 7
 
 def main(config: ExperimentConfig) -> None:
     """Collect demonstrations, train policy and decoder, evaluate under both protocols, write the report."""
-    from playslot_rl.collectors import collect
     from playslot_rl.envs import gym_id
     from playslot_rl.training.runs import world_model_checkpoints
 
@@ -28,11 +27,7 @@ def main(config: ExperimentConfig) -> None:
     world_model_checkpoints(parent_run(config, folder))  # a missing one is refused before anything is recorded
     if not (folder / "config.json").is_file():
         store_config(config, folder)
-    demos = Path(config.data.demos or folder / "data" / "expert")
-    if not config.data.demos:
-        want = config.collect
-        collect(config, "expert", want.expert_episodes, want.expert_steps, demos, config.seed, config.workers)
-    config = replace(config, data=replace(config.data, demos=str(demos)))
+    config = replace(config, data=collect_demos(config, folder))
     train_policy.main(config)
     evaluate.main_if_needed(replace(config, run=name, out=""))
     print(f"demo: {time.monotonic() - began:.0f} s")

@@ -51,13 +51,21 @@ def _collect(config: ExperimentConfig, folder: Path) -> DataConfig:
 
 
 def collect_demos(config: ExperimentConfig, folder: Path) -> DataConfig:
-    """Record demonstrations into `FOLDER/data/expert` unless `data.demos` names some; returns where the data are."""
-    from playslot_rl.collectors import collect
+    """Record demonstrations into `FOLDER/data/expert` unless `data.demos` names some; returns where the data are.
 
-    demos, want = config.data.demos or str(folder / "data" / "expert"), config.collect
-    if not config.data.demos:
-        collect(config, "expert", want.expert_episodes, want.expert_steps, Path(demos), config.seed, config.workers)
-    return replace(config.data, demos=demos)
+    `collect.validation_episodes` more than `collect.expert_episodes` are recorded and held out; a data set begun
+    without them stays as it is.
+    """
+    from playslot_rl.collectors import collect
+    from playslot_rl.collectors.collection import begun_episodes
+
+    if config.data.demos:
+        return config.data
+    demos, want = folder / "data" / "expert", config.collect
+    held_out = 0 if begun_episodes(demos) == want.expert_episodes else want.validation_episodes
+    episodes = want.expert_episodes + held_out
+    collect(config, "expert", episodes, want.expert_steps, demos, config.seed, config.workers)
+    return replace(config.data, demos=str(demos), held_out=held_out)
 
 
 def collect_videos(config: ExperimentConfig, folder: Path) -> DataConfig:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from playslot_rl.config import ExperimentConfig, StageConfig, to_dict
+from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import SHIPPED, shipped
 from playslot_rl.errors import ConfigError, DataError, OutputError
 
@@ -16,8 +15,11 @@ if TYPE_CHECKING:
     import numpy.typing as npt
     import torch
 
+    from playslot_rl.data.demonstrations import DemonstrationSplit
     from playslot_rl.data.source import EpisodeFrames
     from playslot_rl.modules.savi import SAVi
+
+    ParsedVideos = tuple[EpisodeFrames, npt.NDArray[np.float32]]
 
 OURS = ("slots", "dynamics", "policy", "world_model.json")  # known names of a run folder without config.json
 
@@ -86,18 +88,27 @@ def open_device(config: ExperimentConfig) -> torch.device:
 
 
 def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrames:
-    """Open the data sets of a stage.
+    """Open the data sets of a stage; of `data.demos` among several, not the demonstrations that are held out.
 
     Raises:
         DataError: none is named, or one cannot be read.
     """
-    from playslot_rl.data.source import open_sources
+    from playslot_rl.data.demonstrations import episode_range
+    from playslot_rl.data.source import concatenate, open_sources
+
+    def opened(root: str) -> EpisodeFrames:
+        size, resize = config.env.image_size, config.data.resize
+        return open_sources(root, config.data.camera, config.data.cache, image_size=size, resize=resize)
 
     if not roots:
         raise DataError(f"{what}: got no data set, expected data.root=DIR; record one by `playslot collect`")
-    return open_sources(
-        roots, config.data.camera, config.data.cache, image_size=config.env.image_size, resize=config.data.resize
-    )
+    names = [name.strip() for name in roots.split(",")]
+    if not config.data.held_out or config.data.demos not in names or len(names) == 1:
+        return opened(roots)
+    parts = {name: opened(name) for name in names}
+    demos = parts[config.data.demos]
+    parts[config.data.demos] = episode_range(demos, 0, demos.episodes - config.data.held_out)
+    return concatenate([parts[name] for name in names])
 
 
 def demo_root(config: ExperimentConfig) -> str:
@@ -105,77 +116,47 @@ def demo_root(config: ExperimentConfig) -> str:
     return config.data.demos or config.data.root
 
 
+def open_demonstrations(config: ExperimentConfig, what: str) -> DemonstrationSplit:
+    """The demonstrations a stage trains on, and those that only measure.
+
+    Raises:
+        DataError: none are named, they cannot be read, or there are fewer than `demos`.
+    """
+    from playslot_rl.data.demonstrations import split_demonstrations
+
+    videos = open_videos(config, demo_root(config), what)
+    return split_demonstrations(videos, config.demos, config.data.held_out, config.collect.validation_episodes)
+
+
 def demonstration_views(
-    config: ExperimentConfig, videos: EpisodeFrames, source: EpisodeFrames, savi: SAVi, slots_print: str
-) -> Sequence[tuple[EpisodeFrames, npt.NDArray[np.float32]]]:
-    """Demonstrations and their shifted copies (`behaviour.shift`), each with the slots of its frames, cached on disk.
+    config: ExperimentConfig, demos: DemonstrationSplit, savi: SAVi, slots_print: str
+) -> tuple[list[ParsedVideos], list[ParsedVideos]]:
+    """Demonstrations and their shifted copies (`behaviour.shift`), each with the slots (F, N, D) of its frames, and the
+    held-out ones, none or one, likewise; cached on disk.
 
     Args:
         config: of the command.
-        videos: the data set.
-        source: the demonstrations, the first episodes of it.
+        demos: what is trained on, and what is held out.
         savi: parses the frames, on its device.
         slots_print: fingerprint of SAVi's checkpoint.
     """
-    from playslot_rl.data.shifted import parsed_views
+    from playslot_rl.data.shifted import shifted_copies
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.world_model import module_device
 
     def parse(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
         return slot_cache(frames, savi, slots_print, config.data.cache, module_device(savi), config.logging.progress)
 
-    return parsed_views(videos, source, config.behaviour.shift, config.behaviour.shifted_copies, parse)
+    copies = shifted_copies(demos.trained, config.behaviour.shift, config.behaviour.shifted_copies)
+    held_out = [] if demos.held_out is None else [(demos.held_out, parse(demos.held_out))]
+    return [(demos.trained, parse(demos.parsed)), *((copy, parse(copy)) for copy in copies)], held_out
+
+
+def held_out_text(demos: DemonstrationSplit) -> str:
+    """For a closing line: how many demonstrations measured what was learned from the others."""
+    return "none held out" if demos.held_out is None else f"{demos.held_out.episodes} held out"
 
 
 def parent_run(config: ExperimentConfig, folder: Path) -> str:
     """Where a stage finds its parents: `run` if given (`pretrained` is the task's own), else the folder it writes."""
     return f"{SHIPPED}/{config.env.name}" if config.run == SHIPPED else config.run or str(folder)
-
-
-def finished(
-    config: ExperimentConfig,
-    folder: Path,
-    stage: str,
-    wanted: Mapping[str, Any],
-    parents: Mapping[str, Any],
-    roots: str,
-    demos: int | None = None,
-) -> bool:
-    """Whether a stage of a run is finished; if so, say that it is skipped.
-
-    Args:
-        wanted: parts of the config that the checkpoint must have been trained with.
-        parents: checkpoints it must have been trained on, by stage.
-        roots: data sets it must have been trained on; empty if the command names none.
-        demos: first episodes of them that it must have been trained on; None means all.
-
-    Raises:
-        CheckpointError: it was trained otherwise.
-    """
-    from playslot_rl.data.demonstrations import first_demonstrations
-    from playslot_rl.errors import CheckpointError
-    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, require_parents
-
-    path = checkpoint_folder(folder, stage)
-    if not (path / "meta.json").is_file():
-        return False
-    done = read_stage(path, stage)
-    require_parents(done, parents)
-    require_config(done, wanted)
-    facts: list[tuple[str, object, object]] = [("seed", config.seed, done.meta.get("seed", config.seed))]
-    if roots:
-        data = next(iter(done.meta["data"].values()), "none")
-        source = first_demonstrations(open_videos(config, roots, stage), demos)
-        facts.append(("data", source.fingerprint, data))
-    for name, got, old in facts:
-        if got != old:
-            raise CheckpointError(f"{name}: got {got}, expected {old} as {path} was trained with: use another out=")
-    print(f"{stage}: finished before ({done.meta.get('steps')} steps), skipped", flush=True)
-    return True
-
-
-def fixed_keys(stage: StageConfig) -> dict[str, Any]:
-    """A stage's config without the intervals, which a resumed or finished stage may change."""
-    from playslot_rl.training.fit import FREE_KEYS
-
-    return {key: value for key, value in to_dict(stage).items() if key not in FREE_KEYS}

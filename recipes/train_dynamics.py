@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
 
-from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import finished, fixed_keys, open_device, open_run, open_videos, parent_run, store_config
+from playslot_rl.config import ExperimentConfig, ModelConfig, to_dict
+from playslot_rl.recipes.run import open_device, open_run, open_videos, parent_run, store_config
+
+if TYPE_CHECKING:
+    from playslot_rl.training.record import StageRecord, Training
 
 
 def main(config: ExperimentConfig) -> None:
@@ -15,36 +20,46 @@ def main(config: ExperimentConfig) -> None:
         CheckpointError: no finished slots stage, or the run was begun otherwise.
         DataError, OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    import torch
-
-    from playslot_rl.data.slot_cache import slot_cache
-    from playslot_rl.seeding import derived_seed
-    from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage, require_config, save_stage
-    from playslot_rl.training.fit import fit
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config
+    from playslot_rl.training.record import StageRecord, run_stage
     from playslot_rl.training.runs import adopt_stage, require_adoptable, run_folder, stage_model
-    from playslot_rl.training.stage_dynamics import DynamicsStage
-    from playslot_rl.world_model import WorldModel
 
     run = open_run(config)
-    parent = run_folder(parent_run(config, run))
-    slots = read_stage(checkpoint_folder(parent, "slots"), "slots")
+    slots = read_stage(checkpoint_folder(run_folder(parent_run(config, run)), "slots"), "slots")
     require_config(slots, {"env": {"image_size": config.env.image_size}})
     require_adoptable(slots, run)
     model = replace(config.model, savi=stage_model(slots)[0].savi)
-    sizes = to_dict(model)
-    wanted = {"model": {name: sizes[name] for name in ("inverse_dynamics", "predictor")}}
-    trained_as = {**wanted, "dynamics": fixed_keys(config.dynamics)}
-    if finished(config, run, "dynamics", trained_as, {"slots": slots}, config.data.root):
-        return
 
     def ready() -> None:
         adopt_stage(slots, run)
         store_config(config, run)
 
-    device = open_device(config)
-    source = open_videos(config, config.data.root, "train-dynamics")
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derived_seed(config.seed, 0, "dynamics"))
+    record = StageRecord(
+        "dynamics",
+        run,
+        config,
+        stored={"env": to_dict(config.env), "model": to_dict(model), "dynamics": to_dict(config.dynamics)},
+        counts=("model.inverse_dynamics", "model.predictor"),
+        identity={"data.validation": config.data.validation},
+        parents={"slots": slots},
+        open_data=partial(open_videos, config, config.data.root, "train-dynamics"),
+        named=bool(config.data.root),
+        ready=ready,
+    )
+    run_stage(record, partial(_training, config, record, model))
+
+
+def _training(config: ExperimentConfig, record: StageRecord, model: ModelConfig) -> Training:
+    from playslot_rl.data.slot_cache import slot_cache
+    from playslot_rl.seeding import global_seed
+    from playslot_rl.storage.checkpoints import load_weights
+    from playslot_rl.training.fit import Part
+    from playslot_rl.training.record import Training
+    from playslot_rl.training.stage_dynamics import DynamicsStage
+    from playslot_rl.world_model import WorldModel
+
+    device, source, slots = open_device(config), record.data, record.parents["slots"]
+    with global_seed(config.seed, 0, "dynamics"):
         world = WorldModel(model, config.env)
     load_weights(slots, {"savi": world.savi})
     world.to(device)
@@ -52,32 +67,12 @@ def main(config: ExperimentConfig) -> None:
     stage = DynamicsStage(
         world, source, cached, config.dynamics, validation=config.data.validation, seed=config.seed, device=device
     )
-    prints = {"slots": slots.fingerprint, "data": source.fingerprint}
-    result = fit(
-        stage,
-        config.dynamics,
-        run / "dynamics",
-        name="dynamics",
-        seed=config.seed,
-        device=device,
-        logging=config.logging,
-        identity={**wanted, **prints, "data.validation": config.data.validation},
-        ready=ready,
-    )
-    save_stage(
-        checkpoint_folder(run, "dynamics"),
-        stage="dynamics",
-        modules=stage.modules,
-        config={"env": to_dict(config.env), "model": sizes, "dynamics": to_dict(config.dynamics)},
-        data={"train": source.fingerprint},
-        parents={"slots": slots.fingerprint},
-        metrics=result.metrics,
-        steps=result.step,
-        seconds=result.seconds,
-        extra={"episodes": source.episodes, "seed": config.seed},
-    )
-    print(
-        f"dynamics: {result.metrics.get('psnr', float('nan')):.2f} dB on held-out rollouts, "
-        f"code perplexity {result.metrics.get('perplexity', float('nan')):.1f}, {run / 'dynamics'}",
-        flush=True,
+    return Training(
+        [Part("dynamics", stage, config.dynamics)],
+        device,
+        lambda metrics: (
+            f"dynamics: {metrics.get('psnr', float('nan')):.2f} dB on held-out rollouts, "
+            f"code perplexity {metrics.get('perplexity', float('nan')):.1f}, {record.folder}"
+        ),
+        extra={"episodes": source.episodes},
     )

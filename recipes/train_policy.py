@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,21 +15,19 @@ from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
     demo_root,
     demonstration_views,
-    finished,
-    fixed_keys,
+    held_out_text,
+    open_demonstrations,
     open_device,
     open_run,
-    open_videos,
     parent_run,
     store_config,
 )
 
 if TYPE_CHECKING:
-    import torch
-
+    from playslot_rl.data.demonstrations import DemonstrationSplit
     from playslot_rl.storage.checkpoints import StageCheckpoint
-    from playslot_rl.training.fit import FitResult, Stage
-    from playslot_rl.world_model import Agent, WorldModel
+    from playslot_rl.training.fit import Part
+    from playslot_rl.training.record import StageRecord, Training
 
 
 def main(config: ExperimentConfig) -> None:
@@ -38,75 +38,84 @@ def main(config: ExperimentConfig) -> None:
         DataError: no demonstrations, none with actions, or fewer than `demos` or `behaviour.labelled_demos`.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.data.demonstrations import (
-        first_demonstrations,
-        label_demonstrations,
-        require_labelled,
-        with_copies,
-    )
-    from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
-    from playslot_rl.training.fit import fit
-    from playslot_rl.training.runs import use_world_model
-    from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage
+    from playslot_rl.training.record import StageRecord, run_stage
+    from playslot_rl.training.runs import use_world_model, world_model_config
 
     run = open_run(config)
     parent = parent_run(config, run)
     parents = _world_model_of(config, parent, run)
-    if finished(config, run, "policy", _trained_as(config), parents, demo_root(config), config.demos):
-        return
+    model, env = world_model_config(parents)
+    sizes = to_dict(replace(model, policy=config.model.policy, action_decoder=config.model.action_decoder))
+    demos = cache(partial(open_demonstrations, config, "train-policy"))
 
     def ready() -> None:
         use_world_model(run, parent)
         store_config(config, run)
 
-    device = open_device(config)
-    videos = open_videos(config, demo_root(config), "train-policy")
-    source = first_demonstrations(videos, config.demos)
-    require_labelled(config.behaviour.labelled_demos, source.episodes)  # before anything is computed
-    world, agent = _untrained(config, parent, device)
-    prints = {name: checkpoint.fingerprint for name, checkpoint in parents.items()}
-    views = demonstration_views(config, videos, source, world.savi, prints["slots"])
+    record = StageRecord(
+        "policy",
+        run,
+        config,
+        stored={"env": to_dict(env), "model": sizes, "policy": to_dict(config.behaviour)},
+        counts=("model.policy", "model.action_decoder"),
+        identity={"model": sizes},
+        parents=parents,
+        open_data=lambda: demos().trained,
+        named=bool(demo_root(config)),
+        role="demos",
+        ready=ready,
+    )
+    run_stage(record, lambda: _training(config, record, parent, demos))
+
+
+def _training(
+    config: ExperimentConfig, record: StageRecord, parent: str, opened: Callable[[], DemonstrationSplit]
+) -> Training:
+    """The frozen world model's view of the demonstrations; fresh policy, oracle and decoder on top of it."""
+    from playslot_rl.data.demonstrations import label_demonstrations, require_labelled, with_copies
+    from playslot_rl.seeding import global_seed
+    from playslot_rl.training.fit import Part
+    from playslot_rl.training.record import Training
+    from playslot_rl.training.runs import load_world_model
+    from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage
+    from playslot_rl.world_model import Agent
+
+    device, split, behaviour = open_device(config), opened(), config.behaviour
+    require_labelled(behaviour.labelled_demos, split.trained.episodes)  # before anything is computed
+    world = load_world_model(parent, device)
+    world.config = replace(world.config, policy=config.model.policy, action_decoder=config.model.action_decoder)
+    with global_seed(config.seed, 0, "policy"):
+        agent = Agent.untrained(world, oracle=behaviour.oracle).to(device)
+    views, others = demonstration_views(config, split, world.savi, record.prints["slots"])
     demos = with_copies([label_demonstrations(world, frames, slots, device) for frames, slots in views])
-    sizes = to_dict(world.config)
-    behaviour = config.behaviour
+    held_out = next((label_demonstrations(world, frames, slots, device) for frames, slots in others), None)
 
-    def train(stage: Stage, folder: Path, steps: int, lr: float) -> FitResult:
-        return fit(
-            stage,
-            replace(behaviour, steps=steps, optim=replace(behaviour.optim, lr=lr)),
-            folder,
-            name=folder.name,
-            seed=config.seed,
-            device=device,
-            logging=config.logging,
-            identity={"model": sizes, "data": source.fingerprint, **prints},
-            ready=ready,
-            rate="behaviour.optim.lr" if stage is clone else "behaviour.decoder_lr",
+    def parts() -> Iterator[Part]:
+        yield Part(
+            "policy",
+            CloneStage(agent.policy, agent.oracle, demos, behaviour, held_out),
+            behaviour,
+            lr_key="behaviour.optim.lr",
         )
+        agent.eval()
+        decoding = replace(
+            behaviour, steps=behaviour.decoder_steps, optim=replace(behaviour.optim, lr=behaviour.decoder_lr)
+        )
+        decoder = DecoderStage(agent.action_decoder, agent.policy, demos, behaviour, held_out)
+        yield Part("decoder", decoder, decoding, folder="decoder", lr_key="behaviour.decoder_lr")
 
-    clone = CloneStage(agent.policy, agent.oracle, demos, behaviour)
-    cloned = train(clone, run / "policy", behaviour.steps, behaviour.optim.lr)
-    agent.eval()
-    decode = DecoderStage(agent.action_decoder, agent.policy, demos, behaviour)
-    decoded = train(decode, run / "policy" / "decoder", behaviour.decoder_steps, behaviour.decoder_lr)
-    save_stage(
-        checkpoint_folder(run, "policy"),
-        stage="policy",
-        modules={**clone.modules, **decode.modules},
-        config={"env": to_dict(world.env), "model": sizes, "policy": to_dict(behaviour)},
-        data={"demos": source.fingerprint},
-        parents=prints,
-        metrics={**cloned.metrics, **{f"decoder_{key}": value for key, value in decoded.metrics.items()}},
-        steps=cloned.step,
-        seconds=cloned.seconds + decoded.seconds,
+    said = f"policy: {len(demos.lengths)} demos, {behaviour.labelled_demos} labelled, {held_out_text(split)}"
+    return Training(
+        parts(),
+        device,
+        lambda _: f"{said}, {record.folder}",
         extra={
             "demos": len(demos.lengths),
             "labelled_demos": behaviour.labelled_demos,
-            "seed": config.seed,
+            "held_out_demos": 0 if held_out is None else len(held_out.lengths),
             "data_root": demo_root(config),
         },
     )
-    print(f"policy: {len(demos.lengths)} demos, {behaviour.labelled_demos} labelled, {run / 'policy'}", flush=True)
 
 
 def _world_model_of(config: ExperimentConfig, parent: str | Path, run: Path) -> dict[str, StageCheckpoint]:
@@ -120,26 +129,3 @@ def _world_model_of(config: ExperimentConfig, parent: str | Path, run: Path) -> 
         env = {"image_size": config.env.image_size, "action_dim": config.env.action_dim}
         require_config(checkpoint, {"env": env})
     return parents
-
-
-def _trained_as(config: ExperimentConfig) -> dict[str, object]:
-    """Settings that a finished stage must share."""
-    return {
-        "model": {"policy": to_dict(config.model.policy), "action_decoder": to_dict(config.model.action_decoder)},
-        "policy": fixed_keys(config.behaviour),
-    }
-
-
-def _untrained(config: ExperimentConfig, parent: str | Path, device: torch.device) -> tuple[WorldModel, Agent]:
-    """The frozen world model, and fresh policy, oracle and decoder on top of it."""
-    import torch
-
-    from playslot_rl.seeding import derived_seed
-    from playslot_rl.training.runs import load_world_model
-    from playslot_rl.world_model import Agent
-
-    world = load_world_model(parent, device)
-    world.config = replace(world.config, policy=config.model.policy, action_decoder=config.model.action_decoder)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derived_seed(config.seed, 0, "policy"))
-        return world, Agent.untrained(world, oracle=config.behaviour.oracle).to(device)

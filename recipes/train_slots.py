@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import TYPE_CHECKING
+
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import finished, fixed_keys, open_device, open_run, open_videos, store_config
+from playslot_rl.recipes.run import open_device, open_run, open_videos, store_config
+
+if TYPE_CHECKING:
+    from playslot_rl.training.record import StageRecord, Training
 
 
 def main(config: ExperimentConfig) -> None:
@@ -12,57 +18,44 @@ def main(config: ExperimentConfig) -> None:
     Raises:
         DataError, OutputError, CheckpointError, TrainingError: see `playslot_rl.errors`.
     """
-    import torch
+    from playslot_rl.training.record import StageRecord, run_stage
 
+    run = open_run(config)
+    record = StageRecord(
+        "slots",
+        run,
+        config,
+        stored={"env": to_dict(config.env), "model": to_dict(config.model), "slots": to_dict(config.slots)},
+        counts=("env.image_size", "model.savi"),
+        identity={"data.validation": config.data.validation},
+        open_data=partial(open_videos, config, config.data.root, "train-slots"),
+        named=bool(config.data.root),
+        ready=partial(store_config, config, run),
+    )
+    run_stage(record, partial(_training, config, record))
+
+
+def _training(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.modules.savi import SAVi
-    from playslot_rl.seeding import derived_seed
-    from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
-    from playslot_rl.training.fit import fit
+    from playslot_rl.seeding import global_seed
+    from playslot_rl.training.fit import Part
+    from playslot_rl.training.record import Training
     from playslot_rl.training.runs import load_savi, slots_fingerprint
     from playslot_rl.training.stage_slots import SlotsStage
     from playslot_rl.training.warm_start import warm_start
 
-    run = open_run(config)
-    wanted = {"env": {"image_size": config.env.image_size}, "model": {"savi": to_dict(config.model.savi)}}
-    if finished(config, run, "slots", {**wanted, "slots": fixed_keys(config.slots)}, {}, config.data.root):
-        return
-    device = open_device(config)
-    source = open_videos(config, config.data.root, "train-slots")
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derived_seed(config.seed, 0, "slots"))
+    device, source, own = open_device(config), record.data, config.slots
+    with global_seed(config.seed, 0, "slots"):
         savi = SAVi(config.model.savi, config.env.image_size).to(device)
     started: dict[str, str] = {}
-    if config.slots.start_from:
-        warm_start(savi, load_savi(config.slots.start_from, device), config.slots.start_from)
-        started = {"started_from": slots_fingerprint(config.slots.start_from)}
-    stage = SlotsStage(savi, source, config.slots, validation=config.data.validation, seed=config.seed, device=device)
-    identity = {**wanted, "data": source.fingerprint, "data.validation": config.data.validation, **started}
-    result = fit(
-        stage,
-        config.slots,
-        run / "slots",
-        name="slots",
-        seed=config.seed,
-        device=device,
-        logging=config.logging,
-        identity=identity,
-        ready=lambda: store_config(config, run),
+    if own.start_from:
+        warm_start(savi, load_savi(own.start_from, device), own.start_from)
+        started = {"started_from": slots_fingerprint(own.start_from)}
+    stage = SlotsStage(savi, source, own, validation=config.data.validation, seed=config.seed, device=device)
+    return Training(
+        [Part("slots", stage, own)],
+        device,
+        lambda metrics: f"slots: {metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {record.folder}",
+        extra={"episodes": source.episodes, "agent_steps": int((source.lengths - 1).sum()), **started},
+        identity=started,
     )
-    save_stage(
-        checkpoint_folder(run, "slots"),
-        stage="slots",
-        modules=stage.modules,
-        config={"env": to_dict(config.env), "model": to_dict(config.model), "slots": to_dict(config.slots)},
-        data={"train": source.fingerprint},
-        parents={},
-        metrics=result.metrics,
-        steps=result.step,
-        seconds=result.seconds,
-        extra={
-            "episodes": source.episodes,
-            "agent_steps": int((source.lengths - 1).sum()),
-            "seed": config.seed,
-            **started,
-        },
-    )
-    print(f"slots: {result.metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {run / 'slots'}", flush=True)

@@ -10,6 +10,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from playslot_rl.data.demonstrations import real_actions, transitions
+from playslot_rl.data.shifted import shift_frames
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.seeding import StepGenerators
 
@@ -34,27 +36,25 @@ class FrameInputs:
 
     def draw(self, rows: Tensor, generators: StepGenerators) -> Tensor:
         """Frames of rows, each shifted by its own random offset."""
-        frames = self.plain(rows)
         if self.shift == 0:
-            return frames
+            return self.plain(rows)
         offsets = torch.randint(2 * self.shift + 1, (len(rows), 2), generator=generators.torch("shift", "cpu"))
-        return shifted(frames, offsets.to(frames.device) - self.shift)
+        frames = self.source.frames[self.rows[rows.cpu().numpy()]]
+        moved = shift_frames(frames, offsets.numpy() - self.shift)
+        return torch.from_numpy(moved).movedim(-1, 1).to(self.device)
 
     def plain(self, rows: Tensor) -> Tensor:
         """Frames of rows, as they are."""
         return self.source.pixels(self.rows[rows.cpu().numpy()]).to(self.device)
 
 
-def shifted(frames: Tensor, offsets: Tensor) -> Tensor:
-    """Frames (b, 3, H, W) moved by offsets int64 (b, 2) in pixels (down, right); edges are repeated.
+def demonstrated_frames(
+    source: EpisodeFrames, action_dim: int, device: torch.device | str, shift: int = 0
+) -> tuple[FrameInputs, Tensor]:
+    """Frames of all transitions of demonstrations, with their real actions (M, A) in [-1, 1].
 
-    Example:
-        >>> frame = torch.tensor([[1, 2], [3, 4]], dtype=torch.uint8).expand(1, 3, 2, 2)
-        >>> shifted(frame, torch.tensor([[0, 1]]))[0, 0].tolist()
-        [[1, 1], [3, 3]]
+    Raises:
+        DataError: no transition, no actions, or actions of another width.
     """
-    b, _, h, w = frames.shape
-    down = (torch.arange(h, device=frames.device) - offsets[:, :1]).clamp(0, h - 1)
-    right = (torch.arange(w, device=frames.device) - offsets[:, 1:]).clamp(0, w - 1)
-    batch = torch.arange(b, device=frames.device)[:, None, None]
-    return frames[batch, :, down[:, :, None], right[:, None, :]].movedim(-1, 1)
+    rows = transitions(source).rows
+    return FrameInputs(source, rows, device, shift), real_actions(source, rows, action_dim).to(device)

@@ -199,7 +199,8 @@ def job_record(job: Job, config: ExperimentConfig, parents: Mapping[str, str]) -
     """
     values = to_dict(config)
     result = {key: value for key, value in values.items() if key not in _OF_THE_MACHINE}
-    result["data"] = {key: value for key, value in result["data"].items() if key not in ("root", "demos", "cache")}
+    for group, keys in (("data", ("root", "demos", "cache", "held_out")), ("collect", ("validation_episodes",))):
+        result[group] = {key: value for key, value in result[group].items() if key not in keys}
     own = result["baselines"].get(job.method, {})  # another method's settings are none of this job's
     result["baselines"] = {key: value for key, value in own.items() if key != "world"}
     identity = json.dumps([result, config.compare.evaluation_seed, dict(parents)], sort_keys=True)

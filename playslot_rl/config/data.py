@@ -15,6 +15,7 @@ class DataConfig:
     Attributes:
         root: LeRobot v3.0 data set(s) of unlabelled videos; several are separated by commas.
         demos: data set of demonstrations; empty means `root`.
+        held_out: how many of its last episodes are neither trained on nor shown to the world model: they measure.
         camera: image feature(s) to read, separated by commas; empty means the only one.
         resize: resize frames of another size than `env.image_size` (area averaging) instead of refusing them.
         cache: folder of the frame and slot caches; empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
@@ -23,6 +24,7 @@ class DataConfig:
 
     root: str = ""
     demos: str = ""
+    held_out: int = 0
     camera: str = ""
     resize: bool = False
     cache: str = ""
@@ -30,6 +32,7 @@ class DataConfig:
 
     def __post_init__(self) -> None:
         check(0.0 <= self.validation < 1.0, "data.validation", self.validation, "a fraction in [0, 1)")
+        check(self.held_out >= 0, "data.held_out", self.held_out, "0 or more")
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,8 @@ class CollectConfig:
         random_episodes: episodes of the random policy that `pipeline` collects.
         random_steps: agent steps of each.
         expert_episodes: demonstrations that `pipeline` collects for the policy.
+        validation_episodes: further ones that only measure: `demo`, `pipeline` and `compare` record so many more. Of
+            any data set, at most so many of its last episodes, beyond those trained on, are looked at in validation.
         expert_steps: agent steps of each; clips go on past success.
         noise: standard deviation of Gaussian noise added to the expert's actions.
         noisy_episodes: episodes of the noisy expert that `pipeline` adds to the world model's videos.
@@ -51,12 +56,16 @@ class CollectConfig:
     random_episodes: int = 400
     random_steps: int = 20
     expert_episodes: int = 150
+    validation_episodes: int = 10
     expert_steps: int = 20
     noise: float = 0.0
     noisy_episodes: int = 0
     exploration_noise: float = 0.5
     learn_from_demos: bool = False
     storage: Literal["image", "video"] = "image"
+
+    def __post_init__(self) -> None:
+        check(self.validation_episodes >= 0, "collect.validation_episodes", self.validation_episodes, "0 or more")
 
 
 @dataclass(frozen=True)

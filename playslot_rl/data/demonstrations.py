@@ -90,6 +90,56 @@ def first_demonstrations(source: EpisodeFrames, demos: int | None) -> EpisodeFra
     )
 
 
+def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames:
+    """Episodes `first` to `last` (exclusive) as a data set of their own, rows counted anew."""
+    begin, end = int(source.starts[first]), int(source.starts[last - 1] + source.lengths[last - 1])
+    return replace(
+        source,
+        frames=source.frames[begin:end],
+        starts=source.starts[first:last] - begin,
+        lengths=source.lengths[first:last],
+        actions=None if source.actions is None else source.actions[begin:end],
+        success=None if source.success is None else source.success[begin:end],
+        seeds=None if source.seeds is None else source.seeds[first:last],
+        fingerprint=hashlib.sha256(f"{source.fingerprint}/episodes {first} {last}".encode()).hexdigest()[:16],
+    )
+
+
+@dataclass(frozen=True)
+class DemonstrationSplit:
+    """Which demonstrations of a data set are trained on, and which only measure.
+
+    Attributes:
+        trained: the first ones.
+        parsed: what SAVi parses at once, so that one cache serves every number of them.
+        held_out: the last ones; None where nothing is beyond those that are trained on.
+    """
+
+    trained: EpisodeFrames
+    parsed: EpisodeFrames
+    held_out: EpisodeFrames | None
+
+
+def split_demonstrations(source: EpisodeFrames, demos: int | None, kept: int, measured: int) -> DemonstrationSplit:
+    """Train on the first demonstrations, and measure on the last ones.
+
+    Args:
+        source: the data set.
+        demos: how many are trained on; None for all that are not kept.
+        kept: the last ones, which were recorded to measure (`data.held_out`).
+        measured: at most so many of the last ones beyond those that are trained on measure, if more than `kept`.
+
+    Raises:
+        DataError: there are fewer episodes than `demos`.
+    """
+    free = max(1, source.episodes - kept)
+    trained = first_demonstrations(source, free if demos is None else demos)
+    parsed = first_demonstrations(source, max(free, trained.episodes))
+    rest = source.episodes - min(max(kept, measured), source.episodes - trained.episodes)
+    usable = bool((source.lengths[rest:] >= 2).any())
+    return DemonstrationSplit(trained, parsed, episode_range(source, rest, source.episodes) if usable else None)
+
+
 @dataclass(frozen=True)
 class Transitions:
     """Row numbers of the transitions of some episodes, in order.

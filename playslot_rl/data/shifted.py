@@ -9,7 +9,7 @@ Shapes: F frames, H W image height and width.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +20,25 @@ from playslot_rl.data.source import EpisodeFrames, FrameRows, Frames
 
 DIRECTIONS = ((1, 1), (-1, -1), (1, -1), (-1, 1), (1, 0), (-1, 0), (0, 1), (0, -1))
 """Of the copies, (down, right): corners first, so that the first four surround the original."""
+
+
+def shift_frames(frames: Frames, offsets: npt.ArrayLike) -> Frames:
+    """Frames (..., H, W, C) moved by pixels (down, right), all by offsets (2,) or each by its own (..., 2).
+
+    Content that enters repeats the edge.
+
+    Example:
+        >>> frames = np.arange(4, dtype=np.uint8).reshape(1, 2, 2, 1)
+        >>> shift_frames(frames, [[0, 1]])[0, ..., 0].tolist()
+        [[0, 0], [2, 2]]
+    """
+    height, width = frames.shape[-3:-1]
+    flat = frames.reshape(-1, *frames.shape[-3:])
+    moves = np.broadcast_to(np.asarray(offsets).reshape(-1, 2), (len(flat), 2))
+    down = (np.arange(height) - moves[:, :1]).clip(0, height - 1)
+    right = (np.arange(width) - moves[:, 1:]).clip(0, width - 1)
+    moved: Frames = flat[np.arange(len(flat))[:, None, None], down[:, :, None], right[:, None, :]]
+    return moved.reshape(frames.shape)
 
 
 @dataclass(frozen=True)
@@ -54,11 +73,7 @@ class ShiftedFrames:
 
     def __getitem__(self, rows: Any) -> Frames:
         """Rows by an integer, a slice or an integer array of any shape."""
-        height, width = self.shape[1:3]
-        down = (np.arange(height) - self.offset[0]).clip(0, height - 1)
-        right = (np.arange(width) - self.offset[1]).clip(0, width - 1)
-        moved: Frames = np.asarray(self.frames[rows])[..., down[:, None], right[None, :], :]
-        return moved
+        return shift_frames(np.asarray(self.frames[rows]), self.offset)
 
 
 def shifted(source: EpisodeFrames, offset: tuple[int, int]) -> EpisodeFrames:
@@ -71,22 +86,3 @@ def shifted(source: EpisodeFrames, offset: tuple[int, int]) -> EpisodeFrames:
 def shifted_copies(source: EpisodeFrames, shift: int, copies: int) -> Sequence[EpisodeFrames]:
     """The first `copies` of the eight neighbours at `shift` pixels; none where `shift` is 0."""
     return [shifted(source, (shift * y, shift * x)) for y, x in DIRECTIONS[: copies if shift else 0]]
-
-
-def parsed_views(
-    videos: EpisodeFrames,
-    first: EpisodeFrames,
-    shift: int,
-    copies: int,
-    parse: Callable[[EpisodeFrames], npt.NDArray[np.float32]],
-) -> Sequence[tuple[EpisodeFrames, npt.NDArray[np.float32]]]:
-    """Demonstrations and their shifted copies, each with the slots (F, N, D) of its frames.
-
-    Args:
-        videos: the data set; parsed whole, so that one cache serves every number of demonstrations.
-        first: the demonstrations, the first episodes of it.
-        shift: pixels; 0 makes no copies.
-        copies: how many.
-        parse: gives a data set's slots, such as `slot_cache`.
-    """
-    return [(first, parse(videos)), *((copy, parse(copy)) for copy in shifted_copies(first, shift, copies))]

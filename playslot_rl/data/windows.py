@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.errors import DataError
 
 IntArray = npt.NDArray[np.int64]
@@ -104,3 +105,41 @@ def split_episodes(episodes: int, validation: float, seed: int) -> tuple[IntArra
     order = np.random.default_rng(seed).permutation(episodes).astype(np.int64)
     training = np.sort(order[held_out:])
     return training, np.sort(order[:held_out]) if held_out else training
+
+
+class Clips:
+    """Clips of unlabelled videos: windows of the training episodes, and spread ones of the episodes held out.
+
+    Args:
+        source: the videos.
+        frames: T.
+        validation: fraction of episodes held out.
+        seed: of the split.
+        shown: windows that a validation looks at, at most.
+
+    Attributes:
+        train_episodes: indices, int64.
+        held_out: row indices (at most `shown`, T), int64.
+
+    Raises:
+        DataError: no episode has `frames` frames.
+    """
+
+    def __init__(self, source: EpisodeFrames, frames: int, validation: float, seed: int, shown: int = 32) -> None:
+        self.source, self.frames, self.shown = source, frames, shown
+        self.train_episodes, held_out = split_episodes(source.episodes, validation, seed)
+        self.held_out = self.spread(held_out)
+
+    def spread(self, episodes: IntArray) -> IntArray:
+        """At most `shown` disjoint windows of episodes: row indices (at most `shown`, T)."""
+        return spread_windows(self.source.starts, self.source.lengths, self.frames, self.shown, episodes)
+
+    def sample(self, batch: int, generator: np.random.Generator) -> IntArray:
+        """Row indices (batch, T) of windows of the training episodes, drawn uniformly."""
+        return sample_windows(
+            self.source.starts, self.source.lengths, self.frames, batch, generator, self.train_episodes
+        )
+
+    def validation_batches(self) -> list[IntArray]:
+        """The held-out windows, about eight at a time."""
+        return np.array_split(self.held_out, max(1, len(self.held_out) // 8))

@@ -7,7 +7,6 @@ A child names its parents by the fingerprints of their weights and refuses any o
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,8 @@ from typing import Any
 from torch import nn
 
 from playslot_rl.errors import CheckpointError
-from playslot_rl.storage.atomic import explain_write_errors, replace_dir, temporary_name, write_json
+from playslot_rl.storage.atomic import write_json
+from playslot_rl.storage.folders import new_folder
 from playslot_rl.storage.provenance import provenance
 from playslot_rl.storage.resume import first_difference
 from playslot_rl.storage.tensors import (
@@ -96,38 +96,25 @@ def save_stage(
     Raises:
         OutputError: full disk, or a folder that cannot be written.
     """
-    temporary = temporary_name(path)
-    with explain_write_errors(path):
-        remove_leftovers(path)
-        temporary.mkdir(parents=True)
-        try:
-            save_tensors(temporary / "weights.safetensors", module_tensors(modules))
-            fingerprint = weights_fingerprint(temporary / "weights.safetensors")
-            meta = {
-                "format": FORMAT,
-                "stage": stage,
-                "fingerprint": fingerprint,
-                "modules": sorted(modules),
-                "data": dict(data),
-                "parents": dict(parents),
-                "metrics": dict(metrics),
-                "steps": steps,
-                "seconds": round(seconds, 1),
-                **provenance(),
-                **(extra or {}),
-            }
-            write_json(temporary / "config.json", dict(config))
-            write_json(temporary / "meta.json", meta)
-            replace_dir(temporary, path)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+    with new_folder(path, replace=True) as temporary:
+        save_tensors(temporary / "weights.safetensors", module_tensors(modules))
+        fingerprint = weights_fingerprint(temporary / "weights.safetensors")
+        meta = {
+            "format": FORMAT,
+            "stage": stage,
+            "fingerprint": fingerprint,
+            "modules": sorted(modules),
+            "data": dict(data),
+            "parents": dict(parents),
+            "metrics": dict(metrics),
+            "steps": steps,
+            "seconds": round(seconds, 1),
+            **provenance(),
+            **(extra or {}),
+        }
+        write_json(temporary / "config.json", dict(config))
+        write_json(temporary / "meta.json", meta)
     return StageCheckpoint(path, stage, dict(config), meta, fingerprint)
-
-
-def remove_leftovers(path: Path) -> None:
-    """Remove what a process killed while it wrote this checkpoint has left."""
-    for leftover in path.parent.glob(f".{path.name}.tmp-*"):
-        shutil.rmtree(leftover)
 
 
 def read_stage(path: Path, stage: str) -> StageCheckpoint:

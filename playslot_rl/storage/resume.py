@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,9 +17,10 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.errors import CheckpointError, OutputError
-from playslot_rl.storage.atomic import explain_write_errors, replace_dir, temporary_name, write_json
+from playslot_rl.storage.atomic import write_json
+from playslot_rl.storage.folders import new_folder
+from playslot_rl.storage.optimizers import optimizer_tensors, restore_optimizer
 from playslot_rl.storage.tensors import load_modules, load_tensors, module_tensors, save_tensors
-from playslot_rl.training.optim import adam_tensors, restore_adam
 
 FORMAT = "playslot_rl.training/1"
 KEPT = 2
@@ -91,7 +92,7 @@ class TrainingCheckpoints:
         self,
         state: TrainingState,
         modules: Mapping[str, nn.Module],
-        optimizer: torch.optim.Adam,
+        optimizer: torch.optim.Optimizer,
         parameters: Mapping[str, nn.Parameter],
     ) -> Path:
         """Write a checkpoint and remove all but the newest two.
@@ -99,12 +100,11 @@ class TrainingCheckpoints:
         Raises:
             OutputError: full disk; the earlier checkpoints stay.
         """
-        tensors = {"modules": module_tensors(modules), "optimizer": adam_tensors(optimizer, parameters)}
-        values = {"step": state.step, "seconds": state.seconds, "metrics": state.metrics}
-        return self._write(state.step, tensors, values)
+        tensors = {"modules": module_tensors(modules), "optimizer": optimizer_tensors(optimizer, list(parameters))}
+        return self._write(state.step, tensors, asdict(state))
 
     def resume(
-        self, modules: Mapping[str, nn.Module], optimizer: torch.optim.Adam, parameters: Mapping[str, nn.Parameter]
+        self, modules: Mapping[str, nn.Module], optimizer: torch.optim.Optimizer, parameters: Mapping[str, nn.Parameter]
     ) -> TrainingState:
         """Load the newest checkpoint into the modules and the optimiser; a fresh `TrainingState` if there is none.
 
@@ -117,7 +117,7 @@ class TrainingCheckpoints:
             return TrainingState()
         last, stored = newest
         load_modules(modules, load_tensors(last / "modules.safetensors"), str(last))
-        restore_adam(optimizer, parameters, load_tensors(last / "optimizer.safetensors"), str(last))
+        restore_optimizer(optimizer, load_tensors(last / "optimizer.safetensors"), str(last), list(parameters))
         return TrainingState(stored["step"], stored["seconds"], stored["metrics"])
 
     def _write(self, step: int, files: Mapping[str, Mapping[str, Tensor]], state: Mapping[str, Any]) -> Path:
@@ -127,16 +127,10 @@ class TrainingCheckpoints:
             OutputError: full disk; the earlier checkpoints stay.
         """
         final = self.folder / f"step_{step:08d}"
-        temporary = temporary_name(final)
-        with explain_write_errors(final):
-            temporary.mkdir(parents=True)
-            try:
-                for name, tensors in files.items():
-                    save_tensors(temporary / f"{name}.safetensors", tensors)
-                write_json(temporary / "state.json", {"format": FORMAT, **state, "identity": self.identity})
-                replace_dir(temporary, final)
-            finally:
-                shutil.rmtree(temporary, ignore_errors=True)
+        with new_folder(final, replace=True) as temporary:
+            for name, tensors in files.items():
+                save_tensors(temporary / f"{name}.safetensors", tensors)
+            write_json(temporary / "state.json", {"format": FORMAT, **state, "identity": self.identity})
         for old in self.saved()[:-KEPT]:
             shutil.rmtree(old)
         return final

@@ -9,24 +9,31 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import torch
 from torch import Tensor, nn
 
 from playslot_rl.config import LoggingConfig, StageConfig, to_dict
-from playslot_rl.errors import TrainingError
 from playslot_rl.progress import StageProgress
 from playslot_rl.seeding import StepGenerators, global_seed
 from playslot_rl.storage.resume import TrainingCheckpoints, TrainingState
-from playslot_rl.storage.tensors import module_tensors
-from playslot_rl.training.logging import History, MetricLogger, open_logger
 from playslot_rl.training.optim import build_adam, clip_gradients, learning_rate, trainable_parameters
+from playslot_rl.training.watch import Watch, finite
 
-# How often we look does not change what is learned: these may differ when a run is resumed.
-FREE_KEYS = ("checkpoint_every", "validate_every", "log_every")
+FREE_KEYS: Final = ("checkpoint_every", "validate_every", "log_every", "evaluate_every", "minutes", "replay_on_disk")
+"""How often we look, and how long, does not change what is learned: these may differ when a run is resumed."""
+
+
+def fixed_keys(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested plain values without what a resumed or finished training may change."""
+    return {
+        key: fixed_keys(value) if isinstance(value, Mapping) else value
+        for key, value in values.items()
+        if key not in FREE_KEYS
+    }
 
 
 class Stage(Protocol):
@@ -41,6 +48,27 @@ class Stage(Protocol):
 
     def validate(self, step: int) -> Mapping[str, float]:
         """Numbers on held-out data after `step` steps; called without gradients, modules in eval mode."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One training of a stage.
+
+    Attributes:
+        name: for messages, logs and the checkpoints' identity (`slots`, `decoder`).
+        stage: modules, already on their device, with their loss.
+        config: steps, optimiser, intervals.
+        folder: below the stage's own; empty is that one.
+        lr_key: config key of the learning rate, for messages; empty means `NAME.optim.lr`.
+        identity: further plain values that a resumed one must share.
+    """
+
+    name: str
+    stage: Stage
+    config: StageConfig
+    folder: str = ""
+    lr_key: str = ""
+    identity: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -61,33 +89,27 @@ class FitResult:
 
 
 def fit(
-    stage: Stage,
-    config: StageConfig,
+    part: Part,
     folder: Path,
     *,
-    name: str,
     seed: int,
     device: torch.device | str = "cpu",
     logging: LoggingConfig | None = None,
     identity: Mapping[str, Any] | None = None,
     ready: Callable[[], None] | None = None,
-    rate: str = "",
 ) -> FitResult:
-    """Train a stage to `config.steps`, carrying on from its newest checkpoint if it has one.
+    """Train to `part.config.steps`, carrying on from the newest checkpoint if there is one.
 
-    Writes `folder/checkpoints/step_*`, `folder/logs/` and `folder/metrics.jsonl`, nothing else.
+    Writes `checkpoints/step_*`, `logs/` and `metrics.jsonl` in the part's folder, nothing else.
 
     Args:
-        stage: modules, already on `device`, with their loss.
-        config: steps, optimiser, intervals.
+        part: what is trained.
         folder: the stage's folder.
-        name: the stage, for messages and for the prefix of config keys (`slots`, `dynamics`, `behaviour`).
         seed: all randomness derives from it and from the step.
         device: device of the generators.
         logging: backend and progress bar; None logs to `metrics.jsonl` only, silently.
         identity: further plain values a resumed run must share (model config, data and parent fingerprints).
         ready: called once, before the first step, when a stage begun before was found to be the same.
-        rate: config key of the learning rate, for messages; empty means `NAME.optim.lr`.
 
     Raises:
         TrainingError: a loss or gradient is not finite; the last good checkpoint stays.
@@ -95,26 +117,17 @@ def fit(
         OutputError: full disk; the last good checkpoint stays.
         KeyboardInterrupt: Ctrl-C; its message says where the same command carries on.
     """
-    logging = logging or LoggingConfig(backend="none", progress=False)
-    run = _Run(stage, config, folder, name, seed, device, identity or {}, rate or f"{name}.optim.lr")
+    logging, config = logging or LoggingConfig(backend="none", progress=False), part.config
+    run = _Run(part, folder / part.folder, seed, device, identity or {})
     if ready is not None:
         ready()
     start = run.state.step
-    run.history.rewind(start)
-    if start >= config.steps:
-        return FitResult(start, start, run.state.seconds, run.state.metrics)
-    logger = open_logger(logging, folder / "logs", name, start)
-    progress = StageProgress(name, start, config.steps, logging.progress, config.log_every * 10)
-    try:
-        with progress:
+    run.watch.history.rewind(start)
+    if start < config.steps:
+        progress = StageProgress(part.name, start, config.steps, logging.progress, config.log_every * 10)
+        with run.watch.running(logging, start), progress:
             for step in range(start, config.steps):
-                run.advance(step, logger, progress)
-    except KeyboardInterrupt:
-        last = run.checkpoints.last()
-        where = f"step {int(last.name.removeprefix('step_'))} ({last})" if last else "the beginning"
-        raise KeyboardInterrupt(f"{name} interrupted; the same command carries on from {where}") from None
-    finally:
-        logger.close()
+                run.advance(step, progress)
     return FitResult(run.state.step, start, run.state.seconds, run.state.metrics)
 
 
@@ -122,28 +135,20 @@ class _Run:
     """One process's part of a stage: the pieces `fit` moves from step to step."""
 
     def __init__(
-        self,
-        stage: Stage,
-        config: StageConfig,
-        folder: Path,
-        name: str,
-        seed: int,
-        device: torch.device | str,
-        identity: Mapping[str, Any],
-        rate: str,
+        self, part: Part, folder: Path, seed: int, device: torch.device | str, identity: Mapping[str, Any]
     ) -> None:
-        self.rate = rate
-        self.stage, self.config, self.name, self.seed, self.device = stage, config, name, seed, device
-        self.parameters = trainable_parameters(stage.modules)
-        self.optimizer = build_adam(self.parameters, config.optim)
-        fixed = {key: value for key, value in to_dict(config).items() if key not in FREE_KEYS}
-        self.checkpoints = TrainingCheckpoints(folder / "checkpoints", {name: fixed, "seed": seed, **identity})
-        self.history = History(folder / "metrics.jsonl")
-        self.state = self.checkpoints.resume(stage.modules, self.optimizer, self.parameters)
+        self.stage, self.config, self.seed, self.device = part.stage, part.config, seed, device
+        self.parameters = trainable_parameters(part.stage.modules)
+        self.optimizer = build_adam(self.parameters, part.config.optim)
+        own = {part.name: fixed_keys(to_dict(part.config)), "seed": seed}
+        self.checkpoints = TrainingCheckpoints(folder / "checkpoints", {**own, **identity, **part.identity})
+        cure = f"lower {part.lr_key or f'{part.name}.optim.lr'} or check the data"
+        self.watch = Watch(part.name, folder, self.checkpoints, cure)
+        self.state = self.checkpoints.resume(part.stage.modules, self.optimizer, self.parameters)
         self._began = time.monotonic() - self.state.seconds
         self._train_mode(True)
 
-    def advance(self, step: int, logger: MetricLogger, progress: StageProgress) -> None:
+    def advance(self, step: int, progress: StageProgress) -> None:
         """One step, and whatever is due after it."""
         config, done = self.config, step + 1
         values = self._step(step)
@@ -151,15 +156,15 @@ class _Run:
         self.state = TrainingState(done, time.monotonic() - self._began, self.state.metrics)
         if done == 1 or done % config.log_every == 0 or last:
             numbers = {key: float(value) for key, value in values.items()}
-            self._log("train", done, numbers, logger)
+            self._log("train", done, numbers)
             progress.update(done, numbers)
         else:
             progress.update(done, {})
         if done % config.validate_every == 0 or last:
             self.state = replace(self.state, metrics=self._validate(done))
-            self._log("validation", done, self.state.metrics, logger)
+            self._log("validation", done, self.state.metrics)
         if done % config.checkpoint_every == 0 or last:
-            self._require_finite(done)
+            self.watch.require_finite(self.stage.modules, f"step {done}")
             self.checkpoints.save(self.state, self.stage.modules, self.optimizer, self.parameters)
 
     def _step(self, step: int) -> dict[str, Tensor | float]:
@@ -173,52 +178,26 @@ class _Run:
         norm = clip_gradients(self.parameters, self.config.optim.grad_clip)
         # One transfer for both, so that a GPU is waited for once a step.
         loss, size = torch.stack([losses["loss"].detach().float(), norm.float()]).tolist()
-        if not (math.isfinite(loss) and math.isfinite(size)):
-            raise self._diverged(step, loss, size)
+        for what, got in (("loss", loss), ("gradient norm", size)):
+            if not math.isfinite(got):
+                raise self.watch.not_finite(what, str(got), f"step {step + 1}")
         self.optimizer.step()
         values: dict[str, Tensor | float] = {key: value.detach() for key, value in losses.items()}
         return values | {"loss": loss, "lr": rate, "grad_norm": size}
-
-    def _require_finite(self, done: int) -> None:
-        """A finite loss may still have made an infinite weight or buffer: never keep that as a good checkpoint."""
-        for key, value in module_tensors(self.stage.modules).items():
-            if value.is_floating_point() and not bool(value.isfinite().all()):
-                raise self._not_finite(done - 1, key, "not finite")
-
-    def _diverged(self, step: int, loss: float, norm: float) -> TrainingError:
-        what, got = ("loss", loss) if not math.isfinite(loss) else ("gradient norm", norm)
-        return self._not_finite(step, what, str(got))
-
-    def _not_finite(self, step: int, what: str, got: str) -> TrainingError:
-        last = self.checkpoints.last()
-        kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
-        return TrainingError(
-            f"{self.name}: {what} is {got} at step {step + 1}, expected a finite number; {kept}; "
-            f"lower {self.rate} or check the data, and use another out="
-        )
 
     def _validate(self, done: int) -> dict[str, float]:
         self._train_mode(False)
         with torch.no_grad(), global_seed(self.seed, done, "validation"):
             values = {key: float(value) for key, value in self.stage.validate(done).items()}
         self._train_mode(True)
-        # JSON has no NaN; a number that could not be computed is left out, never invented.
-        finite = {key: value for key, value in values.items() if math.isfinite(value)}
-        if values and not finite:
-            raise self._not_finite(done - 1, "validation", next(iter(values)) + " not finite")
-        return finite
+        kept = finite(values)
+        if values and not kept:
+            raise self.watch.not_finite("validation", next(iter(values)) + " not finite", f"step {done}")
+        return kept
 
     def _train_mode(self, on: bool) -> None:
         for module in self.stage.modules.values():
             module.train(on)
 
-    def _log(self, split: str, step: int, values: dict[str, float], logger: MetricLogger) -> None:
-        # JSON has no NaN; a number that could not be computed is left out, never invented.
-        finite = {key: value for key, value in values.items() if math.isfinite(value)}
-        self.history.append(split, step, finite | {"seconds": round(self.state.seconds, 3)})
-        logger.log({f"{self.name}/{split}/{key}": value for key, value in finite.items()}, step)
-
-
-def as_dict(result: FitResult) -> dict[str, Any]:
-    """A result as plain values, for a checkpoint's meta file."""
-    return asdict(result)
+    def _log(self, split: str, step: int, values: Mapping[str, float]) -> None:
+        self.watch.log(split, step, {**values, "seconds": round(self.state.seconds, 3)}, at=step)

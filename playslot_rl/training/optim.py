@@ -1,4 +1,4 @@
-"""Adam, its schedule as a pure function of the step, clipping, and its state as named tensors (never a pickle)."""
+"""Adam, its schedule as a pure function of the step, and clipping."""
 
 from __future__ import annotations
 
@@ -9,9 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.config import OptimConfig
-from playslot_rl.errors import CheckpointError
-
-_STATES = ("step", "exp_avg", "exp_avg_sq")
 
 
 def learning_rate(config: OptimConfig, step: int, steps: int) -> float:
@@ -50,42 +47,3 @@ def clip_gradients(parameters: Mapping[str, nn.Parameter], maximum: float) -> Te
     """Clip the gradient norm in place (0: leave it) and return the norm before clipping, a scalar tensor."""
     gradients = [parameter for parameter in parameters.values() if parameter.grad is not None]
     return nn.utils.clip_grad_norm_(gradients, maximum if maximum > 0 else math.inf)
-
-
-def adam_tensors(optimizer: torch.optim.Adam, parameters: Mapping[str, nn.Parameter]) -> dict[str, Tensor]:
-    """Adam's state as `PARAMETER/STATE` tensors; parameters that never had a gradient have none."""
-    return {
-        f"{name}/{key}": optimizer.state[parameter][key]
-        for name, parameter in parameters.items()
-        if parameter in optimizer.state
-        for key in _STATES
-    }
-
-
-def restore_adam(
-    optimizer: torch.optim.Adam, parameters: Mapping[str, nn.Parameter], tensors: Mapping[str, Tensor], where: str
-) -> None:
-    """Put `adam_tensors` back.
-
-    Raises:
-        CheckpointError: a tensor is unexpected, missing, or of another shape.
-    """
-    expected = {f"{name}/{key}" for name in parameters for key in _STATES}
-    unexpected = sorted(set(tensors) - expected)
-    if unexpected:
-        raise CheckpointError(f"{where} holds the unexpected tensor {unexpected[0]}: use another out= or delete it")
-    for name, parameter in parameters.items():
-        present = [key for key in _STATES if f"{name}/{key}" in tensors]
-        if not present:
-            continue
-        if len(present) < len(_STATES):
-            raise CheckpointError(f"{where} misses a tensor of {name}, expected {', '.join(_STATES)}: delete it")
-        state = {}
-        for key in _STATES:
-            saved = tensors[f"{name}/{key}"]
-            like = torch.zeros((), device=parameter.device) if key == "step" else torch.zeros_like(parameter)
-            if saved.shape != like.shape:
-                got, want = tuple(saved.shape), tuple(like.shape)
-                raise CheckpointError(f"{where}: {name}/{key} has shape {got}, expected {want}: delete that folder")
-            state[key] = like.detach().copy_(saved)
-        optimizer.state[parameter] = state

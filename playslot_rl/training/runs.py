@@ -14,7 +14,7 @@ to RUN. A child names its parents by the fingerprints of their weights and refus
 from __future__ import annotations
 
 import os
-import shutil
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,16 +24,16 @@ from torch import nn
 
 from playslot_rl.config import EnvConfig, ModelConfig, from_dict
 from playslot_rl.errors import CheckpointError
-from playslot_rl.storage.atomic import explain_write_errors, replace_dir, temporary_name, write_bytes, write_json
+from playslot_rl.storage.atomic import write_bytes, write_json
 from playslot_rl.storage.checkpoints import (
     StageCheckpoint,
     checkpoint_folder,
     load_weights,
     read_json,
     read_stage,
-    remove_leftovers,
     require_parents,
 )
+from playslot_rl.storage.folders import new_folder
 
 if TYPE_CHECKING:
     from playslot_rl.modules.savi import SAVi
@@ -92,16 +92,9 @@ def adopt_stage(checkpoint: StageCheckpoint, run: Path) -> None:
     require_adoptable(checkpoint, run)
     if target.exists():
         return
-    temporary = temporary_name(target)
-    with explain_write_errors(target):
-        remove_leftovers(target)
-        try:
-            temporary.mkdir(parents=True)
-            for file in sorted(checkpoint.path.iterdir()):
-                write_bytes(temporary / file.name, file.read_bytes())
-            replace_dir(temporary, target)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+    with new_folder(target, replace=True) as temporary:
+        for file in sorted(checkpoint.path.iterdir()):
+            write_bytes(temporary / file.name, file.read_bytes())
 
 
 def require_adoptable(checkpoint: StageCheckpoint, run: Path) -> None:
@@ -234,6 +227,16 @@ def load_savi(run: Path | str, device: torch.device | str = "cpu") -> SAVi:
     return savi
 
 
+def world_model_config(stages: Mapping[str, StageCheckpoint]) -> tuple[ModelConfig, EnvConfig]:
+    """The model and environment config of a world model's `slots` and `dynamics`.
+
+    Raises:
+        CheckpointError: a config.json is not one of this version.
+    """
+    model, env = stage_model(stages["dynamics"])
+    return replace(model, savi=stage_model(stages["slots"])[0].savi), env
+
+
 def load_world_model(run: Path | str, device: torch.device | str = "cpu") -> WorldModel:
     """World model of a run or the shipped one (`pretrained`), in eval mode, without gradients for its weights.
 
@@ -243,10 +246,8 @@ def load_world_model(run: Path | str, device: torch.device | str = "cpu") -> Wor
     from playslot_rl.world_model import WorldModel
 
     stages = world_model_checkpoints(run)
-    model, env = stage_model(stages["dynamics"])
-    model = replace(model, savi=stage_model(stages["slots"])[0].savi)
     with torch.random.fork_rng(devices=[]):
-        world = WorldModel(model, env)
+        world = WorldModel(*world_model_config(stages))
     load_weights(stages["slots"], {"savi": world.savi})
     load_weights(stages["dynamics"], {"inverse_dynamics": world.inverse_dynamics, "predictor": world.predictor})
     freeze_on(world, device)

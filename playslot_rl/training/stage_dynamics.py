@@ -1,4 +1,4 @@
-"""Stage 2: InvDyn and cOCVP on the cached slots of a frozen SAVi (system.md section 3). A `Stage` for `fit`."""
+"""Stage 2: InvDyn and cOCVP on the cached slots of a frozen SAVi (paper, appendix A). A `Stage` for `fit`."""
 
 from __future__ import annotations
 
@@ -13,14 +13,11 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.config import DynamicsStageConfig
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import sample_windows, split_episodes, spread_windows
+from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.losses.common import total_loss
 from playslot_rl.losses.dynamics import DynamicsLoss
 from playslot_rl.seeding import StepGenerators, step_generator
 from playslot_rl.world_model import WorldModel
-
-VALIDATION_WINDOWS = 32
-Rows = npt.NDArray[np.int64]
 
 
 class DynamicsStage:
@@ -51,9 +48,7 @@ class DynamicsStage:
         self.criterion = DynamicsLoss(model.inverse_dynamics, model.predictor, model.savi, config)
         if self.criterion.needs_actions:
             source.require_actions(model.env.action_dim)
-        self.frames = config.seed_frames + config.predicted_frames
-        self.train_episodes, held_out = split_episodes(source.episodes, validation, seed)
-        self.validation_rows = spread_windows(source.starts, source.lengths, self.frames, VALIDATION_WINDOWS, held_out)
+        self.clips = Clips(source, config.seed_frames + config.predicted_frames, validation, seed)
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -73,24 +68,22 @@ class DynamicsStage:
         self.model.savi.precision = "fp32"
         outs = [
             self.criterion(self._batch(rows), step_generator(0, step, "validation", self.device))
-            for rows in np.array_split(self.validation_rows, max(1, len(self.validation_rows) // 8))
+            for rows in self.clips.validation_batches()
         ]
         names = ("mse_image", "mse_slot", "psnr", "usage", "perplexity")
         return {name: float(np.mean([float(out[name]) for out in outs])) for name in names}
 
-    def _sample(self, generators: StepGenerators) -> Rows:
-        config, numpy = self.config, generators.numpy("windows")
-        rows = sample_windows(
-            self.source.starts, self.source.lengths, self.frames, config.batch_size, numpy, self.train_episodes
-        )
+    def _sample(self, generators: StepGenerators) -> IntArray:
+        config, numpy, clips = self.config, generators.numpy("windows"), self.clips
+        rows = clips.sample(config.batch_size, numpy)
         if config.from_start > 0:
-            fits = self.train_episodes[self.source.lengths[self.train_episodes] >= self.frames]
+            fits = clips.train_episodes[self.source.lengths[clips.train_episodes] >= clips.frames]
             first = self.source.starts[numpy.choice(fits, config.batch_size)]
             chosen = numpy.random(config.batch_size) < config.from_start
-            rows[chosen] = first[chosen, None] + np.arange(self.frames)
+            rows[chosen] = first[chosen, None] + np.arange(clips.frames)
         return rows
 
-    def _batch(self, rows: Rows) -> TensorDict:
+    def _batch(self, rows: IntArray) -> TensorDict:
         batch = {
             keys.SLOTS: torch.from_numpy(self.slots[rows]).to(self.device),
             keys.PIXELS: self.source.pixels(rows).to(self.device),

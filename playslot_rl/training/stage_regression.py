@@ -60,6 +60,12 @@ class TensorInputs:
         return self.values[rows]
 
 
+Examples = tuple[Inputs, Tensor]
+"""Inputs, and a target (M, ...) for each of them."""
+HELD_OUT = "_held_out"
+"""Ends the names of errors on demonstrations beyond those that are trained on."""
+
+
 class RegressionStage:
     """Regress targets (M, ...) from inputs, rows drawn uniformly with replacement.
 
@@ -69,7 +75,9 @@ class RegressionStage:
         inputs: M of them.
         targets: (M, ...), on the device that computes.
         batch_size: b.
-        validated: at most so many rows, evenly spread, are looked at in a validation; 0 takes all.
+        checks: what a validation looks at, by the name of the error; the training data as `unexplained` if empty.
+        held_out: demonstrations that are not trained on, checked as `unexplained_held_out`.
+        validated: at most so many rows of each, evenly spread, are looked at in a validation; 0 takes all.
         stream: name of the generator that draws the rows; `name` if empty.
         precision: `bf16` trains the network under autocast; it is validated in fp32.
 
@@ -85,6 +93,8 @@ class RegressionStage:
         targets: Tensor,
         batch_size: int,
         *,
+        checks: Mapping[str, Examples] | None = None,
+        held_out: Examples | None = None,
         validated: int = 0,
         stream: str = "",
         precision: Precision = "fp32",
@@ -94,6 +104,9 @@ class RegressionStage:
         self.name, self.criterion, self.stream = name, criterion, stream or name
         self.inputs, self.targets, self.batch_size, self.validated = inputs, targets, batch_size, validated
         self.precision = precision
+        self.checks = dict(checks or {"unexplained": (inputs, targets)})
+        if held_out is not None:
+            self.checks[f"unexplained{HELD_OUT}"] = held_out
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -102,24 +115,22 @@ class RegressionStage:
 
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         """Error of one batch."""
-        rows = draw_rows(len(self.targets), self.batch_size, generators, self.stream, self.targets.device)
-        names = self.criterion.tensor_keys
+        device = self.targets.device
+        drawn = torch.randint(len(self.targets), (self.batch_size,), generator=generators.torch(self.stream, "cpu"))
+        rows, names = drawn.to(device), self.criterion.tensor_keys
         batch = {names.observation: self.inputs.draw(rows, generators), names.action: self.targets[rows]}
-        with torch.autocast(self.targets.device.type, torch.bfloat16, enabled=self.precision == "bf16"):
+        with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):
             losses = self.criterion(TensorDict(batch, [len(rows)]))
         return {"loss": losses[self.criterion.out_name]}
 
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
-        """Unexplained fraction of the targets' variance on the training data."""
-        count = min(self.validated or len(self.targets), len(self.targets))
-        rows = torch.linspace(0, len(self.targets) - 1, count, device=self.targets.device).long()
-        return {"unexplained": unexplained(apply_rows(self.criterion.network, self.inputs, rows), self.targets[rows])}
+        """Unexplained fraction of the targets' variance, of each of the checks."""
+        return {name: self._unexplained(*examples) for name, examples in self.checks.items()}
 
-
-def draw_rows(count: int, batch: int, generators: StepGenerators, stream: str, device: torch.device) -> Tensor:
-    """Row numbers (batch,) in [0, count), int64."""
-    drawn = torch.randint(count, (batch,), generator=generators.torch(stream, "cpu"))
-    return drawn.to(device)
+    def _unexplained(self, inputs: Inputs, targets: Tensor) -> float:
+        count = min(self.validated or len(targets), len(targets))
+        rows = torch.linspace(0, len(targets) - 1, count, device=targets.device).long()
+        return unexplained(apply_rows(self.criterion.network, inputs, rows), targets[rows])
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""Stage 1: SAVi on unlabelled clips (system.md section 1). A `Stage` for `playslot_rl.training.fit`."""
+"""Stage 1: SAVi on unlabelled clips (paper, appendix A.1). A `Stage` for `playslot_rl.training.fit`."""
 
 from __future__ import annotations
 
@@ -12,12 +12,10 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.config import SlotsStageConfig
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import sample_windows, split_episodes, spread_windows
+from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.seeding import StepGenerators, step_generator
-
-VALIDATION_WINDOWS = 32
 
 
 class SlotsStage:
@@ -44,10 +42,7 @@ class SlotsStage:
     ) -> None:
         self.savi, self.source, self.config, self.device = savi, source, config, device
         self.criterion = SlotsLoss(savi)
-        self.train_episodes, held_out = split_episodes(source.episodes, validation, seed)
-        self.validation_rows = spread_windows(
-            source.starts, source.lengths, config.clip_frames, VALIDATION_WINDOWS, held_out
-        )
+        self.clips = Clips(source, config.clip_frames, validation, seed)
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -56,14 +51,7 @@ class SlotsStage:
 
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         """Reconstruction error of one batch of clips."""
-        rows = sample_windows(
-            self.source.starts,
-            self.source.lengths,
-            self.config.clip_frames,
-            self.config.batch_size,
-            generators.numpy("windows"),
-            self.train_episodes,
-        )
+        rows = self.clips.sample(self.config.batch_size, generators.numpy("windows"))
         self.savi.precision = self.config.precision
         out = self.criterion(self._batch(rows), generator=generators.torch("slots"))
         return {"loss": out["loss_reconstruction"], "psnr": out["psnr"]}
@@ -72,11 +60,11 @@ class SlotsStage:
         """PSNR (dB) on held-out clips, in fp32."""
         self.savi.precision = "fp32"
         errors = []
-        for rows in np.array_split(self.validation_rows, max(1, len(self.validation_rows) // 8)):
+        for rows in self.clips.validation_batches():
             out = self.criterion(self._batch(rows), generator=step_generator(0, step, "validation", self.device))
             errors.append(float(out["loss_reconstruction"]))
         mse = float(np.mean(errors))
         return {"mse": mse, "psnr": -10.0 * float(np.log10(max(mse, 1e-12)))}
 
-    def _batch(self, rows: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> TensorDict:
+    def _batch(self, rows: IntArray) -> TensorDict:
         return TensorDict({keys.PIXELS: self.source.pixels(rows).to(self.device)}, [len(rows)])

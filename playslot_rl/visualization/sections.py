@@ -237,6 +237,27 @@ def read_history(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
+LEARNED = {
+    "unexplained_parsed": "policy, from parsed slots",
+    "unexplained_imagined": "policy, from imagined slots",
+    "oracle_unexplained": "slot oracle",
+    "decoder_unexplained": "action decoder",
+}
+"""Errors of the behaviour stage -> what makes them."""
+
+
+def _held_out_errors(metrics: dict[str, Any]) -> list[Block]:
+    """Unexplained variance on the demonstrations trained on and on those that are not; none where none are held out."""
+    rows = [
+        [label, percent(metrics[name]), percent(metrics[f"{name}_held_out"])]
+        for name, label in LEARNED.items()
+        if f"{name}_held_out" in metrics and name in metrics
+    ]
+    if not rows:
+        return []
+    return [Table(["unexplained variance", "training demonstrations", "held-out demonstrations"], rows)]
+
+
 def training_section(given: ReportInput, stages: Sequence[str] = STAGES) -> Section:
     """Stage table and loss curves."""
     blocks: list[Block] = []
@@ -253,7 +274,8 @@ def training_section(given: ReportInput, stages: Sequence[str] = STAGES) -> Sect
             [stage, str(meta.get("steps", "–")), took, machine, str(meta.get("commit", ""))[:12] or "–", metrics or "–"]
         )
     if rows:
-        blocks.insert(0, Table(["stage", "steps", "time", "machine", "commit", "held-out metrics at the end"], rows))
+        blocks.insert(0, Table(["stage", "steps", "time", "machine", "commit", "metrics at the end"], rows))
+        blocks[1:1] = _held_out_errors(given.metas.get("policy", {}).get("metrics", {}))
     paths = {name: given.run / folder / "metrics.jsonl" for name, folder in HISTORIES.items()}
     histories = {name: history for name, path in paths.items() if loss_names(history := read_history(path))}
     if histories:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from functools import partial
 
-from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.baselines.online import train_and_save
-from playslot_rl.recipes.run import finished, open_device, open_run, store_config
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.recipes.baselines.online import online_record, train_and_save
+from playslot_rl.recipes.run import open_device, open_run, store_config
 
 
 def main(config: ExperimentConfig) -> None:
@@ -23,21 +23,16 @@ def main(config: ExperimentConfig) -> None:
     require_online(config, own, "dreamer")  # before anything is written or computed
     run = open_run(config)
 
-    import torch
-
     from playslot_rl.baselines.dreamer.learner import DreamerLearner
     from playslot_rl.baselines.dreamer.load import NAME
     from playslot_rl.baselines.dreamer.networks import DreamerNetworks
-    from playslot_rl.baselines.online.loop import fixed_keys
-    from playslot_rl.seeding import derived_seed
+    from playslot_rl.seeding import global_seed
 
-    trained_as = {"env": to_dict(config.env), NAME: fixed_keys(own)}
-    if finished(config, run, NAME, trained_as, {}, ""):
+    record = online_record(config, own, run, NAME, ready=partial(store_config, config, run))
+    if record.finished():
         return
     device = open_device(config)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derived_seed(config.seed, 0, NAME))
+    with global_seed(config.seed, 0, NAME):
         networks = DreamerNetworks(own, config.env).to(device)
         learner = DreamerLearner(networks, own)
-    ready = partial(store_config, config, run)
-    train_and_save(config, own, run, NAME, learner, {"networks": networks}, device=device, ready=ready)
+    train_and_save(record, own, learner, {"networks": networks}, device)

@@ -5,8 +5,23 @@ The head's sizes are `model.policy`, the schedule is `baselines.resnet_oracle`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache, partial
+from typing import TYPE_CHECKING
+
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import demo_root, finished, fixed_keys, open_device, open_run, open_videos, store_config
+from playslot_rl.recipes.run import (
+    demo_root,
+    held_out_text,
+    open_demonstrations,
+    open_device,
+    open_run,
+    store_config,
+)
+
+if TYPE_CHECKING:
+    from playslot_rl.data.demonstrations import DemonstrationSplit
+    from playslot_rl.training.record import StageRecord, Training
 
 
 def main(config: ExperimentConfig) -> None:
@@ -17,68 +32,67 @@ def main(config: ExperimentConfig) -> None:
         DataError: fewer than `demos` demonstrations, or none with actions.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    import torch
+    from playslot_rl.baselines.oracles.resnet import NAME
+    from playslot_rl.training.record import StageRecord, run_stage
 
+    run = open_run(config)
+    demos = cache(partial(open_demonstrations, config, "train-baseline"))
+    record = StageRecord(
+        NAME,
+        run,
+        config,
+        stored={
+            "env": to_dict(config.env),
+            "model": to_dict(config.model),
+            "behaviour": to_dict(config.behaviour),
+            NAME: to_dict(config.baselines.resnet_oracle),
+        },
+        counts=("model.policy", "behaviour.loss"),
+        open_data=lambda: demos().trained,
+        named=bool(demo_root(config)),
+        role="demos",
+        ready=partial(store_config, config, run),
+    )
+    run_stage(record, lambda: _training(config, record, demos))
+
+
+def _training(config: ExperimentConfig, record: StageRecord, opened: Callable[[], DemonstrationSplit]) -> Training:
     from playslot_rl import keys
-    from playslot_rl.baselines.frame_inputs import FrameInputs
+    from playslot_rl.baselines.frame_inputs import demonstrated_frames
     from playslot_rl.baselines.oracles.resnet import NAME, ResNetPolicy, load_pretrained
-    from playslot_rl.data.demonstrations import first_demonstrations, real_actions, transitions
     from playslot_rl.losses.behaviour import BehaviourLoss
-    from playslot_rl.seeding import derived_seed
-    from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
-    from playslot_rl.training.fit import fit
+    from playslot_rl.seeding import global_seed
+    from playslot_rl.training.fit import Part
+    from playslot_rl.training.record import Training
     from playslot_rl.training.stage_regression import RegressionStage
 
-    run, own, demos = open_run(config), config.baselines.resnet_oracle, demo_root(config)
-    wanted = {"model": {"policy": to_dict(config.model.policy)}, "behaviour": {"loss": config.behaviour.loss}}
-    if finished(config, run, NAME, {**wanted, NAME: fixed_keys(own)}, {}, demos, config.demos):
-        return
-    device = open_device(config)
-    source = first_demonstrations(open_videos(config, demos, "train-baseline"), config.demos)
-    moves = transitions(source)
-    actions = real_actions(source, moves.rows, config.env.action_dim).to(device)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derived_seed(config.seed, 0, NAME))
+    own, device, split = config.baselines.resnet_oracle, open_device(config), opened()
+    inputs, actions = demonstrated_frames(split.trained, config.env.action_dim, device, own.shift)
+    held_out = None
+    if split.held_out is not None:
+        held_out = demonstrated_frames(split.held_out, config.env.action_dim, device)
+    with global_seed(config.seed, 0, NAME):
         policy = ResNetPolicy(config.model.policy, config.env.image_size, config.env.action_dim)
     pretraining = load_pretrained(policy, own.weights)
     policy.to(device)
     criterion = BehaviourLoss(policy, config.behaviour.loss)
     criterion.set_keys(observation=keys.PIXELS, action=keys.ACTION)
-    inputs = FrameInputs(source, moves.rows, device, own.shift)
     stage = RegressionStage(
-        "policy", criterion, inputs, actions, own.batch_size, validated=256, precision=own.precision
+        "policy",
+        criterion,
+        inputs,
+        actions,
+        own.batch_size,
+        held_out=held_out,
+        validated=256,
+        precision=own.precision,
     )
-    result = fit(
-        stage,
-        own,
-        run / NAME,
-        name=f"baselines.{NAME}",
-        seed=config.seed,
-        device=device,
-        logging=config.logging,
-        identity={**wanted, "data": source.fingerprint, "pretraining": pretraining},
-        ready=lambda: store_config(config, run),
+    demos = int((split.trained.lengths >= 2).sum())
+    said = f"{NAME}: {demos} demos, all labelled, {held_out_text(split)}, ResNet-18 from {pretraining}"
+    return Training(
+        [Part(f"baselines.{NAME}", stage, own)],
+        device,
+        lambda _: f"{said}, {record.folder}",
+        extra={"demos": demos, "labelled_demos": demos, "pretraining": pretraining},
+        identity={"pretraining": pretraining},
     )
-    save_stage(
-        checkpoint_folder(run, NAME),
-        stage=NAME,
-        modules=stage.modules,
-        config={
-            "env": to_dict(config.env),
-            "model": to_dict(config.model),
-            "behaviour": to_dict(config.behaviour),
-            NAME: to_dict(own),
-        },
-        data={"demos": source.fingerprint},
-        parents={},
-        metrics=result.metrics,
-        steps=result.step,
-        seconds=result.seconds,
-        extra={
-            "demos": len(moves.lengths),
-            "labelled_demos": len(moves.lengths),
-            "pretraining": pretraining,
-            "seed": config.seed,
-        },
-    )
-    print(f"{NAME}: {len(moves.lengths)} demos, all labelled, ResNet-18 from {pretraining}, {run / NAME}", flush=True)

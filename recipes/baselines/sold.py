@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
-from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.baselines.online import train_and_save
-from playslot_rl.recipes.run import finished, open_device, open_run, parent_run, store_config
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.recipes.baselines.online import online_record, train_and_save
+from playslot_rl.recipes.run import open_device, open_run, parent_run, store_config
 
 
 def main(config: ExperimentConfig) -> None:
@@ -24,12 +24,9 @@ def main(config: ExperimentConfig) -> None:
     require_online(config, own, "sold")  # before anything is written or computed
     run = open_run(config)
 
-    import torch
-
-    from playslot_rl.baselines.online.loop import fixed_keys
     from playslot_rl.baselines.sold.learner import SOLDLearner
     from playslot_rl.baselines.sold.load import NAME, build_networks, prior_steps, slots_checkpoint
-    from playslot_rl.seeding import derived_seed
+    from playslot_rl.seeding import global_seed
     from playslot_rl.storage.checkpoints import require_config
     from playslot_rl.training.runs import load_savi, require_adoptable, use_world_model
 
@@ -37,20 +34,17 @@ def main(config: ExperimentConfig) -> None:
     slots = slots_checkpoint(parent)
     require_adoptable(slots, run)
     require_config(slots, {"env": {"image_size": config.env.image_size}})
-    trained_as = {"env": to_dict(config.env), NAME: fixed_keys(own)}
-    if finished(config, run, NAME, trained_as, {"slots": slots}, ""):
-        return
-    before = prior_steps(own, slots)
 
     def ready() -> None:
         use_world_model(run, parent)
         store_config(config, run)
 
+    record = online_record(config, own, run, NAME, ready=ready, parents={"slots": slots})
+    if record.finished():
+        return
+    before = prior_steps(own, slots)
     device = open_device(config)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derived_seed(config.seed, 0, NAME))
+    with global_seed(config.seed, 0, NAME):
         networks = build_networks(own, slots, config.env.action_dim, config.env.max_steps).to(device)
     learner = SOLDLearner(load_savi(parent, device), networks, own, config.env.action_dim)
-    train_and_save(
-        config, own, run, NAME, learner, learner.trained, device=device, ready=ready, slots=slots, prior_steps=before
-    )
+    train_and_save(record, own, learner, learner.trained, device, prior_steps=before)

@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from clips import moving_square
 
-from playslot_rl.baselines.frame_inputs import FrameInputs, shifted
+from playslot_rl.baselines.frame_inputs import FrameInputs
+from playslot_rl.data.shifted import shift_frames
 from playslot_rl.seeding import StepGenerators
 
 
@@ -19,14 +20,13 @@ def test_rows_are_those_of_the_data_set() -> None:
 
 
 def test_a_shift_moves_the_inside_and_repeats_the_edge() -> None:
-    frames = torch.randint(256, (3, 3, 8, 8), dtype=torch.uint8)
-    offsets = torch.tensor([[0, 0], [2, 0], [-1, 3]])
-    moved = shifted(frames, offsets)
-    assert torch.equal(moved[0], frames[0])
-    assert torch.equal(moved[1, :, 2:], frames[1, :, :-2])
-    assert torch.equal(moved[1, :, 0], frames[1, :, 0])
-    assert torch.equal(moved[1, :, 1], frames[1, :, 0])
-    assert torch.equal(moved[2, :, :-1, 3:], frames[2, :, 1:, :-3])
+    frames = np.random.default_rng(0).integers(256, size=(3, 8, 8, 3), dtype=np.uint8)
+    moved = shift_frames(frames, [[0, 0], [2, 0], [-1, 3]])
+    assert np.array_equal(moved[0], frames[0])
+    assert np.array_equal(moved[1, 2:], frames[1, :-2])
+    assert np.array_equal(moved[1, 0], frames[1, 0])
+    assert np.array_equal(moved[1, 1], frames[1, 0])
+    assert np.array_equal(moved[2, :-1, 3:], frames[2, 1:, :-3])
 
 
 def test_shifts_are_drawn_anew_each_step_and_repeat_with_the_seed() -> None:

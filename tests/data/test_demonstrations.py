@@ -7,7 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from playslot_rl.data.demonstrations import first_demonstrations, real_actions, require_labelled, transitions
+from playslot_rl.data.demonstrations import (
+    first_demonstrations,
+    real_actions,
+    require_labelled,
+    split_demonstrations,
+    transitions,
+)
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.errors import DataError
 
@@ -16,7 +22,8 @@ from playslot_rl.errors import DataError
 def source() -> EpisodeFrames:
     """Episodes of 3, 1 and 2 frames."""
     return EpisodeFrames(
-        frames=np.zeros((6, 2, 2, 3), np.uint8), starts=np.array([0, 3, 4]), lengths=np.array([3, 1, 2]),
+        frames=np.arange(72, dtype=np.uint8).reshape(6, 2, 2, 3),
+        starts=np.array([0, 3, 4]), lengths=np.array([3, 1, 2]),
         actions=np.arange(12, dtype=np.float32).reshape(6, 2) - 1, success=None, seeds=np.array([7, 8, 9]),
         fingerprint="whole", fps=10.0, task="", camera="",
     )  # fmt: skip
@@ -57,3 +64,32 @@ def test_actions_are_clamped_and_of_the_right_width(source: EpisodeFrames) -> No
     assert real_actions(source, np.array([0, 1]), 2).tolist() == [[-1.0, 0.0], [1.0, 1.0]]
     with pytest.raises(DataError, match="got actions of width 2, expected 4"):
         real_actions(source, np.array([0]), 4)
+
+
+@pytest.mark.parametrize(
+    ("demos", "kept", "measured", "expected"),
+    [
+        (None, 0, 10, (3, 3, None)),  # all are trained on: nothing is beyond them
+        (2, 0, 10, (2, 3, [2])),
+        (1, 0, 1, (1, 3, [2])),
+        (None, 1, 0, (2, 2, [2])),
+        (1, 1, 2, (1, 2, [1, 2])),
+        (3, 1, 2, (3, 3, None)),
+    ],
+)
+def test_the_last_demonstrations_beyond_those_trained_on_measure(
+    source: EpisodeFrames, demos: int | None, kept: int, measured: int, expected: tuple[int, int, list[int] | None]
+) -> None:
+    split = split_demonstrations(source, demos, kept, measured)
+    assert (split.trained.episodes, split.parsed.episodes) == expected[:2]
+    if expected[2] is None:
+        assert split.held_out is None
+        return
+    assert split.held_out is not None
+    assert split.held_out.episodes == len(expected[2])
+    for own, episode in enumerate(expected[2]):
+        rows, there = split.held_out.episode_rows(own), source.episode_rows(episode)
+        assert np.array_equal(split.held_out.frames[rows], source.frames[there])
+        if source.actions is not None and split.held_out.actions is not None:
+            assert np.array_equal(split.held_out.actions[rows], source.actions[there])
+    assert len({split.held_out.fingerprint, split.trained.fingerprint, source.fingerprint}) == 3

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from playslot_rl.baselines.frame_inputs import shifted as shifted_frames
 from playslot_rl.data.demonstrations import Demonstrations, first_demonstrations, transitions, with_copies
-from playslot_rl.data.shifted import DIRECTIONS, shifted, shifted_copies
+from playslot_rl.data.shifted import DIRECTIONS, shift_frames, shifted, shifted_copies
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames, concatenate, open_source
 from playslot_rl.modules.savi import SAVi
@@ -24,12 +23,16 @@ def source(foreign_images: Path, tmp_path: Path) -> EpisodeFrames:
 
 
 @pytest.mark.parametrize("offset", [(2, -3), (-1, 0), (0, 4)])
-def test_frames_move_as_the_policies_of_frames_move_them(source: EpisodeFrames, offset: tuple[int, int]) -> None:
+def test_every_frame_of_a_copy_moves_alike(source: EpisodeFrames, offset: tuple[int, int]) -> None:
     rows = np.array([[0, 3], [7, 1]])
-    plain = source.pixels(rows).reshape(4, 3, *source.image_size)
-    moved = shifted(source, offset).pixels(rows).reshape(plain.shape)
-    assert torch.equal(moved, shifted_frames(plain, torch.tensor([offset]).repeat(4, 1)))
-    assert not torch.equal(moved, plain)
+    plain, moved = source.frames[rows], shifted(source, offset).frames[rows]
+    assert np.array_equal(moved, shift_frames(plain, np.full((2, 2, 2), offset)))
+    assert np.array_equal(shifted(source, offset).frames[7], moved[1, 0])
+    size = source.image_size[0]
+    for axis, by in zip((2, 3), offset, strict=True):
+        kept = np.arange(size).take(range(max(0, by), size + min(0, by)))
+        moved, plain = moved.take(kept, axis), plain.take(kept - by, axis)
+    assert np.array_equal(moved, plain)
 
 
 def test_copies_surround_the_original_and_have_names_of_their_own(source: EpisodeFrames) -> None:

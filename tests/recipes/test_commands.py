@@ -31,6 +31,15 @@ def test_the_pipeline_makes_a_whole_run(pipeline: tuple[Path, Done]) -> None:
     assert str(run / "report.html") in done.out
 
 
+def test_the_recorded_demonstrations_beyond_those_trained_on_measure(shared_run: Path) -> None:
+    meta = json.loads((shared_run / "policy" / "checkpoint" / "meta.json").read_text())
+    assert (meta["demos"], meta["held_out_demos"]) == (6, 2)
+    names = ("unexplained_parsed", "unexplained_imagined", "oracle_unexplained", "decoder_unexplained")
+    assert meta["metrics"].keys() == {*names, *(f"{name}_held_out" for name in names)}
+    assert all(meta["metrics"][name] != meta["metrics"][f"{name}_held_out"] for name in names)
+    assert "held-out demonstrations" in (shared_run / "report.md").read_text()
+
+
 @pytest.mark.parametrize("protocol", ["simulation", "imagination"])
 def test_eval_info_has_the_promised_keys(shared_run: Path, protocol: str) -> None:
     info = json.loads((shared_run / "evaluation" / protocol / "eval_info.json").read_text())
@@ -50,7 +59,7 @@ def test_evaluation_seeds_are_none_of_the_collected_ones(shared_run: Path) -> No
     for name in ("random", "expert"):
         record = json.loads((shared_run / "data" / name / "meta" / "playslot.json").read_text())
         collected |= {episode["seed"] for episode in record["episodes"]}
-    assert len(collected) == 12
+    assert len(collected) == 6 + 6 + 2  # videos, demonstrations, and those that are held out
     for protocol in ("simulation", "imagination"):
         info = json.loads((shared_run / "evaluation" / protocol / "eval_info.json").read_text())
         assert not collected & set(info["seeds"])

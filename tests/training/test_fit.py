@@ -19,7 +19,7 @@ import playslot_rl.storage.resume as resume_module
 from playslot_rl.config import LoggingConfig
 from playslot_rl.errors import CheckpointError, ConfigError, OutputError, TrainingError
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
-from playslot_rl.training.fit import fit
+from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.logging import History
 
 
@@ -123,7 +123,7 @@ def test_two_checkpoints_are_kept_and_none_is_a_pickle(tmp_path: Path) -> None:
 
 def test_a_nan_loss_stops_and_keeps_the_last_good_checkpoint(tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match=r"loss is nan at step 8.*step_00000006") as caught:
-        fit(ToyStage(nan_at=7), toy_config(), tmp_path, name="toy", seed=3, identity={"data": "abc"})
+        fit(Part("toy", ToyStage(nan_at=7), toy_config()), tmp_path, seed=3, identity={"data": "abc"})
     assert "\n" not in str(caught.value)
     train(tmp_path / "whole")
     _, result = train(tmp_path)
@@ -133,7 +133,7 @@ def test_a_nan_loss_stops_and_keeps_the_last_good_checkpoint(tmp_path: Path) -> 
 
 def test_a_nan_before_the_first_checkpoint_says_so(tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="no checkpoint yet"):
-        fit(ToyStage(nan_at=0), toy_config(), tmp_path, name="toy", seed=3)
+        fit(Part("toy", ToyStage(nan_at=0), toy_config()), tmp_path, seed=3)
 
 
 def test_an_infinite_gradient_of_a_finite_loss_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,7 +156,7 @@ def test_a_changed_config_is_refused(tmp_path: Path, changes: dict[str, float], 
     train(tmp_path)
     before = tensors(tmp_path, 12)
     with pytest.raises(CheckpointError, match=f"^{key}: got .*, expected .*out=") as caught:
-        fit(ToyStage(), toy_config(**changes), tmp_path, name="toy", seed=3, identity={"data": "abc"})  # type: ignore[arg-type]
+        fit(Part("toy", ToyStage(), toy_config(**changes)), tmp_path, seed=3, identity={"data": "abc"})  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     assert_equal(tensors(tmp_path, 12), before)
 
@@ -165,13 +165,13 @@ def test_a_changed_config_is_refused(tmp_path: Path, changes: dict[str, float], 
 def test_another_seed_or_data_set_is_refused(tmp_path: Path, seed: int, data: str, key: str) -> None:
     train(tmp_path)
     with pytest.raises(CheckpointError, match=f"^{key}: got"):
-        fit(ToyStage(), toy_config(), tmp_path, name="toy", seed=seed, identity={"data": data})
+        fit(Part("toy", ToyStage(), toy_config()), tmp_path, seed=seed, identity={"data": data})
 
 
 def test_intervals_may_change_when_resuming(tmp_path: Path) -> None:
     train(tmp_path)
     config = toy_config(checkpoint_every=5, log_every=1)
-    assert fit(ToyStage(), config, tmp_path, name="toy", seed=3, identity={"data": "abc"}).step == 12
+    assert fit(Part("toy", ToyStage(), config), tmp_path, seed=3, identity={"data": "abc"}).step == 12
 
 
 @pytest.mark.parametrize("name", ["modules.safetensors", "optimizer.safetensors", "state.json"])
@@ -226,7 +226,7 @@ def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
 
 def test_plain_progress_lines_where_there_is_no_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     logging = LoggingConfig(backend="none", progress=True)
-    fit(ToyStage(), toy_config(log_every=1), tmp_path, name="toy", seed=3, logging=logging)
+    fit(Part("toy", ToyStage(), toy_config(log_every=1)), tmp_path, seed=3, logging=logging)
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(",")[0] for line in lines] == ["toy: step 10/12", "toy: step 12/12"]
     assert "steps/s" in lines[0]
@@ -234,7 +234,7 @@ def test_plain_progress_lines_where_there_is_no_terminal(tmp_path: Path, capsys:
 
 def test_tensorboard_logs_are_written(tmp_path: Path) -> None:
     logging = LoggingConfig(backend="tensorboard", progress=False)
-    fit(ToyStage(), toy_config(), tmp_path, name="toy", seed=3, logging=logging)
+    fit(Part("toy", ToyStage(), toy_config()), tmp_path, seed=3, logging=logging)
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(tmp_path / "logs"))
@@ -247,7 +247,7 @@ def test_tensorboard_logs_are_written(tmp_path: Path) -> None:
 def test_a_missing_logging_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(ConfigError, match=r"playslot_rl\[wandb\]"):
-        fit(ToyStage(), toy_config(), tmp_path, name="toy", seed=3, logging=LoggingConfig(backend="wandb"))
+        fit(Part("toy", ToyStage(), toy_config()), tmp_path, seed=3, logging=LoggingConfig(backend="wandb"))
 
 
 def test_the_stored_state_is_readable_json(tmp_path: Path) -> None:

@@ -9,14 +9,15 @@ import torch
 from torch import nn
 
 from playslot_rl import keys
-from playslot_rl.config import BehaviourStageConfig, OptimConfig, StageConfig
+from playslot_rl.config import BehaviourStageConfig, OptimConfig, Precision, StageConfig
 from playslot_rl.data.demonstrations import Demonstrations
 from playslot_rl.losses.behaviour import BehaviourLoss
+from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeding import StepGenerators
 from playslot_rl.testing import tiny_config
-from playslot_rl.training.fit import fit
-from playslot_rl.training.stage_behaviour import CloneStage, oracle_stage
+from playslot_rl.training.fit import Part, fit
+from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, oracle_stage
 from playslot_rl.training.stage_regression import RegressionStage, TensorInputs, unexplained
 
 
@@ -32,7 +33,7 @@ def test_a_linear_map_is_found(tmp_path: Path) -> None:
     y = x @ torch.randn(3, 2)
     network = nn.Linear(3, 2)
     config = StageConfig(steps=200, batch_size=16, optim=OptimConfig(lr=3e-2))
-    result = fit(_stage(network, x, y), config, tmp_path, name="toy", seed=0)
+    result = fit(Part("toy", _stage(network, x, y), config), tmp_path, seed=0)
     assert result.metrics["unexplained"] < 0.01
 
 
@@ -55,13 +56,63 @@ def test_nothing_explained_is_one_and_everything_zero() -> None:
     assert unexplained(target.mean(0).expand(30, 2), target) == pytest.approx(1.0)
 
 
-def test_the_oracle_beside_the_policy_is_the_oracle_alone() -> None:
-    torch.manual_seed(0)
-    sizes, config = tiny_config().model.policy, BehaviourStageConfig(batch_size=8, slot_noise=0.1, imagined=True)
-    demos = Demonstrations(
-        slots=torch.randn(30, 4, 32), imagined=torch.randn(30, 4, 32), latents=torch.randn(30, 8),
-        actions=torch.rand(30, 4), episode=torch.zeros(30, dtype=torch.long), lengths=torch.tensor([30]),
+def _demos(seed: int, count: int = 30) -> Demonstrations:
+    torch.manual_seed(seed)
+    return Demonstrations(
+        slots=torch.randn(count, 4, 32), imagined=torch.randn(count, 4, 32), latents=torch.randn(count, 8),
+        actions=torch.rand(count, 4), episode=torch.zeros(count, dtype=torch.long), lengths=torch.tensor([count]),
     )  # fmt: skip
+
+
+def _policies() -> tuple[LatentPolicy, LatentPolicy]:
+    torch.manual_seed(1)
+    sizes = tiny_config().model.policy
+    return LatentPolicy(sizes, 32, 8), LatentPolicy(sizes, 32, 4)
+
+
+def test_held_out_demonstrations_measure_and_are_not_trained_on() -> None:
+    demos, other = _demos(0), _demos(5, 20)
+    config = BehaviourStageConfig(batch_size=8, labelled_demos=1, decoder_inputs="both")
+    policy, oracle = _policies()
+    alone = CloneStage(policy, oracle, demos, config)
+    beside = CloneStage(policy, oracle, demos, config, other)
+    generators = StepGenerators(3, 5)
+    with torch.no_grad():
+        assert alone.loss(5, generators)["loss"] == beside.loss(5, generators)["loss"]
+        plain, both = alone.validate(1), beside.validate(1)
+    assert {key: both[key] for key in plain} == plain
+    assert both.keys() - plain.keys() == {f"{key}_held_out" for key in plain}
+    assert both["unexplained_parsed_held_out"] == unexplained(policy(other.slots), other.latents)
+    assert other.actions is not None
+    assert both["oracle_unexplained_held_out"] == unexplained(oracle(other.slots), other.actions)
+    decoder = ActionDecoder(tiny_config().model.action_decoder, 8, 4).eval()
+    decode = DecoderStage(decoder, policy, demos, config, other)
+    seen = torch.cat([other.latents, policy(other.slots), policy(other.imagined)])
+    expected = unexplained(decoder(seen), other.actions.repeat(3, 1))
+    assert decode.validate(1)["unexplained_held_out"] == pytest.approx(expected, rel=1e-5)
+    assert set(DecoderStage(decoder, policy, demos, config).validate(1)) == {"unexplained"}
+
+
+def test_bf16_is_trained_under_autocast_and_validated_in_fp32() -> None:
+    demos, (policy, oracle) = _demos(0), _policies()
+    decoder = ActionDecoder(tiny_config().model.action_decoder, 8, 4).eval()
+
+    def stages(precision: Precision) -> list[CloneStage | DecoderStage]:
+        config = BehaviourStageConfig(batch_size=8, labelled_demos=1, precision=precision)
+        return [CloneStage(policy, oracle, demos, config), DecoderStage(decoder, policy, demos, config)]
+
+    for full, half, plain in zip(stages("fp32"), stages("bf16"), stages("fp32"), strict=True):
+        with torch.no_grad():
+            losses = [stage.loss(5, StepGenerators(3, 5)) for stage in (full, half, plain)]
+            assert full.validate(1) == half.validate(1)
+        for name in losses[0]:
+            assert losses[0][name] == losses[2][name] != losses[1][name]
+            torch.testing.assert_close(losses[0][name], losses[1][name], rtol=0.05, atol=0.05)
+
+
+def test_the_oracle_beside_the_policy_is_the_oracle_alone() -> None:
+    sizes, config = tiny_config().model.policy, BehaviourStageConfig(batch_size=8, slot_noise=0.1, imagined=True)
+    demos = _demos(0)
     beside, alone = LatentPolicy(sizes, 32, 4), LatentPolicy(sizes, 32, 4)
     alone.load_state_dict(beside.state_dict())
     assert demos.actions is not None

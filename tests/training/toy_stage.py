@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from playslot_rl.config import OptimConfig, StageConfig
 from playslot_rl.modules.quantizer import ActionQuantizer
 from playslot_rl.seeding import StepGenerators, global_seed
-from playslot_rl.training.fit import FitResult, fit
+from playslot_rl.training.fit import FitResult, Part, fit
 
 
 class ToyStage:
@@ -58,7 +58,7 @@ def toy_config(steps: int = 12, **changes: float) -> StageConfig:
 
 def train(folder: Path, steps: int = 12, delay: float = 0.0) -> tuple[ToyStage, FitResult]:
     stage = ToyStage(delay)
-    return stage, fit(stage, toy_config(steps), folder, name="toy", seed=3, identity={"data": "abc"})
+    return stage, fit(Part("toy", stage, toy_config(steps)), folder, seed=3, identity={"data": "abc"})
 
 
 if __name__ == "__main__":

@@ -10,26 +10,34 @@ Shapes: M transitions, Z latent-action width, A action dim.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.baselines.frame_inputs import FrameInputs
+from playslot_rl.baselines.frame_inputs import FrameInputs, demonstrated_frames
 from playslot_rl.baselines.lapo.load import LAPOPolicy, stored_config
 from playslot_rl.baselines.lapo.model import InverseModel
 from playslot_rl.baselines.lapo.stage import infer_latents
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.data.demonstrations import real_actions, transitions
+from playslot_rl.data.demonstrations import DemonstrationSplit, transitions
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
-from playslot_rl.seeding import derived_seed
+from playslot_rl.seeding import global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
 from playslot_rl.training.runs import freeze_on, stage_model
 from playslot_rl.training.stage_regression import RegressionStage, TensorInputs, apply_rows
+
+
+class _Seen(NamedTuple):
+    """Transitions of demonstrations: frames, latents (M, Z) and real actions (M, A)."""
+
+    frames: FrameInputs
+    latents: Tensor
+    actions: Tensor
 
 
 class LAPOBehaviour:
@@ -38,7 +46,7 @@ class LAPOBehaviour:
     Args:
         config: sizes, schedules, labels.
         model: finished inverse and forward model.
-        source: demonstrations.
+        demos: demonstrations, and those that are held out.
         device: where to compute.
 
     Raises:
@@ -47,22 +55,22 @@ class LAPOBehaviour:
     """
 
     def __init__(
-        self, config: ExperimentConfig, model: StageCheckpoint, source: EpisodeFrames, device: torch.device
+        self, config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
     ) -> None:
-        self.config, self.own, self.source, self.device = config, config.baselines.lapo, source, device
-        self.moves = transitions(source)
-        self.actions = real_actions(source, self.moves.rows, config.env.action_dim).to(device)
-        self.latents = infer_latents(load_inverse(model, device), source, self.moves, device)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(derived_seed(config.seed, 0, "lapo"))
+        self.config, self.own, self.device = config, config.baselines.lapo, device
+        inverse = load_inverse(model, device)
+
+        def seen(source: EpisodeFrames, shift: int = 0) -> _Seen:
+            inputs, actions = demonstrated_frames(source, config.env.action_dim, device, shift)
+            return _Seen(inputs, infer_latents(inverse, source, transitions(source), device), actions)
+
+        self.trained = seen(demos.trained, self.own.shift)
+        self.held_out = None if demos.held_out is None else seen(demos.held_out)
+        self.episode = transitions(demos.trained).episode
+        with global_seed(config.seed, 0, "lapo"):
             self.policy = LAPOPolicy(self.own, config.env.image_size).to(device)
             width = self.own.latent_dim
             self.decoder = ActionDecoder(config.model.action_decoder, width, config.env.action_dim).to(device)
-
-    @property
-    def modules(self) -> Mapping[str, nn.Module]:
-        """What is stored."""
-        return {"policy": self.policy, "action_decoder": self.decoder}
 
     def policy_stage(self) -> RegressionStage:
         """Latent actions from frames of all demonstrations, no action read."""
@@ -71,31 +79,40 @@ class LAPOBehaviour:
         return RegressionStage(
             "policy",
             criterion,
-            FrameInputs(self.source, self.moves.rows, self.device, self.own.shift),
-            self.latents,
+            self.trained.frames,
+            self.trained.latents,
             self.own.policy.batch_size,
+            held_out=self.held_out and (self.held_out.frames, self.held_out.latents),
             validated=1024,
             precision=self.own.policy.precision,
         )
 
     def decoder_stage(self) -> RegressionStage:
         """Real actions of the labelled demonstrations, from inferred latents, the policy's, or both."""
-        behaviour = self.config.behaviour
-        chosen = np.flatnonzero(self.moves.episode < behaviour.labelled_demos)
-        rows = torch.from_numpy(chosen).to(self.device)
-        inputs: list[Tensor] = [] if behaviour.decoder_inputs == "policy" else [self.latents[rows]]
-        if behaviour.decoder_inputs != "inverse_dynamics":
-            self.policy.eval()
-            inputs.append(apply_rows(self.policy, FrameInputs(self.source, self.moves.rows, self.device), rows))
-        latents = torch.cat(inputs)
-        self.decoder.standardise(latents)
+        labelled = np.flatnonzero(self.episode < self.config.behaviour.labelled_demos)
+        inputs, actions = self._decoded(self.trained, torch.from_numpy(labelled).to(self.device))
+        held_out = None
+        if self.held_out is not None:
+            held_out = self._decoded(self.held_out, torch.arange(len(self.held_out.actions), device=self.device))
+        self.decoder.standardise(inputs.values)
         return RegressionStage(
             "action_decoder",
             ActionDecoderLoss(self.decoder, self.own.loss),
-            TensorInputs(latents),
-            self.actions[rows].repeat(len(inputs), 1),
+            inputs,
+            actions,
             self.own.policy.batch_size,
+            held_out=held_out,
+            precision=self.own.policy.precision,
         )
+
+    def _decoded(self, seen: _Seen, rows: Tensor) -> tuple[TensorInputs, Tensor]:
+        """What the decoder regresses from, and what it should give, on rows of demonstrations."""
+        kind = self.config.behaviour.decoder_inputs
+        inputs: list[Tensor] = [] if kind == "policy" else [seen.latents[rows]]
+        if kind != "inverse_dynamics":
+            self.policy.eval()
+            inputs.append(apply_rows(self.policy, seen.frames, rows))
+        return TensorInputs(torch.cat(inputs)), seen.actions[rows].repeat(len(inputs), 1)
 
 
 def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseModel:

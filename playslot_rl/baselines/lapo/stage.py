@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -22,7 +21,7 @@ from playslot_rl.baselines.lapo.model import ForwardModel, InverseModel
 from playslot_rl.config import StageConfig
 from playslot_rl.data.demonstrations import Transitions
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import sample_windows, split_episodes, spread_windows
+from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.seeding import StepGenerators
@@ -58,10 +57,9 @@ class LAPOModelStage:
         device: torch.device | str = "cpu",
     ) -> None:
         self.inverse, self.forward, self.source, self.config, self.device = inverse, forward, source, config, device
-        self.train_episodes, held_out = split_episodes(source.episodes, validation, seed)
-        self.pairs = spread_windows(source.starts, source.lengths, 2, VALIDATION_PAIRS, held_out)
-        seen = spread_windows(source.starts, source.lengths, 2, VALIDATION_PAIRS, self.train_episodes)
-        self.still = max(1e-6, self._still(seen))
+        self.clips = Clips(source, 2, validation, seed, VALIDATION_PAIRS)
+        first, second = self._frames(self.clips.spread(self.clips.train_episodes))
+        self.still = max(1e-6, float((first - second).square().mean()))
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -70,15 +68,7 @@ class LAPOModelStage:
 
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         """Error of one batch of pairs."""
-        rows = sample_windows(
-            self.source.starts,
-            self.source.lengths,
-            2,
-            self.config.batch_size,
-            generators.numpy("pairs"),
-            self.train_episodes,
-        )
-        first, second = self._frames(rows)
+        first, second = self._frames(self.clips.sample(self.config.batch_size, generators.numpy("pairs")))
         with torch.autocast(first.device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
             inferred = self.inverse(first, second)
             predicted = self.forward(first, inferred.z)
@@ -95,7 +85,7 @@ class LAPOModelStage:
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
         """`unexplained`: error on held-out pairs over that of no change; `perplexity` of the codes (1 to K)."""
         errors, stills, codes = [], [], []
-        for rows in np.array_split(self.pairs, -(-len(self.pairs) // BATCH)):
+        for rows in np.array_split(self.clips.held_out, -(-len(self.clips.held_out) // BATCH)):
             first, second = self._frames(rows)
             inferred = self.inverse(first, second)
             errors.append(float((self.forward(first, inferred.z) - second).square().sum()))
@@ -104,13 +94,9 @@ class LAPOModelStage:
         _, perplexity = usage(torch.cat(codes), self.inverse.config.codes)
         return {"unexplained": sum(errors) / max(1e-6, sum(stills)), "perplexity": float(perplexity)}
 
-    def _frames(self, rows: npt.NDArray[np.int64]) -> tuple[Tensor, Tensor]:
+    def _frames(self, rows: IntArray) -> tuple[Tensor, Tensor]:
         pixels = normalise(self.source.pixels(rows).to(self.device))
         return pixels[:, 0], pixels[:, 1]
-
-    def _still(self, rows: npt.NDArray[np.int64]) -> float:
-        first, second = self._frames(rows)
-        return float((first - second).square().mean())
 
 
 @torch.no_grad()

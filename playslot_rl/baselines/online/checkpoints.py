@@ -16,10 +16,11 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import nn
 
 from playslot_rl.baselines.online.replay import Replay
 from playslot_rl.errors import CheckpointError
+from playslot_rl.storage.optimizers import optimizer_tensors, restore_optimizer
 from playslot_rl.storage.resume import KEPT, TrainingCheckpoints
 from playslot_rl.storage.tensors import load_modules, load_tensors, module_tensors, save_tensors
 
@@ -49,44 +50,6 @@ class OnlineState:
     metrics: dict[str, float] = field(default_factory=dict)
     curve: list[dict[str, Any]] = field(default_factory=list)
     random: dict[str, Any] = field(default_factory=dict)
-
-
-def optimizer_tensors(optimizers: Mapping[str, torch.optim.Optimizer]) -> dict[str, Tensor]:
-    """State of all optimisers as tensors: `NAME/PARAMETER/STATE`, and the groups' own step counters."""
-    tensors: dict[str, Tensor] = {}
-    for name, optimizer in optimizers.items():
-        stored = optimizer.state_dict()
-        for index, values in stored["state"].items():
-            tensors.update({f"{name}/{index}/{key}": torch.as_tensor(value) for key, value in values.items()})
-        for index, group in enumerate(stored["param_groups"]):
-            if "step" in group:
-                tensors[f"{name}/group{index}/step"] = torch.tensor(group["step"])
-    return tensors
-
-
-def restore_optimizers(
-    optimizers: Mapping[str, torch.optim.Optimizer], tensors: Mapping[str, Tensor], where: str
-) -> None:
-    """Put `optimizer_tensors` back.
-
-    Raises:
-        CheckpointError: they belong to other optimisers.
-    """
-    for name, optimizer in optimizers.items():
-        fresh = optimizer.state_dict()
-        state: dict[int, dict[str, Tensor]] = {}
-        for key, value in tensors.items():
-            owner, index, what = key.split("/")
-            if owner != name:
-                continue
-            if index.startswith("group"):
-                fresh["param_groups"][int(index.removeprefix("group"))]["step"] = int(value)
-            else:
-                state.setdefault(int(index), {})[what] = value
-        known = {index for group in fresh["param_groups"] for index in group["params"]}
-        if not state.keys() <= known:
-            raise CheckpointError(f"{where}: got states of {len(state)} parameters, expected {len(known)}: delete it")
-        optimizer.load_state_dict({"state": state, "param_groups": fresh["param_groups"]})
 
 
 class ReplayJournal:
@@ -180,7 +143,12 @@ class OnlineCheckpoints(TrainingCheckpoints):
         """
         if new is not None:
             self.journal.append(state.episodes - len(new), new)
-        tensors = {"modules": module_tensors(modules), "optimizers": optimizer_tensors(optimizers)}
+        stored = {
+            f"{name}/{key}": value
+            for name, optimizer in optimizers.items()
+            for key, value in optimizer_tensors(optimizer).items()
+        }
+        tensors = {"modules": module_tensors(modules), "optimizers": stored}
         final = self._write(state.step, tensors, asdict(state))
         # Both checkpoints that are kept must find their episodes.
         self._counted = [*self._counted, state.episodes][-KEPT:]
@@ -202,7 +170,10 @@ class OnlineCheckpoints(TrainingCheckpoints):
             return OnlineState()
         last, stored = newest
         load_modules(modules, load_tensors(last / "modules.safetensors"), str(last))
-        restore_optimizers(optimizers, load_tensors(last / "optimizers.safetensors"), str(last))
+        tensors = load_tensors(last / "optimizers.safetensors")
+        for name, optimizer in optimizers.items():
+            own = {key.removeprefix(f"{name}/"): value for key, value in tensors.items() if key.startswith(f"{name}/")}
+            restore_optimizer(optimizer, own, str(last))
         state = OnlineState(**{item.name: stored[item.name] for item in fields(OnlineState)})
         self.journal.rewind(state.episodes)
         replay.restore(self.journal.read(state.episodes), state.episodes)

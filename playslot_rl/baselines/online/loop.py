@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -26,22 +26,13 @@ from playslot_rl.baselines.online.replay import Replay
 from playslot_rl.baselines.online.seeds import development_seeds, training_seed
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.online import OnlineConfig
-from playslot_rl.errors import TrainingError
 from playslot_rl.progress import StageProgress
 from playslot_rl.seeding import StepGenerators, global_seed, step_generator
-from playslot_rl.storage.tensors import module_tensors
-from playslot_rl.training.logging import History, MetricLogger, open_logger
+from playslot_rl.training.fit import fixed_keys
+from playslot_rl.training.watch import Watch
 
 if TYPE_CHECKING:
     from torchrl.trainers.algorithms import DreamerV3UpdateRatio
-
-# How often we look, and how long, does not change what is learned on the way: these may differ on resuming.
-FREE_KEYS: Final = ("minutes", "checkpoint_every", "evaluate_every", "log_every", "replay_on_disk")
-
-
-def fixed_keys(online: OnlineConfig) -> dict[str, Any]:
-    """A method's config without what a resumed or finished run may change."""
-    return {key: value for key, value in to_dict(online).items() if key not in FREE_KEYS}
 
 
 @dataclass(frozen=True)
@@ -99,9 +90,12 @@ def train_online(
     if ready is not None:
         ready()
     start = run.state.step
-    run.history.rewind(start)
+    run.watch.history.rewind(start)
     if not run.finished:
-        run.go_on()
+        progress = StageProgress(name, start, online.steps, config.logging.progress, online.evaluate_every)
+        with run.watch.running(config.logging, start), progress, run.pool:
+            while not run.finished:
+                run.advance(progress)
     run.write_curve()
     draw_curve(folder, name, run.state.curve, run.state.random)
     return OnlineResult(run.state, start, run.state.random)
@@ -127,10 +121,10 @@ class _Run:
         self.learner, self.online, self.config, self.folder = learner, online, config, folder
         self.name, self.title, self.device, self.prior_steps = name, title, device, prior_steps
         self.replay = Replay(online, config.env.max_steps + 1)
-        fixed = fixed_keys(online)
-        env = {"env": to_dict(config.env), "render": to_dict(config.render)}
-        self.checkpoints = OnlineCheckpoints(folder, {name: fixed, "seed": config.seed, **env, **identity})
-        self.history = History(folder / "metrics.jsonl")
+        own = {name: fixed_keys(to_dict(online)), "seed": config.seed}
+        self.checkpoints = OnlineCheckpoints(folder, {**own, **identity})
+        cure = f"lower its learning rate (baselines.{name}.*)"
+        self.watch = Watch(name, folder, self.checkpoints, cure)
         self.state = self.checkpoints.resume_online(learner.modules, learner.optimizers, self.replay)
         self.ratio: DreamerV3UpdateRatio = DreamerV3UpdateRatio(online.update_ratio)
         self.ratio.load_state_dict({"ratio": online.update_ratio, "previous": self.state.ratio_from})
@@ -144,35 +138,19 @@ class _Run:
         late = 0 < self.online.minutes * 60 <= self.state.seconds
         return self.state.step >= self.online.steps or late
 
-    def go_on(self) -> None:
-        """All rounds that are left."""
-        start, logging = self.state.step, self.config.logging
-        logger = open_logger(logging, self.folder / "logs", self.name, start)
-        progress = StageProgress(self.name, start, self.online.steps, logging.progress, self.online.evaluate_every)
-        try:
-            with progress, self.pool:
-                while not self.finished:
-                    self.advance(logger, progress)
-        except KeyboardInterrupt:
-            last = self.checkpoints.last()
-            where = f"step {int(last.name.removeprefix('step_'))} ({last})" if last else "the beginning"
-            raise KeyboardInterrupt(f"{self.name} interrupted; the same command carries on from {where}") from None
-        finally:
-            logger.close()
-
-    def advance(self, logger: MetricLogger, progress: StageProgress) -> None:
+    def advance(self, progress: StageProgress) -> None:
         """One round of episodes, its updates, and whatever is due after it."""
         before = self.state
         if not before.random:
             self.state = replace(before, random=self._measure(random=True))
         self._play()
         if self.state.step > self.online.prefill and self.replay.ready:
-            self._learn(logger)
+            self._learn()
         self.state = replace(self.state, ratio_from=self.ratio.state_dict()["previous"], seconds=self._seconds())
         progress.update(min(self.state.step, self.online.steps), {})
         over = self.finished
         if self._due(before.step, self.online.evaluate_every) or over:
-            self._evaluate(logger)
+            self._evaluate()
         if self._due(before.step, self.online.checkpoint_every) or over:
             self._save()
 
@@ -201,7 +179,7 @@ class _Run:
         values = {"return": sum(played.returns) / n, "success": sum(played.successes) / n}
         self._log("acting", values)
 
-    def _learn(self, logger: MetricLogger) -> None:
+    def _learn(self) -> None:
         self._mode(True)
         for _ in range(self.ratio(self.state.step)):
             update, seed = self.state.updates, self.config.seed
@@ -212,11 +190,10 @@ class _Run:
             numbers = dict(zip(values, torch.stack([v.float() for v in values.values()]).tolist(), strict=True))
             for key, value in numbers.items():
                 if not math.isfinite(value):
-                    raise self._not_finite(key, str(value))
+                    raise self.watch.not_finite(key, str(value), self._when())
             self.state = replace(self.state, updates=update + 1)
             if update == 0 or (update + 1) % self.online.log_every == 0:
-                self._log("train", numbers)
-                logger.log({f"{self.name}/train/{key}": value for key, value in numbers.items()}, update + 1)
+                self._log("train", numbers, at=update + 1)
 
     def _measure(self, random: bool = False) -> dict[str, Any]:
         """Play the development episodes without exploring."""
@@ -232,7 +209,7 @@ class _Run:
         successes = tuple(value for part in played for value in part.successes)
         return curve_point(PlayedEpisodes(played[0].frames, returns, successes))
 
-    def _evaluate(self, logger: MetricLogger) -> None:
+    def _evaluate(self) -> None:
         state = self.state
         point = self._measure()
         row = {
@@ -243,8 +220,7 @@ class _Run:
         }
         metrics = {key: value for key, value in point.items() if isinstance(value, float)}
         self.state = replace(state, metrics=metrics, curve=[*state.curve, row], seconds=self._seconds())
-        self._log("validation", metrics)
-        logger.log({f"{self.name}/validation/{key}": value for key, value in metrics.items()}, state.step)
+        self._log("validation", metrics, at=state.step)
         self.write_curve()
 
     def write_curve(self) -> None:
@@ -253,22 +229,15 @@ class _Run:
         write_curve(self.folder, self.title, self.config.env.name, seeds, self.state.curve, self.state.random)
 
     def _save(self) -> None:
-        for key, value in module_tensors(self.learner.modules).items():
-            if value.is_floating_point() and not bool(value.isfinite().all()):
-                raise self._not_finite(key, "not finite")
+        self.watch.require_finite(self.learner.modules, self._when())
         new = torch.cat(self.new) if self.new else None
         modules, optimizers = self.learner.modules, self.learner.optimizers
         self.checkpoints.save_online(self.state, modules, optimizers, new, self.replay.capacity)
         self.new = []
 
-    def _not_finite(self, what: str, got: str) -> TrainingError:
-        last = self.checkpoints.last()
-        kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
-        return TrainingError(
-            f"{self.name}: {what} is {got} at update {self.state.updates + 1}, expected a finite number; {kept}; "
-            f"lower its learning rate (baselines.{self.name}.*), and use another out="
-        )
+    def _when(self) -> str:
+        return f"update {self.state.updates + 1}"
 
-    def _log(self, split: str, values: Mapping[str, float]) -> None:
+    def _log(self, split: str, values: Mapping[str, float], at: int | None = None) -> None:
         numbers = {"updates": self.state.updates, **values, "seconds": round(self._seconds(), 3)}
-        self.history.append(split, self.state.step, numbers)
+        self.watch.log(split, self.state.step, numbers, at=at)

@@ -9,10 +9,10 @@ from dreamer_parts import A, Parts, random_batch, tiny
 from playslot_rl import keys
 from playslot_rl.baselines.dreamer.learner import DreamerLearner
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
-from playslot_rl.baselines.online.checkpoints import optimizer_tensors, restore_optimizers
 from playslot_rl.config import EnvConfig
 from playslot_rl.errors import ConfigError
 from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.storage.optimizers import optimizer_tensors, restore_optimizer
 from playslot_rl.storage.tensors import load_modules, module_tensors
 
 
@@ -46,8 +46,9 @@ def test_modules_and_optimisers_are_all_that_an_update_depends_on() -> None:
     for number in range(3):
         step(one, number)
     load_modules(other.modules, state(one), "test")
-    tensors = {key: value.clone() for key, value in optimizer_tensors(one.optimizers).items()}
-    restore_optimizers(other.optimizers, tensors, "test")
+    for name, optimizer in one.optimizers.items():
+        tensors = {key: value.clone() for key, value in optimizer_tensors(optimizer).items()}
+        restore_optimizer(other.optimizers[name], tensors, "test")
     for number in range(3, 6):
         assert step(one, number) == step(other, number)
     left, right = state(one), state(other)

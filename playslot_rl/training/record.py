@@ -1,0 +1,202 @@
+"""A stage names itself once: its record says when it is finished, what resumes it, and what is saved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.errors import CheckpointError
+from playslot_rl.storage.checkpoints import (
+    StageCheckpoint,
+    checkpoint_folder,
+    read_stage,
+    require_config,
+    require_parents,
+    save_stage,
+)
+from playslot_rl.training.fit import FitResult, Part, fit, fixed_keys
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """What makes a stage this one and no other.
+
+    Attributes:
+        name: the stage; its folder in the run is called so.
+        run: the run folder.
+        config: of the command.
+        stored: the checkpoint's config, nested plain values: `env` and whatever else the stage depends on.
+        counts: dotted keys of `stored` that a finished and a half-finished stage must share.
+        settings: further ones that a finished stage must share (a half-finished one compares its `Part`s' configs);
+            those of `NAME` if None.
+        identity: further plain values that a half-finished stage must share.
+        parents: checkpoints it is trained on, by stage.
+        open_data: opens what it learns from; None for what learns by acting.
+        named: whether the command names that data set; a finished stage can be asked for without.
+        role: of the data set in the checkpoint (`train` or `demos`).
+        ready: called before the first step, when nothing speaks against it; until then nothing is written.
+    """
+
+    name: str
+    run: Path
+    config: ExperimentConfig
+    stored: Mapping[str, Any]
+    counts: tuple[str, ...] = ()
+    settings: tuple[str, ...] | None = None
+    identity: Mapping[str, Any] = field(default_factory=dict)
+    parents: Mapping[str, StageCheckpoint] = field(default_factory=dict)
+    open_data: Callable[[], EpisodeFrames] | None = None
+    named: bool = True
+    role: str = "train"
+    ready: Callable[[], None] = lambda: None
+
+    @property
+    def folder(self) -> Path:
+        """`RUN/NAME`."""
+        return self.run / self.name
+
+    @cached_property
+    def data(self) -> EpisodeFrames:
+        """What the stage learns from.
+
+        Raises:
+            DataError: none is named, or it cannot be read.
+        """
+        assert self.open_data is not None
+        return self.open_data()
+
+    @cached_property
+    def prints(self) -> dict[str, str]:
+        """Fingerprints of the parents, by stage."""
+        return {name: checkpoint.fingerprint for name, checkpoint in self.parents.items()}
+
+    def finished(self) -> StageCheckpoint | None:
+        """The finished stage, after saying that it is skipped; None if it is not finished.
+
+        Raises:
+            CheckpointError: it was trained otherwise.
+        """
+        path = checkpoint_folder(self.run, self.name)
+        if not (path / "meta.json").is_file():
+            return None
+        done = read_stage(path, self.name)
+        require_parents(done, self.parents)
+        own = (self.name,) if self.settings is None else self.settings
+        require_config(done, fixed_keys(self._of_stored(*self.counts, *own)))
+        facts: list[tuple[str, object, object]] = [("seed", self.config.seed, done.meta.get("seed", self.config.seed))]
+        if self.open_data is not None and self.named:
+            facts.append(("data", self.data.fingerprint, next(iter(done.meta["data"].values()), "none")))
+        for name, got, old in facts:
+            if got != old:
+                raise CheckpointError(f"{name}: got {got}, expected {old} as {path} was trained with: use another out=")
+        print(f"{self.name}: finished before ({done.meta.get('steps')} steps), skipped", flush=True)
+        return done
+
+    def resumes(self) -> dict[str, Any]:
+        """Plain values that a half-finished stage must share, beside its settings and the seed."""
+        data = {} if self.open_data is None else {"data": self.data.fingerprint}
+        return {**self._of_stored(*self.counts), **data, **self.prints, **self.identity}
+
+    def save(
+        self,
+        modules: Mapping[str, nn.Module],
+        metrics: Mapping[str, float],
+        steps: int,
+        seconds: float,
+        extra: Mapping[str, Any],
+    ) -> StageCheckpoint:
+        """Write the finished stage; `extra` goes to its `meta.json`.
+
+        Raises:
+            OutputError: full disk, or a folder that cannot be written.
+        """
+        return save_stage(
+            checkpoint_folder(self.run, self.name),
+            stage=self.name,
+            modules=modules,
+            config=self.stored,
+            data={} if self.open_data is None else {self.role: self.data.fingerprint},
+            parents=self.prints,
+            metrics=metrics,
+            steps=steps,
+            seconds=seconds,
+            extra={"seed": self.config.seed, **extra},
+        )
+
+    def _of_stored(self, *keys: str) -> dict[str, Any]:
+        """The parts of `stored` that dotted keys name, nested as there."""
+        picked: dict[str, Any] = {}
+        for key in keys:
+            *parents, last = key.split(".")
+            source: Any = self.stored
+            target = picked
+            for parent in parents:
+                source, target = source[parent], target.setdefault(parent, {})
+            target[last] = source[last]
+        return picked
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a stage that is not finished trains, and what it says of itself afterwards.
+
+    Attributes:
+        parts: one after the other; made as they are reached, so that a later one may need an earlier one trained. The
+            metrics of all but the first are called after their folder (`decoder_unexplained`).
+        device: of their generators.
+        line: the closing line, from the metrics.
+        extra: more plain values for `meta.json`.
+        identity: further plain values that a half-finished stage must share.
+    """
+
+    parts: Iterable[Part]
+    device: torch.device
+    line: Callable[[Mapping[str, float]], str]
+    extra: Mapping[str, Any] = field(default_factory=dict)
+    identity: Mapping[str, Any] = field(default_factory=dict)
+
+
+def run_stage(record: StageRecord, prepare: Callable[[], Training]) -> StageCheckpoint:
+    """Train a stage, carrying on where it was left, and save it; a finished one is said to be skipped.
+
+    Args:
+        record: what the stage is.
+        prepare: makes what is trained; called only if the stage is not finished.
+
+    Raises:
+        CheckpointError: it was begun or finished otherwise.
+        OutputError, TrainingError, KeyboardInterrupt: as `fit`.
+    """
+    done = record.finished()
+    if done is not None:
+        return done
+    training = prepare()
+    modules: dict[str, nn.Module] = {}
+    metrics: dict[str, float] = {}
+    results: list[FitResult] = []
+    for part in training.parts:
+        result = fit(
+            part,
+            record.folder,
+            seed=record.config.seed,
+            device=training.device,
+            logging=record.config.logging,
+            identity={**record.resumes(), **training.identity},
+            ready=record.ready,
+        )
+        prefix = f"{part.folder}_" if part.folder else ""
+        metrics |= {f"{prefix}{key}": value for key, value in result.metrics.items()}
+        modules |= part.stage.modules
+        results.append(result)
+    seconds = sum(result.seconds for result in results)
+    done = record.save(modules, metrics, results[0].step, seconds, training.extra)
+    print(training.line(metrics), flush=True)
+    return done
