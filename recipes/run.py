@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from playslot_rl.config import ExperimentConfig, StageConfig, to_dict
+from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import SHIPPED, shipped
+from playslot_rl.config.roles import fixed_keys as fixed_keys
 from playslot_rl.errors import ConfigError, DataError, OutputError
 
 if TYPE_CHECKING:
@@ -172,10 +173,3 @@ def finished(
             raise CheckpointError(f"{name}: got {got}, expected {old} as {path} was trained with: use another out=")
     print(f"{stage}: finished before ({done.meta.get('steps')} steps), skipped", flush=True)
     return True
-
-
-def fixed_keys(stage: StageConfig) -> dict[str, Any]:
-    """A stage's config without the intervals, which a resumed or finished stage may change."""
-    from playslot_rl.training.fit import FREE_KEYS
-
-    return {key: value for key, value in to_dict(stage).items() if key not in FREE_KEYS}

@@ -19,11 +19,9 @@ from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import shipped
 from playslot_rl.config.methods import METHODS, MethodName
+from playslot_rl.config.roles import without
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
-
-_OF_THE_MACHINE = ("device", "threads", "workers", "logging", "collector", "compare", "preset", "out", "run")
-"""Config that says where and how loudly a job runs, not what comes out; of data and parents the content counts."""
 
 
 @dataclass(frozen=True)
@@ -196,10 +194,9 @@ def job_record(job: Job, config: ExperimentConfig, parents: Mapping[str, str]) -
         parents: fingerprints of the weights and demonstrations it builds on.
     """
     values = to_dict(config)
-    result = {key: value for key, value in values.items() if key not in _OF_THE_MACHINE}
-    result["data"] = {key: value for key, value in result["data"].items() if key not in ("root", "demos", "cache")}
-    own = result["baselines"].get(job.method, {})  # another method's settings are none of this job's
-    result["baselines"] = {key: value for key, value in own.items() if key != "world"}
+    result = without(config, "machine")  # of data and parents the content counts
+    own = result["baselines"].get(job.method, {})
+    result["baselines"] = own  # another method's settings are none of this job's
     identity = json.dumps([result, config.compare.evaluation_seed, dict(parents)], sort_keys=True)
     return {
         "name": job.name,

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from playslot_rl.config.plain import check
+from playslot_rl.config.roles import role
 
 
 @dataclass(frozen=True)
@@ -21,11 +22,11 @@ class DataConfig:
         validation: fraction of episodes held out from training.
     """
 
-    root: str = ""
-    demos: str = ""
+    root: str = field(default="", metadata=role("machine", "folder"))
+    demos: str = field(default="", metadata=role("machine", "folder"))
     camera: str = ""
     resize: bool = False
-    cache: str = ""
+    cache: str = field(default="", metadata=role("machine", "folder"))
     validation: float = 0.05
 
     def __post_init__(self) -> None:

@@ -16,7 +16,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.config import LoggingConfig, StageConfig, to_dict
+from playslot_rl.config import LoggingConfig, StageConfig
+from playslot_rl.config.roles import fixed_keys
 from playslot_rl.errors import TrainingError
 from playslot_rl.progress import StageProgress
 from playslot_rl.seeding import StepGenerators, global_seed
@@ -24,9 +25,6 @@ from playslot_rl.storage.resume import TrainingCheckpoints, TrainingState
 from playslot_rl.storage.tensors import module_tensors
 from playslot_rl.training.logging import History, MetricLogger, open_logger
 from playslot_rl.training.optim import build_adam, clip_gradients, learning_rate, trainable_parameters
-
-# How often we look does not change what is learned: these may differ when a run is resumed.
-FREE_KEYS = ("checkpoint_every", "validate_every", "log_every")
 
 
 class Stage(Protocol):
@@ -136,8 +134,9 @@ class _Run:
         self.stage, self.config, self.name, self.seed, self.device = stage, config, name, seed, device
         self.parameters = trainable_parameters(stage.modules)
         self.optimizer = build_adam(self.parameters, config.optim)
-        fixed = {key: value for key, value in to_dict(config).items() if key not in FREE_KEYS}
-        self.checkpoints = TrainingCheckpoints(folder / "checkpoints", {name: fixed, "seed": seed, **identity})
+        self.checkpoints = TrainingCheckpoints(
+            folder / "checkpoints", {name: fixed_keys(config), "seed": seed, **identity}
+        )
         self.history = History(folder / "metrics.jsonl")
         self.state = self.checkpoints.resume(stage.modules, self.optimizer, self.parameters)
         self._began = time.monotonic() - self.state.seconds

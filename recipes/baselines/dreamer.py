@@ -28,7 +28,7 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.baselines.dreamer.learner import DreamerLearner
     from playslot_rl.baselines.dreamer.load import NAME
     from playslot_rl.baselines.dreamer.networks import DreamerNetworks
-    from playslot_rl.baselines.online.loop import fixed_keys
+    from playslot_rl.config.roles import fixed_keys
     from playslot_rl.seeding import derived_seed
 
     trained_as = {"env": to_dict(config.env), NAME: fixed_keys(own)}

@@ -26,9 +26,9 @@ def main(config: ExperimentConfig) -> None:
 
     import torch
 
-    from playslot_rl.baselines.online.loop import fixed_keys
     from playslot_rl.baselines.sold.learner import SOLDLearner
     from playslot_rl.baselines.sold.load import NAME, build_networks, prior_steps, slots_checkpoint
+    from playslot_rl.config.roles import fixed_keys
     from playslot_rl.seeding import derived_seed
     from playslot_rl.storage.checkpoints import require_config
     from playslot_rl.training.runs import load_savi, require_adoptable, use_world_model

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -25,7 +25,8 @@ from playslot_rl.baselines.online.learner import Learner
 from playslot_rl.baselines.online.replay import Replay
 from playslot_rl.baselines.online.seeds import development_seeds, training_seed
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.config.online import OnlineConfig
+from playslot_rl.config.baselines import OnlineConfig
+from playslot_rl.config.roles import fixed_keys
 from playslot_rl.errors import TrainingError
 from playslot_rl.progress import StageProgress
 from playslot_rl.seeding import StepGenerators, global_seed, step_generator
@@ -34,14 +35,6 @@ from playslot_rl.training.logging import History, MetricLogger, open_logger
 
 if TYPE_CHECKING:
     from torchrl.trainers.algorithms import DreamerV3UpdateRatio
-
-# How often we look, and how long, does not change what is learned on the way: these may differ on resuming.
-FREE_KEYS: Final = ("minutes", "checkpoint_every", "evaluate_every", "log_every", "replay_on_disk")
-
-
-def fixed_keys(online: OnlineConfig) -> dict[str, Any]:
-    """A method's config without what a resumed or finished run may change."""
-    return {key: value for key, value in to_dict(online).items() if key not in FREE_KEYS}
 
 
 @dataclass(frozen=True)
@@ -127,9 +120,8 @@ class _Run:
         self.learner, self.online, self.config, self.folder = learner, online, config, folder
         self.name, self.title, self.device, self.prior_steps = name, title, device, prior_steps
         self.replay = Replay(online, config.env.max_steps + 1)
-        fixed = fixed_keys(online)
         env = {"env": to_dict(config.env), "render": to_dict(config.render)}
-        self.checkpoints = OnlineCheckpoints(folder, {name: fixed, "seed": config.seed, **env, **identity})
+        self.checkpoints = OnlineCheckpoints(folder, {name: fixed_keys(online), "seed": config.seed, **env, **identity})
         self.history = History(folder / "metrics.jsonl")
         self.state = self.checkpoints.resume_online(learner.modules, learner.optimizers, self.replay)
         self.ratio: DreamerV3UpdateRatio = DreamerV3UpdateRatio(online.update_ratio)

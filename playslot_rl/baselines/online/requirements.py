@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from playslot_rl.baselines.online.seeds import check_seeds
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.online import OnlineConfig
+from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import ConfigError
 
