@@ -19,9 +19,10 @@ from torchrl.envs import EnvBase
 
 from playslot_rl import keys
 from playslot_rl.collectors.policies import EPISODE_SEED, EPISODE_STEP, EXPERT_ACTION, make_policy
-from playslot_rl.collectors.spec import CollectionSpec, redraw
+from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.envs import make_env, task_env
 from playslot_rl.envs.torchrl import TensorView, View, wrap
+from playslot_rl.episode_seeds import redraw_stride
 from playslot_rl.errors import ConfigError
 
 EPISODE_INDEX = "episode_index"
@@ -114,7 +115,7 @@ class SeededView(TensorView):
             self._running = self.jobs.popleft()
         first, self._step = self._running.seed, 0
         for attempt in range(MAX_REDRAWS):
-            self._episode_seed, self._redrawn = redraw(first, attempt), attempt
+            self._episode_seed, self._redrawn = first + attempt * redraw_stride(first), attempt
             observation, info = self.env.reset(seed=self._episode_seed)
             if not info["success"]:
                 return self.view(observation, info), info

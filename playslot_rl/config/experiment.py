@@ -11,9 +11,10 @@ from playslot_rl.config.data import CollectConfig, CollectorConfig, DataConfig
 from playslot_rl.config.env import EnvConfig, RenderConfig
 from playslot_rl.config.methods import MethodName
 from playslot_rl.config.model import ModelConfig
-from playslot_rl.config.plain import check
+from playslot_rl.config.plain import check, check_seed
 from playslot_rl.config.roles import role
 from playslot_rl.config.stages import BehaviourStageConfig, DynamicsStageConfig, SlotsStageConfig
+from playslot_rl.episode_seeds import EVALUATION
 
 
 @dataclass(frozen=True)
@@ -22,11 +23,16 @@ class EvaluationConfig:
 
     Attributes:
         references: also run the random, expert and slot-oracle references.
-        seed_offset: added to `seed`, far above every collection seed, so that no episode was seen in training.
+        seed_offset: first number of the episodes of small seeds (`playslot_rl.episode_seeds`), above all collections'.
+            Below that only the records of the training data sets, which are looked at, keep episodes apart.
     """
 
     references: bool = True
-    seed_offset: int = 1_000_000_000
+    seed_offset: int = EVALUATION
+
+    def __post_init__(self) -> None:
+        most = 2 * EVALUATION
+        check(0 <= self.seed_offset <= most, "evaluation.seed_offset", self.seed_offset, f"0 to {most}")
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,7 @@ class ExperimentConfig:
         preset: name of the preset the values came from.
         policy: collector policy of `collect`: `random` or `expert`.
         episodes: episodes to collect or to evaluate; None means the command's default.
-        seed: seed of data collection, training or evaluation.
+        seed: seed of data collection, training or evaluation, any 32-bit number.
         workers: collector processes; 0 means one per core.
         out: folder to write.
         run: run folder to read (and to write where `out` is empty); `pretrained` names the shipped model.
@@ -103,6 +109,6 @@ class ExperimentConfig:
 
     def __post_init__(self) -> None:
         check(self.episodes is None or self.episodes >= 1, "episodes", self.episodes, "at least 1")
-        check(self.seed >= 0, "seed", self.seed, "a non-negative integer")
+        check_seed("seed", self.seed)
         check(self.demos is None or self.demos >= 1, "demos", self.demos, "at least 1")
         check(self.workers >= 0, "workers", self.workers, "0 (one per core) or more")
