@@ -39,7 +39,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Episode:
+class RecordedEpisode:
     """One recorded episode.
 
     Attributes:
@@ -179,7 +179,7 @@ class EpisodeCollector(Collector):
         """A collector in this process."""
         return cls(TaskMaker(spec), make_policy(spec.policy, spec.noise), **collector_settings(spec))
 
-    def record(self, job: Job) -> Episode:
+    def record(self, job: Job) -> RecordedEpisode:
         """Record one episode.
 
         Raises:
@@ -203,14 +203,14 @@ def collector_settings(spec: CollectionSpec) -> dict[str, Any]:
     }
 
 
-def _episode(batch: TensorDictBase) -> Episode:
+def _episode(batch: TensorDictBase) -> RecordedEpisode:
     """The episode in a batch of shape (T,)."""
     last = batch[-1]["next"]
     steps = batch[EPISODE_STEP].flatten().tolist()
     if steps != list(range(len(steps))) or not bool(last["done"]):
         raise RuntimeError(f"a collector's batch is not one whole episode: its steps are {steps}")
     frames = np.concatenate([batch[keys.PIXELS].numpy(), last[keys.PIXELS].numpy()[None]])
-    return Episode(
+    return RecordedEpisode(
         index=int(batch[0][EPISODE_INDEX]),
         seed=int(batch[0][EPISODE_SEED]),
         redrawn=int(batch[0][REDRAWN]),
@@ -222,7 +222,7 @@ def _episode(batch: TensorDictBase) -> Episode:
     )
 
 
-def record(spec: CollectionSpec, indices: Sequence[int]) -> Iterator[Episode]:
+def record(spec: CollectionSpec, indices: Sequence[int]) -> Iterator[RecordedEpisode]:
     """Record the episodes `indices` of a collection in this process, one after the other.
 
     Raises:

@@ -9,14 +9,14 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from playslot_rl.collectors.episodes import Episode
+from playslot_rl.collectors.episodes import RecordedEpisode
 from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.envs.grid_shapes import generate
 
 CLIPS_AT_ONCE = 64
 
 
-def record(spec: CollectionSpec, indices: Sequence[int], workers: int = 1) -> Iterator[Episode]:
+def record(spec: CollectionSpec, indices: Sequence[int], workers: int = 1) -> Iterator[RecordedEpisode]:
     """Draw the episodes `indices` of a collection.
 
     Args:
@@ -33,7 +33,7 @@ def record(spec: CollectionSpec, indices: Sequence[int], workers: int = 1) -> It
         seeds = [spec.episode_seed(index) for index in some]
         clips = generate(seeds, spec.steps, spec.env)
         for number, (index, seed) in enumerate(zip(some, seeds, strict=True)):
-            yield Episode(
+            yield RecordedEpisode(
                 index=index,
                 seed=seed,
                 redrawn=0,
