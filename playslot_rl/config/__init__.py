@@ -4,72 +4,38 @@
 `to_dict` is its inverse; `fingerprint` names a config by its content (all three: `playslot_rl.config.plain`).
 """
 
-from playslot_rl.config.baselines import (
-    BaselinesConfig,
-    DreamerConfig,
-    LAPOConfig,
-    OnlineConfig,
-    ResNetOracleConfig,
-    SOLDConfig,
-)
-from playslot_rl.config.compare import CompareConfig
-from playslot_rl.config.data import CollectConfig, CollectorConfig, DataConfig
-from playslot_rl.config.env import BlocksConfig, EnvConfig, GridConfig, RenderConfig
-from playslot_rl.config.experiment import EvaluationConfig, ExperimentConfig, ExportConfig, LoggingConfig
-from playslot_rl.config.methods import MethodName
-from playslot_rl.config.model import (
-    ActionDecoderConfig,
-    InverseDynamicsConfig,
-    LatentMode,
-    ModelConfig,
-    PolicyConfig,
-    PredictorConfig,
-    SAViConfig,
-)
-from playslot_rl.config.plain import fingerprint, from_dict, to_dict
-from playslot_rl.config.stages import (
-    BehaviourStageConfig,
-    DynamicsStageConfig,
-    OptimConfig,
-    Precision,
-    SlotsStageConfig,
-    StageConfig,
-)
-
-__all__ = [
-    "ActionDecoderConfig",
-    "BaselinesConfig",
-    "BehaviourStageConfig",
-    "BlocksConfig",
-    "CollectConfig",
-    "CollectorConfig",
-    "CompareConfig",
-    "DataConfig",
-    "DreamerConfig",
-    "DynamicsStageConfig",
-    "EnvConfig",
-    "EvaluationConfig",
-    "ExperimentConfig",
-    "ExportConfig",
-    "GridConfig",
-    "InverseDynamicsConfig",
-    "LAPOConfig",
-    "LatentMode",
-    "LoggingConfig",
-    "MethodName",
-    "ModelConfig",
-    "OnlineConfig",
-    "OptimConfig",
-    "PolicyConfig",
-    "Precision",
-    "PredictorConfig",
-    "RenderConfig",
-    "ResNetOracleConfig",
-    "SAViConfig",
-    "SOLDConfig",
-    "SlotsStageConfig",
-    "StageConfig",
-    "fingerprint",
-    "from_dict",
-    "to_dict",
-]
+from playslot_rl.config.baselines import BaselinesConfig as BaselinesConfig
+from playslot_rl.config.baselines import DreamerConfig as DreamerConfig
+from playslot_rl.config.baselines import LAPOConfig as LAPOConfig
+from playslot_rl.config.baselines import OnlineConfig as OnlineConfig
+from playslot_rl.config.baselines import ResNetOracleConfig as ResNetOracleConfig
+from playslot_rl.config.baselines import SOLDConfig as SOLDConfig
+from playslot_rl.config.compare import CompareConfig as CompareConfig
+from playslot_rl.config.data import CollectConfig as CollectConfig
+from playslot_rl.config.data import CollectorConfig as CollectorConfig
+from playslot_rl.config.data import DataConfig as DataConfig
+from playslot_rl.config.env import BlocksConfig as BlocksConfig
+from playslot_rl.config.env import EnvConfig as EnvConfig
+from playslot_rl.config.env import GridConfig as GridConfig
+from playslot_rl.config.env import RenderConfig as RenderConfig
+from playslot_rl.config.experiment import EvaluationConfig as EvaluationConfig
+from playslot_rl.config.experiment import ExperimentConfig as ExperimentConfig
+from playslot_rl.config.experiment import ExportConfig as ExportConfig
+from playslot_rl.config.experiment import LoggingConfig as LoggingConfig
+from playslot_rl.config.methods import MethodName as MethodName
+from playslot_rl.config.model import ActionDecoderConfig as ActionDecoderConfig
+from playslot_rl.config.model import InverseDynamicsConfig as InverseDynamicsConfig
+from playslot_rl.config.model import LatentMode as LatentMode
+from playslot_rl.config.model import ModelConfig as ModelConfig
+from playslot_rl.config.model import PolicyConfig as PolicyConfig
+from playslot_rl.config.model import PredictorConfig as PredictorConfig
+from playslot_rl.config.model import SAViConfig as SAViConfig
+from playslot_rl.config.plain import fingerprint as fingerprint
+from playslot_rl.config.plain import from_dict as from_dict
+from playslot_rl.config.plain import to_dict as to_dict
+from playslot_rl.config.stages import BehaviourStageConfig as BehaviourStageConfig
+from playslot_rl.config.stages import DynamicsStageConfig as DynamicsStageConfig
+from playslot_rl.config.stages import OptimConfig as OptimConfig
+from playslot_rl.config.stages import Precision as Precision
+from playslot_rl.config.stages import SlotsStageConfig as SlotsStageConfig
+from playslot_rl.config.stages import StageConfig as StageConfig
