@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import sys
-import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from playslot_rl.collectors.export import META_NAME, export
@@ -14,11 +11,8 @@ from playslot_rl.collectors.journal import Journal, journal_path, read_spec
 from playslot_rl.collectors.spec import CollectionSpec, completed, difference
 from playslot_rl.config import CollectorConfig, ExperimentConfig
 from playslot_rl.errors import DataError, OutputError
-from playslot_rl.progress import format_seconds
+from playslot_rl.progress import StageProgress
 from playslot_rl.threads import available_cores
-
-PLAIN_EVERY_S = 10.0
-"""Seconds between progress lines where standard error is no terminal."""
 
 
 def is_complete(out: Path, spec: CollectionSpec) -> bool:
@@ -60,49 +54,6 @@ def begun_episodes(out: Path) -> int | None:
             spec = read_spec(record).get("spec")
             return int(spec["episodes"]) if isinstance(spec, dict) and "episodes" in spec else None
     return None
-
-
-@contextlib.contextmanager
-def progress(name: str, done: int, total: int, enabled: bool) -> Iterator[Callable[[], None]]:
-    """Show episodes, rate and remaining time; gives a function to call after each episode."""
-    began, start = time.monotonic(), done
-    if not enabled:
-        yield lambda: None
-        return
-    if sys.stderr.isatty():
-        from rich import progress as rich
-        from rich.console import Console
-
-        columns = (
-            rich.TextColumn("{task.description}"),
-            rich.BarColumn(),
-            rich.MofNCompleteColumn(),
-            rich.TextColumn("{task.fields[rate]}"),
-            rich.TimeRemainingColumn(),
-        )
-        with rich.Progress(*columns, console=Console(stderr=True)) as bar:
-            task = bar.add_task(name, total=total, completed=done, rate="starting")
-
-            def advance() -> None:
-                nonlocal done
-                done += 1
-                rate = (done - start) / max(1e-9, time.monotonic() - began)
-                bar.update(task, completed=done, rate=f"{rate:.1f} episodes/s")
-
-            yield advance
-        return
-    last = began
-
-    def line() -> None:
-        nonlocal done, last
-        done += 1
-        now = time.monotonic()
-        if done == total or now - last >= PLAIN_EVERY_S:
-            last, rate = now, (done - start) / max(1e-9, now - began)
-            left = format_seconds((total - done) / rate)
-            print(f"{name}: {done}/{total}, {rate:.1f} episodes/s, {left} left", file=sys.stderr, flush=True)
-
-    yield line
 
 
 def collect(
@@ -177,6 +128,7 @@ def _record_missing(journal: Journal, workers: int, settings: CollectorConfig, s
 
     if shown and len(missing) < total:
         say(f"{total - len(missing)} of {total} episodes are there already")
-    with progress(f"collect {journal.spec.policy}", total - len(missing), total, shown) as advance:
-        for _ in record_into(journal, missing, workers, settings, say):
-            advance()
+    done = total - len(missing)
+    with StageProgress(f"collect {journal.spec.policy}", done, total, shown, unit="episodes") as progress:
+        for count, _ in enumerate(record_into(journal, missing, workers, settings, say), done + 1):
+            progress.update(count)

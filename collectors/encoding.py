@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.collectors.episodes import Episode
+from playslot_rl.collectors.episodes import RecordedEpisode
 from playslot_rl.errors import OutputError
 
 ARRAYS: Final = ("states", "actions", "rewards", "success")
@@ -44,7 +44,7 @@ def decode_png(content: bytes) -> Frames:
         return np.asarray(image)
 
 
-def encode(episode: Episode) -> bytes:
+def encode(episode: RecordedEpisode) -> bytes:
     """Content of the episode's file."""
     images = [png(frame) for frame in episode.frames]
     arrays: dict[str, Any] = {name: getattr(episode, name) for name in ARRAYS}
@@ -59,7 +59,7 @@ def encode(episode: Episode) -> bytes:
     return buffer.getvalue()
 
 
-def read(path: Path, decode: bool = True) -> tuple[Episode, list[bytes]]:
+def read(path: Path, decode: bool = True) -> tuple[RecordedEpisode, list[bytes]]:
     """The episode in a file, and the PNGs of its frames.
 
     Args:
@@ -81,7 +81,7 @@ def read(path: Path, decode: bool = True) -> tuple[Episode, list[bytes]]:
                 content = file["images"].tobytes()
                 images = [content[start:end] for start, end in zip([0, *ends], ends, strict=False)]
                 frames = np.stack([decode_png(i) for i in images]) if decode else np.zeros(0, np.uint8)
-        return Episode(numbers[0], numbers[1], numbers[2], frames, **arrays), images
+        return RecordedEpisode(numbers[0], numbers[1], numbers[2], frames, **arrays), images
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise OutputError(
             f"{path}: got a damaged file ({error}), expected an episode; delete it and run the same command again"

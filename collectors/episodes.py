@@ -1,4 +1,6 @@
-"""Episodes from TorchRL's collector, each with a seed of its own.
+"""Episodes from TorchRL's collector, each with a seed of its own: policies, seeded environments, the collector.
+
+The policies' random numbers are functions of an episode's seed and step, so that it is the same in any process.
 
 Shapes: T agent steps, A action dim, S proprioception, H W image height and width.
 """
@@ -8,25 +10,76 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
+import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from playslot_rl import keys
-from playslot_rl.collectors.policies import EPISODE_SEED, EPISODE_STEP, EXPERT_ACTION, make_policy
-from playslot_rl.collectors.spec import CollectionSpec, redraw
+from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.envs import make_env, task_env
 from playslot_rl.envs.torchrl import TensorView, View, wrap
+from playslot_rl.episode_seeds import redraw_stride
 from playslot_rl.errors import ConfigError
 
-EPISODE_INDEX = "episode_index"
-REDRAWN = "redrawn"
-MAX_REDRAWS = 20
+EPISODE_INDEX: Final = "episode_index"
+REDRAWN: Final = "redrawn"
+EPISODE_SEED: Final = "episode_seed"
+"""Seed of the running episode: int64 (1,)."""
+EPISODE_STEP: Final = "episode_step"
+"""Agent steps since its reset: int64 (1,)."""
+EXPERT_ACTION: Final = "expert_action"
+"""The scripted expert's action for the present state: float32 (A,)."""
+POLICY_STREAM: Final = 2
+"""Spawn key of the policy's random numbers; the environment uses 0 and 1 of the same seed."""
+MAX_REDRAWS: Final = 20
+
+
+def step_generator(seed: int, step: int) -> np.random.Generator:
+    """Generator of one step of one episode."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(POLICY_STREAM, step)))
+
+
+class RandomActions(nn.Module):
+    """Uniform actions in [-1, 1]."""
+
+    def forward(self, expert: Tensor, seed: Tensor, step: Tensor) -> Tensor:
+        """Action float32 (A,) from the expert's (A,), of which only the width is used, seed (1,) and step (1,)."""
+        rng = step_generator(int(seed), int(step))
+        return torch.from_numpy(rng.uniform(-1.0, 1.0, expert.shape[-1]).astype(np.float32))
+
+
+class ExpertActions(nn.Module):
+    """The expert's actions, with Gaussian noise.
+
+    Args:
+        noise: standard deviation; the sum is clipped to [-1, 1].
+    """
+
+    def __init__(self, noise: float) -> None:
+        super().__init__()
+        self.noise = noise
+
+    def forward(self, expert: Tensor, seed: Tensor, step: Tensor) -> Tensor:
+        """Action float32 (A,) from the expert's (A,), seed (1,) and step (1,)."""
+        if self.noise == 0.0:
+            return expert.clone()
+        rng = step_generator(int(seed), int(step))
+        noise = rng.normal(0.0, self.noise, expert.shape[-1]).astype(np.float32)
+        return (expert + torch.from_numpy(noise)).clamp(-1.0, 1.0)
+
+
+def make_policy(name: str, noise: float = 0.0) -> TensorDictModule:
+    """Policy of a collector: reads `EXPERT_ACTION`, `EPISODE_SEED`, `EPISODE_STEP` and writes `keys.ACTION`."""
+    module = RandomActions() if name == "random" else ExpertActions(noise)
+    return TensorDictModule(module, in_keys=[EXPERT_ACTION, EPISODE_SEED, EPISODE_STEP], out_keys=[keys.ACTION])
 
 
 @dataclass(frozen=True)
@@ -38,7 +91,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Episode:
+class RecordedEpisode:
     """One recorded episode.
 
     Attributes:
@@ -114,7 +167,7 @@ class SeededView(TensorView):
             self._running = self.jobs.popleft()
         first, self._step = self._running.seed, 0
         for attempt in range(MAX_REDRAWS):
-            self._episode_seed, self._redrawn = redraw(first, attempt), attempt
+            self._episode_seed, self._redrawn = first + attempt * redraw_stride(first), attempt
             observation, info = self.env.reset(seed=self._episode_seed)
             if not info["success"]:
                 return self.view(observation, info), info
@@ -178,7 +231,7 @@ class EpisodeCollector(Collector):
         """A collector in this process."""
         return cls(TaskMaker(spec), make_policy(spec.policy, spec.noise), **collector_settings(spec))
 
-    def record(self, job: Job) -> Episode:
+    def record(self, job: Job) -> RecordedEpisode:
         """Record one episode.
 
         Raises:
@@ -202,14 +255,14 @@ def collector_settings(spec: CollectionSpec) -> dict[str, Any]:
     }
 
 
-def _episode(batch: TensorDictBase) -> Episode:
+def _episode(batch: TensorDictBase) -> RecordedEpisode:
     """The episode in a batch of shape (T,)."""
     last = batch[-1]["next"]
     steps = batch[EPISODE_STEP].flatten().tolist()
     if steps != list(range(len(steps))) or not bool(last["done"]):
         raise RuntimeError(f"a collector's batch is not one whole episode: its steps are {steps}")
     frames = np.concatenate([batch[keys.PIXELS].numpy(), last[keys.PIXELS].numpy()[None]])
-    return Episode(
+    return RecordedEpisode(
         index=int(batch[0][EPISODE_INDEX]),
         seed=int(batch[0][EPISODE_SEED]),
         redrawn=int(batch[0][REDRAWN]),
@@ -221,7 +274,7 @@ def _episode(batch: TensorDictBase) -> Episode:
     )
 
 
-def record(spec: CollectionSpec, indices: Sequence[int]) -> Iterator[Episode]:
+def record(spec: CollectionSpec, indices: Sequence[int]) -> Iterator[RecordedEpisode]:
     """Record the episodes `indices` of a collection in this process, one after the other.
 
     Raises:

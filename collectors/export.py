@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.collectors.episodes import Episode
+from playslot_rl.collectors.episodes import RecordedEpisode
 from playslot_rl.collectors.image_set import ImageSetWriter
 from playslot_rl.collectors.journal import Journal
 from playslot_rl.collectors.spec import CollectionSpec
@@ -64,7 +64,7 @@ def features(spec: CollectionSpec, state_dim: int) -> dict[str, dict[str, Any]]:
     }
 
 
-def rows(episode: Episode, task: str) -> Iterator[dict[str, Any]]:
+def rows(episode: RecordedEpisode, task: str) -> Iterator[dict[str, Any]]:
     """LeRobot frames of an episode: T transitions and then the last observation, whose action is padding.
 
     Reward, success and done of row t belong to the agent step from frame t to t + 1; done is true on the last
@@ -155,7 +155,7 @@ def _write_video(dataset: Any, spec: CollectionSpec, journal: Journal, task: str
     return records
 
 
-def _outcome(episode: Episode) -> dict[str, Any]:
+def _outcome(episode: RecordedEpisode) -> dict[str, Any]:
     solved = bool(episode.success.any())
     return {
         "seed": episode.seed,

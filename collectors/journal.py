@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import shutil
@@ -12,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl.collectors.encoding import encode, read
-from playslot_rl.collectors.episodes import Episode
+from playslot_rl.collectors.episodes import RecordedEpisode
 from playslot_rl.collectors.spec import CollectionSpec, completed, difference
 from playslot_rl.errors import OutputError
 from playslot_rl.storage.atomic import explain_write_errors, write_bytes, write_json
+from playslot_rl.storage.locks import locked
 
 SPEC_NAME = "collection.json"
 LOCK_NAME = "lock"
@@ -31,7 +31,7 @@ def episode_path(folder: Path, index: int) -> Path:
     return folder / f"episode_{index:06d}.npz"
 
 
-def store(folder: Path, episode: Episode) -> None:
+def store(folder: Path, episode: RecordedEpisode) -> None:
     """Write an episode's file into a journal's folder; when this returns it survives a kill and a power cut.
 
     Raises:
@@ -76,42 +76,30 @@ class Journal:
         Raises:
             OutputError: another process is collecting into this folder.
         """
-        with explain_write_errors(self.folder):
-            handle = os.open(self.folder / LOCK_NAME, os.O_CREAT | os.O_RDWR)
-        try:
+        busy = f"{self.folder}: got another process collecting into it, expected none; wait for it or choose out="
+        with contextlib.ExitStack() as stack:
             try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise OutputError(
-                    f"{self.folder}: got another process collecting into it, expected none; wait for it or choose out="
-                ) from error
-            if not self._is_still_there(handle):
+                stack.enter_context(locked(self.folder / LOCK_NAME, busy))
+            except OutputError:
+                if self._is_there():
+                    raise
+            if not self._is_there():  # its owner finished, and removed what we have locked
                 raise OutputError(
                     f"{self.folder}: got a journal that another process has just removed, expected ours; "
                     "run the same command again"
                 )
-            self._sweep()
+            for half in self.folder.glob(".*.tmp-*"):  # of killed processes: the lock is ours, nobody is writing them
+                half.unlink(missing_ok=True)
             yield
-        finally:
-            os.close(handle)
 
-    def _is_still_there(self, handle: int) -> bool:
-        """Whether the locked file is the one that others would lock: the folder's owner may have removed it."""
-        try:
-            return os.path.samestat(os.fstat(handle), (self.folder / LOCK_NAME).stat())
-        except FileNotFoundError:
-            return False
-
-    def _sweep(self) -> None:
-        """Remove halves that killed processes left; the lock is ours, so nobody is writing them."""
-        for half in self.folder.glob(".*.tmp-*"):
-            half.unlink(missing_ok=True)
+    def _is_there(self) -> bool:
+        return (self.folder / SPEC_NAME).is_file()
 
     def path(self, index: int) -> Path:
         """File of episode `index`."""
         return episode_path(self.folder, index)
 
-    def add(self, episode: Episode) -> None:
+    def add(self, episode: RecordedEpisode) -> None:
         """Store an episode; when this returns it survives a kill and a power cut.
 
         Raises:
@@ -123,7 +111,7 @@ class Journal:
         """Store an episode that was encoded elsewhere (see `add`)."""
         write_bytes(self.path(index), content)
 
-    def read(self, index: int) -> Episode:
+    def read(self, index: int) -> RecordedEpisode:
         """Load episode `index`.
 
         Raises:
@@ -131,7 +119,7 @@ class Journal:
         """
         return self.read_with_images(index)[0]
 
-    def read_with_images(self, index: int, decode: bool = True) -> tuple[Episode, list[bytes]]:
+    def read_with_images(self, index: int, decode: bool = True) -> tuple[RecordedEpisode, list[bytes]]:
         """Load episode `index` and the PNGs of its frames; without `decode` its `frames` are left empty.
 
         Raises:

@@ -14,9 +14,8 @@ import warnings
 from typing import Any
 
 from playslot_rl.collectors.encoding import encode
-from playslot_rl.collectors.episodes import EpisodeCollector, Job, TaskMaker, collector_settings
+from playslot_rl.collectors.episodes import EpisodeCollector, Job, TaskMaker, collector_settings, make_policy
 from playslot_rl.collectors.journal import Journal
-from playslot_rl.collectors.policies import make_policy
 from playslot_rl.collectors.workers import Report
 from playslot_rl.errors import ConfigError, PlaySlotError
 

@@ -6,12 +6,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 
-from playslot_rl.collectors import procedural
-from playslot_rl.collectors.episodes import Job, record
+import numpy as np
+
+from playslot_rl.collectors.episodes import Job, RecordedEpisode, record
 from playslot_rl.collectors.journal import Journal
+from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.collectors.workers import LocalWorkers, Report, Workers
 from playslot_rl.config import CollectorConfig
 from playslot_rl.envs import PROCEDURAL
+from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.envs.rendering import check_rendering
 from playslot_rl.errors import PlaySlotError
 
@@ -20,6 +23,7 @@ AHEAD = 2
 POLL_S = 1.0
 START_S = 300.0
 """What a worker is given to import everything, beyond `collector.timeout_s`."""
+CLIPS_AT_ONCE = 64
 
 
 def record_into(
@@ -53,7 +57,7 @@ def record_into(
         return
     drawn = journal.spec.env.name in PROCEDURAL  # quicker than any pool would start
     if drawn or (settings.backend == "local" and workers == 1):
-        for episode in (procedural.record if drawn else record)(journal.spec, indices):
+        for episode in (draw if drawn else record)(journal.spec, indices):
             journal.add(episode)
             yield episode.index
         return
@@ -69,6 +73,33 @@ def record_into(
         yield from _Dispatch(pool, journal, indices, workers, settings, say).run()
     finally:
         pool.close()
+
+
+def draw(spec: CollectionSpec, indices: Sequence[int]) -> Iterator[RecordedEpisode]:
+    """Draw the episodes `indices` of an environment without a simulator (GridShapes): no policy, no workers.
+
+    Args:
+        spec: the collection.
+        indices: which of its episodes.
+
+    Yields:
+        Each episode once. Actions say what the objects did, states where they were; reward and success are zero.
+    """
+    for first in range(0, len(indices), CLIPS_AT_ONCE):
+        some = indices[first : first + CLIPS_AT_ONCE]
+        seeds = [spec.episode_seed(index) for index in some]
+        clips = generate(seeds, spec.steps, spec.env)
+        for number, (index, seed) in enumerate(zip(some, seeds, strict=True)):
+            yield RecordedEpisode(
+                index=index,
+                seed=seed,
+                redrawn=0,
+                frames=clips.frames[number],
+                states=clips.states[number],
+                actions=clips.actions[number],
+                rewards=np.zeros(spec.steps, np.float32),
+                success=np.zeros(spec.steps, np.bool_),
+            )
 
 
 class _Dispatch:

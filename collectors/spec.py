@@ -8,14 +8,12 @@ from typing import Any, Literal
 
 from playslot_rl.config import EnvConfig, ExperimentConfig, RenderConfig, from_dict
 from playslot_rl.envs import PROCEDURAL, gym_id
+from playslot_rl.episode_seeds import EPISODES, LARGEST_SEED, episode_seed
 from playslot_rl.errors import ConfigError
 
 FORMAT = 1
-BLOCK = 1_000_000
-"""Seeds set aside for one value of `seed`: its first half for random episodes, its second half for the expert's."""
-OFFSETS = {"random": 0, "expert": 500_000}
-REDRAW_STRIDE = 10**12
-"""Distance between an episode's seed and the one drawn next where it starts solved: far above all other seeds."""
+OFFSETS = {"random": 0, "expert": EPISODES // 2}
+"""First episode of a seed: its first half is for random episodes, its second half for the expert's."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +48,7 @@ class CollectionSpec:
 
         Raises:
             ConfigError: unknown policy or environment, an expert of an environment without one, too few or too many
-                episodes or steps, or a seed whose episodes would be evaluation episodes.
+                episodes or steps, or a seed beyond 32 bits.
         """
         if policy not in OFFSETS:
             near = difflib.get_close_matches(policy, OFFSETS, n=1)
@@ -60,22 +58,19 @@ class CollectionSpec:
             _check_procedural(config.env, policy)
         else:
             gym_id(config.env.name)
-        if not 1 <= episodes <= BLOCK // 2:
-            raise ConfigError(f"episodes: got {episodes}, expected 1 to {BLOCK // 2}; split larger sets over seeds")
+        if not 1 <= episodes <= EPISODES // 2:
+            raise ConfigError(f"episodes: got {episodes}, expected 1 to {EPISODES // 2}; split larger sets over seeds")
         if steps < 2:
             raise ConfigError(f"steps: got {steps}, expected at least 2; set collect.{policy}_steps")
-        limit = config.evaluation.seed_offset // BLOCK
-        if not 0 <= seed < limit:
-            raise ConfigError(
-                f"seed: got {seed}, expected 0 to {limit - 1}; larger ones are evaluation's, choose a smaller one"
-            )
+        if not 0 <= seed <= LARGEST_SEED + 1:  # `pipeline` collects some episodes with the seed after the typed one
+            raise ConfigError(f"seed: got {seed}, expected 0 to {LARGEST_SEED}; choose a smaller one")
         noise = config.collect.noise if policy == "expert" else 0.0
         env = replace(config.env, max_steps=steps)
         return cls(policy, episodes, steps, seed, noise, config.collect.storage, env, config.render)
 
     def episode_seed(self, index: int) -> int:
         """Seed of episode `index`."""
-        return self.seed * BLOCK + OFFSETS[self.policy] + index
+        return episode_seed("collection", self.seed, OFFSETS[self.policy] + index)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dict; groups of the environment that have their default values (those of other tasks) left out.
@@ -100,11 +95,6 @@ def _check_procedural(env: EnvConfig, policy: str) -> None:
             f"policy: got {policy} for env={env.name}, expected random: its shapes move by themselves; leave policy out"
         )
     check_actions(env)
-
-
-def redraw(seed: int, attempt: int) -> int:
-    """Seed of the `attempt`-th draw (from 0) of the episode with this seed."""
-    return seed + attempt * REDRAW_STRIDE
 
 
 def completed(stored: object) -> dict[str, Any]:

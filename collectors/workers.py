@@ -102,11 +102,6 @@ class LocalWorkers:
         self._processes: list[SpawnProcess | None] = [None] * count
         self._pipes: list[Connection[Any, Any] | None] = [None] * count
 
-    @property
-    def pids(self) -> list[int]:
-        """Process ids of the workers that run."""
-        return [p.pid for p in self._processes if p is not None and p.pid is not None]
-
     def start(self, slot: int) -> None:
         """See `Workers`."""
         ours, theirs = self._context.Pipe()

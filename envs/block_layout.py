@@ -12,8 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import BlocksConfig
+from playslot_rl.config.env import COLOURS, Rgb
 from playslot_rl.envs.block_scene import CUBE, SMALL_CUBE, TABLE_TOP
-from playslot_rl.envs.colours import COLOURS, Rgb, redness
+from playslot_rl.envs.colours import redness
 
 Variant = Literal["reach", "push", "pick"]
 

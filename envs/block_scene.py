@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
 CAMERA: Final = FixedCamera("frontview", position=(1.9, 0.75, 0.8), euler=(0.0, 1.0, 1.571), fovy=60.0)
 TABLE_TOP: Final = 0.4
-TABLE_X: Final = (1.05, 1.55)
-TABLE_Y: Final = (0.4, 1.1)
 CUBE: Final = 0.045
 """Half the side of the cubes of Reach and Push."""
 SMALL_CUBE: Final = 0.03

@@ -1,4 +1,4 @@
-"""The sixteen colours of the cubes, and how different two colours look (CIEDE2000)."""
+"""How different two colours look (CIEDE2000)."""
 
 from __future__ import annotations
 
@@ -7,27 +7,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-Rgb = tuple[int, int, int]
-
-COLOURS: Final[dict[str, Rgb]] = {
-    "lime": (0, 255, 0),
-    "darkslategrey": (47, 79, 79),
-    "saddlebrown": (139, 69, 19),
-    "midnightblue": (25, 25, 112),
-    "darkgreen": (0, 100, 0),
-    "darkkhaki": (189, 183, 107),
-    "mediumturquoise": (72, 209, 204),
-    "red": (255, 0, 0),
-    "orange": (255, 165, 0),
-    "yellow": (255, 255, 0),
-    "mediumvioletred": (199, 21, 133),
-    "mediumblue": (0, 0, 205),
-    "mediumspringgreen": (0, 250, 154),
-    "thistle": (216, 191, 216),
-    "magenta": (255, 0, 255),
-    "dodgerblue": (30, 144, 255),
-}
-"""CSS name -> sRGB [0, 255]."""
+from playslot_rl.config.env import COLOURS, Rgb
 
 _TO_XYZ: Final = (
     (0.4124564, 0.3575761, 0.1804375),

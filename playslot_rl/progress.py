@@ -6,7 +6,10 @@ import sys
 import time
 from collections.abc import Mapping
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Final, Literal, Self
+
+PLAIN_EVERY_S: Final = 10.0
+"""Seconds between lines where no number of steps is given."""
 
 
 def format_seconds(seconds: float) -> str:
@@ -20,19 +23,28 @@ def format_seconds(seconds: float) -> str:
 
 
 class StageProgress:
-    """Step, rate, loss and remaining time of a stage.
+    """How far a stage is, how fast, and what remains of its time.
 
     Args:
         name: the stage.
-        start, steps: the first step of this process and the last one.
+        start, total: what was done before, and all there is to do.
         enabled: `false` prints nothing.
-        plain_every: steps between lines where standard error is no terminal.
+        plain_every: `unit` between lines where standard error is no terminal; 0 means ten seconds.
+        unit: what is counted.
     """
 
-    def __init__(self, name: str, start: int, steps: int, enabled: bool, plain_every: int) -> None:
-        self.name, self.start, self.steps, self.enabled = name, start, steps, enabled
-        self.plain_every = max(1, plain_every)
-        self._began = time.monotonic()
+    def __init__(
+        self,
+        name: str,
+        start: int,
+        total: int,
+        enabled: bool,
+        plain_every: int = 0,
+        unit: Literal["steps", "episodes"] = "steps",
+    ) -> None:
+        self.name, self.start, self.total, self.enabled = name, start, total, enabled
+        self.plain_every, self.unit = plain_every, unit
+        self._began = self._last = time.monotonic()
         self._bar: Any = None
         self._task: Any = None
 
@@ -49,7 +61,7 @@ class StageProgress:
                 rich.TimeRemainingColumn(),
             )
             self._bar = rich.Progress(*columns, console=Console(stderr=True))
-            self._task = self._bar.add_task(self.name, total=self.steps, completed=self.start, info="")
+            self._task = self._bar.add_task(self.name, total=self.total, completed=self.start, info="")
             self._bar.start()
         return self
 
@@ -57,16 +69,26 @@ class StageProgress:
         if self._bar is not None:
             self._bar.stop()
 
-    def update(self, done: int, values: Mapping[str, float]) -> None:
-        """Show that `done` steps are finished."""
+    def update(self, done: int, values: Mapping[str, float] | None = None) -> None:
+        """Show that `done` are finished, and the `loss` among `values`."""
         if not self.enabled:
             return
         rate = (done - self.start) / max(1e-9, time.monotonic() - self._began)
+        speed = f"{rate:.2f} steps/s" if self.unit == "steps" else f"{rate:.1f} episodes/s"
+        loss = f"loss {values['loss']:.5f}" if values and "loss" in values else ""
         if self._bar is not None:
-            info = f"loss {values['loss']:.5f}  {rate:.2f} steps/s" if "loss" in values else ""
-            self._bar.update(self._task, completed=done, **({"info": info} if info else {}))
-        elif done % self.plain_every == 0 or done == self.steps:
-            left = format_seconds((self.steps - done) / max(rate, 1e-9))
-            loss = f"loss {values['loss']:.5f}, " if "loss" in values else ""
-            text = f"{self.name}: step {done}/{self.steps}, {loss}{rate:.2f} steps/s, {left} left"
-            print(text, file=sys.stderr, flush=True)
+            info = f"{loss}  {speed}" if loss or self.unit == "episodes" else None
+            self._bar.update(self._task, completed=done, **({} if info is None else {"info": info.strip()}))
+        elif self._due(done):
+            left = format_seconds((self.total - done) / max(rate, 1e-9))
+            count = f"{'step ' if self.unit == 'steps' else ''}{done}/{self.total}"
+            parts = [count, *([loss] if loss else []), speed, f"{left} left"]
+            print(f"{self.name}: {', '.join(parts)}", file=sys.stderr, flush=True)
+
+    def _due(self, done: int) -> bool:
+        """Whether it is time for a plain line."""
+        now = time.monotonic()
+        due = done % self.plain_every == 0 if self.plain_every else now - self._last >= PLAIN_EVERY_S
+        if due:
+            self._last = now
+        return due or done == self.total

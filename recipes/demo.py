@@ -6,6 +6,8 @@ import time
 from dataclasses import replace
 
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.episode_seeds import LARGEST_SEED
+from playslot_rl.errors import ConfigError
 from playslot_rl.recipes import evaluate, train_policy
 from playslot_rl.recipes.pipeline import collect_demos
 from playslot_rl.recipes.run import open_run, parent_run, store_config
@@ -22,6 +24,10 @@ def main(config: ExperimentConfig) -> None:
     began = time.monotonic()
     gym_id(config.env.name)  # one without a simulator is refused before anything is written
     name = config.out or "runs/demo"
+    if config.seed > LARGEST_SEED - FIRST_SEED:
+        raise ConfigError(
+            f"seed: got {config.seed}, expected at most {LARGEST_SEED - FIRST_SEED}; choose a smaller one"
+        )
     config = replace(config, out=name, run="pretrained", seed=FIRST_SEED + config.seed)
     folder = open_run(config)
     world_model_checkpoints(parent_run(config, folder))  # a missing one is refused before anything is recorded

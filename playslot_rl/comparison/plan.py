@@ -19,11 +19,9 @@ from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import shipped
 from playslot_rl.config.methods import METHODS, MethodName
+from playslot_rl.config.roles import without
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
-
-_OF_THE_MACHINE = ("device", "threads", "workers", "logging", "collector", "compare", "preset", "out", "run")
-"""Config that says where and how loudly a job runs, not what comes out; of data and parents the content counts."""
 
 
 @dataclass(frozen=True)
@@ -198,11 +196,10 @@ def job_record(job: Job, config: ExperimentConfig, parents: Mapping[str, str]) -
         parents: fingerprints of the weights and demonstrations it builds on.
     """
     values = to_dict(config)
-    result = {key: value for key, value in values.items() if key not in _OF_THE_MACHINE}
-    for group, keys in (("data", ("root", "demos", "cache", "held_out")), ("collect", ("validation_episodes",))):
-        result[group] = {key: value for key, value in result[group].items() if key not in keys}
-    own = result["baselines"].get(job.method, {})  # another method's settings are none of this job's
-    result["baselines"] = {key: value for key, value in own.items() if key != "world"}
+    result = without(config, "machine")  # of data and parents the content counts
+    result["baselines"] = result["baselines"].get(job.method, {})  # another method's settings are none of this job's
+    if result["model"]["predictor"]["kind"] == "cocvp":
+        del result["model"]["predictor"]["kind"]  # jobs from before there was a choice are the same jobs
     identity = json.dumps([result, config.compare.evaluation_seed, dict(parents)], sort_keys=True)
     return {
         "name": job.name,

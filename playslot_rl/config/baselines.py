@@ -1,13 +1,294 @@
-"""Config of the baselines (the group `baselines` of the experiment's config)."""
+"""Config of the baselines (the group `baselines` of the experiment's config), one class a method.
+
+The slot oracle has none: its sizes are `model.policy`, its schedule is `behaviour`.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
-from playslot_rl.config.dreamer import DreamerConfig
-from playslot_rl.config.lapo import LAPOConfig
-from playslot_rl.config.oracles import ResNetOracleConfig
-from playslot_rl.config.sold import SOLDConfig
+from playslot_rl.config.plain import check
+from playslot_rl.config.roles import role
+from playslot_rl.config.stages import OptimConfig, StageConfig
+
+
+@dataclass(frozen=True)
+class ResNetOracleConfig(StageConfig):
+    """Schedule of the ResNet oracle; the head's sizes are `model.policy`, its loss `behaviour.loss`.
+
+    Attributes:
+        weights: of ResNet-18: `auto` (ImageNet's from torchvision's cache, from scratch where they are not there),
+            `scratch`, `download` (ImageNet's, fetched if they are not in the cache), or the path of a file of them
+            (`.pth` as torchvision publishes it, or `.safetensors` with the same names).
+        shift: frames are shifted by up to so many pixels either way in training, edges repeated; 0 does not.
+    """
+
+    steps: int = 20_000
+    batch_size: int = 64
+    optim: OptimConfig = field(
+        default_factory=lambda: OptimConfig(lr=2e-4, warmup_steps=0, schedule="constant", grad_clip=0.0)
+    )
+    weights: str = "auto"
+    shift: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(0 <= self.shift <= 16, "baselines.resnet_oracle.shift", self.shift, "0 to 16 pixels")
+
+
+def _stage(steps: int, lr: float, schedule: Literal["cosine", "constant"]) -> StageConfig:
+    return StageConfig(
+        steps=steps, batch_size=64, optim=OptimConfig(lr=lr, warmup_steps=0, schedule=schedule, grad_clip=1.0)
+    )
+
+
+@dataclass(frozen=True)
+class LAPOConfig:
+    """Sizes and schedule of LAPO. The action decoder's size is `model.action_decoder`, its inputs
+    `behaviour.decoder_inputs`, its labels `behaviour.labelled_demos`: as for PlaySlot.
+
+    Attributes:
+        channels: of the convolutional encoders; each halves the resolution.
+        hidden: width of the layer between an encoder and its output.
+        groups: G codes that make up a latent action.
+        code_dim: width of each, so that a latent action has `groups * code_dim` numbers.
+        codes: K entries of the codebook, which the groups share.
+        decay: of the codebook's moving average.
+        dead_threshold: EMA cluster size under which a code is revived.
+        commitment: weight beta of the commitment term.
+        loss: of the latent policy and the action decoder: `l2` or `l1`.
+        shift: shift of frames in the latent policy's training, pixels.
+        model: training of inverse and forward model.
+        policy: training of the latent policy.
+        decoder_steps: optimiser steps of the action decoder.
+        decoder_lr: its base learning rate; the rest is as for the policy.
+        world: another run of LAPO whose inverse and forward model are taken; empty trains them on `data.root`.
+    """
+
+    channels: tuple[int, ...] = (64, 128, 128)
+    hidden: int = 256
+    groups: int = 8
+    code_dim: int = 16
+    codes: int = 64
+    decay: float = 0.99
+    dead_threshold: float = 1.0
+    commitment: float = 0.05
+    loss: Literal["l2", "l1"] = "l2"
+    shift: int = 0
+    model: StageConfig = field(default_factory=lambda: _stage(200_000, 3e-4, "cosine"))
+    policy: StageConfig = field(default_factory=lambda: _stage(20_000, 2e-4, "constant"))
+    decoder_steps: int = 20_000
+    decoder_lr: float = 2e-4
+    world: str = field(default="", metadata=role("machine", "folder"))
+
+    def __post_init__(self) -> None:
+        check(1 <= len(self.channels) <= 5, "baselines.lapo.channels", self.channels, "1 to 5 widths")
+        check(self.groups >= 1, "baselines.lapo.groups", self.groups, "at least 1")
+        check(self.codes >= 2, "baselines.lapo.codes", self.codes, "at least 2")
+        check(0.0 < self.decay < 1.0, "baselines.lapo.decay", self.decay, "a number in (0, 1)")
+        check(0 <= self.shift <= 16, "baselines.lapo.shift", self.shift, "0 to 16 pixels")
+        check(self.decoder_steps >= 1, "baselines.lapo.decoder_steps", self.decoder_steps, "at least 1")
+
+    @property
+    def latent_dim(self) -> int:
+        """Z = G times the width of a code."""
+        return self.groups * self.code_dim
+
+
+@dataclass(frozen=True)
+class OnlineConfig:
+    """Acting, replay and schedule of a method that learns by acting.
+
+    A step is an agent step: `env.frame_skip` environment steps of the same action.
+
+    Attributes:
+        steps: agent steps in all, those of the random start too.
+        minutes: wall-clock budget over all processes; 0 means none. Training then ends at the round that crosses it,
+            so that how far it got depends on the machine.
+        prefill: agent steps of uniformly random actions before the first update.
+        envs: episodes played side by side, a round: the policy changes between rounds only.
+        update_ratio: updates for each agent step.
+        batch_size: sequences in an update (B).
+        sequence: frames in a sequence (T); 0 means whole episodes. Sequences longer than an episode run across
+            episodes, shorter ones stay within one.
+        reward_scale: rewards are multiplied by it before the method learns from them; the curve's returns are not.
+            Grids of values and the least range of returns that is divided by (1) suit rewards of the order of 1 to 10.
+        capacity: frames that the replay keeps; the oldest episodes go first.
+        replay_on_disk: memory-map the replay, where it does not fit into memory.
+        evaluate_every: agent steps between points of the learning curve.
+        evaluation_episodes: development episodes for a point.
+        checkpoint_every: agent steps between checkpoints.
+        log_every: updates between lines of `metrics.jsonl`.
+    """
+
+    steps: int = 1_000_000
+    minutes: float = field(default=0.0, metadata=role("free"))
+    prefill: int = 1000
+    envs: int = 1
+    update_ratio: float = 0.5
+    batch_size: int = 16
+    sequence: int = 64
+    reward_scale: float = 1.0
+    capacity: int = 1_000_000
+    replay_on_disk: bool = field(default=False, metadata=role("free"))
+    evaluate_every: int = field(default=10_000, metadata=role("free"))
+    evaluation_episodes: int = 20
+    checkpoint_every: int = field(default=10_000, metadata=role("free"))
+    log_every: int = field(default=100, metadata=role("free"))
+
+    def __post_init__(self) -> None:
+        for name in (
+            "steps", "prefill", "envs", "batch_size", "capacity",
+            "evaluate_every", "evaluation_episodes", "checkpoint_every", "log_every",
+        ):  # fmt: skip
+            check(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
+        check(self.minutes >= 0, "minutes", self.minutes, "at least 0")
+        check(self.reward_scale > 0, "reward_scale", self.reward_scale, "above 0")
+        check(self.update_ratio > 0, "update_ratio", self.update_ratio, "above 0")
+        check(self.sequence == 0 or self.sequence >= 2, "sequence", self.sequence, "0 (whole episodes), or at least 2")
+        check(self.prefill <= self.steps, "prefill", self.prefill, f"at most steps ({self.steps})")
+
+
+@dataclass(frozen=True)
+class DreamerConfig(OnlineConfig):
+    """Sizes and schedule of DreamerV3 (Hafner et al. 2023); the defaults are its size of 12 M parameters.
+
+    Attributes:
+        frame_size: side of the frames it sees, pixels; smaller than `env.image_size` by a whole factor, averaged.
+            0 means `env.image_size`.
+        depth, mults: channels of the encoder's stages, `depth` times each of `mults`; each stage halves the frame.
+        kernel: side of the convolutions.
+        belief: width of the recurrent state h.
+        blocks: blocks of the recurrent core.
+        categoricals, classes: the stochastic state z: that many one-hot variables of that many classes.
+        hidden: width of the RSSM's hidden layers.
+        units: width of the heads' hidden layers.
+        layers: hidden layers of actor and critic; the reward head has one.
+        lr: learning rate of the one optimiser.
+        warmup: updates of its linear warm-up.
+        reconstruction_weight: of the image loss (a sum over pixels).
+        free_nats: below which the KL terms do not push.
+        representation_weight: of the KL term that trains the posterior; the prior's weighs 1.
+        replay_value_weight: of the critic's loss on replayed rewards, which also trains the representation.
+        horizon: steps imagined.
+        gamma: discount; 1 - 1/333 in the source.
+        lmbda: of the lambda returns.
+        entropy: weight of the actor's entropy.
+        critic_rate: of the slow critic's moving average.
+    """
+
+    update_ratio: float = 0.25
+    frame_size: int = 0
+    depth: int = 16
+    mults: tuple[int, ...] = (2, 3, 4, 4)
+    kernel: int = 5
+    belief: int = 2048
+    blocks: int = 8
+    categoricals: int = 32
+    classes: int = 16
+    hidden: int = 256
+    units: int = 256
+    layers: int = 3
+    lr: float = 4e-5
+    warmup: int = 1000
+    reconstruction_weight: float = 1.0
+    free_nats: float = 1.0
+    representation_weight: float = 0.1
+    replay_value_weight: float = 0.3
+    horizon: int = 15
+    gamma: float = 1 - 1 / 333
+    lmbda: float = 0.95
+    entropy: float = 3e-4
+    critic_rate: float = 0.02
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self.belief % self.blocks == 0, "belief", self.belief, f"a multiple of blocks ({self.blocks})")
+        check(0 < self.gamma < 1, "gamma", self.gamma, "between 0 and 1")
+        check(0 <= self.lmbda <= 1, "lmbda", self.lmbda, "0 to 1")
+        check(self.horizon >= 1, "horizon", self.horizon, "at least 1")
+        check(self.frame_size >= 0, "frame_size", self.frame_size, "0 (the environment's) or pixels")
+
+
+@dataclass(frozen=True)
+class SOLDConfig(OnlineConfig):
+    """Sizes and schedule of SOLD (Mosbach et al., 2025); the defaults are the source's where our references name them.
+
+    Of `OnlineConfig`, `sequence` (18 frames: 3 of context and 15 predicted) differs, and so do the sizes of batches.
+    Of a longer sequence (0: whole episodes) the dynamics and the reward learn from a window of C + H frames, drawn anew
+    each time; imagination starts anywhere in it.
+
+    Attributes:
+        dim, heads, mlp_dim: token width, attention heads and hidden width of all four transformers.
+        dynamics_layers: layers of OCVP-Seq, each one attention over objects and one over time.
+        head_layers: layers of the slot-aggregation transformers of reward, value and actor.
+        bins: categories of the two-hot heads, evenly spaced in symlog from -`limit` to `limit`.
+        limit: the grid's ends, in symlog.
+        mean: how a head's probabilities become a value, averaged in `symlog` or `linear` (see `heads.py`).
+        context: frames (C) that a rollout starts from, at most: 1 to C are drawn. The actor acts on its last C frames.
+        horizon: imagined steps (H).
+        starts: imagined rollouts in an update, from frames drawn from its batch.
+        gamma, lmbda: discount and lambda of the returns.
+        entropy: weight of the policy's entropy.
+        actor_gradient: `dynamics` (through the imagined rollout) or `reinforce`.
+        return_rate: share of the new batch in the average of the returns' 5-95 percentile range.
+        critic_decay: of the average of the critic's weights, which its loss pulls it towards.
+        actor_average: of the average of the actor's weights, which is evaluated and saved; 0 takes the last weights.
+        slot_weight, image_weight: weights of the dynamics' losses. With an image loss the replay keeps pixels too.
+        decoded_frames: predicted frames decoded for the image loss, drawn at random; 0 decodes all of them.
+        actor_lr, critic_lr, model_lr: Adam's rates; `model_lr` is that of dynamics and reward.
+        grad_clip: maximum gradient norm of each of the four networks.
+        world_model_updates: first updates that train dynamics and reward only.
+        savi_steps: agent steps of the data that SAVi was trained on; None reads them from its checkpoint.
+    """
+
+    batch_size: int = 16
+    sequence: int = 18
+    dim: int = 256
+    heads: int = 8
+    mlp_dim: int = 512
+    dynamics_layers: int = 4
+    head_layers: int = 3
+    bins: int = 255
+    limit: float = 20.0
+    mean: Literal["symlog", "linear"] = "symlog"
+    context: int = 3
+    horizon: int = 15
+    starts: int = 256
+    gamma: float = 0.96
+    lmbda: float = 0.95
+    entropy: float = 3e-4
+    actor_gradient: Literal["dynamics", "reinforce"] = "dynamics"
+    return_rate: float = 0.01
+    critic_decay: float = 0.98
+    actor_average: float = 0.0
+    slot_weight: float = 1.0
+    image_weight: float = 1.0
+    decoded_frames: int = 0
+    actor_lr: float = 3e-5
+    critic_lr: float = 3e-5
+    model_lr: float = 1e-4
+    grad_clip: float = 10.0
+    world_model_updates: int = 0
+    savi_steps: int | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        group = "baselines.sold"
+        check(self.dim % self.heads == 0, f"{group}.heads", self.heads, f"a divisor of {group}.dim={self.dim}")
+        check(self.context >= 1, f"{group}.context", self.context, "at least 1")
+        check(self.horizon >= 1, f"{group}.horizon", self.horizon, "at least 1")
+        check(self.starts >= 1, f"{group}.starts", self.starts, "at least 1")
+        check(self.bins >= 3 and self.bins % 2 == 1, f"{group}.bins", self.bins, "an odd number from 3 on")
+        check(self.limit > 0, f"{group}.limit", self.limit, "above 0")
+        longer = self.sequence == 0 or self.sequence > self.context
+        check(longer, f"{group}.sequence", self.sequence, f"0, or more than {group}.context={self.context}")
+        for name in ("gamma", "lmbda", "critic_decay", "actor_average", "return_rate"):
+            check(0 <= getattr(self, name) <= 1, f"{group}.{name}", getattr(self, name), "a number in [0, 1]")
+        learns = self.slot_weight + self.image_weight > 0 and min(self.slot_weight, self.image_weight) >= 0
+        check(learns, f"{group}.slot_weight", self.slot_weight, "slot_weight or image_weight above 0, none below")
+        check(self.savi_steps is None or self.savi_steps >= 0, f"{group}.savi_steps", self.savi_steps, "0 or more")
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from playslot_rl.config.methods import MethodName
-from playslot_rl.config.plain import check
+from playslot_rl.config.plain import check, check_seed
 
 LAUNCHERS: dict[str, str] = {
     "basic": "hydra",
@@ -27,7 +27,7 @@ class CompareConfig:
         demos: numbers of demonstrations, for the methods that learn from them.
         seeds: training seeds.
         online_seeds: training seeds of the methods that act, which take the longest; empty means `seeds`.
-        evaluation_seed: block of evaluation seeds, the same for every method and training seed.
+        evaluation_seed: seed of the evaluation's episodes, the same for every method and training seed.
         launcher: Hydra launcher that runs the jobs; empty runs them one after the other.
         hydra: further overrides for Hydra, such as `hydra.launcher.n_jobs=2`.
     """
@@ -49,8 +49,8 @@ class CompareConfig:
         check(set(online) <= set(self.seeds), "compare.online_seeds", online, f"some of seeds={self.seeds}")
         check(len(set(online)) == len(online), "compare.online_seeds", online, "each one once")
         check(all(n >= 1 for n in self.demos), "demos", self.demos, "numbers of at least 1")
-        check(all(s >= 0 for s in self.seeds), "seeds", self.seeds, "non-negative integers")
-        check(0 <= self.evaluation_seed <= 1000, "compare.evaluation_seed", self.evaluation_seed, "0 to 1000")
+        check_seed("seeds", *self.seeds)
+        check_seed("compare.evaluation_seed", self.evaluation_seed)
         known = ", ".join(LAUNCHERS)
         check(self.launcher in ("", *LAUNCHERS), "hydra.launcher", self.launcher, f"one of {known}")
         check(not self.hydra or bool(self.launcher), "hydra", self.hydra, "hydra.launcher=NAME with it")

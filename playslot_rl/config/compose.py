@@ -18,6 +18,7 @@ from typing import Any, Final
 
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.methods import MethodName, canonical_method
+from playslot_rl.config.roles import keys_of
 from playslot_rl.errors import ConfigError
 
 CONF_MODULE: Final = "playslot_rl.recipes.conf"
@@ -28,11 +29,6 @@ COMPARE: Final = "compare"
 """The command whose `methods=`, `demos=` and `seeds=` are lists, and which takes `hydra.` keys."""
 SHIPPED: Final = "pretrained"
 """`run=pretrained` names the task's shipped world model, `run=pretrained/ENV` one of them: no run folders."""
-
-_FOLDERS: Final = frozenset({"out", "run", "data.root", "data.demos", "data.cache", "slots.start_from"})
-
-# These say what one invocation does, on which machine; a stored run does not hand them on.
-_OF_THE_CALL: Final = ("out", "run", "episodes", "policy", "protocol", "workers", "collector", "device", "export")
 
 
 def shipped(run: str) -> bool:
@@ -200,12 +196,12 @@ def _assignments(pairs: Mapping[str, str]) -> list[str]:
 
     Text is quoted here, since commas, equals signs, brackets, `${` and digits in a path mean something to Hydra.
     """
-    assignments = []
+    assignments, folders = [], keys_of(ExperimentConfig, "folder")
     for key, value in pairs.items():
         if key in GROUPS:
             continue
         if _hint(key) is str and value != "null":
-            text = _expand_home(_unquote(value)) if key in _FOLDERS else _unquote(value)
+            text = _expand_home(_unquote(value)) if key in folders else _unquote(value)
             value = _quote(text)
         assignments.append(f"++{key}={value}")
     return assignments
@@ -242,7 +238,7 @@ def _from_run(run: Path, pairs: Mapping[str, str]) -> ExperimentConfig:
                 )
     values = to_dict(stored)
     defaults = to_dict(ExperimentConfig())
-    values.update({key: defaults[key] for key in _OF_THE_CALL})
+    values.update({key: defaults[key] for key in keys_of(ExperimentConfig, "call")})
     typed = _hydra(None, _assignments(pairs))
     config = from_dict(ExperimentConfig, _merge(values, typed))
     return config if config.out else dataclasses.replace(config, out=str(run))

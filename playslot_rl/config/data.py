@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from playslot_rl.config.plain import check
+from playslot_rl.config.roles import role
 
 
 @dataclass(frozen=True)
@@ -22,12 +23,12 @@ class DataConfig:
         validation: fraction of episodes held out from training.
     """
 
-    root: str = ""
-    demos: str = ""
-    held_out: int = 0
+    root: str = field(default="", metadata=role("machine", "folder"))
+    demos: str = field(default="", metadata=role("machine", "folder"))
+    held_out: int = field(default=0, metadata=role("machine"))
     camera: str = ""
     resize: bool = False
-    cache: str = ""
+    cache: str = field(default="", metadata=role("machine", "folder"))
     validation: float = 0.05
 
     def __post_init__(self) -> None:
@@ -56,7 +57,7 @@ class CollectConfig:
     random_episodes: int = 400
     random_steps: int = 20
     expert_episodes: int = 150
-    validation_episodes: int = 10
+    validation_episodes: int = field(default=10, metadata=role("machine"))
     expert_steps: int = 20
     noise: float = 0.0
     noisy_episodes: int = 0

@@ -3,9 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 from playslot_rl.config.plain import check
+
+Rgb = tuple[int, int, int]
+
+COLOURS: Final[dict[str, Rgb]] = {
+    "lime": (0, 255, 0),
+    "darkslategrey": (47, 79, 79),
+    "saddlebrown": (139, 69, 19),
+    "midnightblue": (25, 25, 112),
+    "darkgreen": (0, 100, 0),
+    "darkkhaki": (189, 183, 107),
+    "mediumturquoise": (72, 209, 204),
+    "red": (255, 0, 0),
+    "orange": (255, 165, 0),
+    "yellow": (255, 255, 0),
+    "mediumvioletred": (199, 21, 133),
+    "mediumblue": (0, 0, 205),
+    "mediumspringgreen": (0, 250, 154),
+    "thistle": (216, 191, 216),
+    "magenta": (255, 0, 255),
+    "dodgerblue": (30, 144, 255),
+}
+"""Colours of the blocks: CSS name -> sRGB [0, 255]."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +78,7 @@ class BlocksConfig:
             `odd_groups` (the others form groups of a colour).
         distractors: other objects, 0 to 4.
         distractors_to: where given, each episode draws their number from `distractors` to this.
-        colour: colour of the odd object (a name in `playslot_rl.envs.colours`); empty draws it for each episode.
+        colour: colour of the odd object (a name in `COLOURS`); empty draws it for each episode.
         reward: `dense` or `sparse`.
     """
 
@@ -72,8 +94,6 @@ class BlocksConfig:
         limits = f"{self.distractors} (env.blocks.distractors) to 4, or null"
         check(self.distractors <= last <= 4, "env.blocks.distractors_to", last, limits)
         if self.colour:
-            from playslot_rl.envs.colours import COLOURS
-
             check(self.colour in COLOURS, "env.blocks.colour", self.colour, f"one of {', '.join(COLOURS)}")
             odd = self.task in ("odd", "odd_groups")
             check(odd, "env.blocks.colour", self.colour, f"no colour with env.blocks.task={self.task}")

@@ -12,7 +12,7 @@ LatentMode = Literal["hybrid", "discrete", "continuous", "ground_truth"]
 
 @dataclass(frozen=True)
 class SAViConfig:
-    """Sizes of SAVi (system.md section 1; paper, appendix A.1).
+    """Sizes of SAVi (paper, appendix A.1).
 
     Attributes:
         n_slots: N.
@@ -20,7 +20,7 @@ class SAViConfig:
         initial: `gaussian` (learned mean and scale shared by all slots; paper) or `learned` (one vector per slot).
         encoder: `full` (four 5x5 stride-1 convs; paper) or `strided` (5x5 convs with `encoder_strides`).
         encoder_channels: channels of each encoder conv.
-        encoder_strides: strides of the encoder convs (all 1 for `full`).
+        encoder_strides: strides of the encoder convs; `full` takes only 1.
         token_dim: width of the encoder tokens' MLP and of q, k, v.
         decoder: `broadcast` (full-resolution spatial broadcast; paper) or `pixel_shuffle` (from 8x8 upwards).
         decoder_channels: channels of the decoder.
@@ -63,6 +63,12 @@ class SAViConfig:
             f"one stride for each of the {len(self.encoder_channels)} encoder channels",
         )
         check(
+            self.encoder == "strided" or set(self.encoder_strides) <= {1},
+            "model.savi.encoder_strides",
+            self.encoder_strides,
+            "strides of 1 with model.savi.encoder=full",
+        )
+        check(
             self.decoder_position == "linear" or self.decoder == "pixel_shuffle",
             "model.savi.decoder_position",
             self.decoder_position,
@@ -78,7 +84,7 @@ class SAViConfig:
 
 @dataclass(frozen=True)
 class InverseDynamicsConfig:
-    """Sizes of InvDyn and its quantiser (system.md section 2; paper, appendix A.2).
+    """Sizes of InvDyn and its quantiser (paper, appendix A.2).
 
     Attributes:
         variant: `single` (InvDyn_S, one z per step) or `multi` (InvDyn_M, one z per slot and step).

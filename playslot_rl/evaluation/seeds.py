@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.episode_seeds import episode_seed
 from playslot_rl.errors import ConfigError, DataError
-
-BLOCK = 1_000_000
-"""Seeds set aside for each value of `seed`."""
 
 
 def first_seed(config: ExperimentConfig, seed: int) -> int:
     """First evaluation seed of `seed`; the others follow it one by one."""
-    return config.evaluation.seed_offset + seed * BLOCK
+    return episode_seed("evaluation", seed, 0, config.evaluation.seed_offset)
 
 
 def recorded_seeds(root: Path) -> set[int]:

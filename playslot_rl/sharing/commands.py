@@ -66,14 +66,15 @@ def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
         ConfigError: the preset or the environment is not one of this version.
     """
     from playslot_rl.config.compose import compose
-    from playslot_rl.training.fit import FREE_KEYS
+    from playslot_rl.config.roles import keys_of
 
+    free = keys_of(ExperimentConfig, "free")
     preset = flatten(to_dict(compose([f"env={config.env.name}", f"preset={config.preset}"])))
     return [
         f"{key}={_value(value)}"
         for key, value in flatten(to_dict(config)).items()
         if any(key.startswith(f"{group}.") for group in groups)
-        and key.rpartition(".")[2] not in FREE_KEYS
+        and key not in free
         and (key not in preset or preset[key] != value)
     ]
 

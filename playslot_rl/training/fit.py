@@ -11,29 +11,18 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
 
 from playslot_rl.config import LoggingConfig, StageConfig, to_dict
+from playslot_rl.config.roles import fixed_keys
 from playslot_rl.progress import StageProgress
 from playslot_rl.seeding import StepGenerators, global_seed
 from playslot_rl.storage.resume import TrainingCheckpoints, TrainingState
 from playslot_rl.training.optim import build_adam, clip_gradients, learning_rate, trainable_parameters
 from playslot_rl.training.watch import Watch, finite
-
-FREE_KEYS: Final = ("checkpoint_every", "validate_every", "log_every", "evaluate_every", "minutes", "replay_on_disk")
-"""How often we look, and how long, does not change what is learned: these may differ when a run is resumed."""
-
-
-def fixed_keys(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested plain values without what a resumed or finished training may change."""
-    return {
-        key: fixed_keys(value) if isinstance(value, Mapping) else value
-        for key, value in values.items()
-        if key not in FREE_KEYS
-    }
 
 
 class Stage(Protocol):

@@ -12,6 +12,7 @@ import torch
 from torch import nn
 
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.roles import fixed_keys
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.checkpoints import (
@@ -22,7 +23,7 @@ from playslot_rl.storage.checkpoints import (
     require_parents,
     save_stage,
 )
-from playslot_rl.training.fit import FitResult, Part, fit, fixed_keys
+from playslot_rl.training.fit import FitResult, Part, fit
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from playslot_rl.baselines.online.learner import Learner
-    from playslot_rl.config.online import OnlineConfig
+    from playslot_rl.config.baselines import OnlineConfig
     from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.record import StageRecord
 

@@ -18,7 +18,7 @@ import pytest
 from playslot_rl import keys
 from playslot_rl.collectors import collect
 from playslot_rl.collectors.journal import Journal, journal_path
-from playslot_rl.collectors.spec import CollectionSpec, redraw
+from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.errors import ConfigError, DataError, OutputError
 
@@ -156,8 +156,21 @@ def test_episodes_that_start_solved_are_redrawn(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(type(env.unwrapped), "reset", reset)
     observation, _ = SeededView(env, [(0, 0)]).reset()
-    assert (int(observation["episode_seed"][0]), int(observation["redrawn"][0])) == (redraw(0, 1), 1)
+    assert (int(observation["episode_seed"][0]), int(observation["redrawn"][0])) == (10**12, 1)
     env.close()
+
+
+@pytest.mark.parametrize("seed", [4242, 2**32 - 1])
+def test_any_seed_is_taken_and_its_data_are_whole(tmp_path: Path, seed: int) -> None:
+    from playslot_rl.evaluation.seeds import recorded_seeds
+
+    out = collect(config(), "random", 2, STEPS, tmp_path / "data", seed=seed, workers=1)
+    spec = CollectionSpec.make(config(), "random", 2, STEPS, seed)
+    assert recorded_seeds(out) == {spec.episode_seed(0), spec.episode_seed(1)}
+    dataset = load(out)
+    assert [int(dataset[i][keys.FEATURE_SEED]) for i in (0, STEPS + 1)] == [spec.episode_seed(0), spec.episode_seed(1)]
+    assert small(tmp_path / "zero") != out
+    assert (frames_of(out) != frames_of(tmp_path / "zero")).any()
 
 
 def test_video_storage_keeps_colours(made: Path, tmp_path: Path) -> None:
@@ -261,7 +274,8 @@ def test_damaged_journal_file_is_named(made: Path, tmp_path: Path) -> None:
         (("expret", 1, 3, 0), "did you mean policy=expert"),
         (("expert", 0, 3, 0), "episodes: got 0"),
         (("expert", 1, 1, 0), "steps: got 1"),
-        (("expert", 1, 3, 1000), "larger ones are evaluation's"),
+        (("expert", 1, 3, -1), "seed: got -1, expected 0 to 4294967295"),
+        (("expert", 1, 3, 2**33), "seed: got 8589934592, expected 0 to 4294967295"),
     ],
 )
 def test_bad_requests_are_refused(arguments: tuple[str, int, int, int], message: str) -> None:

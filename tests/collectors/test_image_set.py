@@ -12,7 +12,7 @@ import pytest
 
 from playslot_rl import keys
 from playslot_rl.collectors import export
-from playslot_rl.collectors.episodes import Episode
+from playslot_rl.collectors.episodes import RecordedEpisode
 from playslot_rl.collectors.journal import Journal
 from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.config import ExperimentConfig, from_dict
@@ -20,10 +20,10 @@ from playslot_rl.config import ExperimentConfig, from_dict
 EPISODES, STEPS, SIDE = 5, 4, 32
 
 
-def fake_episode(spec: CollectionSpec, index: int) -> Episode:
+def fake_episode(spec: CollectionSpec, index: int) -> RecordedEpisode:
     rng = np.random.default_rng(index)
     side, steps = spec.env.image_size, spec.steps
-    return Episode(
+    return RecordedEpisode(
         index,
         spec.episode_seed(index),
         index % 2,

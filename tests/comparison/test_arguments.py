@@ -40,7 +40,7 @@ def test_hydras_keys_are_kept_as_they_are() -> None:
         ("demos=10,10", "demos: got .*, expected each one once"),
         ("demos=0", "demos: got .*, expected numbers of at least 1"),
         ("demos=ten", "compare.demos: got 'ten'"),
-        ("seeds=-1", "seeds: got .*, expected non-negative integers"),
+        ("seeds=-1", "seeds: got .*, expected a non-negative integer of 32 bits"),
         ("hydra.launcher=slurm", "hydra.launcher: got 'slurm', expected one of basic, joblib"),
         ("hydra.launcher.n_jobs=2", "expected hydra.launcher=NAME with it"),
         ("demo=10", "unknown key demo: .*; did you mean demos"),

@@ -8,8 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from playslot_rl.config import ExperimentConfig, ModelConfig, SAViConfig, fingerprint, from_dict, to_dict
+from playslot_rl.config import (
+    DreamerConfig,
+    ExperimentConfig,
+    ModelConfig,
+    SAViConfig,
+    SlotsStageConfig,
+    fingerprint,
+    from_dict,
+    to_dict,
+)
 from playslot_rl.config.compose import choices, compose
+from playslot_rl.config.roles import fixed_keys, keys_of, without
 from playslot_rl.errors import ConfigError
 
 PRESETS = ["compact", "paper", "smoke"]
@@ -166,6 +176,35 @@ def test_a_config_stored_before_the_collector_had_settings_loads(tmp_path: Path)
 def test_equal_configs_have_equal_fingerprints() -> None:
     assert fingerprint(compose(["preset=smoke"])) == fingerprint(compose(["preset=smoke"]))
     assert fingerprint(compose(["preset=smoke"])) != fingerprint(compose(["preset=smoke", "seed=1"]))
+
+
+def test_the_full_encoder_takes_no_strides() -> None:
+    with pytest.raises(ValueError, match=r"encoder_strides: got \(2, 2\), expected strides of 1 with .*encoder=full"):
+        SAViConfig(encoder="full", encoder_channels=(8, 8), encoder_strides=(2, 2))
+    assert SAViConfig(encoder="strided", encoder_channels=(8, 8), encoder_strides=(2, 1)).encoder == "strided"
+
+
+def test_roles_say_what_each_key_counts_for() -> None:
+    looking = {"checkpoint_every", "validate_every", "log_every"}
+    assert keys_of(SlotsStageConfig, "free") == looking
+    assert keys_of(DreamerConfig, "free") == {"minutes", "replay_on_disk", "evaluate_every"} | looking - {
+        "validate_every"
+    }
+    call = {"out", "run", "episodes", "policy", "protocol", "workers", "collector", "device", "export"}
+    assert keys_of(ExperimentConfig, "call") == call
+    machine = {"device", "threads", "workers", "logging", "collector", "compare", "preset", "out", "run"}
+    named = {"data.root", "data.demos", "data.cache", "baselines.lapo.world"}
+    assert keys_of(ExperimentConfig, "machine") == machine | named
+    assert keys_of(ExperimentConfig, "folder") == {"out", "run", "slots.start_from"} | named
+
+
+def test_a_config_without_a_role_keeps_all_other_keys() -> None:
+    config = ExperimentConfig()
+    left, whole = without(config, "machine"), to_dict(config)
+    assert whole["data"].keys() - left["data"].keys() == {"root", "demos", "cache"}
+    assert {**whole["data"], **left["data"]} == whole["data"]
+    assert to_dict(config) == whole
+    assert fixed_keys(to_dict(config.slots)) == {k: v for k, v in whole["slots"].items() if not k.endswith("_every")}
 
 
 def test_a_config_checks_its_values() -> None:

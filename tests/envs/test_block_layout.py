@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from playslot_rl.config import BlocksConfig
+from playslot_rl.config.env import COLOURS
 from playslot_rl.envs.block_layout import LIFT, REACH_Z, Layout, Variant, draw_layout
-from playslot_rl.envs.colours import COLOURS, redness
+from playslot_rl.envs.colours import redness
 
 START = np.array([1.3419, 0.7491, 0.5347])
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from playslot_rl.config import DataConfig, EvaluationConfig, ExperimentConfig
+from playslot_rl.episode_seeds import episode_seed
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, recorded_seeds, training_seeds
 
@@ -23,6 +24,7 @@ def test_seed_blocks_do_not_meet() -> None:
     config = ExperimentConfig()
     assert first_seed(config, 0) == config.evaluation.seed_offset
     assert first_seed(config, 1) - first_seed(config, 0) == 1_000_000
+    assert first_seed(config, 4242) == episode_seed("evaluation", 4242, 0)
 
 
 def test_seeds_are_read_from_lists_and_from_episode_records(tmp_path: Path) -> None:

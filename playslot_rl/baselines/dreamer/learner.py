@@ -13,7 +13,7 @@ from torchrl.trainers.algorithms import DreamerV3OptimizationStepper, DreamerV3O
 from playslot_rl import keys
 from playslot_rl.baselines.dreamer.losses import build_loss, records
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
-from playslot_rl.config.dreamer import DreamerConfig
+from playslot_rl.config.baselines import DreamerConfig
 from playslot_rl.losses.common import total_loss
 from playslot_rl.seeding import StepGenerators
 

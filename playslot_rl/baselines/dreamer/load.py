@@ -14,7 +14,7 @@ from playslot_rl.acting.actor import Actor
 from playslot_rl.baselines.dreamer.learner import act
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
 from playslot_rl.config import EnvConfig, from_dict
-from playslot_rl.config.dreamer import DreamerConfig
+from playslot_rl.config.baselines import DreamerConfig
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
 

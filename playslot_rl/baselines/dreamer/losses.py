@@ -19,7 +19,7 @@ from torchrl.objectives.utils import ValueEstimators
 
 from playslot_rl import keys
 from playslot_rl.baselines.dreamer.networks import BINS, UNIMIX, DreamerNetworks, actor_module
-from playslot_rl.config.dreamer import DreamerConfig
+from playslot_rl.config.baselines import DreamerConfig
 
 
 def world_model(networks: DreamerNetworks) -> TensorDictSequential:

@@ -32,7 +32,7 @@ from torchrl.modules import (
 
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig
-from playslot_rl.config.dreamer import DreamerConfig
+from playslot_rl.config.baselines import DreamerConfig
 from playslot_rl.errors import ConfigError
 
 UNIMIX = 0.01

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
 from playslot_rl.baselines.lapo.encoder import EncoderMLP
-from playslot_rl.config.lapo import LAPOConfig
+from playslot_rl.config.baselines import LAPOConfig
 from playslot_rl.config.plain import to_dict
 from playslot_rl.frames import normalise
 from playslot_rl.modules.action_decoder import ActionDecoder

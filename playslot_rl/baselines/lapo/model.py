@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from playslot_rl.baselines.lapo.encoder import ConvEncoder, EncoderMLP, ResidualBlock
-from playslot_rl.config.lapo import LAPOConfig
+from playslot_rl.config.baselines import LAPOConfig
 from playslot_rl.frames import normalise
 from playslot_rl.modules.quantizer import ActionQuantizer
 

@@ -19,7 +19,7 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import Actor, RandomActor
 from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.baselines.online.learner import Learner
-from playslot_rl.baselines.online.seeds import REDRAW_STRIDE
+from playslot_rl.episode_seeds import redraw_stride
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,9 @@ def play(
         rewards.append(moment.rewards)
         action = moment.seen.get(keys.ACTION).cpu()
 
+    stride = redraw_stride(seeds[0])  # seeds of one call are of one stream
     outcomes = run_episodes(
-        pool, actor, seeds, look_on, stop=False, see_last=True, draw=False, stride=REDRAW_STRIDE, lockstep=len(seeds)
+        pool, actor, seeds, look_on, stop=False, see_last=True, draw=False, stride=stride, lockstep=len(seeds)
     )
     received = np.stack(rewards)
     returns = tuple(received.sum(axis=0, dtype=np.float64).tolist())

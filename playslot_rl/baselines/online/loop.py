@@ -23,12 +23,12 @@ from playslot_rl.baselines.online.checkpoints import OnlineCheckpoints, OnlineSt
 from playslot_rl.baselines.online.curve import curve_point, draw_curve, write_curve
 from playslot_rl.baselines.online.learner import Learner
 from playslot_rl.baselines.online.replay import Replay
-from playslot_rl.baselines.online.seeds import development_seeds, training_seed
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.config.online import OnlineConfig
+from playslot_rl.config.baselines import OnlineConfig
+from playslot_rl.config.roles import fixed_keys
+from playslot_rl.episode_seeds import episode_seed
 from playslot_rl.progress import StageProgress
 from playslot_rl.seeding import StepGenerators, global_seed, step_generator
-from playslot_rl.training.fit import fixed_keys
 from playslot_rl.training.watch import Watch
 
 if TYPE_CHECKING:
@@ -166,7 +166,7 @@ class _Run:
 
     def _play(self) -> None:
         state, n = self.state, self.online.envs
-        seeds = [training_seed(self.config.seed, state.episodes + i) for i in range(n)]
+        seeds = [episode_seed("training", self.config.seed, state.episodes + i) for i in range(n)]
         generator = step_generator(self.config.seed, state.rounds, "act", self.device)
         self._mode(False)
         with global_seed(self.config.seed, state.rounds, "act"):
@@ -195,9 +195,13 @@ class _Run:
             if update == 0 or (update + 1) % self.online.log_every == 0:
                 self._log("train", numbers, at=update + 1)
 
+    def _development_seeds(self) -> list[int]:
+        """The fixed episodes behind a learning curve, the same ones for every method and training seed."""
+        return [episode_seed("development", 0, i) for i in range(self.online.evaluation_episodes)]
+
     def _measure(self, random: bool = False) -> dict[str, Any]:
         """Play the development episodes without exploring."""
-        seeds, played = development_seeds(self.online.evaluation_episodes), []
+        seeds, played = self._development_seeds(), []
         self._mode(False)
         with global_seed(self.config.seed, self.state.rounds, "development"):
             for first in range(0, len(seeds), LOCKSTEP):
@@ -225,8 +229,14 @@ class _Run:
 
     def write_curve(self) -> None:
         """Renew `curve.json`."""
-        seeds = development_seeds(self.online.evaluation_episodes)
-        write_curve(self.folder, self.title, self.config.env.name, seeds, self.state.curve, self.state.random)
+        write_curve(
+            self.folder,
+            self.title,
+            self.config.env.name,
+            self._development_seeds(),
+            self.state.curve,
+            self.state.random,
+        )
 
     def _save(self) -> None:
         self.watch.require_finite(self.learner.modules, self._when())

@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from playslot_rl import keys
-from playslot_rl.config.online import OnlineConfig
+from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.errors import ConfigError
 
 STREAM: Final = "stream"

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from playslot_rl.baselines.online.seeds import check_seeds
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.online import OnlineConfig
+from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.envs import gym_id
+from playslot_rl.episode_seeds import EPISODES
 from playslot_rl.errors import ConfigError
 
 
@@ -13,7 +13,8 @@ def require_online(config: ExperimentConfig, online: OnlineConfig, method: str) 
     """Refuse what cannot be learned by acting, before anything is started.
 
     Raises:
-        ConfigError: an environment without a simulator or without a dense reward, or seeds beyond their block.
+        ConfigError: an environment without a simulator or without a dense reward, or more episodes than
+            a seed has.
     """
     gym_id(config.env.name)
     if config.env.name.startswith("block_") and config.env.blocks.reward != "dense":
@@ -21,4 +22,8 @@ def require_online(config: ExperimentConfig, online: OnlineConfig, method: str) 
             f"env.blocks.reward: got {config.env.blocks.reward} with method={method}, expected dense: "
             "methods that learn by acting need a dense reward; set env.blocks.reward=dense"
         )
-    check_seeds(config, online.steps // config.env.max_steps + online.envs)
+    episodes = online.steps // config.env.max_steps + online.envs
+    if episodes > EPISODES:
+        raise ConfigError(
+            f"steps: got {episodes} episodes, expected at most {EPISODES}; lower it, or raise env.max_steps"
+        )

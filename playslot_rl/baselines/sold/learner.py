@@ -22,7 +22,7 @@ from playslot_rl.baselines.sold import losses
 from playslot_rl.baselines.sold.acting import SOLDActor
 from playslot_rl.baselines.sold.imagination import imagine
 from playslot_rl.baselines.sold.networks import SOLDNetworks, acting_window
-from playslot_rl.config.sold import SOLDConfig
+from playslot_rl.config.baselines import SOLDConfig
 from playslot_rl.frames import normalise
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.seeding import StepGenerators

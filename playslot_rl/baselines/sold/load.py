@@ -9,7 +9,7 @@ import torch
 from playslot_rl.baselines.sold.acting import SOLDActor
 from playslot_rl.baselines.sold.networks import SOLDNetworks, acting_window
 from playslot_rl.config import from_dict
-from playslot_rl.config.sold import SOLDConfig
+from playslot_rl.config.baselines import SOLDConfig
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.storage.checkpoints import (
     StageCheckpoint,

@@ -9,7 +9,7 @@ from torch import nn
 from playslot_rl.baselines.sold.aggregation import SlotAggregation
 from playslot_rl.baselines.sold.heads import ActorHead, ScalarHead
 from playslot_rl.config import PredictorConfig
-from playslot_rl.config.sold import SOLDConfig
+from playslot_rl.config.baselines import SOLDConfig
 from playslot_rl.modules.predictors.ocvp_seq import OCVPSeq
 
 

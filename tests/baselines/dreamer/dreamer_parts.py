@@ -12,7 +12,7 @@ from playslot_rl import keys
 from playslot_rl.baselines.dreamer.losses import build_loss
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
 from playslot_rl.config import EnvConfig
-from playslot_rl.config.dreamer import DreamerConfig
+from playslot_rl.config.baselines import DreamerConfig
 from playslot_rl.seeding import global_seed
 
 B, T, A = 2, 5, 4

@@ -13,7 +13,7 @@ from playslot_rl.baselines.lapo.load import LAPOPolicy, lapo_actor
 from playslot_rl.baselines.lapo.model import ForwardModel, InverseModel
 from playslot_rl.baselines.lapo.stage import LAPOModelStage, infer_latents
 from playslot_rl.config import ActionDecoderConfig, OptimConfig, StageConfig
-from playslot_rl.config.lapo import LAPOConfig
+from playslot_rl.config.baselines import LAPOConfig
 from playslot_rl.data.demonstrations import transitions
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeding import StepGenerators, global_seed

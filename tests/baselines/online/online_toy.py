@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.baselines.online.loop import OnlineResult, train_online
 from playslot_rl.config import EnvConfig, ExperimentConfig, LoggingConfig, RenderConfig
-from playslot_rl.config.online import OnlineConfig
+from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.seeding import StepGenerators, global_seed
 
 STEPS = 4

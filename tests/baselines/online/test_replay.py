@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from playslot_rl import keys
 from playslot_rl.baselines.online.replay import Replay
-from playslot_rl.config.online import OnlineConfig
+from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.errors import ConfigError
 
 FRAMES = 4

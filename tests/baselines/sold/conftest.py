@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from playslot_rl import keys
 from playslot_rl.baselines.sold.learner import SOLDLearner
 from playslot_rl.baselines.sold.networks import SOLDNetworks
-from playslot_rl.config.sold import SOLDConfig
+from playslot_rl.config.baselines import SOLDConfig
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.testing import tiny_config
 

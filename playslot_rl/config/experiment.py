@@ -1,0 +1,114 @@
+"""Config of a command: everything that can be set (re-exported by `playslot_rl.config`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from playslot_rl.config.baselines import BaselinesConfig
+from playslot_rl.config.compare import CompareConfig
+from playslot_rl.config.data import CollectConfig, CollectorConfig, DataConfig
+from playslot_rl.config.env import EnvConfig, RenderConfig
+from playslot_rl.config.methods import MethodName
+from playslot_rl.config.model import ModelConfig
+from playslot_rl.config.plain import check, check_seed
+from playslot_rl.config.roles import role
+from playslot_rl.config.stages import BehaviourStageConfig, DynamicsStageConfig, SlotsStageConfig
+from playslot_rl.episode_seeds import EVALUATION
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Evaluation.
+
+    Attributes:
+        references: also run the random, expert and slot-oracle references.
+        seed_offset: first number of the episodes of small seeds (`playslot_rl.episode_seeds`), above all collections'.
+            Below that only the records of the training data sets, which are looked at, keep episodes apart.
+    """
+
+    references: bool = True
+    seed_offset: int = EVALUATION
+
+    def __post_init__(self) -> None:
+        most = 2 * EVALUATION
+        check(0 <= self.seed_offset <= most, "evaluation.seed_offset", self.seed_offset, f"0 to {most}")
+
+
+@dataclass(frozen=True)
+class ExportConfig:
+    """Where `export` pushes the model folder; nowhere with an empty `repo`.
+
+    Attributes:
+        repo: `user/name` on the Hugging Face Hub; made if it is not there.
+        private: make it private; refused where it is public.
+        branch: empty means main.
+        tag: one more name for the commit; never moved.
+    """
+
+    repo: str = ""
+    private: bool = False
+    branch: str = ""
+    tag: str = ""
+
+
+@dataclass(frozen=True)
+class LoggingConfig:
+    """Logging: `tensorboard` (default), `wandb`, `trackio` or `none`, and a progress bar."""
+
+    backend: Literal["tensorboard", "wandb", "trackio", "none"] = "tensorboard"
+    progress: bool = True
+    project: str = "playslot_rl"
+
+
+@dataclass(frozen=True)
+class ExperimentConfig:
+    """Everything a command needs.
+
+    Attributes:
+        preset: name of the preset the values came from.
+        policy: collector policy of `collect`: `random` or `expert`.
+        episodes: episodes to collect or to evaluate; None means the command's default.
+        seed: seed of data collection, training or evaluation, any 32-bit number.
+        workers: collector processes; 0 means one per core.
+        out: folder to write.
+        run: run folder to read (and to write where `out` is empty); `pretrained` names the shipped model.
+        protocol: evaluation protocol.
+        device: torch device; empty means a GPU if there is one.
+        threads: torch threads; 0 leaves torch's choice.
+        method: what `train-baseline` trains (a name of `playslot_rl.config.methods`).
+        demos: demonstrations of the data set to use, the first ones; None means all.
+    """
+
+    preset: str = field(default="paper", metadata=role("machine"))
+    policy: Literal["random", "expert"] = field(default="expert", metadata=role("call"))
+    episodes: int | None = field(default=None, metadata=role("call"))
+    seed: int = 0
+    workers: int = field(default=0, metadata=role("call", "machine"))
+    out: str = field(default="", metadata=role("call", "machine", "folder"))
+    run: str = field(default="", metadata=role("call", "machine", "folder"))
+    protocol: Literal["simulation", "imagination"] = field(default="simulation", metadata=role("call"))
+    device: str = field(default="", metadata=role("call", "machine"))
+    threads: int = field(default=0, metadata=role("machine"))
+    method: MethodName = "playslot"
+    demos: int | None = None
+    env: EnvConfig = field(default_factory=EnvConfig)
+    render: RenderConfig = field(default_factory=RenderConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    collect: CollectConfig = field(default_factory=CollectConfig)
+    collector: CollectorConfig = field(default_factory=CollectorConfig, metadata=role("call", "machine"))
+    model: ModelConfig = field(default_factory=ModelConfig)
+    slots: SlotsStageConfig = field(default_factory=SlotsStageConfig)
+    dynamics: DynamicsStageConfig = field(default_factory=DynamicsStageConfig)
+    behaviour: BehaviourStageConfig = field(default_factory=BehaviourStageConfig)
+    baselines: BaselinesConfig = field(default_factory=BaselinesConfig)
+    compare: CompareConfig = field(default_factory=CompareConfig, metadata=role("machine"))
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    logging: LoggingConfig = field(default_factory=LoggingConfig, metadata=role("machine"))
+    export: ExportConfig = field(default_factory=ExportConfig, metadata=role("call"))
+
+    def __post_init__(self) -> None:
+        check(self.episodes is None or self.episodes >= 1, "episodes", self.episodes, "at least 1")
+        check_seed("seed", self.seed)
+        check(self.demos is None or self.demos >= 1, "demos", self.demos, "at least 1")
+        check(self.workers >= 0, "workers", self.workers, "0 (one per core) or more")

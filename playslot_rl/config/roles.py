@@ -1,0 +1,61 @@
+"""What a key of the config counts for, said where the key is declared: `field(default=0, metadata=role("machine"))`.
+
+A key without a role says what is computed: it is stored with a run, handed on, and part of every identity.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from playslot_rl.config.plain import to_dict
+
+Role = Literal["call", "machine", "free", "folder"]
+"""`call`: what one invocation does; a stored run does not hand it on.
+
+`machine`: where, how loudly and of which names a job of a comparison is made, not what comes out.
+`free`: how often and how long we look; may differ when a stage is resumed or found finished.
+`folder`: one or several paths, in which a leading `~` is expanded.
+"""
+
+
+def role(*roles: Role) -> dict[str, frozenset[Role]]:
+    """Metadata of a field that has these roles; those of a group hold for all of its keys."""
+    return {"roles": frozenset(roles)}
+
+
+def keys_of(cls: type, wanted: Role) -> frozenset[str]:
+    """Dotted names of the keys and groups of a config class, at any depth, that have a role."""
+    hints, found = typing.get_type_hints(cls), set[str]()
+    for field in dataclasses.fields(cls):
+        if wanted in field.metadata.get("roles", ()):
+            found.add(field.name)
+        elif dataclasses.is_dataclass(hints[field.name]):
+            found.update(f"{field.name}.{key}" for key in keys_of(hints[field.name], wanted))
+    return frozenset(found)
+
+
+def without(config: Any, unwanted: Role) -> dict[str, Any]:
+    """Nested plain dict of a config, less the keys and groups that have a role."""
+    values = to_dict(config)
+    for key in keys_of(type(config), unwanted):
+        *groups, name = key.split(".")
+        level = values
+        for group in groups:
+            level = level[group]
+        del level[name]
+    return values
+
+
+def fixed_keys(values: Mapping[str, Any]) -> dict[str, Any]:
+    """What a resumed or finished training must share with these nested plain values: all keys that are not `free`."""
+    from playslot_rl.config.experiment import ExperimentConfig
+
+    free = {key.rpartition(".")[2] for key in keys_of(ExperimentConfig, "free")}
+    return {
+        key: fixed_keys(value) if isinstance(value, Mapping) else value
+        for key, value in values.items()
+        if key not in free
+    }

@@ -1,0 +1,134 @@
+"""Config of one training, steps, batch, optimiser, and of the three stages (re-exported by `playslot_rl.config`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from playslot_rl.config.plain import check
+from playslot_rl.config.roles import role
+
+Precision = Literal["fp32", "bf16"]
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """Adam and its schedule.
+
+    Attributes:
+        lr: base learning rate.
+        warmup_steps: linear warm-up.
+        schedule: `cosine` to zero over the stage's steps after warm-up, or `constant`.
+        grad_clip: maximum gradient norm; 0 switches clipping off.
+    """
+
+    lr: float = 1e-4
+    warmup_steps: int = 0
+    schedule: Literal["cosine", "constant"] = "cosine"
+    grad_clip: float = 0.05
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """What every training stage has.
+
+    Attributes:
+        steps: optimiser steps.
+        batch_size: windows per step.
+        optim: optimiser.
+        precision: `bf16` autocasts the convolutions.
+        checkpoint_every: steps between checkpoints.
+        validate_every: steps between validations.
+        log_every: steps between log lines.
+    """
+
+    steps: int = 200_000
+    batch_size: int = 64
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    precision: Precision = "fp32"
+    checkpoint_every: int = field(default=1000, metadata=role("free"))
+    validate_every: int = field(default=1000, metadata=role("free"))
+    log_every: int = field(default=50, metadata=role("free"))
+
+    def __post_init__(self) -> None:
+        check(self.steps >= 1, "steps", self.steps, "at least 1")
+        check(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
+        check(self.checkpoint_every >= 1, "checkpoint_every", self.checkpoint_every, "at least 1")
+
+
+@dataclass(frozen=True)
+class SlotsStageConfig(StageConfig):
+    """Stage 1, SAVi.
+
+    Attributes:
+        clip_frames: frames per clip.
+        start_from: run (or `pretrained/ENV`) whose SAVi this one starts from; empty starts from scratch (paper).
+    """
+
+    clip_frames: int = 8
+    start_from: str = field(default="", metadata=role("folder"))
+
+
+@dataclass(frozen=True)
+class DynamicsStageConfig(StageConfig):
+    """Stage 2, InvDyn and cOCVP.
+
+    Attributes:
+        seed_frames: parsed frames a rollout starts from.
+        predicted_frames: frames predicted after the seed.
+        from_start: fraction of the clips that start at their episode's first frame, as imagination does.
+        teacher_steps: first steps in which every input is a parsed slot (one parallel pass; 0 in the paper).
+        decoded_frames: predicted frames decoded for the image loss, drawn at random; 0 decodes all of them.
+        image_weight, slot_weight, vq_weight: loss weights (lambda of Eq. "full loss").
+    """
+
+    seed_frames: int = 6
+    predicted_frames: int = 8
+    from_start: float = 0.0
+    teacher_steps: int = 0
+    decoded_frames: int = 0
+    image_weight: float = 1.0
+    slot_weight: float = 1.0
+    vq_weight: float = 0.25
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self.seed_frames >= 1, "dynamics.seed_frames", self.seed_frames, "at least 1")
+        check(self.predicted_frames >= 1, "dynamics.predicted_frames", self.predicted_frames, "at least 1")
+
+
+@dataclass(frozen=True)
+class BehaviourStageConfig(StageConfig):
+    """Stage 3, latent policy, action decoder and the slot oracle.
+
+    Attributes:
+        labelled_demos: demonstrations whose real actions the action decoder may see.
+        imagined: also clone from slots that cOCVP predicts along each demonstration.
+        loss: `l2` (paper) or `l1`, of policy, oracle and decoder. Where an expert switches at once between opposite
+            actions, the mean that `l2` finds is neither, and the policy dithers; the median is one of them.
+        slot_noise: standard deviation of Gaussian noise added to the slots that policy and oracle clone from (0 in the
+            paper); slots have a standard deviation of about 0.7, and a prediction is about 0.03 off.
+        shift: policy, oracle and decoder also learn from copies of the demonstrations moved by so many pixels, with the
+            same actions (0 in the paper, none): from ten demonstrations a policy learns where it has been.
+        shifted_copies: how many, of the eight directions (`playslot_rl.data.shifted.DIRECTIONS`).
+        decoder_inputs: `inverse_dynamics` (InvDyn's latents; paper), `policy` (the policy's outputs) or `both`.
+        decoder_steps: optimiser steps of the action decoder.
+        decoder_lr: its base learning rate; the rest of `optim` is shared.
+        oracle: also train the slot oracle (same network on the real actions of all demos).
+    """
+
+    labelled_demos: int = 50
+    imagined: bool = True
+    loss: Literal["l2", "l1"] = "l2"
+    slot_noise: float = 0.0
+    shift: int = 0
+    shifted_copies: int = 8
+    decoder_inputs: Literal["inverse_dynamics", "policy", "both"] = "inverse_dynamics"
+    decoder_steps: int = 2000
+    decoder_lr: float = 2e-4
+    oracle: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(0 <= self.shift <= 16, "behaviour.shift", self.shift, "0 to 16 pixels")
+        check(1 <= self.shifted_copies <= 8, "behaviour.shifted_copies", self.shifted_copies, "1 to 8")
