@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from playslot_rl.collectors.export import META_NAME, export
-from playslot_rl.collectors.journal import Journal, journal_path, read_spec
+from playslot_rl.collectors.journal import SPEC_NAME, Journal, journal_path, read_spec
 from playslot_rl.collectors.spec import CollectionSpec, completed, difference
 from playslot_rl.config import CollectorConfig, ExperimentConfig
 from playslot_rl.errors import DataError, OutputError
@@ -49,9 +49,10 @@ def is_complete(out: Path, spec: CollectionSpec) -> bool:
 
 def begun_episodes(out: Path) -> int | None:
     """Episodes of the collection that `out` holds, or that was begun there; None where there is none."""
-    for record in (out / META_NAME, journal_path(out.absolute()) / "collection.json"):
+    for record in (out / META_NAME, journal_path(out.absolute()) / SPEC_NAME):
         if record.is_file():
-            spec = read_spec(record).get("spec")
+            stored = read_spec(record)
+            spec = stored if record.name == SPEC_NAME else stored.get("spec")
             return int(spec["episodes"]) if isinstance(spec, dict) and "episodes" in spec else None
     return None
 
@@ -98,7 +99,7 @@ def collect(
     shown = config.logging.progress
     folder = journal_path(out)
     if is_complete(out, spec):
-        if (folder / "collection.json").is_file():
+        if (folder / SPEC_NAME).is_file():
             Journal(folder, spec).remove()  # killed between the rename and this
         if shown:
             print(f"collect: {out} is complete ({episodes} episodes), nothing to do", file=sys.stderr)

@@ -17,6 +17,7 @@ import pytest
 
 from playslot_rl import keys
 from playslot_rl.collectors import collect
+from playslot_rl.collectors.collection import begun_episodes
 from playslot_rl.collectors.journal import Journal, journal_path
 from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.config import ExperimentConfig, from_dict
@@ -199,6 +200,13 @@ def test_other_settings_are_refused_by_name(made: Path, tmp_path: Path) -> None:
     restore(made, out)
     with pytest.raises(OutputError, match=r"env\.warmup_steps: got 1, expected 2"):
         small(out, env={"image_size": 32, "warmup_steps": 2})
+
+
+def test_episodes_of_a_collection_are_known_from_its_data_set_and_from_its_journal(made: Path, tmp_path: Path) -> None:
+    assert begun_episodes(made) == 2
+    assert begun_episodes(tmp_path / "data") is None
+    restore(made, tmp_path / "data")
+    assert begun_episodes(tmp_path / "data") == 2
 
 
 def test_foreign_journal_folder_is_refused(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from playslot_rl.config import (
 from playslot_rl.config.compose import choices, compose
 from playslot_rl.config.roles import fixed_keys, keys_of, without
 from playslot_rl.errors import ConfigError
+from playslot_rl.storage.resume import flatten
 
 PRESETS = ["compact", "paper", "smoke"]
 ENVS = ["block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "grid_shapes", "sketchy"]
@@ -194,17 +195,27 @@ def test_roles_say_what_each_key_counts_for() -> None:
     assert keys_of(ExperimentConfig, "call") == call
     machine = {"device", "threads", "workers", "logging", "collector", "compare", "preset", "out", "run"}
     named = {"data.root", "data.demos", "data.cache", "baselines.lapo.world"}
-    assert keys_of(ExperimentConfig, "machine") == machine | named
+    measures = {"data.held_out", "collect.validation_episodes"}
+    assert keys_of(ExperimentConfig, "machine") == machine | named | measures
     assert keys_of(ExperimentConfig, "folder") == {"out", "run", "slots.start_from"} | named
 
 
 def test_a_config_without_a_role_keeps_all_other_keys() -> None:
     config = ExperimentConfig()
     left, whole = without(config, "machine"), to_dict(config)
-    assert whole["data"].keys() - left["data"].keys() == {"root", "demos", "cache"}
+    assert whole["data"].keys() - left["data"].keys() == {"root", "demos", "cache", "held_out"}
     assert {**whole["data"], **left["data"]} == whole["data"]
     assert to_dict(config) == whole
-    assert fixed_keys(to_dict(config.slots)) == {k: v for k, v in whole["slots"].items() if not k.endswith("_every")}
+    fixed = fixed_keys(whole)
+    assert fixed["slots"] == {k: v for k, v in whole["slots"].items() if not k.endswith("_every")}
+    assert "minutes" not in fixed["baselines"]["dreamer"]
+
+
+def test_a_name_is_free_in_every_group_or_in_none() -> None:
+    """So that stored values, which have no class, can be told apart by name."""
+    free = keys_of(ExperimentConfig, "free")
+    names = {key.rpartition(".")[2] for key in free}
+    assert {key for key in flatten(to_dict(ExperimentConfig())) if key.rpartition(".")[2] in names} == free
 
 
 def test_a_config_checks_its_values() -> None:

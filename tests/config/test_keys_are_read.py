@@ -25,7 +25,6 @@ LOOPS = ("playslot_rl/training/", "playslot_rl/baselines/online/", "recipes/base
 
 CHECKED = {
     "model.savi.encoder": "`full` refuses strides, in SAViConfig",
-    "behaviour.precision": "PENDING: the branch that makes the stage use it removes this line",
 }
 """Keys that say something although no computation reads them."""
 

@@ -229,14 +229,8 @@ class _Run:
 
     def write_curve(self) -> None:
         """Renew `curve.json`."""
-        write_curve(
-            self.folder,
-            self.title,
-            self.config.env.name,
-            self._development_seeds(),
-            self.state.curve,
-            self.state.random,
-        )
+        seeds = self._development_seeds()
+        write_curve(self.folder, self.title, self.config.env.name, seeds, self.state.curve, self.state.random)
 
     def _save(self) -> None:
         self.watch.require_finite(self.learner.modules, self._when())
