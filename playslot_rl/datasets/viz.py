@@ -44,6 +44,13 @@ class Clip:
     frames: dict[str, npt.NDArray[np.uint8]]
 
 
+def view(root: Path, *, episodes: int, out: Path | None, rerun: bool) -> list[str]:
+    """`write_page` or `show_in_rerun`; returns what to tell people."""
+    if rerun:
+        return [f"rerun shows episodes {show_in_rerun(root, episodes)} of {root}"]
+    return [f"page: {write_page(root, out, episodes)}"]
+
+
 def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 6) -> Path:
     """Write one HTML file about a data set; styles and pictures are inside it.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pkgutil
 import shutil
 import subprocess
 import sys
@@ -27,6 +28,8 @@ ACTIONS = ["info", "verify", "repair", "merge", "split", "viz", "push", "pull"]
 
 def test_the_actions_are_the_promised_ones(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(command.ACTIONS) == ACTIONS
+    for action in command.ACTIONS.values():
+        assert callable(pkgutil.resolve_name(action.does))
     for arguments in (["--help"], ["dataset", "--help"]):
         with pytest.raises(SystemExit) as ended:
             cli.main(arguments)
@@ -99,7 +102,7 @@ def test_an_interrupt_says_that_nothing_was_changed(
 ) -> None:
     from playslot_rl.datasets import verify
 
-    def interrupt(*_: object) -> None:
+    def interrupt(root: Path) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(verify, "verify", interrupt)
@@ -124,10 +127,10 @@ def test_merge_split_and_repair_from_the_command_line(
 def test_push_and_pull_hand_their_arguments_on(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    got: list[Any] = []
+    got: list[dict[str, object]] = []
 
-    def spy(*arguments: object, **options: object) -> Any:
-        got.append((arguments, options))
+    def spy(**options: object) -> Any:
+        got.append(options)
         return types.SimpleNamespace(lines=lambda: ["done"])
 
     for name in ("push", "pull"):
@@ -137,8 +140,8 @@ def test_push_and_pull_hand_their_arguments_on(
     assert cli.main(["dataset", "push", "d", "me/x", "--private", "--branch", "b"]) == 0
     assert cli.main(["dataset", "pull", "me/x", "d", "--revision", "r"]) == 0
     assert got == [
-        ((Path("d"), "me/x"), {"private": True, "branch": "b", "tag": None}),
-        (("me/x", Path("d")), {"revision": "r"}),
+        {"root": Path("d"), "repo_id": "me/x", "private": True, "branch": "b", "tag": None},
+        {"repo_id": "me/x", "root": Path("d"), "revision": "r"},
     ]
     assert capsys.readouterr().out == "done\ndone\n"
 
