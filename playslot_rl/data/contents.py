@@ -112,11 +112,6 @@ class Contents:
         return sum(self.file_rows)
 
     @property
-    def images(self) -> list[str]:
-        """Features whose frames are in the parquet files."""
-        return [name for name, feature in self.features.items() if feature["dtype"] == "image"]
-
-    @property
     def videos(self) -> list[str]:
         """Features whose frames are in mp4 files."""
         return [name for name, feature in self.features.items() if feature["dtype"] == "video"]
@@ -153,23 +148,20 @@ class Contents:
             begin += rows
         return found
 
-    def video_file(self, camera: str, row: dict[str, Any]) -> Path:
-        """File with an episode's video.
+    def video_file(self, camera: str, row: dict[str, Any]) -> Path | None:
+        """File with an episode's video, or None where its row names none."""
+        return self._file(f"videos/{camera}", self.info.get("video_path") or VIDEO_PATH, row, video_key=camera)
 
-        Raises:
-            KeyError: the row names none.
-        """
-        place = {"chunk_index": row[f"videos/{camera}/chunk_index"], "file_index": row[f"videos/{camera}/file_index"]}
-        return self.root / str(self.info.get("video_path") or VIDEO_PATH).format(video_key=camera, **place)
+    def data_file(self, row: dict[str, Any]) -> Path | None:
+        """File with an episode's rows, or None where its row names none."""
+        return self._file("data", self.info.get("data_path") or DATA_PATH, row)
 
-    def data_file(self, row: dict[str, Any]) -> Path:
-        """File with an episode's rows.
-
-        Raises:
-            KeyError: the row names none.
-        """
-        place = {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
-        return self.root / str(self.info.get("data_path") or DATA_PATH).format(**place)
+    def _file(self, prefix: str, template: str, row: dict[str, Any], **names: str) -> Path | None:
+        try:
+            place = {name: row[f"{prefix}/{name}"] for name in ("chunk_index", "file_index")}
+            return self.root / template.format(**place, **names)
+        except (KeyError, ValueError, TypeError):
+            return None
 
     def file_hash(self, camera: str) -> str:
         """Hash of the metadata, the rows and the camera's videos as they are stored: 16 hex digits."""

@@ -81,6 +81,7 @@ def _image_frames(
 
     wanted = {row for span in spans for row in range(span.start, span.stop)}
     decode = functools.partial(_decode_image, contents.root)
+    size = stated_size(contents.features[camera])
     row = 0
     # Decoding PNG releases the interpreter lock; two threads suffice to keep one core busy with it.
     with ThreadPoolExecutor(2) as pool:
@@ -95,11 +96,14 @@ def _image_frames(
                 here = [i for i in range(len(batch)) if row + i in wanted]
                 cells = batch.column(0).take(here).to_pylist()
                 for i, result in zip(here, pool.map(decode, cells), strict=True):
-                    fault = _image_fault(result, stated_size(contents.features[camera]))
-                    if fault:
-                        problems.error(DAMAGED, f"{path}: row {row + i - begin}, {camera}: {fault}")
+                    if isinstance(result, str):
+                        fault = f"cannot be decoded ({result}), expected a PNG or JPEG image"
+                    elif result.shape[:2] != size:
+                        fault = f"got {result.shape[:2]}, expected {size} as stated"
                     else:
                         yield row + i, result
+                        continue
+                    problems.error(DAMAGED, f"{path}: row {row + i - begin}, {camera}: {fault}")
                 row += len(batch)
 
 
@@ -120,12 +124,6 @@ def _decode_image(root: Path, cell: dict[str, Any] | None) -> Array | str:
         return " ".join(str(error).split())[:80] or type(error).__name__
 
 
-def _image_fault(result: Array | str, size: tuple[int, int]) -> str:
-    if isinstance(result, str):
-        return f"cannot be decoded ({result}), expected a PNG or JPEG image"
-    return "" if result.shape[:2] == size else f"got {result.shape[:2]}, expected {size} as stated"
-
-
 def _video_frames(
     contents: Contents, camera: str, spans: Sequence[Span], problems: Problems
 ) -> Iterator[tuple[int, Decoded]]:
@@ -134,13 +132,11 @@ def _video_frames(
     for episode in contents.episodes:
         if episode.index not in rows:
             continue
-        try:
-            path = contents.video_file(camera, episode.row)
-            begin = float(episode.row[f"videos/{camera}/from_timestamp"])
-        except (KeyError, TypeError, ValueError):
+        path, begin = contents.video_file(camera, episode.row), episode.row.get(f"videos/{camera}/from_timestamp")
+        if path is None or begin is None:
             problems.error(DAMAGED, f"episode {episode.index}: got no place of {camera} in meta/episodes, expected one")
             continue
-        files.setdefault(path, []).append((begin, rows[episode.index]))
+        files.setdefault(path, []).append((float(begin), rows[episode.index]))
     size = stated_size(contents.features[camera])
     for path, places in files.items():
         if not path.is_file():

@@ -27,6 +27,7 @@ from playslot_rl.data.contents import (
     STATS_NAME,
     TASKS_NAME,
     VIDEO_PATH,
+    Array,
     Contents,
     Episode,
     Span,
@@ -80,30 +81,35 @@ def assemble(choices: Sequence[Choice], out: Path, made_by: str) -> None:
         raise DataError(f"{out}: got no episode to write, expected at least one")
     out.mkdir(parents=True)
     info = _info(choices)
-    tasks = _Tasks()
+    tasks: dict[str, int] = {}  # numbered as they appear
     copiers = {camera: _copier(out, camera, info) for camera in choices[0].contents.videos}
     rows = _RowWriter(out, info)
-    table = _EpisodeWriter(out)
+    table: list[dict[str, Any]] = []
     all_stats: list[Stats] = []
     try:
         for choice in choices:
+            contents = choice.contents
             for span, episode, piece in zip(choice.spans, choice.episodes, _pieces(choice), strict=True):
-                numbers = choice.contents.columns["task_index"][span.start : span.stop]
-                placed = rows.write(piece, tasks.renumber(choice.contents.tasks, numbers))
-                videos = {c: copier.copy(*_video(choice.contents, c, episode)) for c, copier in copiers.items()}
-                stats = {**episode.stats, **placed.stats}
-                places = {k: v for place in videos.values() for k, v in place.items()}
-                table.write(episode, {**placed.row, **places}, stats)
+                numbers = contents.columns["task_index"][span.start : span.stop].tolist()
+                task_index = np.array([tasks.setdefault(contents.tasks[n], len(tasks)) for n in numbers], np.int64)
+                row, stats_of_places = rows.write(piece, task_index)
+                for camera, copier in copiers.items():
+                    path, begin = (
+                        contents.video_file(camera, episode.row),
+                        episode.row[f"videos/{camera}/from_timestamp"],
+                    )
+                    assert path is not None, "a sound data set, or one whose frames were decoded"
+                    row |= copier.copy(path, float(begin), episode.length)
+                stats = {**episode.stats, **stats_of_places}
+                table.append(_episode_row(episode, row, stats))
                 all_stats.append(stats)
     finally:
         rows.close()
-        table.close()
         for copier in copiers.values():
             copier.close()
-    tasks.save(out)
-    episodes = sum(len(choice.spans) for choice in choices)
-    info |= {"total_episodes": episodes, "total_frames": rows.rows, "total_tasks": len(tasks.words)}
-    info["splits"] = {"train": f"0:{episodes}"}
+    _write_metadata(out, table, list(tasks))
+    info |= {"total_episodes": rows.episodes, "total_frames": rows.rows, "total_tasks": len(tasks)}
+    info["splits"] = {"train": f"0:{rows.episodes}"}
     write_json(out / STATS_NAME, _plain(aggregate(all_stats)))
     write_json(out / INFO_NAME, info)
     _write_record(choices, out, made_by)
@@ -127,11 +133,6 @@ def _copier(out: Path, camera: str, info: Mapping[str, Any]) -> VideoCopier:
     return VideoCopier(out, camera, VIDEO_PATH, float(info["fps"]), limit, files)
 
 
-def _video(contents: Contents, camera: str, episode: Episode) -> tuple[Path, float, int]:
-    begin = float(episode.row[f"videos/{camera}/from_timestamp"])
-    return contents.video_file(camera, episode.row), begin, episode.length
-
-
 def _pieces(choice: Choice) -> Iterator[Any]:
     """Tables of the chosen episodes' rows; each file is read once where episodes are in order."""
     import pyarrow.parquet as pq
@@ -146,12 +147,6 @@ def _pieces(choice: Choice) -> Iterator[Any]:
         yield table.slice(span.start - int(starts[span.file]), span.length)
 
 
-@dataclass(frozen=True)
-class _Placed:
-    row: dict[str, Any]
-    stats: Stats
-
-
 class _RowWriter:
     """Rows of the new data set: one row group an episode, as LeRobot writes them."""
 
@@ -159,10 +154,11 @@ class _RowWriter:
         self.out, self.rows, self.episodes, self._number = out, 0, 0, -1
         self._limit = float(info.get("data_files_size_in_mb") or DATA_SIZE_MB) * MEGABYTE
         self._files = int(info.get("chunks_size") or DEFAULT_FILES)
+        self._path = out
         self._writer: Any = None
         self._schema: Any = None
 
-    def write(self, table: Any, task_index: np.ndarray[Any, Any]) -> _Placed:
+    def write(self, table: Any, task_index: Array) -> tuple[dict[str, Any], Stats]:
         """Append an episode; returns its place and the statistics that depend on it."""
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -179,13 +175,14 @@ class _RowWriter:
         if self._schema is None:
             metadata = {k: v for k, v in (table.schema.metadata or {}).items() if k != b"pandas"}
             self._schema = table.schema.with_metadata(metadata or None)
-        table = table.select(self._schema.names).cast(self._schema)
-        if self._writer is None or self._path().stat().st_size >= self._limit:
+        if self._writer is None or self._path.stat().st_size >= self._limit:
             self.close()
             self._number += 1
-            self._path().parent.mkdir(parents=True, exist_ok=True)
-            self._writer = pq.ParquetWriter(self._path(), self._schema, compression="snappy", use_dictionary=True)
-        self._writer.write_table(table)
+            chunk, file = divmod(self._number, self._files)
+            self._path = self.out / DATA_PATH.format(chunk_index=chunk, file_index=file)
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._writer = pq.ParquetWriter(self._path, self._schema, compression="snappy", use_dictionary=True)
+        self._writer.write_table(table.select(self._schema.names).cast(self._schema))
         chunk, file = divmod(self._number, self._files)
         row = {
             "episode_index": self.episodes,
@@ -195,78 +192,32 @@ class _RowWriter:
             "dataset_to_index": self.rows + length,
         }
         self.rows, self.episodes = self.rows + length, self.episodes + 1
-        return _Placed(row, {name: of_numbers(values) for name, values in places.items()})
+        return row, {name: of_numbers(values) for name, values in places.items()}
 
     def close(self) -> None:
         if self._writer is not None:
             self._writer.close()
-            self._writer = None
-
-    def _path(self) -> Path:
-        chunk, file = divmod(self._number, self._files)
-        return self.out / DATA_PATH.format(chunk_index=chunk, file_index=file)
 
 
-class _Tasks:
-    """Tasks of the new data set, numbered as they appear."""
-
-    def __init__(self) -> None:
-        self.words: list[str] = []
-
-    def renumber(self, known: Mapping[int, str], numbers: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """New task numbers of rows."""
-        new = np.empty(len(numbers), np.int64)
-        for number in dict.fromkeys(numbers.tolist()):
-            if known[number] not in self.words:
-                self.words.append(known[number])
-            new[numbers == number] = self.words.index(known[number])
-        return new
-
-    def save(self, out: Path) -> None:
-        import pandas as pd
-
-        frame = pd.DataFrame({"task_index": range(len(self.words))}, index=pd.Index(self.words, name="task"))
-        frame.to_parquet(out / TASKS_NAME)
+def _episode_row(episode: Episode, changes: Mapping[str, Any], stats: Stats) -> dict[str, Any]:
+    flat = {f"stats/{n}/{key}": value for n, group in _plain(stats).items() for key, value in group.items()}
+    kept = {k: v for k, v in episode.row.items() if k not in ("episode_index", "tasks", "length")}
+    row = {"episode_index": 0, "tasks": list(episode.tasks), "length": episode.length, **kept, **changes}
+    return row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0} | flat
 
 
-class _EpisodeWriter:
-    """`meta/episodes`: one file, written in pieces."""
+def _write_metadata(out: Path, episodes: Sequence[Mapping[str, Any]], tasks: Sequence[str]) -> None:
+    """`meta/episodes`, in one file, and the tasks in words."""
+    import pandas as pd
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
-    def __init__(self, out: Path) -> None:
-        self._path = out / EPISODES_PATH.format(chunk_index=0, file_index=0)
-        self._path.parent.mkdir(parents=True)
-        self._rows: list[dict[str, Any]] = []
-        self._writer: Any = None
-
-    def write(self, episode: Episode, changes: Mapping[str, Any], stats: Stats) -> None:
-        """Append an episode's row."""
-        flat = {f"stats/{n}/{key}": value for n, group in _plain(stats).items() for key, value in group.items()}
-        kept = {k: v for k, v in episode.row.items() if k not in ("episode_index", "tasks", "length")}
-        row = {"episode_index": 0, "tasks": list(episode.tasks), "length": episode.length, **kept, **changes}
-        self._rows.append(row | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0} | flat)
-        if len(self._rows) >= ROWS_OF_METADATA:
-            self._flush()
-
-    def close(self) -> None:
-        self._flush()
-        if self._writer is not None:
-            self._writer.close()
-
-    def _flush(self) -> None:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        if not self._rows:
-            return
-        if self._writer is None:
-            names = dict.fromkeys(name for row in self._rows for name in row)
-            whole = [{name: row.get(name) for name in names} for row in self._rows]
-            table = pa.Table.from_pylist(whole)
-            self._writer = pq.ParquetWriter(self._path, table.schema, compression="snappy", use_dictionary=True)
-        else:
-            table = pa.Table.from_pylist(self._rows, schema=self._writer.schema)
-        self._writer.write_table(table)
-        self._rows.clear()
+    path = out / EPISODES_PATH.format(chunk_index=0, file_index=0)
+    path.parent.mkdir(parents=True)
+    names = dict.fromkeys(name for row in episodes for name in row)
+    table = pa.Table.from_pylist([{name: row.get(name) for name in names} for row in episodes])
+    pq.write_table(table, path, row_group_size=ROWS_OF_METADATA)
+    pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(tasks, name="task")).to_parquet(out / TASKS_NAME)
 
 
 def _plain(stats: Stats) -> dict[str, dict[str, Any]]:

@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from playslot_rl.data.contents import UNREADABLE, Contents, Episode, Span, Stats, read_contents
 from playslot_rl.data.problems import Problems
 from playslot_rl.datasets.assemble import Choice, assemble
-from playslot_rl.datasets.frames import CameraScan, scan_frames
-from playslot_rl.datasets.rows import length_fault, row_faults
+from playslot_rl.datasets.fingerprint import CameraScan, scan_frames
 from playslot_rl.datasets.statistics import differing
-from playslot_rl.datasets.verify import LOOSE_CAMERA, Verification, episode_statistics, verify
+from playslot_rl.datasets.verify import LOOSE_CAMERA, Verification, episode_statistics, length_fault, row_faults, verify
 from playslot_rl.datasets.video_copy import frame_count
 from playslot_rl.errors import DataError, OutputError
 from playslot_rl.storage.atomic import explain_write_errors, fsync_folder
@@ -92,13 +92,17 @@ def repair(root: str | Path, out: str | Path | None = None) -> RepairResult:
         more = f"; {_journal_note(beside)}" if beside else "; record it again"
         raise DataError(f"{folder}: got no whole episode to restore ({(lost or before.errors)[0]}), expected one{more}")
     stated = int(contents.info["total_episodes"])
-    if out is not None:
-        with new_folder(Path(out), create=False, key="--out ") as temporary:
-            result = _write(choice, temporary)
-        return RepairResult(Path(out), result, stated, tuple(lost), None, beside)
-    repaired = folder.with_name(f"{folder.name}.repaired")
+    repaired = Path(out) if out is not None else folder.with_name(f"{folder.name}.repaired")
     with new_folder(repaired, create=False, key="--out ") as temporary:
-        result = _write(choice, temporary)
+        assemble([choice], temporary, "playslot dataset repair")
+        result = verify(temporary)
+        if not result.ok:
+            raise DataError(
+                f"{folder}: cannot be repaired: got {result.errors[0]} after it, expected a sound data set; "
+                "it was left as it is"
+            )
+    if out is not None:
+        return RepairResult(repaired, result, stated, tuple(lost), None, beside)
     damaged = _free_name(folder)
     with explain_write_errors(folder):
         folder.rename(damaged)
@@ -112,17 +116,6 @@ def _journal_note(journal: Path) -> str:
         f"{journal} holds the episodes of an unfinished collection: `playslot collect` with the same arguments as "
         "then may restore more than a repair"
     )
-
-
-def _write(choice: Choice, temporary: Path) -> Verification:
-    assemble([choice], temporary, "playslot dataset repair")
-    result = verify(temporary)
-    if not result.ok:
-        raise DataError(
-            f"{choice.contents.root}: cannot be repaired: got {result.errors[0]} after it, expected a sound data set; "
-            "it was left as it is"
-        )
-    return result
 
 
 def _undo_half_rename(folder: Path) -> None:
@@ -166,11 +159,11 @@ def _whole_episodes(contents: Contents, lost: list[str]) -> Choice:
         seen.add(span.index)
         spans.append(span)
         episodes.append(replace(episode, stats=_statistics(contents, scans, number, episode)))
-    gone = sorted(set(known) - {span.index for span in contents.spans})
-    stated = int(contents.info["total_episodes"])
-    gone += sorted(set(range(stated)) - set(known) - {span.index for span in contents.spans})
+    expected = set(known) | set(range(int(contents.info["total_episodes"])))
+    gone = sorted(expected - {span.index for span in contents.spans})
     if gone:
-        lost.append(f"episodes {_ranges(gone)}: no rows are left of them")
+        more = f" and {len(gone) - 8} more" if len(gone) > 8 else ""
+        lost.append(f"episodes {', '.join(map(str, gone[:8]))}{more}: no rows are left of them")
     return Choice(contents, spans, episodes)
 
 
@@ -211,12 +204,7 @@ def _statistics(contents: Contents, scans: Mapping[str, CameraScan], number: int
 
 def _stale_files(contents: Contents) -> set[int]:
     """Data files that no episode names although all of their episodes have metadata that name others."""
-    named = set()
-    for episode in contents.episodes:
-        try:
-            named.add(contents.data_file(episode.row))
-        except (KeyError, ValueError, TypeError):
-            continue
+    named = {contents.data_file(episode.row) for episode in contents.episodes}
     known = {episode.index for episode in contents.episodes}
     stale = set()
     for number, path in enumerate(contents.data_files):
@@ -229,23 +217,27 @@ def _stale_files(contents: Contents) -> set[int]:
 def _locate_videos(contents: Contents, spans: list[Span], known: Mapping[int, Episode]) -> dict[int, Episode]:
     """Metadata of each episode: its own, or made from its rows and the order in which LeRobot joins videos."""
     counts = {camera: _video_files(contents, camera) for camera in contents.videos}
-    position = {camera: [0, 0] for camera in contents.videos}
+    position = dict.fromkeys(contents.videos, (0, 0))
     located: dict[int, Episode] = {}
     for span in spans:
         episode = known.get(span.index)
         if episode is None:
-            row: dict[str, object] = {}
+            row: dict[str, Any] = {}
             for camera, files in counts.items():
                 row |= _next_place(contents, camera, files, position[camera], span.length)
-            complete = all(f"videos/{camera}/from_timestamp" in row for camera in contents.videos)
-            if not complete:
+            if any(f"videos/{camera}/from_timestamp" not in row for camera in contents.videos):
                 continue
             numbers = contents.columns["task_index"][span.start : span.stop].tolist()
             tasks = tuple(dict.fromkeys(contents.tasks[n] for n in numbers if n in contents.tasks))
             episode = Episode(span.index, span.length, tasks, row, {})
         located[span.index] = episode
         for camera, files in counts.items():
-            _advance(contents, camera, files, position[camera], episode)
+            name = f"videos/{camera}"
+            place = episode.row.get(f"{name}/chunk_index"), episode.row.get(f"{name}/file_index")
+            end = episode.row.get(f"{name}/to_timestamp")
+            numbers = [number for number, file in enumerate(files) if file[:2] == place]
+            if numbers and end is not None:
+                position[camera] = numbers[0], round(float(end) * contents.fps)
     return located
 
 
@@ -265,8 +257,8 @@ def _video_files(contents: Contents, camera: str) -> list[Place]:
 
 
 def _next_place(
-    contents: Contents, camera: str, files: list[Place], position: list[int], length: int
-) -> dict[str, object]:
+    contents: Contents, camera: str, files: list[Place], position: tuple[int, int], length: int
+) -> dict[str, Any]:
     number, frame = position
     if number < len(files) and frame + length > files[number][2]:
         number, frame = number + 1, 0
@@ -278,20 +270,3 @@ def _next_place(
         f"videos/{camera}/from_timestamp": frame / contents.fps,
         f"videos/{camera}/to_timestamp": (frame + length) / contents.fps,
     }
-
-
-def _advance(contents: Contents, camera: str, files: list[Place], position: list[int], episode: Episode) -> None:
-    row = episode.row
-    try:
-        place = (row[f"videos/{camera}/chunk_index"], row[f"videos/{camera}/file_index"])
-        end = round(float(row[f"videos/{camera}/to_timestamp"]) * contents.fps)
-    except (KeyError, TypeError, ValueError):
-        return
-    numbers = [number for number, file in enumerate(files) if file[:2] == place]
-    if numbers:
-        position[:] = [numbers[0], end]
-
-
-def _ranges(numbers: list[int]) -> str:
-    shown = ", ".join(map(str, numbers[:8]))
-    return f"{shown} and {len(numbers) - 8} more" if len(numbers) > 8 else shown

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,10 +12,12 @@ from typing import Any
 import numpy as np
 
 from playslot_rl.data.contents import (
+    INFO_NAME,
     PLACE,
     RECORD_NAME,
     REQUIRED,
     STATS_NAME,
+    TASKS_NAME,
     Array,
     Contents,
     Episode,
@@ -24,12 +27,12 @@ from playslot_rl.data.contents import (
     read_contents,
 )
 from playslot_rl.data.problems import Problems
-from playslot_rl.datasets.fingerprint import fingerprint_of
-from playslot_rl.datasets.frames import CameraScan, scan_frames
-from playslot_rl.datasets.rows import check_rows
+from playslot_rl.datasets.fingerprint import CameraScan, fingerprint_of, scan_frames
 from playslot_rl.datasets.statistics import aggregate, differing, has_statistics, of_numbers, rounded
 from playslot_rl.errors import DataError
 
+TIME_TOLERANCE_S = 1e-4
+"""As LeRobot's default; float32 holds it up to about half an hour."""
 LOOSE_CAMERA = 0.05
 """Tolerance, of [0, 1], for statistics of frames that were compressed with loss or sampled in another way."""
 
@@ -127,6 +130,167 @@ def require_sound(root: str | Path) -> Contents:
     return contents
 
 
+def check_rows(contents: Contents, problems: Problems) -> None:
+    """Check the rows and the metadata that speak about them; reads no frames. Findings go to `problems`.
+
+    LeRobot's own reader takes all of this for granted: a stale shard, for instance, gives it more rows than episodes.
+    """
+    _check_counts(contents, problems)
+    _check_files(contents, problems)
+    _check_episodes(contents, problems)
+    for span in contents.spans:
+        for kind, fault in row_faults(contents, span):
+            problems.error(kind, f"episode {span.index}: {fault}")
+    _check_places(contents, problems)
+
+
+def row_faults(contents: Contents, span: Span) -> list[tuple[str, str]]:
+    """What is wrong with the rows of one episode, whatever else the data set holds: (kind, message)."""
+    rows = slice(span.start, span.stop)
+    faults = []
+    frame = contents.columns["frame_index"][rows]
+    if not np.array_equal(frame, np.arange(span.length)):
+        shown = ", ".join([str(number) for number in frame[:4]] + ["..."] * (span.length > 4))
+        faults.append(("frame_index", f"got frame_index [{shown}], expected 0 to {span.length - 1} in order"))
+    late = np.abs(contents.columns["timestamp"][rows].astype(np.float64) - np.arange(span.length) / contents.fps)
+    if not bool((late <= TIME_TOLERANCE_S).all()):
+        worst = int(np.argmax(np.nan_to_num(late, nan=np.inf)))
+        got = contents.columns["timestamp"][rows][worst]
+        faults.append(
+            (
+                "timestamp",
+                f"got timestamp {got:.6g} at frame {worst}, expected {worst / contents.fps:.6g} (frame / fps)",
+            )
+        )
+    unknown = set(contents.columns["task_index"][rows].tolist()) - set(contents.tasks)
+    if unknown:
+        faults.append(("task_index", f"got task_index {sorted(unknown)}, expected one of {TASKS_NAME}"))
+    for name, values in contents.columns.items():
+        if values.dtype.kind == "f" and not np.isfinite(values[rows]).all():
+            faults.append(("not finite", f"got a value of {name} that is NaN or infinite, expected numbers"))
+    return faults
+
+
+def length_fault(episode: Episode, span: Span) -> str:
+    """Disagreement of an episode's metadata with its number of rows, or nothing."""
+    if episode.length == span.length:
+        return ""
+    return f"got {span.length} rows, expected {episode.length} as in meta/episodes"
+
+
+def _check_counts(contents: Contents, problems: Problems) -> None:
+    info = contents.info
+    for name, got in (
+        ("total_frames", contents.rows),
+        ("total_episodes", len(contents.episodes)),
+        ("total_tasks", len(contents.tasks)),
+    ):
+        if name in info and int(info[name]) != got:
+            problems.error("wrong count", f"{INFO_NAME}: got {name} {info[name]}, but the files hold {got}")
+    if not contents.rows:
+        problems.error("empty", f"{contents.root}: got no readable rows, expected episodes")
+    expected = f"0:{len(contents.episodes)}"
+    splits = info.get("splits") or {}
+    if set(splits) == {"train"} and splits["train"] != expected:
+        problems.warning("splits", f"{INFO_NAME}: got splits train={splits['train']}, expected {expected}")
+
+
+def _check_files(contents: Contents, problems: Problems) -> None:
+    """Every file that is named is there, and every file that is there is named."""
+    of_rows = [(episode, contents.data_file(episode.row)) for episode in contents.episodes]
+    of_video = [(e, contents.video_file(camera, e.row)) for e in contents.episodes for camera in contents.videos]
+    videos = set((contents.root / "videos").rglob("*.mp4"))
+    for what, present, namers in (("rows", set(contents.data_files), of_rows), ("video", videos, of_video)):
+        for episode, path in namers:
+            if path is None:
+                problems.error(
+                    "damaged episode row", f"episode {episode.index}: got no file of its {what}, expected one"
+                )
+        named = {path for _, path in namers if path is not None}
+        for path in sorted(named - present):
+            if not path.is_file():  # an unreadable one has been noted already
+                problems.error(f"missing {what}", f"{path}: got no such file, expected {what} that meta/episodes names")
+        for path in sorted(present - named):
+            problems.error(
+                "stale shard",
+                f"{path}: got a file that no episode names, expected none: it is left from another version",
+            )
+    leftovers = contents.root / "images"  # LeRobot leaves its folders, but no files unless it was interrupted
+    if any(path.is_file() for path in leftovers.rglob("*")):
+        problems.warning("leftover", f"{leftovers}: got images of an interrupted recording, expected none: delete them")
+
+
+def _check_episodes(contents: Contents, problems: Problems) -> None:
+    numbers = [episode.index for episode in contents.episodes]
+    if numbers != list(range(len(numbers))):
+        problems.error(
+            "episode_index", f"meta/episodes: got episodes {numbers[:6]}..., expected 0, 1, 2, ... each once"
+        )
+    by_index = {episode.index: episode for episode in contents.episodes}
+    rows_of = Counter(span.index for span in contents.spans)
+    for index in sorted(set(by_index) - set(rows_of)):
+        problems.error("missing rows", f"episode {index}: got no rows, expected {by_index[index].length}")
+    for index, runs in rows_of.items():
+        if runs > 1:
+            problems.error("episode_index", f"episode {index}: got rows in {runs} places, expected one run of rows")
+    for span in contents.spans:
+        episode = by_index.get(span.index)
+        if episode is None:
+            problems.error("missing metadata", f"episode {span.index}: got rows, but no row in meta/episodes")
+            continue
+        fault = length_fault(episode, span)
+        if fault:
+            problems.error("wrong length", f"episode {span.index}: {fault}")
+        _check_metadata(contents, episode, span, problems)
+
+
+def _check_metadata(contents: Contents, episode: Episode, span: Span, problems: Problems) -> None:
+    place = (episode.row.get("dataset_from_index"), episode.row.get("dataset_to_index"))
+    if place != (span.start, span.stop):
+        problems.error(
+            "dataset_from_index",
+            f"episode {span.index}: got dataset_from_index, dataset_to_index {place}, expected {span.start, span.stop}",
+        )
+    words = {contents.tasks.get(int(n)) for n in contents.columns["task_index"][span.start : span.stop]}
+    if words != set(episode.tasks):
+        got = sorted(map(str, words))
+        problems.error(
+            "tasks", f"episode {span.index}: got tasks {got} in its rows, expected {sorted(episode.tasks)} as stated"
+        )
+    there, named = contents.data_files[span.file], contents.data_file(episode.row)
+    if named is None:
+        return  # noted with the files
+    if named != there:
+        problems.error("wrong file", f"episode {span.index}: got rows in {there}, expected them in {named}")
+    for camera in contents.videos:
+        begin, end = (episode.row.get(f"videos/{camera}/{side}_timestamp") for side in ("from", "to"))
+        if begin is None or end is None or abs((end - begin) * contents.fps - span.length) > 0.5:
+            problems.error(
+                "video timestamps",
+                f"episode {span.index}: got {camera} from {begin} to {end} s, expected {span.length} frames of it",
+            )
+
+
+def _check_places(contents: Contents, problems: Problems) -> None:
+    index = contents.columns["index"]
+    wrong = np.flatnonzero(index != np.arange(len(index)))
+    if len(wrong):
+        row = int(wrong[0])
+        problems.error("index", f"row {row}: got index {index[row]}, expected {row} (and {len(wrong) - 1} more rows)")
+    order = [span.index for span in contents.spans]
+    if order != sorted(order):
+        problems.error("episode_index", f"got rows of episodes in the order {order[:6]}..., expected ascending")
+    for episode in contents.episodes:
+        chunk, file = (episode.row.get(f"meta/episodes/{name}_index") for name in ("chunk", "file"))
+        if chunk is not None and file is not None:
+            path = contents.root / f"meta/episodes/chunk-{chunk:03d}/file-{file:03d}.parquet"
+            if not path.is_file():
+                problems.warning(
+                    "meta/episodes", f"episode {episode.index}: names {path}, which is not there: LeRobot's own "
+                    "merge_datasets leaves such rows, and its split_dataset fails on them",
+                )  # fmt: skip
+
+
 def check_statistics(contents: Contents, scans: Mapping[str, CameraScan], problems: Problems) -> None:
     """Recompute the statistics of every episode and of all, and compare."""
     by_index = {episode.index: episode for episode in contents.episodes}
@@ -136,9 +300,57 @@ def check_statistics(contents: Contents, scans: Mapping[str, CameraScan], proble
     )
     for span, exact, rounded_ones in zip(contents.spans, actual, theirs, strict=True):
         episode = by_index.get(span.index)
-        if episode is not None and episode.length == span.length:
-            _check_episode(contents, episode, exact, rounded_ones, problems)
-    _check_all(contents, actual, theirs, problems)
+        if episode is None or episode.length != span.length:
+            continue
+        where = f"episode {episode.index}"
+        for name in exact:
+            if name in episode.stats:
+                _compare(contents, where, name, episode.stats[name], exact[name], rounded_ones[name], problems)
+            else:
+                problems.warning("no statistics", f"{where}: got no statistics of {name} in meta/episodes")
+    path = contents.root / STATS_NAME
+    try:
+        content: dict[str, dict[str, Any]] = json.loads(path.read_text())
+        stored = {name: {k: np.asarray(v, np.float64) for k, v in group.items()} for name, group in content.items()}
+    except (OSError, ValueError, AttributeError, TypeError) as error:
+        reason = "no such file" if isinstance(error, FileNotFoundError) else f"{error!r}"
+        problems.error("wrong statistics", f"{path}: got {reason}, expected the statistics of all frames")
+        return
+    total, their_total = aggregate(actual), aggregate(theirs)
+    for name, feature in contents.features.items():
+        if name not in total or is_depth(feature):
+            continue
+        if name in stored:
+            _compare(contents, str(path), name, stored[name], total[name], their_total[name], problems)
+        else:
+            problems.error("wrong statistics", f"{path}: got no statistics of {name}, expected those of every feature")
+
+
+def _compare(
+    contents: Contents,
+    where: str,
+    name: str,
+    stored: dict[str, Array],
+    actual: dict[str, Array],
+    theirs: dict[str, Array],
+    problems: Problems,
+) -> None:
+    """Note which of a feature's statistics are not those of its frames or rows."""
+    kind = contents.features[name]["dtype"]
+    # Frames in videos have lost something since; frames in images may have been sampled in another way.
+    sampled = "count" in stored and np.array_equal(stored["count"].reshape(-1), actual["count"])
+    loose = kind == "video" or (kind == "image" and "count" in stored and not sampled)
+    wrong = differing(stored, actual, theirs, LOOSE_CAMERA if loose else 0.0)
+    if not wrong:
+        return
+    message = (
+        f"{where}: got {', '.join(wrong)} of {name} that the frames and rows do not give, expected their statistics"
+    )
+    if name in REQUIRED:
+        of = "rows' places" if name in PLACE else "time"
+        problems.warning("statistics of places", f"{message} (of the {of} only: LeRobot's own merge leaves them stale)")
+    else:
+        problems.error("wrong statistics", message)
 
 
 def episode_statistics(
@@ -166,65 +378,6 @@ def episode_statistics(
                 if as_lerobot:
                     stats[name] |= rounded([values.reshape(len(values), -1) if values.ndim == 1 else values])
     return stats
-
-
-def _looseness(contents: Contents, name: str, stored: dict[str, Array], actual: dict[str, Array]) -> float:
-    """Frames in videos have lost something since; frames in images may have been sampled in another way."""
-    if contents.features[name]["dtype"] == "video":
-        return LOOSE_CAMERA
-    other = contents.features[name]["dtype"] == "image" and "count" in stored
-    return LOOSE_CAMERA if other and not np.array_equal(stored["count"].reshape(-1), actual["count"]) else 0.0
-
-
-def _check_episode(contents: Contents, episode: Episode, actual: Stats, theirs: Stats, problems: Problems) -> None:
-    for name, computed in actual.items():
-        stored = episode.stats.get(name)
-        if stored is None:
-            problems.warning("no statistics", f"episode {episode.index}: got no statistics of {name} in meta/episodes")
-            continue
-        wrong = differing(stored, computed, theirs[name], _looseness(contents, name, stored, computed))
-        if wrong:
-            _report(problems, name, f"episode {episode.index}: got {', '.join(wrong)} of {name}")
-
-
-def _check_all(contents: Contents, actual: list[Stats], theirs: list[Stats], problems: Problems) -> None:
-    path = contents.root / STATS_NAME
-    stored = read_statistics(path, problems)
-    if stored is None or not actual:
-        return
-    total, their_total = aggregate(actual), aggregate(theirs)
-    for name, feature in contents.features.items():
-        if name not in total or is_depth(feature):
-            continue
-        if name not in stored:
-            problems.error("wrong statistics", f"{path}: got no statistics of {name}, expected those of every feature")
-            continue
-        loose = _looseness(contents, name, stored[name], total[name])
-        wrong = differing(stored[name], total[name], their_total[name], loose)
-        if wrong:
-            _report(problems, name, f"{path}: got {', '.join(wrong)} of {name}")
-
-
-def _report(problems: Problems, name: str, what: str) -> None:
-    message = f"{what} that the frames and rows do not give, expected their statistics"
-    if name in REQUIRED:
-        of = "rows' places" if name in PLACE else "time"
-        problems.warning("statistics of places", f"{message} (of the {of} only: LeRobot's own merge leaves them stale)")
-    else:
-        problems.error("wrong statistics", message)
-
-
-def read_statistics(path: Path, problems: Problems) -> Stats | None:
-    """`meta/stats.json`, or None (noted) where it is missing or damaged."""
-    try:
-        stored: dict[str, dict[str, Any]] = json.loads(path.read_text())
-        return {
-            name: {key: np.asarray(value, np.float64) for key, value in stats.items()} for name, stats in stored.items()
-        }
-    except (OSError, ValueError, AttributeError, TypeError) as error:
-        reason = "no such file" if isinstance(error, FileNotFoundError) else f"{error!r}"
-        problems.error("wrong statistics", f"{path}: got {reason}, expected the statistics of all frames")
-        return None
 
 
 def _check_record(contents: Contents, problems: Problems) -> None:

@@ -143,7 +143,7 @@ def _curves(contents: Contents) -> list[str]:
 
 
 def _clips(contents: Contents, chosen: Sequence[int]) -> list[Clip]:
-    cameras = [c for c in [*contents.images, *contents.videos] if not is_depth(contents.features[c])]
+    cameras = [c for c in contents.cameras if not is_depth(contents.features[c])]
     return [
         Clip(
             contents.spans[n], contents.episodes[n], {camera: episode_frames(contents, camera, n) for camera in cameras}
