@@ -98,7 +98,7 @@ class ClosedLoop:
 
 def _resized(frames: Tensor, side: int) -> Tensor:
     """(B, 3, H, W) to uint8 (B, 3, side, side), by what the frames of the training went through."""
-    from playslot_rl.data.frame_cache import resize_frames
+    from playslot_rl.data.frames import resize_frames
 
     small = resize_frames(quantise(frames).movedim(1, -1).cpu().numpy(), side)
     return torch.from_numpy(small).movedim(-1, 1)

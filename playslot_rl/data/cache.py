@@ -22,16 +22,6 @@ def cache_folder(cache: str | Path = "") -> Path:
     return Path(chosen).expanduser() if chosen else Path.home() / ".cache" / "playslot_rl"
 
 
-def require_outside(cache: Path, root: Path) -> None:
-    """Refuse a cache below a data set's root: a push would upload it.
-
-    Raises:
-        DataError: `cache` lies in `root`.
-    """
-    if cache.resolve().is_relative_to(root.resolve()):
-        raise DataError(f"data.cache={cache}: got a folder inside the data set {root}, expected one outside: move it")
-
-
 def build_once(folder: Path, build: Callable[[Path], None]) -> Path:
     """Return `folder`, made by `build(temporary)` if it does not exist.
 

@@ -74,6 +74,14 @@ def to_rgb(frame: Decoded) -> npt.NDArray[np.uint8]:
     return pixels
 
 
+def resize_frames(frames: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.uint8]:
+    """Resize whole frames by area averaging: uint8 (n, H, W, 3) to (n, size, size, 3)."""
+    from PIL import Image
+
+    resized = [np.asarray(Image.fromarray(f).resize((size, size), Image.Resampling.BOX)) for f in frames]
+    return np.stack(resized)
+
+
 def _image_frames(
     contents: Contents, camera: str, spans: Sequence[Span], problems: Problems
 ) -> Iterator[tuple[int, Decoded]]:

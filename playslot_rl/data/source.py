@@ -1,5 +1,7 @@
 """Opening data sets for training: decoded frames by row number, whatever LeRobot v3.0 data set they come from.
 
+A data set is decoded once, into the frame cache: an uncompressed, memory-mapped uint8 array.
+
 Shapes: F frames, E episodes, H W image height and width, A action width.
 """
 
@@ -15,15 +17,19 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.data.cache import load_cached
+from playslot_rl import keys
+from playslot_rl.data.cache import ArrayWriter, build_once, cache_folder, load_cached
 from playslot_rl.data.contents import Contents, open_files, stated_size
-from playslot_rl.data.frame_cache import frame_cache
+from playslot_rl.data.frames import resize_frames, rgb_frames
 from playslot_rl.errors import DataError
+from playslot_rl.storage.atomic import write_json
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 Frames = npt.NDArray[np.uint8]
+_FORMAT = "1"
+"""Of the frame cache."""
 
 
 class FrameRows(Protocol):
@@ -162,8 +168,11 @@ def open_source(
     """
     files = open_files(root)
     camera = files.camera(camera)
-    _check_size(files, camera, image_size, resize)
-    folder, fingerprint = frame_cache(files, camera, cache, image_size if resize else None)
+    stated = stated_size(files.features[camera])
+    # Refused before everything is decoded, where the metadata say it.
+    if image_size is not None and not resize and stated != (image_size, image_size):
+        raise _wrong_size(files, camera, stated, image_size)
+    folder, fingerprint = _frame_cache(files, camera, cache, image_size if resize else None)
     frames: Frames = load_cached(folder, "frames.npy")
     if image_size is not None and frames.shape[1:3] != (image_size, image_size):
         raise _wrong_size(files, camera, (frames.shape[1], frames.shape[2]), image_size)
@@ -239,15 +248,69 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
     )
 
 
-def _check_size(files: Contents, camera: str, image_size: int | None, resize: bool) -> None:
-    """Refuse a wrong size before decoding everything, where the metadata say it."""
-    got = stated_size(files.features[camera])
-    if image_size is not None and not resize and got != (image_size, image_size):
-        raise _wrong_size(files, camera, got, image_size)
-
-
 def _wrong_size(files: Contents, camera: str, got: tuple[int, int], expected: int) -> DataError:
     return DataError(
         f"{files.root}: got frames of {got[0]}x{got[1]} from {camera}, expected {expected}x{expected}: "
         "set env.image_size, resize them by data.resize=true, or record at that size"
     )
+
+
+def _frame_cache(files: Contents, camera: str, cache: str | Path, size: int | None) -> tuple[Path, str]:
+    """The cache folder of a data set's camera, made if needed, and the data set's fingerprint.
+
+    It holds `frames.npy` uint8 (F, H, W, 3), `columns.npz` and `meta.json`, and is keyed by the data set's content, the
+    camera and the frame size (None keeps it), never by the path.
+    """
+    folder = cache_folder(cache)
+    if folder.resolve().is_relative_to(files.root.resolve()):  # a push would upload it
+        raise DataError(
+            f"data.cache={folder}: got a folder inside the data set {files.root}, expected one outside: move it"
+        )
+    fingerprint = _fingerprint(files, camera, folder)
+    key = hashlib.sha256(json.dumps([_FORMAT, fingerprint, camera, size]).encode()).hexdigest()[:24]
+    return build_once(folder / "frames" / key, lambda tmp: _build(files, camera, size, tmp)), fingerprint
+
+
+def _fingerprint(files: Contents, camera: str, cache: Path) -> str:
+    """Content hash of a data set, remembered by the names, sizes and times of its files: hashing videos is slow."""
+    listing = sorted(
+        (str(path.relative_to(files.root)), path.stat().st_size, path.stat().st_mtime_ns)
+        for folder in ("meta", "data", "videos")
+        for path in (files.root / folder).rglob("*")
+        if path.is_file()
+    )
+    key = hashlib.sha256(json.dumps([str(files.root.resolve()), camera, listing]).encode()).hexdigest()[:32]
+    note = cache / "fingerprints" / f"{key}.json"
+    if note.is_file():
+        return str(json.loads(note.read_text())["fingerprint"])
+    fingerprint = files.file_hash(camera)
+    write_json(note, {"fingerprint": fingerprint})
+    return fingerprint
+
+
+def _build(files: Contents, camera: str, size: int | None, folder: Path) -> None:
+    writer: ArrayWriter | None = None
+    for row, frame in rgb_frames(files, camera):
+        pixels = frame if size is None or frame.shape[:2] == (size, size) else resize_frames(frame[None], size)[0]
+        if writer is None:
+            writer = ArrayWriter(folder / "frames.npy", (files.rows, *pixels.shape), np.uint8)
+        writer.write(pixels[None], row)
+    if writer is None:
+        raise DataError(f"{files.root}: got no frames of {camera}, expected {files.rows}: collect or pull it again")
+    writer.close()
+    np.savez(folder / "columns.npz", **_columns(files))  # type: ignore[arg-type]
+    tasks = files.episodes[0].tasks
+    write_json(folder / "meta.json", {"camera": camera, "fps": files.fps, "task": tasks[0] if tasks else ""})
+
+
+def _columns(files: Contents) -> dict[str, npt.NDArray[Any]]:
+    lengths = np.array([episode.length for episode in files.episodes], np.int64)
+    starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
+    found: dict[str, npt.NDArray[Any]] = {"starts": starts, "lengths": lengths}
+    if keys.FEATURE_ACTION in files.columns:
+        found["actions"] = files.columns[keys.FEATURE_ACTION].astype(np.float32).reshape(files.rows, -1)
+    if keys.FEATURE_SUCCESS in files.columns:
+        found["success"] = files.columns[keys.FEATURE_SUCCESS].astype(bool)
+    if keys.FEATURE_SEED in files.columns:
+        found["seeds"] = files.columns[keys.FEATURE_SEED][starts].astype(np.int64)
+    return found

@@ -34,11 +34,13 @@ from playslot_rl.data.contents import (
     Stats,
 )
 from playslot_rl.datasets.statistics import aggregate, of_numbers
-from playslot_rl.datasets.video_copy import DEFAULT_FILES, DEFAULT_SIZE_MB, VideoCopier
+from playslot_rl.datasets.video_copy import VideoCopier
 from playslot_rl.errors import DataError
 from playslot_rl.storage.atomic import write_json
 
 DATA_SIZE_MB: Final = 100
+VIDEO_SIZE_MB: Final = 200
+FILES_IN_A_FOLDER: Final = 1000
 ROWS_OF_METADATA: Final = 1000
 MEGABYTE: Final = 2**20
 
@@ -82,8 +84,11 @@ def assemble(choices: Sequence[Choice], out: Path, made_by: str) -> None:
     out.mkdir(parents=True)
     info = _info(choices)
     tasks: dict[str, int] = {}  # numbered as they appear
-    copiers = {camera: _copier(out, camera, info) for camera in choices[0].contents.videos}
-    rows = _RowWriter(out, info)
+    video_bytes = int(float(info.get("video_files_size_in_mb") or VIDEO_SIZE_MB) * MEGABYTE)
+    files = int(info.get("chunks_size") or FILES_IN_A_FOLDER)
+    cameras = choices[0].contents.videos
+    copiers = {camera: VideoCopier(out, camera, float(info["fps"]), video_bytes, files) for camera in cameras}
+    rows = _RowWriter(out, float(info.get("data_files_size_in_mb") or DATA_SIZE_MB) * MEGABYTE, files)
     table: list[dict[str, Any]] = []
     all_stats: list[Stats] = []
     try:
@@ -127,12 +132,6 @@ def _info(choices: Sequence[Choice]) -> dict[str, Any]:
     return info
 
 
-def _copier(out: Path, camera: str, info: Mapping[str, Any]) -> VideoCopier:
-    limit = int(float(info.get("video_files_size_in_mb") or DEFAULT_SIZE_MB) * MEGABYTE)
-    files = int(info.get("chunks_size") or DEFAULT_FILES)
-    return VideoCopier(out, camera, VIDEO_PATH, float(info["fps"]), limit, files)
-
-
 def _pieces(choice: Choice) -> Iterator[Any]:
     """Tables of the chosen episodes' rows; each file is read once where episodes are in order."""
     import pyarrow.parquet as pq
@@ -150,11 +149,9 @@ def _pieces(choice: Choice) -> Iterator[Any]:
 class _RowWriter:
     """Rows of the new data set: one row group an episode, as LeRobot writes them."""
 
-    def __init__(self, out: Path, info: Mapping[str, Any]) -> None:
+    def __init__(self, out: Path, limit: float, files: int) -> None:
         self.out, self.rows, self.episodes, self._number = out, 0, 0, -1
-        self._limit = float(info.get("data_files_size_in_mb") or DATA_SIZE_MB) * MEGABYTE
-        self._files = int(info.get("chunks_size") or DEFAULT_FILES)
-        self._path = out
+        self._limit, self._files, self._path = limit, files, out
         self._writer: Any = None
         self._schema: Any = None
 

@@ -8,7 +8,7 @@ import torch
 
 from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop
-from playslot_rl.data.frame_cache import resize_frames
+from playslot_rl.data.frames import resize_frames
 from playslot_rl.testing import tiny_agent
 from playslot_rl.world_model import Agent
 

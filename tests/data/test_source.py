@@ -60,11 +60,11 @@ def test_lossless_video_is_close_to_what_was_recorded(foreign_video: Path, tmp_p
 def test_the_second_opening_decodes_nothing(
     foreign_images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from playslot_rl.data import frame_cache
+    from playslot_rl.data import source as module
     from playslot_rl.data.contents import Contents
 
     first = open_source(foreign_images, cache=tmp_path)
-    monkeypatch.setattr(frame_cache, "rgb_frames", None)
+    monkeypatch.setattr(module, "rgb_frames", None)
     monkeypatch.setattr(Contents, "file_hash", None)
     second = open_source(foreign_images, cache=tmp_path)
     assert np.array_equal(first.frames, second.frames)
