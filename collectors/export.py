@@ -20,8 +20,8 @@ from playslot_rl.collectors.episodes import RecordedEpisode
 from playslot_rl.collectors.image_set import ImageSetWriter
 from playslot_rl.collectors.journal import Journal
 from playslot_rl.collectors.spec import CollectionSpec
-from playslot_rl.data.quiet import quiet_datasets
 from playslot_rl.errors import OutputError
+from playslot_rl.progress import quiet_datasets
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.folders import new_folder
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import TracebackType
 from typing import Any, Final, Literal, Self
 
@@ -92,3 +93,17 @@ class StageProgress:
         if due:
             self._last = now
         return due or done == self.total
+
+
+@contextlib.contextmanager
+def quiet_datasets() -> Iterator[None]:
+    """Without the progress bar that `datasets` draws for every episode."""
+    import datasets
+
+    shown = datasets.utils.logging.is_progress_bar_enabled()
+    datasets.disable_progress_bars()
+    try:
+        yield
+    finally:
+        if shown:
+            datasets.enable_progress_bars()

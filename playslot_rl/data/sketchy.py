@@ -24,9 +24,9 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.data.quiet import quiet_datasets
 from playslot_rl.data.tfrecord import Value, parse_example, read_records
 from playslot_rl.errors import ConfigError, DataError, OutputError
+from playslot_rl.progress import quiet_datasets
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.folders import new_folder, require_free
 

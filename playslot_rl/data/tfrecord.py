@@ -50,14 +50,24 @@ def read_records(path: Path) -> Iterator[bytes]:
         with path.open("rb") as file:
             number = 0
             while header := file.read(12):
-                length = _length(path, number, header)
+                if len(header) < 12:
+                    raise _truncated(path, number, f"{len(header)} of 12 bytes of its header")
+                length, crc = struct.unpack("<QI", header)
+                if masked_crc(header[:8]) != crc or length > LONGEST:
+                    what = (
+                        "the file is damaged: download it again"
+                        if number
+                        else "expected a TFRecord file: check the path"
+                    )
+                    raise DataError(f"{path}: record {number} has a wrong checksum of its length, {what}")
                 body = file.read(length + 4)
                 if len(body) < length + 4:
+                    raise _truncated(path, number, f"{len(body)} of {length + 4} bytes")
+                if masked_crc(body[:length]) != struct.unpack("<I", body[length:])[0]:
                     raise DataError(
-                        f"{path}: record {number} is truncated, got {len(body)} of {length + 4} bytes: "
-                        "download or extract it again"
+                        f"{path}: record {number} has a wrong checksum of its data, the file is damaged: "
+                        "download it again"
                     )
-                _check(path, number, body[:length], body[length:])
                 yield body[:length]
                 number += 1
     except OSError as error:
@@ -66,24 +76,8 @@ def read_records(path: Path) -> Iterator[bytes]:
         ) from error
 
 
-def _length(path: Path, number: int, header: bytes) -> int:
-    if len(header) < 12:
-        raise DataError(
-            f"{path}: record {number} is truncated, got {len(header)} of 12 bytes of its header: "
-            "download or extract it again"
-        )
-    (length,) = struct.unpack("<Q", header[:8])
-    if masked_crc(header[:8]) != struct.unpack("<I", header[8:])[0] or length > LONGEST:
-        what = "expected a TFRecord file: check the path" if number == 0 else "the file is damaged: download it again"
-        raise DataError(f"{path}: record {number} has a wrong checksum of its length, {what}")
-    return int(length)
-
-
-def _check(path: Path, number: int, data: bytes, crc: bytes) -> None:
-    if masked_crc(data) != struct.unpack("<I", crc)[0]:
-        raise DataError(
-            f"{path}: record {number} has a wrong checksum of its data, the file is damaged: download it again"
-        )
+def _truncated(path: Path, number: int, got: str) -> DataError:
+    return DataError(f"{path}: record {number} is truncated, got {got}: download or extract it again")
 
 
 @cache
@@ -91,31 +85,26 @@ def example_class() -> Any:
     """The protobuf message `tf.train.Example`, declared here since it comes with TensorFlow only."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-    field = descriptor_pb2.FieldDescriptorProto
+    kinds = descriptor_pb2.FieldDescriptorProto
     file = descriptor_pb2.FileDescriptorProto(name="playslot_rl/example.proto", package="playslot", syntax="proto3")
-    for name, kind in (("BytesList", "TYPE_BYTES"), ("FloatList", "TYPE_FLOAT"), ("Int64List", "TYPE_INT64")):
-        values = file.message_type.add(name=name).field.add(name="value", number=1)
-        values.label, values.type = field.LABEL_REPEATED, getattr(field, kind)
+
+    def add(message: Any, name: str, number: int, kind: int, of: str | None = None, *, repeated: bool = False) -> Any:
+        label = kinds.LABEL_REPEATED if repeated else kinds.LABEL_OPTIONAL
+        return message.field.add(name=name, number=number, type=kind, label=label, type_name=of and f".playslot.{of}")
+
     feature = file.message_type.add(name="Feature")
     feature.oneof_decl.add(name="kind")
-    for number, name in enumerate(("BytesList", "FloatList", "Int64List"), 1):
-        one = feature.field.add(name=name.lower().removesuffix("list") + "_list", number=number, oneof_index=0)
-        one.label, one.type, one.type_name = field.LABEL_OPTIONAL, field.TYPE_MESSAGE, f".playslot.{name}"
+    for number, name in enumerate(("Bytes", "Float", "Int64"), 1):
+        values = file.message_type.add(name=f"{name}List")
+        add(values, "value", 1, getattr(kinds, f"TYPE_{name.upper()}"), repeated=True)
+        add(feature, f"{name.lower()}_list", number, kinds.TYPE_MESSAGE, values.name).oneof_index = 0
     features = file.message_type.add(name="Features")
     entry = features.nested_type.add(name="FeatureEntry")
     entry.options.map_entry = True
-    key = entry.field.add(name="key", number=1)
-    key.label, key.type = field.LABEL_OPTIONAL, field.TYPE_STRING
-    value = entry.field.add(name="value", number=2)
-    value.label, value.type, value.type_name = field.LABEL_OPTIONAL, field.TYPE_MESSAGE, ".playslot.Feature"
-    table = features.field.add(name="feature", number=1)
-    table.label, table.type, table.type_name = (
-        field.LABEL_REPEATED,
-        field.TYPE_MESSAGE,
-        ".playslot.Features.FeatureEntry",
-    )
-    whole = file.message_type.add(name="Example").field.add(name="features", number=1)
-    whole.label, whole.type, whole.type_name = field.LABEL_OPTIONAL, field.TYPE_MESSAGE, ".playslot.Features"
+    add(entry, "key", 1, kinds.TYPE_STRING)
+    add(entry, "value", 2, kinds.TYPE_MESSAGE, "Feature")
+    add(features, "feature", 1, kinds.TYPE_MESSAGE, "Features.FeatureEntry", repeated=True)
+    add(file.message_type.add(name="Example"), "features", 1, kinds.TYPE_MESSAGE, "Features")
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("playslot.Example"))
@@ -140,8 +129,7 @@ def parse_example(record: bytes) -> dict[str, Value]:
         kind = feature.WhichOneof("kind")
         if kind == "bytes_list":
             found[name] = list(feature.bytes_list.value)
-        elif kind == "float_list":
-            found[name] = np.array(feature.float_list.value, np.float32)
-        elif kind == "int64_list":
-            found[name] = np.array(feature.int64_list.value, np.int64)
+        elif kind is not None:
+            dtype: type[Any] = np.float32 if kind == "float_list" else np.int64
+            found[name] = np.array(getattr(feature, kind).value, dtype)
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -91,10 +92,13 @@ def info(root: str | Path) -> DatasetSummary:
     """
     contents = require_sound(root)
     lengths = [span.length for span in contents.spans]
-    tasks: dict[str, int] = {}
-    for episode in contents.episodes:
-        for words in episode.tasks:
-            tasks[words] = tasks.get(words, 0) + 1
+    sizes = {}
+    for name, folder in (("rows", "data"), ("videos", "videos"), ("metadata", "meta")):
+        sizes[name] = sum(path.stat().st_size for path in (contents.root / folder).rglob("*") if path.is_file())
+    solved, seeds = contents.columns.get(keys.FEATURE_SUCCESS), contents.columns.get(keys.FEATURE_SEED)
+    success_rate = None
+    if solved is not None:
+        success_rate = float(np.mean([bool(solved[span.start : span.stop].any()) for span in contents.spans]))
     return DatasetSummary(
         root=str(root),
         format=str(contents.info["codebase_version"]),
@@ -103,39 +107,19 @@ def info(root: str | Path) -> DatasetSummary:
         episodes=len(lengths),
         frames=contents.rows,
         lengths=(min(lengths), float(np.mean(lengths)), max(lengths)),
-        tasks=tasks,
+        tasks=dict(Counter(words for episode in contents.episodes for words in episode.tasks)),
         features={name: _kind(f) for name, f in contents.features.items() if name not in REQUIRED},
-        bytes={name: _bytes(contents.root / folder) for name, folder in _FOLDERS.items()},
-        success_rate=success_rate(contents),
-        seeds=_seeds(contents),
+        bytes=sizes,
+        success_rate=success_rate,
+        seeds=None if seeds is None else (int(seeds.min()), int(seeds.max())),
         source=_source(contents),
     )
-
-
-_FOLDERS = {"rows": "data", "videos": "videos", "metadata": "meta"}
-
-
-def success_rate(contents: Contents) -> float | None:
-    """Share of episodes in which the task was solved, or None where the data set does not say."""
-    solved = contents.columns.get(keys.FEATURE_SUCCESS)
-    if solved is None or not contents.spans:
-        return None
-    return float(np.mean([bool(solved[span.start : span.stop].any()) for span in contents.spans]))
 
 
 def _kind(feature: Mapping[str, Any]) -> str:
     shape = "x".join(map(str, feature["shape"]))
     codec = (feature.get("info") or {}).get("video.codec")
     return f"{feature['dtype']} {shape}{f' ({codec})' if codec else ''}"
-
-
-def _bytes(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
-def _seeds(contents: Contents) -> tuple[int, int] | None:
-    seeds = contents.columns.get(keys.FEATURE_SEED)
-    return None if seeds is None or not len(seeds) else (int(seeds.min()), int(seeds.max()))
 
 
 def _source(contents: Contents) -> dict[str, Any] | None:

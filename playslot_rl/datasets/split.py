@@ -49,11 +49,18 @@ def split(root: str | Path, out: str | Path, fractions: Mapping[str, float], *, 
         seed: of the draw.
 
     Raises:
-        DataError: shares that do not add up, too few episodes, or a damaged data set.
+        DataError: a name that is no folder name, shares that do not add up, too few episodes, or a damaged data set.
         OutputError: `out` exists, or the disk is full.
     """
     target = Path(out)
-    check_fractions(fractions)
+    for name, share in fractions.items():
+        if not name.replace("-", "").replace("_", "").isalnum() or not 0 < share <= 1:
+            raise DataError(
+                f"fractions: got {name}={share:g}, expected a plain name and a share of more than 0, at most 1"
+            )
+    total = sum(fractions.values())
+    if abs(total - 1) > 1e-6:
+        raise DataError(f"fractions: got a sum of {total:g}, expected 1, as in train=0.9,val=0.1")
     require_free(target, "--out ")
     contents = require_sound(root)
     parts = draw(len(contents.spans), fractions, seed)
@@ -63,22 +70,6 @@ def split(root: str | Path, out: str | Path, fractions: Mapping[str, float], *, 
             assemble([choose(contents, indices)], temporary / name, "playslot dataset split")
             made[name] = require_verified(temporary / name, [contents.root])
     return SplitResult(target, {name: tuple(indices) for name, indices in parts.items()}, made)
-
-
-def check_fractions(fractions: Mapping[str, float]) -> None:
-    """Refuse shares that make no sense.
-
-    Raises:
-        DataError: a name that is no folder name, a share outside (0, 1], or a sum other than 1.
-    """
-    for name, share in fractions.items():
-        if not name.replace("-", "").replace("_", "").isalnum() or not 0 < share <= 1:
-            raise DataError(
-                f"fractions: got {name}={share:g}, expected a plain name and a share of more than 0, at most 1"
-            )
-    total = sum(fractions.values())
-    if abs(total - 1) > 1e-6:
-        raise DataError(f"fractions: got a sum of {total:g}, expected 1, as in train=0.9,val=0.1")
 
 
 def draw(episodes: int, fractions: Mapping[str, float], seed: int) -> dict[str, list[int]]:

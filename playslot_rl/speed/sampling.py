@@ -18,10 +18,10 @@ import numpy as np
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.data.quiet import quiet_datasets
 from playslot_rl.data.source import open_source
 from playslot_rl.data.windows import sample_windows
 from playslot_rl.frames import normalise
+from playslot_rl.progress import quiet_datasets
 from playslot_rl.speed.spec import Sizes
 from playslot_rl.threads import available_cores
 
