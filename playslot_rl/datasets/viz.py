@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,13 @@ from playslot_rl.data.frames import rgb_frames
 from playslot_rl.datasets.info import info
 from playslot_rl.datasets.verify import require_sound
 from playslot_rl.errors import ConfigError
+from playslot_rl.storage.atomic import write_text
+from playslot_rl.visualization.animation import animation
+from playslot_rl.visualization.charts import curve_chart
+from playslot_rl.visualization.document import Block, Document, Picture, Section, Table, Text
+from playslot_rl.visualization.grid import image_grid, png
+from playslot_rl.visualization.html import to_html
+from playslot_rl.visualization.palette import DARK, LIGHT
 
 STRIP: Final = 8
 """Frames of the strip: the first, the last, and some between."""
@@ -67,9 +74,6 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
         DataError: the data set is damaged.
         OutputError: the file cannot be written.
     """
-    from playslot_rl.storage.atomic import write_text
-    from playslot_rl.visualization.document import Document, Section, Table
-    from playslot_rl.visualization.html import to_html
 
     contents = require_sound(root)
     target = Path(out) if out is not None else contents.root.with_name(f"{contents.root.absolute().name}.html")
@@ -78,7 +82,8 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
     chosen = spread(len(contents.spans), episodes)
     summary = info(root)
     about = Table(["fact", "value"], summary.facts())
-    sections = [Section("Data set", [about, _feature_table(summary.features)])]
+    features = Table(("feature", "type and shape"), [[f"`{name}`", kind] for name, kind in summary.features.items()])
+    sections = [Section("Data set", [about, features])]
     sections += [_episode_section(contents, clip) for clip in _clips(contents, chosen)]
     lead = f"{summary.episodes} episodes, {summary.frames} frames at {summary.fps:g} fps; shown: {_names(chosen)}."
     write_text(target, to_html(Document(f"Data set {contents.root.absolute().name}", lead, sections)))
@@ -106,19 +111,15 @@ def show_in_rerun(root: str | Path, episodes: int = 6) -> str:
     chosen = spread(len(contents.spans), episodes)
     rr.init(f"playslot dataset {contents.root.absolute().name}", spawn=True)
     for clip in _clips(contents, chosen):
-        _log_clip(rr, contents, clip)
+        where = f"episode_{clip.span.index}"
+        for t in range(clip.span.length):
+            rr.set_time("frame_index", sequence=t)
+            rr.set_time("timestamp", duration=t / contents.fps)
+            for camera, frames in clip.frames.items():
+                rr.log(f"{where}/{camera}", rr.Image(frames[t]))
+            for name in _curves(contents):
+                rr.log(f"{where}/{name}", rr.Scalars(np.atleast_1d(contents.columns[name][clip.span.start + t])))
     return _names(chosen)
-
-
-def _log_clip(rr: Any, contents: Contents, clip: Clip) -> None:
-    where = f"episode_{clip.span.index}"
-    for t in range(clip.span.length):
-        rr.set_time("frame_index", sequence=t)
-        rr.set_time("timestamp", duration=t / contents.fps)
-        for camera, frames in clip.frames.items():
-            rr.log(f"{where}/{camera}", rr.Image(frames[t]))
-        for name in _curves(contents):
-            rr.log(f"{where}/{name}", rr.Scalars(np.atleast_1d(contents.columns[name][clip.span.start + t])))
 
 
 def spread(total: int, wanted: int) -> list[int]:
@@ -161,20 +162,11 @@ def episode_frames(contents: Contents, camera: str, number: int) -> npt.NDArray[
     return np.stack([frame for _, frame in rgb_frames(contents, camera, [contents.spans[number]])])
 
 
-def _feature_table(features: dict[str, str]) -> Any:
-    from playslot_rl.visualization.document import Table
-
-    return Table(("feature", "type and shape"), [[f"`{name}`", kind] for name, kind in features.items()])
-
-
-def _episode_section(contents: Contents, clip: Clip) -> Any:
-    from playslot_rl.visualization.document import Section, Text
-
-    blocks: list[Any] = [Text(_caption(contents, clip))]
+def _episode_section(contents: Contents, clip: Clip) -> Section:
+    blocks: list[Block] = [Text(_caption(contents, clip))]
     for camera, frames in clip.frames.items():
         blocks += _camera_pictures(contents, clip, camera, frames)
-    curves = _curve_picture(contents, clip)
-    return Section(f"Episode {clip.span.index}", [*blocks, *([curves] if curves else [])])
+    return Section(f"Episode {clip.span.index}", [*blocks, *_curve_pictures(contents, clip)])
 
 
 def _caption(contents: Contents, clip: Clip) -> str:
@@ -192,11 +184,7 @@ def _caption(contents: Contents, clip: Clip) -> str:
     return "; ".join(parts) + "."
 
 
-def _camera_pictures(contents: Contents, clip: Clip, camera: str, frames: npt.NDArray[np.uint8]) -> list[Any]:
-    from playslot_rl.visualization.animation import animation
-    from playslot_rl.visualization.document import Picture
-    from playslot_rl.visualization.grid import image_grid, png
-
+def _camera_pictures(contents: Contents, clip: Clip, camera: str, frames: npt.NDArray[np.uint8]) -> list[Picture]:
     step = max(1, max(frames.shape[1:3]) // SHOWN_SIDE)
     small = frames[:, ::step, ::step]
     scale = max(1, SHOWN_SIDE // max(small.shape[1:3]))
@@ -215,11 +203,7 @@ def _camera_pictures(contents: Contents, clip: Clip, camera: str, frames: npt.ND
     ]
 
 
-def _curve_picture(contents: Contents, clip: Clip) -> Any:
-    from playslot_rl.visualization.charts import curve_chart
-    from playslot_rl.visualization.document import Picture
-    from playslot_rl.visualization.palette import DARK, LIGHT
-
+def _curve_pictures(contents: Contents, clip: Clip) -> list[Picture]:
     rows = slice(clip.span.start, clip.span.stop)
     panels: dict[str, dict[str, Array]] = {}
     for name in _curves(contents):
@@ -229,7 +213,7 @@ def _curve_picture(contents: Contents, clip: Clip) -> Any:
         parts = itertools.zip_longest(labels, values.T)
         panels[name] = {str(label or number): line for number, (label, line) in enumerate(parts)}
     if not panels:
-        return None
+        return []
     alt = f"{', '.join(panels)} of episode {clip.span.index} over its frames"
     light, dark = (curve_chart(panels, theme) for theme in (LIGHT, DARK))
-    return Picture(f"episode-{clip.span.index}-curves", light, alt, "By frame number", dark=dark)
+    return [Picture(f"episode-{clip.span.index}-curves", light, alt, "By frame number", dark=dark)]
