@@ -250,16 +250,14 @@ def read_contents(root: str | Path, problems: Problems, *, statistics: bool = Tr
             episodes += _episodes(path, table, problems)
     episodes.sort(key=lambda episode: episode.index)
     names = [name for name, feature in info["features"].items() if feature["dtype"] not in ("image", "video")]
-    files, counts = [], []
-    pieces: dict[str, list[Array]] = {name: [] for name in names}
+    files, parts = [], []
     for path in _data_files(folder):
         rows = _columns(path, names, info["features"], problems)
         if rows is not None:
             files.append(path)
-            counts.append(len(rows["index"]))
-            for name in names:
-                pieces[name].append(rows[name])
-    columns = {name: np.concatenate(piece) if piece else np.zeros(0, np.int64) for name, piece in pieces.items()}
+            parts.append(rows)
+    counts = [len(rows["index"]) for rows in parts]
+    columns = {name: np.concatenate([rows[name] for rows in parts] or [np.zeros(0, np.int64)]) for name in names}
     return Contents(folder, info, episodes, tasks, files, counts, columns)
 
 

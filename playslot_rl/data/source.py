@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -178,18 +178,11 @@ def open_source(
         raise _wrong_size(files, camera, (frames.shape[1], frames.shape[2]), image_size)
     meta = json.loads((folder / "meta.json").read_text())
     with np.load(folder / "columns.npz") as columns:
-        loaded = {name: columns[name] for name in columns.files}
+        labels: dict[str, Any] = {
+            name: columns.get(name) for name in ("starts", "lengths", "actions", "success", "seeds")
+        }
     return EpisodeFrames(
-        frames=frames,
-        starts=loaded["starts"],
-        lengths=loaded["lengths"],
-        actions=loaded.get("actions"),
-        success=loaded.get("success"),
-        seeds=loaded.get("seeds"),
-        fingerprint=fingerprint,
-        fps=meta["fps"],
-        task=meta["task"],
-        camera=camera,
+        frames=frames, fingerprint=fingerprint, fps=meta["fps"], task=meta["task"], camera=camera, **labels
     )
 
 
@@ -234,7 +227,8 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
             return None
         return np.concatenate(labels)
 
-    return EpisodeFrames(
+    return replace(
+        sources[0],
         frames=ConcatFrames(parts),
         starts=np.concatenate([s.starts + offset for s, offset in zip(sources, offsets, strict=True)]),
         lengths=np.concatenate([s.lengths for s in sources]),
@@ -242,9 +236,6 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
         success=joined("success"),
         seeds=joined("seeds"),
         fingerprint=hashlib.sha256("+".join(s.fingerprint for s in sources).encode()).hexdigest()[:16],
-        fps=sources[0].fps,
-        task=sources[0].task,
-        camera=sources[0].camera,
     )
 
 

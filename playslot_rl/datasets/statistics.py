@@ -25,11 +25,6 @@ LARGE_IMAGE: Final = 300
 THINNED_SIDE: Final = 150
 
 
-def has_statistics(feature: dict[str, Any]) -> bool:
-    """Whether LeRobot keeps statistics of such a feature."""
-    return feature["dtype"] not in ("string", "language")
-
-
 def sampled(length: int) -> list[int]:
     """Frames of an episode that LeRobot takes for a camera's statistics."""
     count = max(min(100, length), min(int(length**0.75), 10_000))
@@ -108,21 +103,13 @@ def aggregate(episodes: Sequence[Stats]) -> Stats:
 def _aggregate(parts: Sequence[dict[str, Array]]) -> dict[str, Array]:
     count = np.array([float(np.asarray(part["count"]).reshape(-1)[0]) for part in parts])
     weight = count / count.sum()
-
-    def stacked(name: str) -> Array:
-        return np.stack([np.asarray(part[name], np.float64) for part in parts])
-
-    def weighted(values: Array) -> Array:
-        result: Array = np.tensordot(weight, values, axes=1)
-        return result
-
-    mean = weighted(stacked("mean"))
-    variance = weighted(stacked("std") ** 2 + (stacked("mean") - mean) ** 2)
-    total = {"min": stacked("min").min(0), "max": stacked("max").max(0), "mean": mean, "std": np.sqrt(variance)}
+    names = [name for name in parts[0] if all(name in part for part in parts)]
+    values = {name: np.stack([np.asarray(part[name], np.float64) for part in parts]) for name in names}
+    total = {name: np.tensordot(weight, value, axes=1) for name, value in values.items()}
+    total["min"], total["max"] = values["min"].min(0), values["max"].max(0)
+    spread = values["std"] ** 2 + (values["mean"] - total["mean"]) ** 2
+    total["std"] = np.sqrt(np.tensordot(weight, spread, axes=1))
     total["count"] = np.array([int(count.sum())])
-    for name in parts[0]:
-        if name not in total and all(name in part for part in parts):
-            total[name] = weighted(stacked(name))
     return total
 
 

@@ -28,7 +28,7 @@ from playslot_rl.data.contents import (
 )
 from playslot_rl.data.problems import Problems
 from playslot_rl.datasets.fingerprint import CameraScan, fingerprint_of, scan_frames
-from playslot_rl.datasets.statistics import aggregate, differing, has_statistics, of_numbers, rounded
+from playslot_rl.datasets.statistics import aggregate, differing, of_numbers, rounded
 from playslot_rl.errors import DataError
 
 TIME_TOLERANCE_S = 1e-4
@@ -366,17 +366,16 @@ def episode_statistics(
     """
     span: Span = contents.spans[number]
     stats: Stats = {}
-    for name, feature in contents.features.items():
+    for name in contents.features:
         if name in scans:
             camera = (scans[name].theirs if as_lerobot else scans[name].stats)[number]
             if camera is not None:
                 stats[name] = camera
-        elif has_statistics(feature) and name in contents.columns:
+        elif name in contents.columns and contents.columns[name].dtype.kind in "fiub":  # LeRobot has none of words
             values = contents.columns[name][span.start : span.stop]
-            if values.dtype.kind in "fiub":
-                stats[name] = of_numbers(values)
-                if as_lerobot:
-                    stats[name] |= rounded([values.reshape(len(values), -1) if values.ndim == 1 else values])
+            stats[name] = of_numbers(values)
+            if as_lerobot:
+                stats[name] |= rounded([values.reshape(len(values), -1) if values.ndim == 1 else values])
     return stats
 
 
