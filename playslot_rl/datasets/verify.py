@@ -338,8 +338,8 @@ def _compare(
     """Note which of a feature's statistics are not those of its frames or rows."""
     kind = contents.features[name]["dtype"]
     # Frames in videos have lost something since; frames in images may have been sampled in another way.
-    sampled = "count" in stored and np.array_equal(stored["count"].reshape(-1), actual["count"])
-    loose = kind == "video" or (kind == "image" and "count" in stored and not sampled)
+    resampled = "count" in stored and not np.array_equal(stored["count"].reshape(-1), actual["count"])
+    loose = kind == "video" or (kind == "image" and resampled)
     wrong = differing(stored, actual, theirs, LOOSE_CAMERA if loose else 0.0)
     if not wrong:
         return
