@@ -135,12 +135,9 @@ def _free_name(folder: Path) -> Path:
 
 def _whole_episodes(contents: Contents, lost: list[str]) -> Choice:
     """The episodes that can be kept, with metadata and statistics made anew; the others go to `lost`."""
-    problems = Problems()
-    scans = scan_frames(contents, problems)
+    scans = scan_frames(contents, Problems())
     stale = _stale_files(contents)
-    lost += [
-        f"{contents.data_files[number]}: left from another version, its rows are double" for number in sorted(stale)
-    ]
+    lost += [f"{contents.data_files[n]}: left from another version, its rows are double" for n in sorted(stale)]
     known = {episode.index: episode for episode in contents.episodes}
     located = _locate_videos(contents, [span for span in contents.spans if span.file not in stale], known)
     if set(located) != set(known):  # frames of episodes without metadata are found only now
@@ -152,7 +149,9 @@ def _whole_episodes(contents: Contents, lost: list[str]) -> Choice:
         if span.file in stale:
             continue
         episode = located.get(span.index)
-        reason = _reason(contents, scans, span, known.get(span.index), episode, span.index in seen)
+        reason = "its rows are there twice"
+        if span.index not in seen:
+            reason = _reason(contents, scans, span, known.get(span.index), episode)
         if reason or episode is None:
             lost.append(f"episode {span.index} ({span.length} rows): {reason}")
             continue
@@ -168,16 +167,9 @@ def _whole_episodes(contents: Contents, lost: list[str]) -> Choice:
 
 
 def _reason(
-    contents: Contents,
-    scans: Mapping[str, CameraScan],
-    span: Span,
-    known: Episode | None,
-    located: Episode | None,
-    double: bool,
+    contents: Contents, scans: Mapping[str, CameraScan], span: Span, known: Episode | None, located: Episode | None
 ) -> str:
     """Why an episode cannot be kept, or nothing."""
-    if double:
-        return "its rows are there twice"
     fault = length_fault(known, span) if known is not None else ""
     if fault:
         return fault
