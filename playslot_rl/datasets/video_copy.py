@@ -103,8 +103,8 @@ class VideoCopier:
     def _copy_packets(self, source: _Source, first: int, begin: float, length: int) -> dict[str, Any]:
         stream, context = source.stream, source.stream.codec_context
         # What has to be equal for two streams to go into one file.
-        codec = (context.name, context.width, context.height, context.pix_fmt, stream.time_base)
-        codec += (bytes(context.extradata or b""),)
+        extra = bytes(context.extradata or b"")
+        codec = (context.name, context.width, context.height, context.pix_fmt, stream.time_base, extra)
         if self._out is None or self._bytes >= self.limit or codec != self._codec:
             self._next(stream)
             self._codec = codec
