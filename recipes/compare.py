@@ -25,9 +25,9 @@ def main(config: ExperimentConfig) -> None:
         PlaySlotError: a job failed; the others have finished, and the table says so.
         KeyboardInterrupt: Ctrl-C; the same command carries on.
     """
+    from playslot_rl.comparison.launch import comparison_lock
     from playslot_rl.comparison.plan import check_comparison, job_record
     from playslot_rl.comparison.report import Comparison
-    from playslot_rl.comparison.status import comparison_lock
     from playslot_rl.evaluation.success import DEFAULT_EPISODES
     from playslot_rl.recipes import compare_data
     from playslot_rl.recipes.run import parent_run
@@ -63,8 +63,7 @@ def _run_due(config: ExperimentConfig, report: Comparison) -> None:
         PlaySlotError: the launcher itself failed.
         KeyboardInterrupt: Ctrl-C. In both cases what there is has been written.
     """
-    from playslot_rl.comparison.launch import run_process, run_sweep
-    from playslot_rl.comparison.status import read_status
+    from playslot_rl.comparison.launch import read_status, run_process, run_sweep
     from playslot_rl.storage.atomic import write_json
 
     due = {}
@@ -97,7 +96,7 @@ def _open(out: Path) -> None:
     Raises:
         OutputError: it does.
     """
-    from playslot_rl.comparison.status import LOCK
+    from playslot_rl.comparison.launch import LOCK
 
     if out.exists() and not out.is_dir():
         raise OutputError(f"out={out}: got a file, expected a folder: choose another out=")

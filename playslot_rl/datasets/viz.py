@@ -61,8 +61,7 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
         OutputError: the file cannot be written.
     """
     from playslot_rl.storage.atomic import write_text
-    from playslot_rl.visualization.document import Document, Section, Table
-    from playslot_rl.visualization.html import to_html
+    from playslot_rl.visualization.document import Document, Section, Table, to_html
 
     contents = require_sound(root)
     target = Path(out) if out is not None else contents.root.with_name(f"{contents.root.absolute().name}.html")
@@ -186,9 +185,8 @@ def _caption(contents: Contents, clip: Clip) -> str:
 
 
 def _camera_pictures(contents: Contents, clip: Clip, camera: str, frames: npt.NDArray[np.uint8]) -> list[Any]:
-    from playslot_rl.visualization.animation import animation
     from playslot_rl.visualization.document import Picture
-    from playslot_rl.visualization.grid import image_grid, png
+    from playslot_rl.visualization.grid import animation, image_grid, png
 
     step = max(1, max(frames.shape[1:3]) // SHOWN_SIDE)
     small = frames[:, ::step, ::step]
@@ -209,9 +207,8 @@ def _camera_pictures(contents: Contents, clip: Clip, camera: str, frames: npt.ND
 
 
 def _curve_picture(contents: Contents, clip: Clip) -> Any:
-    from playslot_rl.visualization.charts import curve_chart
+    from playslot_rl.visualization.charts import DARK, LIGHT, curve_chart
     from playslot_rl.visualization.document import Picture
-    from playslot_rl.visualization.palette import DARK, LIGHT
 
     rows = slice(clip.span.start, clip.span.stop)
     panels: dict[str, dict[str, Array]] = {}

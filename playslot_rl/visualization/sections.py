@@ -11,11 +11,10 @@ from typing import Any
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.seeds import first_seed
-from playslot_rl.evaluation.success import PROTOCOLS, hardware
-from playslot_rl.visualization.charts import loss_chart, loss_names, success_chart
+from playslot_rl.evaluation.success import PROTOCOLS
+from playslot_rl.visualization.charts import DARK, LIGHT, Theme, loss_chart, loss_names, success_chart
 from playslot_rl.visualization.document import Block, Missing, Picture, Section, Table, Text
 from playslot_rl.visualization.grid import png
-from playslot_rl.visualization.palette import DARK, LIGHT, Theme
 from playslot_rl.world_model import Agent, WorldModel
 
 STAGES = ("slots", "dynamics", "policy")
@@ -151,7 +150,7 @@ def rollout_section(given: ReportInput) -> Section:
     title = "Imagined and simulated rollouts"
     if given.agent is None:
         return Section(title, [Missing("There is no trained policy.", given.command("train-policy"))])
-    from playslot_rl.visualization.animation import animation
+    from playslot_rl.visualization.grid import animation
     from playslot_rl.visualization.rollouts import draw_animation, draw_strip, run_rollouts
 
     start = given.first_seed
@@ -213,7 +212,7 @@ def prototype_section(given: ReportInput, clip: Callable[[], Any]) -> Section:
     if model.inverse_dynamics.n_prototypes == 0:
         mode = model.config.inverse_dynamics.mode
         return Section(title, [Text(f"The latent-action mode is `{mode}`, which has no prototypes.")])
-    from playslot_rl.visualization.prototypes import draw_prototypes
+    from playslot_rl.visualization.slots import draw_prototypes
 
     alt = "One row a prototype: the first frame and imagined frames up to t = 15, then a map of what changed."
     caption = (
@@ -287,25 +286,3 @@ def training_section(given: ReportInput, stages: Sequence[str] = STAGES) -> Sect
     if elsewhere:
         blocks.append(Text(f"No loss curves here for {', '.join(elsewhere)}: trained outside this run folder."))
     return Section("Training", blocks)
-
-
-# --- settings -----------------------------------------------------------------------------------------------------
-
-
-def model_rows(model: WorldModel | None) -> list[list[str]]:
-    """Slots, latent actions and prototypes of a world model; nothing without one."""
-    if model is None:
-        return []
-    savi, inverse = model.config.savi, model.config.inverse_dynamics
-    return [
-        ["slots", f"{savi.n_slots} of width {savi.slot_dim}"],
-        ["latent actions", f"{inverse.mode}, {inverse.variant}, width {model.latent_shape[-1]}"],
-        ["prototypes", str(model.inverse_dynamics.n_prototypes)],
-    ]
-
-
-def machine_row() -> list[str]:
-    """The machine that makes the report."""
-    machine = hardware()
-    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
-    return ["report made on", f"{machine['machine']}, {machine['cores']} cores{gpu}, torch {machine['torch']}"]

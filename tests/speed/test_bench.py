@@ -23,18 +23,21 @@ from playslot_rl.losses.dynamics import DynamicsLoss
 from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.predictors.cocvp import COCVP
-from playslot_rl.speed.cases import build_savi, build_step, dynamics_loss, slots_loss
-from playslot_rl.speed.race import start
-from playslot_rl.speed.report import TARGETS, table
-from playslot_rl.speed.spec import (
+from playslot_rl.speed.cases import (
     Sizes,
     Variant,
+    build_savi,
+    build_step,
+    dynamics_loss,
     dynamics_variants,
     plain,
     quick_sizes,
     rollout_variants,
     savi_variants,
+    slots_loss,
 )
+from playslot_rl.speed.race import start
+from playslot_rl.speed.report import TARGETS, table
 
 ALL = savi_variants() | dynamics_variants(1) | rollout_variants()
 
