@@ -40,11 +40,6 @@ class Status:
     seconds: float = 0.0
 
 
-def status_file(job_file: Path) -> Path:
-    """`NAME.status.json` beside `NAME.json`."""
-    return job_file.with_suffix(".status.json")
-
-
 def log_file(job_file: Path) -> Path:
     """`NAME.log` beside `NAME.json`: what the job printed."""
     return job_file.with_suffix(".log")
@@ -53,7 +48,7 @@ def log_file(job_file: Path) -> Path:
 def read_status(job_file: Path) -> Status:
     """The stored status; `waiting` where there is none, or no readable one."""
     try:
-        return from_dict(Status, json.loads(status_file(job_file).read_text()))
+        return from_dict(Status, json.loads(job_file.with_suffix(".status.json").read_text()))
     except (OSError, ValueError):
         return Status()
 
@@ -64,7 +59,7 @@ def write_status(job_file: Path, status: Status) -> None:
     Raises:
         OutputError: full disk.
     """
-    write_json(status_file(job_file), asdict(status))
+    write_json(job_file.with_suffix(".status.json"), asdict(status))
 
 
 def comparison_lock(out: Path) -> AbstractContextManager[None]:

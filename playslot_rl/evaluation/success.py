@@ -28,6 +28,7 @@ from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
 from playslot_rl.storage.atomic import write_json
+from playslot_rl.threads import available_cores
 from playslot_rl.world_model import Agent
 
 PROTOCOLS = ("simulation", "imagination")
@@ -55,9 +56,6 @@ class RunFacts:
     extra: dict[str, Any] = field(default_factory=dict)
 
 
-_EXTRA = ("pretraining", "env_steps")
-
-
 def run_facts(run: Path, stage: str = "policy") -> RunFacts:
     """Read `RUN/STAGE/checkpoint/meta.json`; a baseline's stage has its method's name.
 
@@ -75,17 +73,13 @@ def run_facts(run: Path, stage: str = "policy") -> RunFacts:
     prints = {str(k): str(v) for k, v in meta.get("parents", {}).items()}
     prints[stage] = str(meta.get("fingerprint", ""))
     return RunFacts(
-        demos=_count(meta.get("demos")),
-        labelled_demos=_count(meta.get("labelled_demos")),
+        demos=meta.get("demos"),
+        labelled_demos=meta.get("labelled_demos"),
         fingerprints=prints,
         commit=str(meta.get("commit", "")),
         method="playslot" if stage == "policy" else stage,
-        extra={name: meta[name] for name in _EXTRA if name in meta},
+        extra={name: meta[name] for name in ("pretraining", "env_steps") if name in meta},
     )
-
-
-def _count(value: Any) -> int | None:
-    return None if value is None else int(value)
 
 
 def check_protocol(protocol: str) -> None:
@@ -184,7 +178,7 @@ def measure(
         "references_protocol": "simulation (closed loop), on the same seeds",
         "max_steps": config.env.max_steps,
         "redrawn": sum(e.redrawn for e in outcome),
-        "per_episode": episode_records(outcome),
+        "per_episode": [asdict(e) for e in outcome],
         "seed": seed,
         **task_facts(config, seed),
         "wall_seconds": round(wall, 2),
@@ -266,13 +260,11 @@ def _stored(run: Path, result: dict[str, Any]) -> dict[str, Any]:
 
 def hardware() -> dict[str, Any]:
     """Processor, cores, threads and GPU."""
-    import os
-
     gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
     return {
         "machine": platform.machine(),
         "system": platform.system(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": available_cores(),
         "threads": torch.get_num_threads(),
         "gpu": gpu,
         "python": platform.python_version(),
@@ -314,11 +306,15 @@ def run_references(
     }
     if oracle is not None:
         actors["slot_oracle"] = oracle
-    stored = _read_cache(cache)
+    stored: dict[str, dict[str, Any]] = {}
+    if cache is not None and cache.is_file():
+        with contextlib.suppress(json.JSONDecodeError):  # only a cache: run the references again
+            stored = json.loads(cache.read_text())
     results: dict[str, dict[str, Any]] = {}
     for name, actor in actors.items():
         weights = oracle_fingerprint if name == "slot_oracle" else name
-        key = _key(name, weights, config, seeds)
+        what = [weights, to_dict(config.env), to_dict(config.render), list(seeds)]
+        key = f"{name}-{hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]}"
         if not weights or key not in stored:
             stored[key] = summary(run_episodes(pool, actor, seeds))
         results[name] = stored[key]
@@ -328,23 +324,3 @@ def run_references(
         kept = {k: v for k, v in stored.items() if oracle_fingerprint or not k.startswith("slot_oracle")}
         write_json(cache, kept)
     return results
-
-
-def _key(name: str, weights: str, config: ExperimentConfig, seeds: Sequence[int]) -> str:
-    what = [weights, to_dict(config.env), to_dict(config.render), list(seeds)]
-    return f"{name}-{hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]}"
-
-
-def _read_cache(path: Path | None) -> dict[str, dict[str, Any]]:
-    if path is None or not path.is_file():
-        return {}
-    try:
-        stored: dict[str, dict[str, Any]] = json.loads(path.read_text())
-    except json.JSONDecodeError:
-        return {}  # only a cache: run the references again
-    return stored
-
-
-def episode_records(episodes: Sequence[Outcome]) -> list[dict[str, Any]]:
-    """Plain dicts of the episodes, for JSON."""
-    return [asdict(e) for e in episodes]

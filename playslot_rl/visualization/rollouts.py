@@ -32,7 +32,7 @@ class Rollouts:
     """The same episodes imagined, executed open-loop, and run closed-loop.
 
     Attributes:
-        clips: (E, 3, T + 1, H, W, 3): frames decoded from the unfolded slots, those of the imagined rollout's actions in
+        clips: (E, 3, T + 1, H, W, 3): frames decoded from the unfolded slots, those of the imagined actions in
             the simulator, and those of the agent observing every frame.
         executed_outcome, closed_outcome: the episodes of the last two.
     """
