@@ -95,7 +95,9 @@ def _footnotes(result: Result) -> list[str]:
     notes.append(_times(done, result))
     notes += _shared(result)
     notes += _open_jobs(rows, result["jobs"])
-    notes.append(f"Made by `{result['command']}` at commit {result['commit'] or 'unknown'}; {_machine(result)}.")
+    at = result["hardware"]
+    where = f"{at['machine']}, {at['cores']} cores, {at['gpu'] or 'no GPU'}"
+    notes.append(f"Made by `{result['command']}` at commit {result['commit'] or 'unknown'}; {where}.")
     return notes
 
 
@@ -194,11 +196,6 @@ def _reference(value: Result) -> str:
         return "not run"
     low, high = value["ci95"]
     return f"{100 * value['success_rate']:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
-
-
-def _machine(result: Result) -> str:
-    at = result["hardware"]
-    return f"{at['machine']}, {at['cores']} cores, {at['gpu'] or 'no GPU'}"
 
 
 def _jobs(rows: Sequence[Result]) -> str:

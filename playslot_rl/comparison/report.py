@@ -24,7 +24,7 @@ from playslot_rl.evaluation.success import hardware, run_references
 from playslot_rl.storage.atomic import write_bytes, write_json, write_text
 from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
 from playslot_rl.storage.provenance import provenance
-from playslot_rl.training.runs import world_model_checkpoints
+from playslot_rl.training.runs import world_model_checkpoints, world_model_folder
 from playslot_rl.visualization.charts import LIGHT, figure_bytes
 
 
@@ -96,23 +96,19 @@ def count_samples(job: Job, meta: Mapping[str, Any]) -> int | None:
 
 def count_parameters(run: Path, stage: str) -> int:
     """Floating-point numbers in a run's checkpoint and in those of its parents (weights, and a few buffers)."""
-    from playslot_rl.storage.checkpoints import checkpoint_folder
-    from playslot_rl.training.runs import world_model_folder
+    from safetensors import safe_open
 
     parents = read_json(checkpoint_folder(run, stage) / "meta.json").get("parents", {})
     folders = [checkpoint_folder(run, stage)]
     for name in parents:
         own = checkpoint_folder(run, name)
         folders.append(own if own.is_dir() else checkpoint_folder(world_model_folder(run), name))
-    return sum(_numbers(folder / "weights.safetensors") for folder in folders)
-
-
-def _numbers(path: Path) -> int:
-    from safetensors import safe_open
-
-    with safe_open(path, framework="pt") as file:
-        slices = [file.get_slice(key) for key in file.keys()]  # noqa: SIM118  no mapping
-        return sum(math.prod(part.get_shape()) for part in slices if part.get_dtype().startswith(("F", "BF")))
+    count = 0
+    for folder in folders:
+        with safe_open(folder / "weights.safetensors", framework="pt") as file:
+            slices = [file.get_slice(key) for key in file.keys()]  # noqa: SIM118  no mapping
+            count += sum(math.prod(part.get_shape()) for part in slices if part.get_dtype().startswith(("F", "BF")))
+    return count
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -187,9 +183,9 @@ class Comparison:
         Raises:
             ConfigError: an evaluation seed that a training data set holds.
         """
-        config, episodes = self.config, self.config.episodes or 0
+        config = self.config
         start = first_seed(config, config.compare.evaluation_seed)
-        seeds = list(range(start, start + episodes))
+        seeds = list(range(start, start + (config.episodes or 0)))
         check_disjoint(seeds, training_seeds(config))
         with TaskPool(config.env, config.render) as pool:
             found = run_references(None, config, seeds, pool, cache=self.out / "references.json")
@@ -275,5 +271,4 @@ class Comparison:
         if "lapo" not in self.config.compare.methods:
             return None
         stage = read_stage(checkpoint_folder(self.out / "lapo_world", "lapo_model"), "lapo_model")
-        names = ("fingerprint", "seconds", "episodes")
-        return {name: stage.meta.get(name) for name in names}
+        return {name: stage.meta.get(name) for name in ("fingerprint", "seconds", "episodes")}

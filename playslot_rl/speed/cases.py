@@ -105,11 +105,6 @@ class Variant:
     decoded_frames: int = 0
 
 
-def plain(case: Case) -> Variant:
-    """The plain computation in fp32, as PyTorch comes."""
-    return Variant(case, collapse=False, precision="fp32", channels_last=False, allocator=False, cached=False)
-
-
 def savi_variants() -> dict[str, Variant]:
     """First layer, precision (fp32 in PyTorch's own memory format, bf16 in channels_last) and allocator: eight."""
     precisions: tuple[Precision, ...] = ("fp32", "bf16")
@@ -122,8 +117,8 @@ def savi_variants() -> dict[str, Variant]:
 
 def dynamics_variants(decoded_frames: int) -> dict[str, Variant]:
     """Plain, the same with single parts of the fast path, the fast path, and fewer decoded frames on top."""
-    base = plain("dynamics_step")
     fast = Variant("dynamics_step")
+    base = replace(fast, collapse=False, precision="fp32", channels_last=False, allocator=False, cached=False)
     return {
         "plain_fp32_glibc": base,
         "plain_fp32_allocator": replace(base, allocator=True),

@@ -42,7 +42,13 @@ def sampling_rates(sizes: Sizes) -> dict[str, float]:
     frames = sizes.window_batch * sizes.window
     with tempfile.TemporaryDirectory(prefix="playslot-bench-") as folder, quiet_datasets():
         root = write_dataset(Path(folder) / "data", sizes)
-        cached = cache_batches(root, Path(folder) / "cache", sizes)
+        source, generator = open_source(root, cache=Path(folder) / "cache"), np.random.default_rng(0)
+
+        def cached() -> Tensor:
+            """A batch as the training stages read it, as floats."""
+            rows = sample_windows(source.starts, source.lengths, sizes.window, sizes.window_batch, generator)
+            return normalise(source.pixels(rows))
+
         for _ in range(sizes.repeats + 1):
             rates["cache"].append(frames / _seconds(cached, sizes.cache_batches, sizes))
             with contextlib.closing(lerobot_batches(root, sizes)) as batches:
@@ -84,17 +90,6 @@ def write_dataset(root: Path, sizes: Sizes) -> Path:
         dataset.save_episode()
     dataset.finalize()
     return root
-
-
-def cache_batches(root: Path, cache: Path, sizes: Sizes) -> Callable[[], Tensor]:
-    """Batches as the training stages read them, as floats."""
-    source, generator = open_source(root, cache=cache), np.random.default_rng(0)
-
-    def read() -> Tensor:
-        rows = sample_windows(source.starts, source.lengths, sizes.window, sizes.window_batch, generator)
-        return normalise(source.pixels(rows))
-
-    return read
 
 
 def lerobot_batches(root: Path, sizes: Sizes) -> Generator[Tensor]:

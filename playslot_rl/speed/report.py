@@ -68,7 +68,7 @@ def measure(
         "window_sampling": {"ratio": rates["cache"] / rates["lerobot"], "unit": "frames/s", **rates},
         "render": _entry(render, "full", "fast"),
         "render_block_push": _entry(blocks, "full", "fast"),
-        "machine": {**machine(), "threads": threads, "repeats": sizes.repeats, "quick": quick},
+        "machine": {**_machine(), "threads": threads, "repeats": sizes.repeats, "quick": quick},
     }
 
 
@@ -76,7 +76,7 @@ def _entry(seconds: Mapping[str, float], slow: str, fast: str) -> Figures:
     return {"ratio": seconds[slow] / seconds[fast], "unit": "s", **seconds}
 
 
-def machine() -> Figures:
+def _machine() -> Figures:
     """What the figures were measured on."""
     from importlib.metadata import version
 

@@ -62,11 +62,6 @@ METHOD_STYLES: Final = {
 }
 
 
-def rgb(colour: str) -> tuple[int, int, int]:
-    """Red, green and blue in [0, 255] of `#rrggbb`."""
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
-
-
 def new_figure(width: float, height: float) -> Figure:
     """A figure of so many inches, without pyplot: no global state, no display needed."""
     from matplotlib.figure import Figure

@@ -83,16 +83,10 @@ def write_report(
         if module is not None:
             module.eval()
     with TaskPool(config.env, config.render) if pool is None else nullcontext(pool) as used:
-        given = ReportInput(run, config, model, agent, used, shown_path(run), read_metas(run))
-        return save(run, build_objects(given) if config.env.name in PROCEDURAL else build(given))
-
-
-def save(run: Path, document: Document) -> Path:
-    """Write a report and its figures into a run folder; returns the path of the HTML file.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
+        relative = os.path.relpath(run)
+        shown = relative if not relative.startswith("..") else run.name
+        given = ReportInput(run, config, model, agent, used, shown, read_metas(run))
+        document = build_objects(given) if config.env.name in PROCEDURAL else build(given)
     figures = run / "figures"
     figures.mkdir(parents=True, exist_ok=True)
     for section in document.sections:
@@ -126,12 +120,6 @@ def read_metas(run: Path) -> dict[str, dict[str, Any]]:
     homes = {"slots": model, "dynamics": model, "policy": run}
     paths = {stage: checkpoint_folder(homes[stage], stage) / "meta.json" for stage in STAGES}
     return {stage: json.loads(path.read_text()) for stage, path in paths.items() if path.is_file()}
-
-
-def shown_path(run: Path) -> str:
-    """The run folder relative to the working directory; only its name where it lies elsewhere."""
-    relative = os.path.relpath(run)
-    return relative if not relative.startswith("..") else run.name
 
 
 def build(given: ReportInput) -> Document:

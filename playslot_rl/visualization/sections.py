@@ -111,9 +111,11 @@ def success_section(given: ReportInput) -> Section:
             if r["success_rate"] is not None
         ]
         alt = "; ".join(f"{n}: {percent(rate)}, {interval(list(ci))}" for n, rate, ci, _ in drawn)
-        blocks.append(
-            chart("success", lambda theme: success_chart(drawn, theme), f"Success rates. {alt}.", _ways(given))
+        ways = (
+            "Simulation: the agent sees every frame. Imagination: it sees the first frame only, unfolds "
+            f"{given.config.env.max_steps} steps in latent space, and the decoded actions are then executed."
         )
+        blocks.append(chart("success", lambda theme: success_chart(drawn, theme), f"Success rates. {alt}.", ways))
     for protocol in PROTOCOLS:
         if protocol not in results:
             command = given.command("evaluate", f"protocol={protocol}")
@@ -124,13 +126,6 @@ def success_section(given: ReportInput) -> Section:
 def _steps(result: dict[str, Any]) -> str:
     value = result.get("mean_steps_to_success")
     return "–" if value is None else f"{value:.1f}"
-
-
-def _ways(given: ReportInput) -> str:
-    return (
-        "Simulation: the agent sees every frame. Imagination: it sees the first frame only, unfolds "
-        f"{given.config.env.max_steps} steps in latent space, and the decoded actions are then executed."
-    )
 
 
 def _success_rows(results: dict[str, dict[str, Any]]) -> list[tuple[str, dict[str, Any], str, str]]:

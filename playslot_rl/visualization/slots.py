@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from PIL import Image
+from PIL.ImageColor import getrgb
 
 from playslot_rl.frames import to_float, to_uint8
-from playslot_rl.visualization.charts import OKABE_ITO, rgb
+from playslot_rl.visualization.charts import OKABE_ITO
 from playslot_rl.visualization.grid import film_strip, image_grid
 from playslot_rl.world_model import WorldModel
 
@@ -46,7 +47,7 @@ def segmentation(frames: Frames, masks: npt.NDArray[np.float32]) -> Frames:
         frames: (T, H, W, 3) uint8.
         masks: (T, N, 1, H, W), sum to one over N.
     """
-    colours = np.array([rgb(OKABE_ITO[n % len(OKABE_ITO)]) for n in range(masks.shape[1])], np.float32)
+    colours = np.array([getrgb(OKABE_ITO[n % len(OKABE_ITO)]) for n in range(masks.shape[1])], np.float32)
     colour = colours[masks[:, :, 0].argmax(1)]
     grey = frames.astype(np.float32).mean(-1, keepdims=True)
     mixed: Frames = np.clip(0.6 * colour + 0.4 * grey, 0, 255).astype(np.uint8)
