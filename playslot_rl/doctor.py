@@ -6,15 +6,16 @@ import importlib.metadata
 import io
 import os
 import platform
-import re
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
+
+from packaging.requirements import Requirement
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.threads import available_cores
@@ -77,18 +78,16 @@ def check_packages() -> Check:
     except importlib.metadata.PackageNotFoundError:
         return Check("packages", "FAIL", "playslot_rl is not installed", _REINSTALL)
     wrong = []
-    for requirement in requirements:
-        match = re.match(r"([A-Za-z0-9._-]+)(?:\[[^]]*\])?(?:==([^;,\s]+))?\s*(;.*)?", requirement)
-        if match is None or "extra" in (match[3] or ""):
+    for requirement in map(Requirement, requirements):
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
-        name, wanted = match[1], match[2]
         try:
-            have = importlib.metadata.version(name)
+            have = importlib.metadata.version(requirement.name)
         except importlib.metadata.PackageNotFoundError:
-            wrong.append(f"{name} is missing")
+            wrong.append(f"{requirement.name} is missing")
             continue
-        if wanted and have.split("+")[0] != wanted:
-            wrong.append(f"{name} is {have}, expected {wanted}")
+        if not requirement.specifier.contains(have, prereleases=True):
+            wrong.append(f"{requirement.name} is {have}, expected {str(requirement.specifier).removeprefix('==')}")
     if wrong:
         return Check("packages", "FAIL", "; ".join(wrong), _REINSTALL)
     return Check("packages", "ok", "all requirements, in the pinned versions")
@@ -160,7 +159,8 @@ def check_ffmpeg() -> Check:
 def check_disk(folder: Path) -> Check:
     """Free space where data and runs go."""
     try:
-        free = shutil.disk_usage(_existing(folder)).free / 1e9
+        there = next(path for path in (folder, *folder.parents) if path.exists())
+        free = shutil.disk_usage(there).free / 1e9
     except OSError as error:
         return Check("disk", "FAIL", _one_line(error), f"choose another folder than {folder}")
     found = f"{free:.0f} GB free in {folder}"
@@ -206,29 +206,23 @@ def main(config: ExperimentConfig) -> int:
         0 if everything essential works, otherwise 1.
     """
     failed = 0
-    for check in _checks(config):
+    checks: list[Callable[[], Check]] = [
+        check_python,
+        check_packages,
+        lambda: check_torch(config.device),
+        check_rendering,
+        check_video,
+        check_ffmpeg,
+        lambda: check_disk(Path(config.out or ".").resolve()),
+        check_cores,
+        lambda: check_cache(cache_folder(config)),
+    ]
+    for check in checks:
         finding = check()
         print(finding.line(), flush=True)
         failed += finding.status == "FAIL"
     print("\neverything essential works" if not failed else f"\n{failed} essential part(s) do not work")
     return 1 if failed else 0
-
-
-def _checks(config: ExperimentConfig) -> Iterator[Callable[[], Check]]:
-    yield check_python
-    yield check_packages
-    yield lambda: check_torch(config.device)
-    yield check_rendering
-    yield check_video
-    yield check_ffmpeg
-    yield lambda: check_disk(Path(config.out or ".").resolve())
-    yield check_cores
-    yield lambda: check_cache(cache_folder(config))
-
-
-def _existing(folder: Path) -> Path:
-    """The folder, or its nearest ancestor that exists."""
-    return next(path for path in (folder, *folder.parents) if path.exists())
 
 
 def _one_line(error: BaseException) -> str:

@@ -17,8 +17,8 @@ def main(config: ExperimentConfig, json_path: Path | None = None) -> None:
     Raises:
         PlaySlotError: a child died. RenderError: no GL backend. OutputError: the file cannot be written.
     """
+    from playslot_rl.speed.cases import Sizes, quick_sizes
     from playslot_rl.speed.report import measure, table
-    from playslot_rl.speed.spec import Sizes, quick_sizes
     from playslot_rl.storage.atomic import write_json
 
     quick = config.preset == "smoke"

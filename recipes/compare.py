@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compare import CompareConfig
 from playslot_rl.errors import OutputError, PlaySlotError
 
 if TYPE_CHECKING:
-    from playslot_rl.comparison.plan import Job
     from playslot_rl.comparison.report import Comparison
 
 
@@ -25,9 +23,9 @@ def main(config: ExperimentConfig) -> None:
         PlaySlotError: a job failed; the others have finished, and the table says so.
         KeyboardInterrupt: Ctrl-C; the same command carries on.
     """
-    from playslot_rl.comparison.plan import check_comparison, job_record
+    from playslot_rl.comparison.launch import comparison_lock
+    from playslot_rl.comparison.plan import check_comparison, job_config, job_record, jobs
     from playslot_rl.comparison.report import Comparison
-    from playslot_rl.comparison.status import comparison_lock
     from playslot_rl.evaluation.success import DEFAULT_EPISODES
     from playslot_rl.recipes import compare_data
     from playslot_rl.recipes.run import parent_run
@@ -41,8 +39,12 @@ def main(config: ExperimentConfig) -> None:
     config = compare_data.check_data(config, out)
     with comparison_lock(out):
         config = compare_data.prepare(config, out)
-        plan = _plan(config, out)
-        report = Comparison(config, out, {job: job_record(job, own, parents) for job, own, parents in plan}, began)
+        plain = replace(config, compare=CompareConfig(evaluation_seed=config.compare.evaluation_seed))
+        parents, records = compare_data.Parents(config, out), {}
+        for job in jobs(config, out):
+            own = job_config(plain, job, config.run, str(out / "lapo_world") if job.method == "lapo" else "")
+            records[job] = job_record(job, own, parents.of(job))
+        report = Comparison(config, out, records, began)
         report.references()
         _run_due(config, report)
         failed = report.write()
@@ -51,7 +53,7 @@ def main(config: ExperimentConfig) -> None:
     if failed:
         names = ", ".join(row["name"] for row in failed)
         raise PlaySlotError(
-            f"compare: {len(failed)} of {len(plan)} jobs failed ({names}), the others finished; "
+            f"compare: {len(failed)} of {len(records)} jobs failed ({names}), the others finished; "
             f"{out / 'comparison.md'} says why, and the same command tries them again"
         )
 
@@ -63,8 +65,7 @@ def _run_due(config: ExperimentConfig, report: Comparison) -> None:
         PlaySlotError: the launcher itself failed.
         KeyboardInterrupt: Ctrl-C. In both cases what there is has been written.
     """
-    from playslot_rl.comparison.launch import run_process, run_sweep
-    from playslot_rl.comparison.status import read_status
+    from playslot_rl.comparison.launch import read_status, run_process, run_sweep
     from playslot_rl.storage.atomic import write_json
 
     due = {}
@@ -97,23 +98,10 @@ def _open(out: Path) -> None:
     Raises:
         OutputError: it does.
     """
-    from playslot_rl.comparison.status import LOCK
+    from playslot_rl.comparison.launch import LOCK
 
     if out.exists() and not out.is_dir():
         raise OutputError(f"out={out}: got a file, expected a folder: choose another out=")
     names = {path.name for path in out.iterdir()} if out.is_dir() else set()
     if names and (not names & {LOCK, "jobs"} or names & {"meta", "config.json"}):
         raise OutputError(f"out={out}: got a folder that holds something else, expected none: choose another out=")
-
-
-def _plan(config: ExperimentConfig, out: Path) -> Sequence[tuple[Job, ExperimentConfig, dict[str, Any]]]:
-    """Every job with its own config and the fingerprints of what it builds on."""
-    from playslot_rl.comparison.plan import job_config, jobs
-    from playslot_rl.recipes.compare_data import Parents
-
-    plain = replace(config, compare=CompareConfig(evaluation_seed=config.compare.evaluation_seed))
-    parents, lapo = Parents(config, out), str(out / "lapo_world")
-    return [
-        (job, job_config(plain, job, config.run, lapo if job.method == "lapo" else ""), parents.of(job))
-        for job in jobs(config, out)
-    ]

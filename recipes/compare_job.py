@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from playslot_rl.comparison.status import Status, job_lock, read_status, write_status
+from playslot_rl.comparison.launch import Status, job_lock, read_status, write_status
 from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.errors import explain
 

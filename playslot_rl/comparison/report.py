@@ -1,29 +1,163 @@
-"""The result of a comparison on disk: `comparison.json`, `comparison.md`, `comparison.png` and `comparison.svg`."""
+"""What came out of a comparison: one row a job and protocol, their summary over training seeds, and the files
+`comparison.json`, `comparison.md`, `comparison.png` and `comparison.svg`.
+"""
 
 from __future__ import annotations
 
+import json
+import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from playslot_rl.acting.episodes import TaskPool
+from playslot_rl.comparison.launch import Status, read_status
+from playslot_rl.comparison.page import comparison_figure, comparison_page, failures
 from playslot_rl.comparison.plan import Job, uses_slots
-from playslot_rl.comparison.results import failures, job_rows, read_json, summarise
-from playslot_rl.comparison.status import read_status
-from playslot_rl.comparison.table import comparison_page
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import shipped
-from playslot_rl.evaluation.references import run_references
+from playslot_rl.config.methods import METHODS
+from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
-from playslot_rl.evaluation.success import hardware
+from playslot_rl.evaluation.success import hardware, run_references
 from playslot_rl.storage.atomic import write_bytes, write_json, write_text
 from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
 from playslot_rl.storage.provenance import provenance
-from playslot_rl.training.runs import world_model_checkpoints
-from playslot_rl.visualization.charts import figure_bytes
-from playslot_rl.visualization.comparison import comparison_figure
-from playslot_rl.visualization.palette import LIGHT
+from playslot_rl.training.runs import world_model_checkpoints, world_model_folder
+from playslot_rl.visualization.charts import LIGHT, figure_bytes
+
+
+def job_rows(job: Job, frame_skip: int, fingerprint: str | None = None) -> list[dict[str, Any]]:
+    """One row for each protocol of a job, finished or not.
+
+    Keys: `name`, `method`, `title`, `protocol`, `demos`, `seed`, `status`, `error`, `labelled_demos`, `agent_steps`
+    and `env_steps` (an agent step is `frame_skip` of them), `samples` (optimiser steps times batch),
+    `success_rate`, `successes`, `episodes`, `ci95` (Wilson), `mean_steps_to_success`, `train_seconds`,
+    `evaluation_seconds`, `parameters`, `pretraining` (null where there is nothing to say), `curve` (rows of an online
+    method's learning curve, with both kinds of steps).
+
+    Args:
+        job: which one.
+        frame_skip: environment steps in an agent step.
+        fingerprint: of the job as it is asked for now; one that ended as another is `waiting`. None takes any.
+    """
+    status = read_status(job.file)
+    if fingerprint is not None and status.fingerprint != fingerprint:
+        status = Status()
+    meta = read_json(job.run / job.stage / "checkpoint" / "meta.json") if status.status == "done" else {}
+    rows = []
+    for protocol in job.protocols:
+        info = read_json(job.run / "evaluation" / protocol / "eval_info.json") if status.status == "done" else {}
+        episodes, rate = info.get("episodes"), info.get("success_rate")
+        rows.append(
+            {
+                "name": job.name,
+                "method": job.method,
+                "title": METHODS[job.method].title,
+                "protocol": protocol,
+                "demos": job.demos,
+                "seed": job.seed,
+                "status": status.status,
+                "error": status.error or None,
+                "labelled_demos": None if METHODS[job.method].online else meta.get("labelled_demos"),
+                "agent_steps": meta.get("env_steps"),
+                "env_steps": None if meta.get("env_steps") is None else meta["env_steps"] * frame_skip,
+                "samples": count_samples(job, meta),
+                "success_rate": rate,
+                "successes": None if rate is None else round(rate * info["episodes"]),
+                "episodes": episodes,
+                "ci95": info.get("ci95"),
+                "mean_steps_to_success": info.get("mean_steps_to_success"),
+                "train_seconds": meta.get("seconds"),
+                "evaluation_seconds": info.get("wall_seconds"),
+                "parameters": count_parameters(job.run, job.stage) if meta else None,
+                "pretraining": meta.get("pretraining"),
+                "curve": learning_curve(job, frame_skip) if METHODS[job.method].online else None,
+            }
+        )
+    return rows
+
+
+def learning_curve(job: Job, frame_skip: int) -> list[dict[str, Any]] | None:
+    """Rows of `RUN/METHOD/curve.json`, there before the job is done too; None without one."""
+    rows = read_json(job.run / job.stage / "curve.json").get("rows") or []
+    return [
+        {**row, "agent_steps": row["env_steps"], "env_steps": row["env_steps"] * frame_skip} for row in rows
+    ] or None
+
+
+def count_samples(job: Job, meta: Mapping[str, Any]) -> int | None:
+    """Examples a method's policy was trained on, repeats included: optimiser steps times batch."""
+    config = read_json(job.run / job.stage / "checkpoint" / "config.json").get(job.stage, {})
+    batch = config.get("batch_size", config.get("policy", {}).get("batch_size"))
+    return None if batch is None or METHODS[job.method].online or not meta else int(meta.get("steps", 0)) * int(batch)
+
+
+def count_parameters(run: Path, stage: str) -> int:
+    """Floating-point numbers in a run's checkpoint and in those of its parents (weights, and a few buffers)."""
+    from safetensors import safe_open
+
+    parents = read_json(checkpoint_folder(run, stage) / "meta.json").get("parents", {})
+    folders = [checkpoint_folder(run, stage)]
+    for name in parents:
+        own = checkpoint_folder(run, name)
+        folders.append(own if own.is_dir() else checkpoint_folder(world_model_folder(run), name))
+    count = 0
+    for folder in folders:
+        with safe_open(folder / "weights.safetensors", framework="pt") as file:
+            slices = [file.get_slice(key) for key in file.keys()]  # noqa: SIM118  no mapping
+            count += sum(math.prod(part.get_shape()) for part in slices if part.get_dtype().startswith(("F", "BF")))
+    return count
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON file, or nothing where it is missing or damaged: a row then has nulls."""
+    try:
+        values: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return values
+
+
+def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of finished jobs, pooled over training seeds.
+
+    Keys: `method`, `title`, `protocol`, `demos`, `agent_steps` and `env_steps` (means), `seeds`, `success_rate` (mean
+    over the seeds), `ci95`, `lowest` and `highest` (of a seed), `episodes`, `labelled_demos`.
+
+    `ci95` is Wilson's interval of that mean over the episodes of one seed: all seeds play the same ones, so that
+    pooling them would count an episode that is easy, or hard, for all of them several times.
+    """
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        if row["success_rate"] is not None:
+            groups.setdefault((row["method"], row["protocol"], row["demos"]), []).append(row)
+    summary = []
+    for (method, protocol, demos), group in groups.items():
+        rates = [r["success_rate"] for r in group]
+        summary.append(
+            {
+                "method": method,
+                "title": METHODS[method].title,
+                "protocol": protocol,
+                "demos": demos,
+                **{key: _mean(r[key] for r in group) for key in ("agent_steps", "env_steps")},
+                "seeds": sorted(r["seed"] for r in group),
+                "success_rate": sum(rates) / len(rates),
+                "ci95": list(wilson(sum(r["successes"] for r in group) / len(group), group[0]["episodes"])),
+                "lowest": min(rates),
+                "highest": max(rates),
+                "episodes": sum(r["episodes"] for r in group),
+                "labelled_demos": group[0]["labelled_demos"],
+            }
+        )
+    return summary
+
+
+def _mean(values: Iterable[float | None]) -> int | None:
+    known = [value for value in values if value is not None]
+    return round(sum(known) / len(known)) if known else None
 
 
 class Comparison:
@@ -49,9 +183,9 @@ class Comparison:
         Raises:
             ConfigError: an evaluation seed that a training data set holds.
         """
-        config, episodes = self.config, self.config.episodes or 0
+        config = self.config
         start = first_seed(config, config.compare.evaluation_seed)
-        seeds = list(range(start, start + episodes))
+        seeds = list(range(start, start + (config.episodes or 0)))
         check_disjoint(seeds, training_seeds(config))
         with TaskPool(config.env, config.render) as pool:
             found = run_references(None, config, seeds, pool, cache=self.out / "references.json")
@@ -137,5 +271,4 @@ class Comparison:
         if "lapo" not in self.config.compare.methods:
             return None
         stage = read_stage(checkpoint_folder(self.out / "lapo_world", "lapo_model"), "lapo_model")
-        names = ("fingerprint", "seconds", "episodes")
-        return {name: stage.meta.get(name) for name in names}
+        return {name: stage.meta.get(name) for name in ("fingerprint", "seconds", "episodes")}

@@ -21,12 +21,9 @@ from playslot_rl.datasets.info import info
 from playslot_rl.datasets.verify import require_sound
 from playslot_rl.errors import ConfigError
 from playslot_rl.storage.atomic import write_text
-from playslot_rl.visualization.animation import animation
-from playslot_rl.visualization.charts import curve_chart
-from playslot_rl.visualization.document import Block, Document, Picture, Section, Table, Text
-from playslot_rl.visualization.grid import image_grid, png
-from playslot_rl.visualization.html import to_html
-from playslot_rl.visualization.palette import DARK, LIGHT
+from playslot_rl.visualization.charts import DARK, LIGHT, curve_chart
+from playslot_rl.visualization.document import Block, Document, Picture, Section, Table, Text, to_html
+from playslot_rl.visualization.grid import animation, image_grid, png
 
 STRIP: Final = 8
 """Frames of the strip: the first, the last, and some between."""

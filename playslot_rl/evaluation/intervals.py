@@ -6,19 +6,18 @@ import math
 from statistics import NormalDist
 
 
-def wilson(successes: float, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Interval of the success probability; unlike the normal one it stays in [0, 1] and is not empty at 0 or 100 %.
+def wilson(successes: float, trials: int) -> tuple[float, float]:
+    """95 % interval of a success probability; unlike the normal one it stays in [0, 1] and is not empty at 0 or 100 %.
 
     Args:
         successes: number of successes, from 0 to `trials`; a mean over repetitions need not be whole.
         trials: number of episodes, at least 1.
-        confidence: coverage, in (0, 1).
 
     Returns:
         Lower and upper end, both in [0, 1].
 
     Raises:
-        ValueError: a count or the confidence is outside its range.
+        ValueError: a count is outside its range.
 
     Example:
         >>> low, high = wilson(9, 10)
@@ -27,9 +26,7 @@ def wilson(successes: float, trials: int, confidence: float = 0.95) -> tuple[flo
     """
     if trials < 1 or not 0 <= successes <= trials:
         raise ValueError(f"wilson: got {successes} of {trials}, expected 0 <= successes <= trials and trials >= 1")
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"wilson: got confidence {confidence}, expected a number in (0, 1)")
-    z = NormalDist().inv_cdf(0.5 + confidence / 2)
+    z = NormalDist().inv_cdf(0.975)
     rate = successes / trials
     scale = 1 + z * z / trials
     centre = (rate + z * z / (2 * trials)) / scale

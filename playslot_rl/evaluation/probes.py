@@ -86,17 +86,13 @@ def _hold_out(groups: Ints, fraction: float, seed: int, what: str) -> tuple[npt.
     return np.isin(groups, held), len(held)
 
 
-def probe_actions(
-    z: Floats, actions: Floats, episodes: Ints, seed: int = 0, held_out: float = 0.25, codes: Ints | None = None
-) -> dict[str, Any]:
+def probe_actions(z: Floats, actions: Floats, episodes: Ints, codes: Ints | None = None) -> dict[str, Any]:
     """How much of the real action can be read from the latent, on episodes the probe has not seen.
 
     Args:
         z: (M, Z) latents.
         actions: (M, A) real actions in [-1, 1].
-        episodes: (M,) episode of each transition; whole episodes are held out.
-        seed: of the split and of the non-linear probe.
-        held_out: fraction of episodes held out.
+        episodes: (M,) episode of each transition; a quarter of the episodes is held out, whole.
         codes: (M, C) codes; adds the probe `code`, which sees their one-hot form only.
 
     Returns:
@@ -108,17 +104,17 @@ def probe_actions(
     """
     if not len(z) == len(actions) == len(episodes):
         raise ValueError(f"probe_actions: got {len(z)}, {len(actions)} and {len(episodes)} rows, expected as many each")
-    test, test_episodes = _hold_out(episodes, held_out, seed, "probe_actions: episode")
+    test, test_episodes = _hold_out(episodes, 0.25, 0, "probe_actions: episode")
     result: dict[str, Any] = {"train": int((~test).sum()), "test": int(test.sum()), "test_episodes": test_episodes}
     for name in ("linear", "mlp"):
-        result[name] = _score(name, z[~test], actions[~test], z[test], actions[test], seed)
+        result[name] = _score(name, z[~test], actions[~test], z[test], actions[test])
     if codes is not None and codes.size and codes.min() >= 0:
         hot = np.eye(int(codes.max()) + 1, dtype=np.float32)[codes].reshape(len(codes), -1)
-        result["code"] = _score("linear", hot[~test], actions[~test], hot[test], actions[test], seed)
+        result["code"] = _score("linear", hot[~test], actions[~test], hot[test], actions[test])
     return result
 
 
-def _score(kind: str, x: Floats, y: Floats, x_test: Floats, y_test: Floats, seed: int) -> dict[str, Any]:
+def _score(kind: str, x: Floats, y: Floats, x_test: Floats, y_test: Floats) -> dict[str, Any]:
     import warnings
 
     from sklearn.linear_model import RidgeCV
@@ -132,7 +128,7 @@ def _score(kind: str, x: Floats, y: Floats, x_test: Floats, y_test: Floats, seed
         # Adam with a fixed number of passes: early stopping would need a split by episodes that sklearn does not make.
         net = MLPRegressor(
             hidden_layer_sizes=(64, 64), alpha=1e-3, learning_rate_init=2e-3, batch_size=128, max_iter=60,
-            random_state=seed, tol=0.0, n_iter_no_change=60,
+            random_state=0, tol=0.0, n_iter_no_change=60,
         )  # fmt: skip
         model = make_pipeline(StandardScaler(), net)
     with warnings.catch_warnings():
@@ -146,23 +142,15 @@ def _score(kind: str, x: Floats, y: Floats, x_test: Floats, y_test: Floats, seed
     return {"r2": r2, "mean_r2": float(np.mean(known)) if known else None}
 
 
-def probe_moves(
-    features: Floats,
-    moves: Ints,
-    clips: Ints,
-    classes: int,
-    seed: int = 0,
-    held_out: float = 0.3,
-) -> dict[str, Any]:
+def probe_moves(features: Floats, moves: Ints, clips: Ints, classes: int, seed: int = 0) -> dict[str, Any]:
     """Accuracy of multinomial logistic regression on clips that it was not fitted on.
 
     Args:
         features: (M, D) what the probe sees, such as the prototype of the object's slot.
         moves: (M,) labels from 0 to `classes` - 1.
-        clips: (M,) clip of each transition; whole clips are held out.
+        clips: (M,) clip of each transition; 0.3 of the clips are held out, whole.
         classes: number of moves.
         seed: of the split.
-        held_out: fraction of clips held out.
 
     Returns:
         `accuracy` (0 to 1); beside it `chance` (1 / classes) and `majority` (always the most frequent move of the
@@ -173,7 +161,7 @@ def probe_moves(
     """
     if not len(features) == len(moves) == len(clips):
         raise ValueError(f"probe_moves: got {len(features)}, {len(moves)} and {len(clips)} rows, expected as many each")
-    test, test_clips = _hold_out(clips, held_out, seed, "probe_moves: clip")
+    test, test_clips = _hold_out(clips, 0.3, seed, "probe_moves: clip")
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler

@@ -45,16 +45,15 @@ def _seeds_in(node: Any) -> Iterable[int]:
                 yield from _seeds_in(value)
 
 
+def data_folders(config: ExperimentConfig, run: Path | None = None) -> list[Path]:
+    """Data sets the config names, then what is in the run's `data` folder."""
+    named = [Path(root.strip()) for root in f"{config.data.root},{config.data.demos}".split(",") if root.strip()]
+    return [*named, *(sorted((run / "data").glob("*")) if run is not None else [])]
+
+
 def training_seeds(config: ExperimentConfig, run: Path | None = None) -> set[int]:
     """Episode seeds of every data set the config (or the run's `data` folder) names."""
-    roots = [r.strip() for r in f"{config.data.root},{config.data.demos}".split(",") if r.strip()]
-    found: set[int] = set()
-    for root in roots:
-        found |= recorded_seeds(Path(root))
-    if run is not None and (run / "data").is_dir():
-        for folder in sorted((run / "data").iterdir()):
-            found |= recorded_seeds(folder)
-    return found
+    return {seed for root in data_folders(config, run) for seed in recorded_seeds(root)}
 
 
 def check_disjoint(seeds: Iterable[int], training: set[int]) -> None:

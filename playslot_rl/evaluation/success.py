@@ -1,4 +1,5 @@
-"""Success in simulation (closed loop) and in imagination (open loop), on a fixed list of seeds, one episode each.
+"""Success in simulation (closed loop) and in imagination (open loop), on a fixed list of seeds, one episode each; and
+that of the references on the same seeds: random actions, the scripted expert, and the slot oracle.
 
 TorchRL's `Evaluator` counts the first N *finished* episodes, which favours short ones and overstates success; the plain
 loop here runs each seed once. That it acts as the TorchRL environments do is tested.
@@ -7,23 +8,27 @@ loop here runs each seed once. That it acts as the TorchRL environments do is te
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import platform
 import time
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
-from playslot_rl.acting.actor import Actor
+from playslot_rl.acting.actor import Actor, ExpertActor, RandomActor
 from playslot_rl.acting.agent import ImaginationActor, oracle_actor, playslot_actor
-from playslot_rl.acting.episodes import TaskPool, run_episodes
+from playslot_rl.acting.episodes import Outcome, TaskPool, run_episodes
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.evaluation.references import episode_records, run_references, summary
+from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
 from playslot_rl.storage.atomic import write_json
+from playslot_rl.threads import available_cores
 from playslot_rl.world_model import Agent
 
 PROTOCOLS = ("simulation", "imagination")
@@ -51,9 +56,6 @@ class RunFacts:
     extra: dict[str, Any] = field(default_factory=dict)
 
 
-_EXTRA = ("pretraining", "env_steps")
-
-
 def run_facts(run: Path, stage: str = "policy") -> RunFacts:
     """Read `RUN/STAGE/checkpoint/meta.json`; a baseline's stage has its method's name.
 
@@ -71,17 +73,13 @@ def run_facts(run: Path, stage: str = "policy") -> RunFacts:
     prints = {str(k): str(v) for k, v in meta.get("parents", {}).items()}
     prints[stage] = str(meta.get("fingerprint", ""))
     return RunFacts(
-        demos=_count(meta.get("demos")),
-        labelled_demos=_count(meta.get("labelled_demos")),
+        demos=meta.get("demos"),
+        labelled_demos=meta.get("labelled_demos"),
         fingerprints=prints,
         commit=str(meta.get("commit", "")),
         method="playslot" if stage == "policy" else stage,
-        extra={name: meta[name] for name in _EXTRA if name in meta},
+        extra={name: meta[name] for name in ("pretraining", "env_steps") if name in meta},
     )
-
-
-def _count(value: Any) -> int | None:
-    return None if value is None else int(value)
 
 
 def check_protocol(protocol: str) -> None:
@@ -180,7 +178,7 @@ def measure(
         "references_protocol": "simulation (closed loop), on the same seeds",
         "max_steps": config.env.max_steps,
         "redrawn": sum(e.redrawn for e in outcome),
-        "per_episode": episode_records(outcome),
+        "per_episode": [asdict(e) for e in outcome],
         "seed": seed,
         **task_facts(config, seed),
         "wall_seconds": round(wall, 2),
@@ -262,15 +260,67 @@ def _stored(run: Path, result: dict[str, Any]) -> dict[str, Any]:
 
 def hardware() -> dict[str, Any]:
     """Processor, cores, threads and GPU."""
-    import os
-
     gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
     return {
         "machine": platform.machine(),
         "system": platform.system(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": available_cores(),
         "threads": torch.get_num_threads(),
         "gpu": gpu,
         "python": platform.python_version(),
         "torch": torch.__version__,
     }
+
+
+def summary(episodes: Sequence[Outcome]) -> dict[str, Any]:
+    """`success_rate` (0 to 1), `ci95` (Wilson) and `mean_steps_to_success` (agent steps; None without a success)."""
+    steps = [e.steps for e in episodes if e.steps is not None]
+    return {
+        "success_rate": len(steps) / len(episodes),
+        "ci95": list(wilson(len(steps), len(episodes))),
+        "mean_steps_to_success": float(np.mean(steps)) if steps else None,
+    }
+
+
+def run_references(
+    oracle: Actor | None,
+    config: ExperimentConfig,
+    seeds: Sequence[int],
+    pool: TaskPool,
+    oracle_fingerprint: str = "",
+    cache: Path | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Results of `random`, `expert` and `slot_oracle`, always closed-loop.
+
+    Args:
+        oracle: the slot oracle beside the agent; None gives null values.
+        config: environment and renderer.
+        seeds: evaluation seeds.
+        pool: environments.
+        oracle_fingerprint: names the weights of oracle and SAVi; empty means that the oracle's result is not cached.
+        cache: JSON file that both protocols of a run share; None means no cache.
+    """
+    actors: dict[str, Actor] = {
+        "random": RandomActor(config.env.max_steps, config.env.action_dim),
+        "expert": ExpertActor(),
+    }
+    if oracle is not None:
+        actors["slot_oracle"] = oracle
+    stored: dict[str, dict[str, Any]] = {}
+    if cache is not None and cache.is_file():
+        with contextlib.suppress(json.JSONDecodeError):  # only a cache: run the references again
+            stored = json.loads(cache.read_text())
+    results: dict[str, dict[str, Any]] = {}
+    for name, actor in actors.items():
+        weights = oracle_fingerprint if name == "slot_oracle" else name
+        what = [weights, to_dict(config.env), to_dict(config.render), list(seeds)]
+        key = f"{name}-{hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]}"
+        if not weights or key not in stored:
+            stored[key] = summary(run_episodes(pool, actor, seeds))
+        results[name] = stored[key]
+    if oracle is None:
+        results["slot_oracle"] = {"success_rate": None, "ci95": None, "mean_steps_to_success": None}
+    if cache is not None:
+        kept = {k: v for k, v in stored.items() if oracle_fingerprint or not k.startswith("slot_oracle")}
+        write_json(cache, kept)
+    return results

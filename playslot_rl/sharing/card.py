@@ -16,7 +16,7 @@ from playslot_rl.sharing.commands import reproduce
 from playslot_rl.sharing.config import LICENCE, TAGS, SharedPolicyConfig
 from playslot_rl.sharing.folder import shared_modules
 from playslot_rl.sharing.source import Result
-from playslot_rl.visualization.markdown import table
+from playslot_rl.visualization.document import table
 
 if TYPE_CHECKING:
     from playslot_rl.world_model import Agent

@@ -19,7 +19,7 @@ from typing import Any
 
 from playslot_rl.allocator import tune_allocator
 from playslot_rl.errors import PlaySlotError
-from playslot_rl.speed.spec import Sizes, Variant
+from playslot_rl.speed.cases import Sizes, Variant
 from playslot_rl.threads import set_threads
 
 

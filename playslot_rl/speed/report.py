@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from playslot_rl.config import BlocksConfig, EnvConfig
-from playslot_rl.speed.spec import Sizes, dynamics_variants, rollout_variants, savi_variants
+from playslot_rl.speed.cases import Sizes, dynamics_variants, rollout_variants, savi_variants
 from playslot_rl.threads import available_cores
-from playslot_rl.visualization import markdown
+from playslot_rl.visualization import document
 
 TARGETS: Final = {
     "savi_step": 2.5,
@@ -45,9 +45,8 @@ def measure(
     """
     from playslot_rl.allocator import tune_allocator
     from playslot_rl.envs.block_ids import block_config
-    from playslot_rl.speed.drawing import render_seconds
+    from playslot_rl.speed.frames import render_seconds, sampling_rates
     from playslot_rl.speed.race import race
-    from playslot_rl.speed.sampling import sampling_rates
 
     tune_allocator()  # of this process, which samples windows, as every recipe does; each child sets its own
     say("SAVi training step, eight variants")
@@ -69,7 +68,7 @@ def measure(
         "window_sampling": {"ratio": rates["cache"] / rates["lerobot"], "unit": "frames/s", **rates},
         "render": _entry(render, "full", "fast"),
         "render_block_push": _entry(blocks, "full", "fast"),
-        "machine": {**machine(), "threads": threads, "repeats": sizes.repeats, "quick": quick},
+        "machine": {**_machine(), "threads": threads, "repeats": sizes.repeats, "quick": quick},
     }
 
 
@@ -77,7 +76,7 @@ def _entry(seconds: Mapping[str, float], slow: str, fast: str) -> Figures:
     return {"ratio": seconds[slow] / seconds[fast], "unit": "s", **seconds}
 
 
-def machine() -> Figures:
+def _machine() -> Figures:
     """What the figures were measured on."""
     from importlib.metadata import version
 
@@ -114,8 +113,8 @@ def table(figures: Figures) -> str:
     m = figures["machine"]
     versions = f"Python {m['python']}, torch {m['torch']}, mujoco {m['mujoco']}, lerobot {m['lerobot']}"
     parts = [
-        markdown.table(["case", "ratio", "target"], ratios),
-        markdown.table(["case", "variant", "median"], medians),
+        document.table(["case", "ratio", "target"], ratios),
+        document.table(["case", "variant", "median"], medians),
         f"{m['cpu']}, {m['cores']} cores, {m['system']}, {versions}; medians of {m['repeats']}",
     ]
     return "\n\n".join(parts)

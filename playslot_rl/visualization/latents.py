@@ -10,6 +10,7 @@ import numpy as np
 
 from playslot_rl.errors import DataError
 from playslot_rl.evaluation.probes import code_table, codebook_usage, infer_latents, probe_actions
+from playslot_rl.evaluation.seeds import data_folders
 from playslot_rl.visualization.charts import usage_chart
 from playslot_rl.visualization.document import Block, Missing, Section, Table, Text
 from playslot_rl.visualization.sections import ReportInput, chart
@@ -35,10 +36,7 @@ class LatentData:
 
 def data_roots(given: ReportInput) -> list[Path]:
     """Data sets of the run: those its config names, then those in its `data` folder."""
-    config = given.config.data
-    named = [Path(r.strip()) for r in f"{config.root},{config.demos}".split(",") if r.strip()]
-    inside = sorted((given.run / "data").iterdir()) if (given.run / "data").is_dir() else []
-    found = [p for p in [*named, *inside] if (p / "meta" / "info.json").is_file()]
+    found = [p for p in data_folders(given.config, given.run) if (p / "meta" / "info.json").is_file()]
     return list({p.resolve(): p for p in found}.values())
 
 

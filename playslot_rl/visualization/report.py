@@ -4,28 +4,44 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import nullcontext
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from playslot_rl.acting.actor import ExpertActor
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.envs import PROCEDURAL
+from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.evaluation.objects import RESULT, parse_clips, seed_frames
+from playslot_rl.evaluation.seeds import first_seed
+from playslot_rl.evaluation.success import hardware
+from playslot_rl.frames import to_uint8
 from playslot_rl.storage.atomic import write_bytes, write_text
 from playslot_rl.storage.checkpoints import checkpoint_folder
 from playslot_rl.training.runs import world_model_folder
-from playslot_rl.visualization.document import Block, Document, Picture, Section, Table, Text
-from playslot_rl.visualization.html import to_html
+from playslot_rl.visualization.document import (
+    Block,
+    Document,
+    Missing,
+    Picture,
+    Section,
+    Table,
+    Text,
+    to_html,
+    to_markdown,
+)
+from playslot_rl.visualization.grid import film_strip, png
 from playslot_rl.visualization.latents import latent_section
-from playslot_rl.visualization.markdown import to_markdown
-from playslot_rl.visualization.rollouts import expert_frames
+from playslot_rl.visualization.rollouts import record
 from playslot_rl.visualization.sections import (
     STAGES,
     ReportInput,
-    machine_row,
-    model_rows,
+    percent,
     prototype_section,
     read_evaluations,
     rollout_section,
@@ -62,33 +78,15 @@ def write_report(
         OutputError: a file cannot be written.
     """
     config = config or stored_config(run)
-    if config.env.name in PROCEDURAL:
-        from playslot_rl.visualization.object_report import build as build_objects
-
-        model = world_model.eval() if world_model is not None else None
-        return save(run, build_objects(run, config, model, shown_path(run), read_metas(run)))
-    own = TaskPool(config.env, config.render) if pool is None else None
-    used = pool or own
-    assert used is not None
     model = world_model or (agent.world_model if agent is not None else None)
     for module in (model, agent):
         if module is not None:
             module.eval()
-    given = ReportInput(run, config, model, agent, used, shown_path(run), read_metas(run))
-    try:
-        document = build(given)
-    finally:
-        if own is not None:
-            own.close()
-    return save(run, document)
-
-
-def save(run: Path, document: Document) -> Path:
-    """Write a report and its figures into a run folder; returns the path of the HTML file.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
+    with TaskPool(config.env, config.render) if pool is None else nullcontext(pool) as used:
+        relative = os.path.relpath(run)
+        shown = relative if not relative.startswith("..") else run.name
+        given = ReportInput(run, config, model, agent, used, shown, read_metas(run))
+        document = build_objects(given) if config.env.name in PROCEDURAL else build(given)
     figures = run / "figures"
     figures.mkdir(parents=True, exist_ok=True)
     for section in document.sections:
@@ -124,21 +122,12 @@ def read_metas(run: Path) -> dict[str, dict[str, Any]]:
     return {stage: json.loads(path.read_text()) for stage, path in paths.items() if path.is_file()}
 
 
-def shown_path(run: Path) -> str:
-    """The run folder relative to the working directory; only its name where it lies elsewhere."""
-    relative = os.path.relpath(run)
-    return relative if not relative.startswith("..") else run.name
-
-
 def build(given: ReportInput) -> Document:
     """All sections, success first."""
-    clips: list[Any] = []
 
+    @cache
     def clip() -> Any:
-        if not clips:
-            clips.append(expert_frames(given.pool, given.first_seed))
-        frames: np.ndarray[Any, Any] = clips[0]
-        return frames
+        return record(given.pool, ExpertActor(), [given.first_seed])[0][0]
 
     sections = [
         success_section(given),
@@ -168,33 +157,40 @@ def labels_used(given: ReportInput) -> str:
 
 def settings_section(given: ReportInput) -> Section:
     """Settings, sizes and what a reader should know before quoting a number."""
-    config, model = given.config, given.world_model
-    env = config.env
-    rows = [
-        ["frames", f"{env.image_size} x {env.image_size} pixels, rendering `{config.render.quality}`"],
+    env, model = given.config.env, given.world_model
+    task = [
+        ["frames", f"{env.image_size} x {env.image_size} pixels, rendering `{given.config.render.quality}`"],
         ["agent step", f"{env.frame_skip} environment steps; at most {env.max_steps} agent steps an episode"],
         ["warm-up", f"{env.warmup_steps} random agent steps after each reset"],
     ]
-    rows += model_rows(model)
+    measured = []
     if model is not None:
-        sizes = {
-            name: sum(p.numel() for p in module.parameters()) for name, module in _parts(model, given.agent).items()
-        }
-        rows.append(["parameters", ", ".join(f"{name} {size:,}" for name, size in sizes.items())])
+        parts: dict[str, Any] = {"SAVi": model.savi, "InvDyn": model.inverse_dynamics, "cOCVP": model.predictor}
+        if given.agent is not None:
+            parts |= {"policy": given.agent.policy, "action decoder": given.agent.action_decoder}
+        sizes = {name: sum(p.numel() for p in part.parameters()) for name, part in parts.items()}
+        measured.append(["parameters", ", ".join(f"{name} {size:,}" for name, size in sizes.items())])
     for protocol, result in read_evaluations(given.run).items():
         seeds = result["seeds"]
         what = f"{len(seeds)} seeds from {min(seeds)} to {max(seeds)}, {seconds(result.get('wall_seconds'))}"
-        rows.append([f"evaluation, {protocol}", f"{what}, {result.get('redrawn', 0)} redrawn"])
-    rows.append(machine_row())
-    blocks: list[Block] = [Table(["setting", "value"], rows), *(Text(note) for note in notes(given))]
-    return Section("Settings and notes", blocks)
+        measured.append([f"evaluation, {protocol}", f"{what}, {result.get('redrawn', 0)} redrawn"])
+    return Section("Settings and notes", [_settings(model, task, measured), *(Text(note) for note in notes(given))])
 
 
-def _parts(model: WorldModel, agent: Agent | None) -> dict[str, Any]:
-    parts: dict[str, Any] = {"SAVi": model.savi, "InvDyn": model.inverse_dynamics, "cOCVP": model.predictor}
-    if agent is not None:
-        parts |= {"policy": agent.policy, "action decoder": agent.action_decoder}
-    return parts
+def _settings(model: WorldModel | None, task: list[list[str]], measured: list[list[str]]) -> Table:
+    """The rows of the task, of the world model, of what was measured, and of the machine that makes the report."""
+    rows = list(task)
+    if model is not None:
+        savi, inverse = model.config.savi, model.config.inverse_dynamics
+        rows += [
+            ["slots", f"{savi.n_slots} of width {savi.slot_dim}"],
+            ["latent actions", f"{inverse.mode}, {inverse.variant}, width {model.latent_shape[-1]}"],
+            ["prototypes", str(model.inverse_dynamics.n_prototypes)],
+        ]
+    machine = hardware()
+    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
+    here = ["report made on", f"{machine['machine']}, {machine['cores']} cores{gpu}, torch {machine['torch']}"]
+    return Table(["setting", "value"], [*rows, *measured, here])
 
 
 def notes(given: ReportInput) -> list[str]:
@@ -221,3 +217,112 @@ def notes(given: ReportInput) -> list[str]:
     if len(seeds) == 1:
         found.append("One training seed: the intervals cover the choice of episodes, not that of the training run.")
     return found
+
+
+# --- videos whose objects and moves are known (GridShapes): no policy, but ARI and probes ---------------------------
+
+CLIPS_SHOWN = 3
+PROBES = {"prototype": "from the slot's prototype", "latent": "from the slot's latent action (mean)"}
+
+
+def build_objects(given: ReportInput) -> Document:
+    """All sections of the report on known objects; what is missing is named with its command."""
+    config, grid = given.config, given.config.env.grid
+    path = given.run / RESULT
+    result = json.loads(path.read_text()) if path.is_file() else None
+    seed = first_seed(config, config.seed) if result is None else int(result["seeds"][0])
+    clips = generate(range(seed, seed + CLIPS_SHOWN), config.env.max_steps, config.env)
+    sections = [
+        scores_section(given, result),
+        prediction_section(given, clips.frames, result),
+        slots_section(given, lambda: clips.frames[0], "The first evaluated clip."),
+        prototype_section(given, lambda: clips.frames[0]),
+        code_section(result),
+        training_section(given, ("slots", "dynamics")),
+        object_settings(given, result),
+    ]
+    lead = (
+        f"`{config.env.name}` with {grid.objects} objects, preset `{config.preset}`, seed {config.seed}. A PlaySlot "
+        "world model learned from videos alone; where the objects are and what they did is known, and only scores it."
+    )
+    return Document(f"PlaySlot report: {given.run.resolve().name}", lead, sections)
+
+
+def scores_section(given: ReportInput, result: dict[str, Any] | None) -> Section:
+    """ARI and probes."""
+    title = "Objects and moves"
+    if result is None:
+        return Section(title, [Missing("Nothing has been scored yet.", given.command("evaluate"))])
+    ari = [
+        ["all pixels", f"{result['ari']:.3f}"],
+        ["pixels of objects (FG-ARI)", f"{result['foreground_ari']:.3f}"],
+    ]
+    caption = (
+        f"Slot masks against the true masks, {result['episodes']} held-out clips scored as wholes; 1 is perfect, 0 is "
+        "chance. Each pixel belongs to the slot with the largest mask."
+    )
+    probes = [
+        [label, percent(p["accuracy"]), percent(p["majority"]), percent(p["chance"]), str(p["test"])]
+        for name, label in PROBES.items()
+        if (p := result["probes"].get(name)) is not None
+    ]
+    headers = ["move of an object, read", "accuracy", "most frequent move", "chance", "moves tested"]
+    note = "Logistic regression, fitted and tested on different clips. A slot belongs to the object it overlaps most."
+    blocks: list[Block] = [Table(["adjusted Rand index", "mean"], ari, caption), Table(headers, probes, note)]
+    if result["unmatched"]:
+        blocks.append(
+            Text(f"{result['unmatched']} objects got no slot: there are fewer slots than objects and ground.")
+        )
+    return Section(title, blocks)
+
+
+def prediction_section(given: ReportInput, frames: Any, result: dict[str, Any] | None) -> Section:
+    """Predicted beside true frames."""
+    title = "Prediction"
+    if given.world_model is None:
+        return Section(title, [Missing("There is no trained dynamics model.", given.command("train-dynamics"))])
+    parsed = parse_clips(given.world_model, frames)
+    predicted, seed = to_uint8(parsed.predicted), seed_frames(given.config.env.max_steps)
+    pairs = np.stack([frames[:, seed : seed + predicted.shape[1]], predicted], 1)
+    labels = [f"{c + 1} {name}" for c in range(len(frames)) for name in ("true", "predicted")]
+    drawn = film_strip(pairs.reshape(-1, *pairs.shape[2:]), labels, first=seed)
+    blocks: list[Block] = []
+    if result is not None:
+        ahead = result["prediction"]
+        blocks.append(
+            Text(
+                f"{ahead['predicted_frames']} frames predicted from {ahead['seed_frames']} seen ones, under the latent "
+                f"actions inferred from the true video: PSNR {ahead['psnr']:.1f} dB, SSIM {ahead['ssim']:.3f}; "
+                f"reconstruction {result['reconstruction']['psnr']:.1f} dB. The paper (two objects): 54.1 dB and 0.996."
+            )
+        )
+    alt = "Two rows a clip: true frames and the predictions for the same times."
+    return Section(title, [*blocks, Picture("prediction", png(drawn), alt, "The first evaluated clips, not chosen.")])
+
+
+def code_section(result: dict[str, Any] | None) -> Section:
+    """What the objects did, by prototype."""
+    title = "Prototypes and moves"
+    if result is None or result["codes"] is None:
+        return Section(title, [Text("No prototypes have been scored.")])
+    rows = []
+    for code, counts in enumerate(result["codes"]):
+        total = sum(counts)
+        rows.append([f"code {code}", str(total), *(percent(n / total if total else None) for n in counts)])
+    caption = "Transitions of objects whose slot has this prototype, and what the object did."
+    return Section(title, [Table(["", "transitions", *result["moves"]], rows, caption)])
+
+
+def object_settings(given: ReportInput, result: dict[str, Any] | None) -> Section:
+    """Settings and sizes."""
+    env, grid = given.config.env, given.config.env.grid
+    task = [
+        ["frames", f"{env.image_size} x {env.image_size} pixels, drawn from seeds"],
+        ["objects", f"{grid.objects} of {grid.size} pixels, {grid.speed} pixels a step"],
+        ["new direction", f"with probability {grid.change} at each step"],
+    ]
+    measured = []
+    if result is not None:
+        seeds, took = result["seeds"], seconds(result.get("wall_seconds"))
+        measured.append(["scored", f"{len(seeds)} clips, seeds {min(seeds)} to {max(seeds)}, {took}"])
+    return Section("Settings", [_settings(given.world_model, task, measured)])

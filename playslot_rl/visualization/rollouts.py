@@ -15,13 +15,12 @@ from PIL import Image
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import Actor, ExpertActor
+from playslot_rl.acting.actor import Actor
 from playslot_rl.acting.agent import ImaginationActor, playslot_actor
 from playslot_rl.acting.episodes import Moment, Outcome, TaskPool, run_episodes
 from playslot_rl.evaluation.video import VideoMetrics, video_metrics
 from playslot_rl.frames import to_float, to_uint8
-from playslot_rl.visualization.animation import side_by_side
-from playslot_rl.visualization.grid import image_grid
+from playslot_rl.visualization.grid import film_strip, side_by_side
 from playslot_rl.world_model import Agent
 
 Frames = npt.NDArray[np.uint8]
@@ -33,21 +32,18 @@ class Rollouts:
     """The same episodes imagined, executed open-loop, and run closed-loop.
 
     Attributes:
-        imagined: (E, T + 1, H, W, 3) frames decoded from the unfolded slots.
-        executed: same shape; the imagined rollout's actions in the simulator.
-        closed: same shape; the agent observing every frame.
-        executed_outcome, closed_outcome: their episodes.
+        clips: (E, 3, T + 1, H, W, 3): frames decoded from the unfolded slots, those of the imagined actions in
+            the simulator, and those of the agent observing every frame.
+        executed_outcome, closed_outcome: the episodes of the last two.
     """
 
-    imagined: Frames
-    executed: Frames
-    closed: Frames
+    clips: Frames
     executed_outcome: list[Outcome]
     closed_outcome: list[Outcome]
 
     def metrics(self) -> VideoMetrics:
         """PSNR and SSIM of the imagined against the executed frames, without the parsed first one."""
-        return video_metrics(to_float(self.imagined[:, 1:]), to_float(self.executed[:, 1:]))
+        return video_metrics(to_float(self.clips[:, 0, 1:]), to_float(self.clips[:, 1, 1:]))
 
 
 def record(
@@ -65,12 +61,6 @@ def record(
     return frames, run_episodes(pool, actor, seeds, keep, stop=False)
 
 
-def expert_frames(pool: TaskPool, seed: int) -> Frames:
-    """Frames (T + 1, H, W, 3) of one episode of the scripted expert."""
-    frames: Frames = record(pool, ExpertActor(), [seed])[0][0]
-    return frames
-
-
 @torch.no_grad()
 def run_rollouts(agent: Agent, pool: TaskPool, seeds: Sequence[int]) -> Rollouts:
     """Run the episodes of `seeds` both ways."""
@@ -84,22 +74,15 @@ def run_rollouts(agent: Agent, pool: TaskPool, seeds: Sequence[int]) -> Rollouts
     slots = torch.cat(unfolded)
     imagined = np.stack([to_uint8(agent.world_model.savi.decode(s).frames) for s in slots])
     closed, closed_outcome = record(pool, playslot_actor(agent), seeds)
-    return Rollouts(imagined, executed, closed, executed_outcome, closed_outcome)
+    return Rollouts(np.stack([imagined, executed, closed], 1), executed_outcome, closed_outcome)
 
 
-def draw_animation(rollouts: Rollouts, scale: int = 2) -> list[Image.Image]:
+def draw_animation(rollouts: Rollouts) -> list[Image.Image]:
     """One picture a step: a row an episode, the three ways of running it side by side."""
-    clips = np.stack([rollouts.imagined, rollouts.executed, rollouts.closed], 1)
-    return side_by_side(clips, COLUMNS, [f"episode {i + 1}" for i in range(len(clips))], scale)
+    return side_by_side(rollouts.clips, COLUMNS, [f"episode {i + 1}" for i in range(len(rollouts.clips))])
 
 
-def draw_strip(rollouts: Rollouts, columns: int = 8, scale: int = 2) -> Image.Image:
+def draw_strip(rollouts: Rollouts) -> Image.Image:
     """Frames spread evenly over time: three rows an episode."""
-    steps = rollouts.imagined.shape[1]
-    shown = np.unique(np.linspace(0, steps - 1, min(columns, steps)).round().astype(int))
-    rows, labels = [], []
-    for i in range(len(rollouts.imagined)):
-        for name, clip in zip(COLUMNS, (rollouts.imagined, rollouts.executed, rollouts.closed), strict=True):
-            rows.append(clip[i, shown])
-            labels.append(f"{i + 1} {name}")
-    return image_grid(np.stack(rows), labels, [f"t = {t}" for t in shown], scale)
+    labels = [f"{i + 1} {name}" for i in range(len(rollouts.clips)) for name in COLUMNS]
+    return film_strip(rollouts.clips.reshape(-1, *rollouts.clips.shape[2:]), labels)

@@ -11,11 +11,10 @@ from typing import Any
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.seeds import first_seed
-from playslot_rl.evaluation.success import PROTOCOLS, hardware
-from playslot_rl.visualization.charts import loss_chart, loss_names, success_chart
+from playslot_rl.evaluation.success import PROTOCOLS
+from playslot_rl.visualization.charts import DARK, LIGHT, Theme, loss_chart, loss_names, success_chart
 from playslot_rl.visualization.document import Block, Missing, Picture, Section, Table, Text
 from playslot_rl.visualization.grid import png
-from playslot_rl.visualization.palette import DARK, LIGHT, Theme
 from playslot_rl.world_model import Agent, WorldModel
 
 STAGES = ("slots", "dynamics", "policy")
@@ -112,9 +111,11 @@ def success_section(given: ReportInput) -> Section:
             if r["success_rate"] is not None
         ]
         alt = "; ".join(f"{n}: {percent(rate)}, {interval(list(ci))}" for n, rate, ci, _ in drawn)
-        blocks.append(
-            chart("success", lambda theme: success_chart(drawn, theme), f"Success rates. {alt}.", _ways(given))
+        ways = (
+            "Simulation: the agent sees every frame. Imagination: it sees the first frame only, unfolds "
+            f"{given.config.env.max_steps} steps in latent space, and the decoded actions are then executed."
         )
+        blocks.append(chart("success", lambda theme: success_chart(drawn, theme), f"Success rates. {alt}.", ways))
     for protocol in PROTOCOLS:
         if protocol not in results:
             command = given.command("evaluate", f"protocol={protocol}")
@@ -125,13 +126,6 @@ def success_section(given: ReportInput) -> Section:
 def _steps(result: dict[str, Any]) -> str:
     value = result.get("mean_steps_to_success")
     return "–" if value is None else f"{value:.1f}"
-
-
-def _ways(given: ReportInput) -> str:
-    return (
-        "Simulation: the agent sees every frame. Imagination: it sees the first frame only, unfolds "
-        f"{given.config.env.max_steps} steps in latent space, and the decoded actions are then executed."
-    )
 
 
 def _success_rows(results: dict[str, dict[str, Any]]) -> list[tuple[str, dict[str, Any], str, str]]:
@@ -151,7 +145,7 @@ def rollout_section(given: ReportInput) -> Section:
     title = "Imagined and simulated rollouts"
     if given.agent is None:
         return Section(title, [Missing("There is no trained policy.", given.command("train-policy"))])
-    from playslot_rl.visualization.animation import animation
+    from playslot_rl.visualization.grid import animation
     from playslot_rl.visualization.rollouts import draw_animation, draw_strip, run_rollouts
 
     start = given.first_seed
@@ -213,7 +207,7 @@ def prototype_section(given: ReportInput, clip: Callable[[], Any]) -> Section:
     if model.inverse_dynamics.n_prototypes == 0:
         mode = model.config.inverse_dynamics.mode
         return Section(title, [Text(f"The latent-action mode is `{mode}`, which has no prototypes.")])
-    from playslot_rl.visualization.prototypes import draw_prototypes
+    from playslot_rl.visualization.slots import draw_prototypes
 
     alt = "One row a prototype: the first frame and imagined frames up to t = 15, then a map of what changed."
     caption = (
@@ -287,25 +281,3 @@ def training_section(given: ReportInput, stages: Sequence[str] = STAGES) -> Sect
     if elsewhere:
         blocks.append(Text(f"No loss curves here for {', '.join(elsewhere)}: trained outside this run folder."))
     return Section("Training", blocks)
-
-
-# --- settings -----------------------------------------------------------------------------------------------------
-
-
-def model_rows(model: WorldModel | None) -> list[list[str]]:
-    """Slots, latent actions and prototypes of a world model; nothing without one."""
-    if model is None:
-        return []
-    savi, inverse = model.config.savi, model.config.inverse_dynamics
-    return [
-        ["slots", f"{savi.n_slots} of width {savi.slot_dim}"],
-        ["latent actions", f"{inverse.mode}, {inverse.variant}, width {model.latent_shape[-1]}"],
-        ["prototypes", str(model.inverse_dynamics.n_prototypes)],
-    ]
-
-
-def machine_row() -> list[str]:
-    """The machine that makes the report."""
-    machine = hardware()
-    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
-    return ["report made on", f"{machine['machine']}, {machine['cores']} cores{gpu}, torch {machine['torch']}"]

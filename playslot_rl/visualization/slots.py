@@ -1,33 +1,26 @@
-"""What each slot holds: reconstruction, objects and segmentation.
+"""What the parts of a world model hold: slots as masks and objects, action prototypes by what they do.
 
-Shapes: T frames, N slots, H W image height and width.
+Shapes: T frames, N slots, K prototypes, P predicted frames, H W image height and width.
 """
 
 from __future__ import annotations
-
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from PIL import Image
+from PIL.ImageColor import getrgb
 
 from playslot_rl.frames import to_float, to_uint8
-from playslot_rl.modules.savi import SAVi
-from playslot_rl.visualization.grid import image_grid
-from playslot_rl.visualization.palette import OKABE_ITO, rgb
+from playslot_rl.visualization.charts import OKABE_ITO
+from playslot_rl.visualization.grid import film_strip, image_grid
+from playslot_rl.world_model import WorldModel
 
 Frames = npt.NDArray[np.uint8]
 
 
-class HasSAVi(Protocol):
-    """A world model, as far as the slots are concerned."""
-
-    savi: SAVi
-
-
 @torch.no_grad()
-def slot_cells(model: HasSAVi, frames: Frames) -> Frames:
+def slot_cells(model: WorldModel, frames: Frames) -> Frames:
     """Rows of pictures for a clip.
 
     Args:
@@ -54,16 +47,69 @@ def segmentation(frames: Frames, masks: npt.NDArray[np.float32]) -> Frames:
         frames: (T, H, W, 3) uint8.
         masks: (T, N, 1, H, W), sum to one over N.
     """
-    colours = np.array([rgb(OKABE_ITO[n % len(OKABE_ITO)]) for n in range(masks.shape[1])], np.float32)
+    colours = np.array([getrgb(OKABE_ITO[n % len(OKABE_ITO)]) for n in range(masks.shape[1])], np.float32)
     colour = colours[masks[:, :, 0].argmax(1)]
     grey = frames.astype(np.float32).mean(-1, keepdims=True)
     mixed: Frames = np.clip(0.6 * colour + 0.4 * grey, 0, 255).astype(np.uint8)
     return mixed
 
 
-def draw_slots(model: HasSAVi, frames: Frames, columns: int = 6) -> Image.Image:
+def draw_slots(model: WorldModel, frames: Frames, columns: int = 6) -> Image.Image:
     """Grid for `columns` frames spread evenly over a clip (T, H, W, 3)."""
     cells = slot_cells(model, frames)
-    shown = np.unique(np.linspace(0, len(frames) - 1, min(columns, len(frames))).round().astype(int))
     labels = ["frame", "reconstruction", "segmentation", *(f"slot {n + 1}" for n in range(cells.shape[0] - 3))]
-    return image_grid(cells[:, shown], labels, [f"t = {t}" for t in shown])
+    return film_strip(cells, labels, columns)
+
+
+@torch.no_grad()
+def prototype_frames(model: WorldModel, frame: Frames, steps: int = 15) -> Frames:
+    """Frames imagined while each prototype is held, with zero variability.
+
+    Args:
+        model: world model with a codebook.
+        frame: (H, W, 3) uint8, the first frame.
+        steps: P.
+
+    Returns:
+        (K, P, H, W, 3) uint8. With one latent per slot every slot gets the prototype.
+
+    Raises:
+        ValueError: the latent-action mode has no prototypes.
+    """
+    mode = model.config.inverse_dynamics.mode
+    if mode not in ("hybrid", "discrete"):
+        raise ValueError(f"prototypes: got latent-action mode {mode}, expected hybrid or discrete")
+    device = next(model.savi.parameters()).device
+    generator = torch.Generator(device).manual_seed(0)
+    slots, _ = model.savi(to_float(frame, device)[None, None], generator=generator)
+    prototypes = model.inverse_dynamics.prototypes
+    k = len(prototypes)
+    p = prototypes[:, None].expand(k, steps, -1)
+    if model.inverse_dynamics.per_slot:
+        p = p[:, :, None].expand(k, steps, slots.shape[2], -1)
+    predicted = model.predictor.rollout(slots.expand(k, -1, -1, -1), p, torch.zeros_like(p))
+    return to_uint8(model.savi.decode(predicted).frames)
+
+
+def draw_prototypes(model: WorldModel, frame: Frames, steps: int = 15, columns: int = 8) -> Image.Image:
+    """Rows are prototypes, columns the first frame and imagined frames up to `steps`; last, the change since t = 0."""
+    imagined = prototype_frames(model, frame, steps)
+    first = np.broadcast_to(frame, (len(imagined), 1, *frame.shape))
+    clips = np.concatenate([first, imagined], 1)
+    shown = np.unique(np.linspace(0, steps, min(columns, steps + 1)).round().astype(int))
+    change = change_map(clips[:, 1], clips[:, -1])[:, None]
+    cells = np.concatenate([clips[:, shown], change], 1)
+    return image_grid(cells, [f"code {k}" for k in range(len(cells))], [*(f"t = {t}" for t in shown), "change"])
+
+
+def change_map(before: Frames, after: Frames) -> Frames:
+    """Where pictures (K, H, W, 3) differ: blue what left, orange what came, on white (by change in brightness).
+
+    The first *imagined* frame is the reference, so that the decoder's blur is not shown as motion.
+    """
+    difference = after.astype(np.float32).mean(-1) - before.astype(np.float32).mean(-1)
+    strength = np.clip(np.abs(difference) / 48.0, 0, 1)[..., None]
+    blue, orange = np.array([0, 114, 178], np.float32), np.array([213, 94, 0], np.float32)
+    colour = np.where(difference[..., None] > 0, orange, blue)
+    picture: Frames = (255 * (1 - strength) + colour * strength).astype(np.uint8)
+    return picture

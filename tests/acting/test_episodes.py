@@ -12,7 +12,7 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import ExpertActor, RandomActor
 from playslot_rl.acting.episodes import LOCKSTEP, Actions, Moment, Task, TaskPool, run_episodes
 from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.evaluation.references import summary
+from playslot_rl.evaluation.success import summary
 
 
 class Counter:

@@ -12,9 +12,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from jobs_on_disk import comparison, finish
 
+from playslot_rl.comparison.launch import Status, write_status
 from playslot_rl.comparison.plan import Job
-from playslot_rl.comparison.results import job_rows, summarise
-from playslot_rl.comparison.status import Status, write_status
+from playslot_rl.comparison.report import job_rows, summarise
 from playslot_rl.storage.atomic import write_json
 
 

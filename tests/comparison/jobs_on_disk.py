@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
+from playslot_rl.comparison.launch import Status, write_status
 from playslot_rl.comparison.plan import Job
-from playslot_rl.comparison.status import Status, write_status
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.tensors import save_tensors

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from playslot_rl.comparison import launch
-from playslot_rl.comparison.status import Status, job_lock, log_file, read_status, write_status
+from playslot_rl.comparison.launch import Status, job_lock, log_file, read_status, write_status
 from playslot_rl.errors import PlaySlotError
 
 

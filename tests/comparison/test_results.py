@@ -9,14 +9,12 @@ from typing import Any
 import pytest
 from jobs_on_disk import comparison, finish
 
+from playslot_rl.comparison.page import cell, comparison_figure, comparison_page
 from playslot_rl.comparison.plan import Job
-from playslot_rl.comparison.results import count_parameters, failures, job_rows, summarise
-from playslot_rl.comparison.table import cell, comparison_page
+from playslot_rl.comparison.report import count_parameters, failures, job_rows, summarise
 from playslot_rl.config import MethodName
 from playslot_rl.evaluation.intervals import wilson
-from playslot_rl.visualization.charts import figure_bytes
-from playslot_rl.visualization.comparison import comparison_figure
-from playslot_rl.visualization.palette import LIGHT, METHOD_STYLES
+from playslot_rl.visualization.charts import LIGHT, METHOD_STYLES, figure_bytes
 
 
 def _of(result: dict[str, Any], method: str, protocol: str = "simulation", demos: int | None = 10) -> dict[str, Any]:
@@ -41,7 +39,7 @@ def test_a_failed_job_is_a_row_and_no_number(ended: dict[str, Any]) -> None:
 
 
 def test_what_an_older_run_of_a_failed_job_left_is_not_counted(tmp_path: Path) -> None:
-    from playslot_rl.comparison.status import Status, write_status
+    from playslot_rl.comparison.launch import Status, write_status
 
     job = finish(Job("lapo", 10, 0, tmp_path), {"simulation": 9})
     write_status(job.file, Status("failed", "f", "out of memory", 1.0))

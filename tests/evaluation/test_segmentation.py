@@ -7,7 +7,7 @@ import pytest
 
 from playslot_rl.config import EnvConfig
 from playslot_rl.envs.grid_shapes import generate
-from playslot_rl.evaluation.segmentation import adjusted_rand_index, match_slots, overlaps
+from playslot_rl.evaluation.objects import adjusted_rand_index, match_slots, overlaps
 
 TRUTH = generate([1], 6, EnvConfig(name="grid_shapes")).masks[0]
 

@@ -19,7 +19,7 @@ from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.acting.episodes import TaskPool, run_episodes
 from playslot_rl.config import EvaluationConfig, ExperimentConfig
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.evaluation import references
+from playslot_rl.evaluation import success
 from playslot_rl.evaluation.success import RunFacts, evaluate, evaluate_run, run_facts
 from playslot_rl.testing import tiny_config
 from playslot_rl.world_model import Agent, WorldModel, latent_policy_module
@@ -106,14 +106,14 @@ def test_references_are_run_once_for_both_protocols(
     (tmp_path / "evaluation").mkdir()
     first = evaluate(agent, config, "simulation", 1, 0, facts=FACTS, run=tmp_path, pool=pool)
     calls: list[str] = []
-    real = references.run_episodes
-    monkeypatch.setattr(references, "run_episodes", lambda _, c, s: calls.append(type(c).__name__) or real(pool, c, s))
+    real = success.run_episodes
+    monkeypatch.setattr(success, "run_episodes", lambda _, c, s: calls.append(type(c).__name__) or real(pool, c, s))
     again = evaluate(agent, config, "imagination", 1, 0, facts=FACTS, run=tmp_path, pool=pool)
-    assert not calls
+    assert calls == ["ImaginationActor"]  # the agent alone
     assert again["references"] == first["references"]
     other = replace(FACTS, fingerprints={"slots": "a", "policy": "another"})
     evaluate(agent, config, "imagination", 1, 0, facts=other, run=tmp_path, pool=pool)
-    assert calls == ["SlotActor"]  # another oracle; random and expert do not depend on weights
+    assert calls[1:] == ["ImaginationActor", "SlotActor"]  # another oracle; random and expert depend on no weights
 
 
 def test_training_seeds_are_never_evaluated(

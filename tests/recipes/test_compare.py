@@ -16,7 +16,7 @@ import pytest
 from commands import ONE_CORE, Done, assert_one_line, contents, playslot
 
 from playslot_rl.comparison import launch
-from playslot_rl.comparison.status import Status, comparison_lock
+from playslot_rl.comparison.launch import Status, comparison_lock
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.recipes import compare_job
 

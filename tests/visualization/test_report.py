@@ -17,9 +17,7 @@ from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.testing import tiny_config
 from playslot_rl.visualization import latents
 from playslot_rl.visualization.charts import loss_names
-from playslot_rl.visualization.document import Document, Missing, Section, Table, Text
-from playslot_rl.visualization.html import to_html
-from playslot_rl.visualization.markdown import to_markdown
+from playslot_rl.visualization.document import Document, Missing, Section, Table, Text, to_html, to_markdown
 from playslot_rl.visualization.report import write_report
 from playslot_rl.world_model import Agent, WorldModel
 

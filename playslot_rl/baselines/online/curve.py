@@ -64,8 +64,7 @@ def draw_curve(folder: Path, name: str, rows: Sequence[Mapping[str, Any]], rando
     Raises:
         OutputError: full disk.
     """
-    from playslot_rl.visualization.charts import learning_chart
-    from playslot_rl.visualization.palette import DARK, LIGHT
+    from playslot_rl.visualization.charts import DARK, LIGHT, learning_chart
 
     for theme in (LIGHT, DARK):
         write_bytes(folder / f"curve_{theme.name}.png", learning_chart({name: rows}, random, theme))

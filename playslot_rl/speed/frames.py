@@ -1,6 +1,8 @@
-"""Reading training windows: frame cache and `sample_windows` against `LeRobotDataset` and `DataLoader`.
+"""Frames read and drawn, each fast and as the libraries do it.
 
-Both deliver batches of float32 frames (B, T, 3, H, W) in [0, 1] of random windows of the same small data set.
+Reading: frame cache and `sample_windows` against `LeRobotDataset` and `DataLoader`; both give batches of float32 frames
+(B, T, 3, H, W) in [0, 1] of random windows of the same small data set. Drawing: the fast path against MuJoCo's default
+off-screen settings, same scene, same process.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ import contextlib
 import tempfile
 import time
 from collections.abc import Callable, Generator
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -18,11 +21,12 @@ import numpy as np
 from torch import Tensor
 
 from playslot_rl import keys
+from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.data.source import open_source
 from playslot_rl.data.windows import sample_windows
 from playslot_rl.frames import normalise
 from playslot_rl.progress import quiet_datasets
-from playslot_rl.speed.spec import Sizes
+from playslot_rl.speed.cases import Sizes
 from playslot_rl.threads import available_cores
 
 _FPS = 10
@@ -38,7 +42,13 @@ def sampling_rates(sizes: Sizes) -> dict[str, float]:
     frames = sizes.window_batch * sizes.window
     with tempfile.TemporaryDirectory(prefix="playslot-bench-") as folder, quiet_datasets():
         root = write_dataset(Path(folder) / "data", sizes)
-        cached = cache_batches(root, Path(folder) / "cache", sizes)
+        source, generator = open_source(root, cache=Path(folder) / "cache"), np.random.default_rng(0)
+
+        def cached() -> Tensor:
+            """A batch as the training stages read it, as floats."""
+            rows = sample_windows(source.starts, source.lengths, sizes.window, sizes.window_batch, generator)
+            return normalise(source.pixels(rows))
+
         for _ in range(sizes.repeats + 1):
             rates["cache"].append(frames / _seconds(cached, sizes.cache_batches, sizes))
             with contextlib.closing(lerobot_batches(root, sizes)) as batches:
@@ -82,17 +92,6 @@ def write_dataset(root: Path, sizes: Sizes) -> Path:
     return root
 
 
-def cache_batches(root: Path, cache: Path, sizes: Sizes) -> Callable[[], Tensor]:
-    """Batches as the training stages read them, as floats."""
-    source, generator = open_source(root, cache=cache), np.random.default_rng(0)
-
-    def read() -> Tensor:
-        rows = sample_windows(source.starts, source.lengths, sizes.window, sizes.window_batch, generator)
-        return normalise(source.pixels(rows))
-
-    return read
-
-
 def lerobot_batches(root: Path, sizes: Sizes) -> Generator[Tensor]:
     """Batches as LeRobot's own training reads them, for ever."""
     import torch
@@ -114,3 +113,28 @@ def lerobot_batches(root: Path, sizes: Sizes) -> Generator[Tensor]:
     )
     for batch in loader:
         yield batch[keys.FEATURE_IMAGE]
+
+
+def render_seconds(config: EnvConfig, sizes: Sizes) -> dict[str, float]:
+    """Median seconds a frame of a task, `full` and `fast`; the repeats take turns.
+
+    Raises:
+        RenderError: there is no working GL backend.
+    """
+    from playslot_rl.envs import make_env
+
+    frames = {"full": sizes.full_frames, "fast": sizes.fast_frames}
+    seconds: dict[str, list[float]] = {name: [] for name in frames}
+    with ExitStack() as stack:
+        tasks: dict[str, Any] = {}
+        for name in frames:
+            tasks[name] = make_env(config, RenderConfig(quality="full" if name == "full" else "fast")).unwrapped
+            stack.callback(tasks[name].close)
+            tasks[name].reset(seed=0)
+        for _ in range(sizes.repeats + 1):
+            for name, count in frames.items():
+                begin = time.perf_counter()
+                for _ in range(count):
+                    tasks[name].draw()
+                seconds[name].append((time.perf_counter() - begin) / count)
+    return {name: median(times[1:]) for name, times in seconds.items()}

@@ -1,15 +1,24 @@
-"""`comparison.md`: the table, the plot and the footnotes of a comparison."""
+"""`comparison.md` and its plot: tables, footnotes, success against demonstrations and against environment steps."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from playslot_rl.comparison.results import failures
 from playslot_rl.config.methods import METHODS
-from playslot_rl.visualization.markdown import table
+from playslot_rl.visualization.charts import METHOD_STYLES, Theme, legend, new_figure, step_axis, style_axes
+from playslot_rl.visualization.document import table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Result = Mapping[str, Any]
+
+
+def failures(rows: Sequence[Result]) -> list[Result]:
+    """One row for each job that is not done."""
+    return list({row["name"]: row for row in rows if row["status"] != "done"}.values())
 
 
 def comparison_page(result: Result) -> str:
@@ -77,7 +86,7 @@ def _footnotes(result: Result) -> list[str]:
         f"Labels: {row['title']} saw the real actions of {row['labels']}."
         for row in ({"title": t, "labels": _labels(done, t)} for t in _titles(done) if _labels(done, t))
     ]
-    notes += _steps(result)
+    notes += _acting_cost(result)
     notes += _one_each(done, "pretraining", "{title} starts from {value} weights.")
     sizes = _one_each(done, "parameters", "{title} {value}")
     notes += [f"Parameters, those of the models it builds on included: {'; '.join(sizes)}."] if sizes else []
@@ -86,11 +95,13 @@ def _footnotes(result: Result) -> list[str]:
     notes.append(_times(done, result))
     notes += _shared(result)
     notes += _open_jobs(rows, result["jobs"])
-    notes.append(f"Made by `{result['command']}` at commit {result['commit'] or 'unknown'}; {_machine(result)}.")
+    at = result["hardware"]
+    where = f"{at['machine']}, {at['cores']} cores, {at['gpu'] or 'no GPU'}"
+    notes.append(f"Made by `{result['command']}` at commit {result['commit'] or 'unknown'}; {where}.")
     return notes
 
 
-def _steps(result: Result) -> list[str]:
+def _acting_cost(result: Result) -> list[str]:
     """What acting cost, in both kinds of steps."""
     notes = []
     for row in result["summary"]:
@@ -187,11 +198,6 @@ def _reference(value: Result) -> str:
     return f"{100 * value['success_rate']:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
 
 
-def _machine(result: Result) -> str:
-    at = result["hardware"]
-    return f"{at['machine']}, {at['cores']} cores, {at['gpu'] or 'no GPU'}"
-
-
 def _jobs(rows: Sequence[Result]) -> str:
     headers = ["job", "protocol", "status", "success", "labels", "environment steps", "training", "evaluation"]
     body = [
@@ -218,3 +224,97 @@ def _number(value: object) -> str:
 
 def _list(values: Iterable[object]) -> str:
     return ", ".join(map(str, values))
+
+
+def comparison_figure(result: Result, theme: Theme) -> Figure:
+    """Draw a comparison.
+
+    A method has its colour and marker everywhere; imagination is dashed. Bars are 95 % Wilson intervals over the
+    episodes, which all seeds share, small dots are single seeds, the grey lines the references.
+
+    Args:
+        result: what `comparison.json` holds.
+        theme: page.
+    """
+    offline = [row for row in result["summary"] if row["demos"] is not None]
+    curves = [row for row in result["rows"] if row["curve"]]
+    final = [row for row in result["summary"] if row["demos"] is None]
+    online = bool(curves or final)
+    figure = new_figure(9.6 if offline and online else 6.4, 3.9)
+    panels = int(bool(offline)) + int(online) or 1
+    if offline or not online:
+        axes = figure.add_subplot(1, panels, 1)
+        _demonstrations(axes, offline, result["rows"], theme)
+        _finish(axes, result, theme)
+    if online:
+        axes = figure.add_subplot(1, panels, panels)
+        _steps(axes, curves, final, theme)
+        _finish(axes, result, theme)
+    legend(figure, theme, loc="outside lower center", ncols=3, fontsize=9)
+    return figure
+
+
+def _demonstrations(axes: Axes, summary: Sequence[Result], rows: Sequence[Result], theme: Theme) -> None:
+    series = list(dict.fromkeys((row["method"], row["protocol"], row["title"]) for row in summary))
+    numbers = sorted({row["demos"] for row in summary})
+    for index, (method, protocol, title) in enumerate(series):
+        style, own = METHOD_STYLES[method], [r for r in summary if (r["method"], r["protocol"]) == (method, protocol)]
+        own.sort(key=lambda row: row["demos"])
+        # Side by side, so that equal rates do not hide each other; by a factor, since the axis is logarithmic.
+        aside = 1.035 ** (index - (len(series) - 1) / 2)
+        x, y = [row["demos"] * aside for row in own], [100 * row["success_rate"] for row in own]
+        below = [max(0.0, 100 * (row["success_rate"] - row["ci95"][0])) for row in own]
+        above = [max(0.0, 100 * (row["ci95"][1] - row["success_rate"])) for row in own]
+        dream = protocol == "imagination"
+        colour = theme.series[style.colour]
+        axes.errorbar(
+            x, y, [below, above], color=colour, marker=style.marker, markersize=6, linewidth=1.6,
+            linestyle="--" if dream else "-", markerfacecolor=theme.ground if dream else colour, capsize=2,
+            elinewidth=1.2, label=f"{title}, imagination" if dream else title,
+        )  # fmt: skip
+        single = [
+            r for r in rows if (r["method"], r["protocol"]) == (method, protocol) and r["success_rate"] is not None
+        ]
+        if len({row["seed"] for row in single}) > 1:
+            dots = [row["demos"] * aside for row in single]
+            axes.plot(dots, [100 * row["success_rate"] for row in single], ".", color=colour, markersize=4, alpha=0.5)
+    axes.set_xscale("log")
+    axes.set_xticks(numbers, [str(n) for n in numbers])
+    axes.minorticks_off()
+    axes.set_xlabel("demonstrations")
+
+
+def _steps(axes: Axes, curves: Sequence[Result], final: Sequence[Result], theme: Theme) -> None:
+    for method in dict.fromkeys(row["method"] for row in [*curves, *final]):
+        style = METHOD_STYLES[method]
+        colour = theme.series[style.colour]
+        own = [row for row in curves if row["method"] == method]
+        for row in own:
+            points = [p for p in row["curve"] if p.get("success_rate") is not None and p.get("env_steps") is not None]
+            x = [p["env_steps"] for p in points]
+            axes.plot(x, [100 * p["success_rate"] for p in points], color=colour, linewidth=1.2, alpha=0.6)
+        for end in (row for row in final if row["method"] == method and row["env_steps"] is not None):
+            low, high = end["ci95"]
+            error = [[100 * (end["success_rate"] - low)], [100 * (high - end["success_rate"])]]
+            axes.errorbar(
+                [end["env_steps"]], [100 * end["success_rate"]], error, color=colour, marker=style.marker,
+                markersize=7, linestyle="none", capsize=2, label=end["title"],
+            )  # fmt: skip
+        dots = [r for r in own if r["env_steps"] is not None and r["success_rate"] is not None]
+        if len(dots) > 1:
+            rates = [100 * r["success_rate"] for r in dots]
+            axes.plot([r["env_steps"] for r in dots], rates, ".", color=colour, markersize=4, alpha=0.5)
+        if not any(row["method"] == method and row["env_steps"] is not None for row in final):
+            axes.plot([], [], color=colour, marker=style.marker, label=(own or list(final))[0]["title"])
+    step_axis(axes)
+    axes.set_xlabel("environment steps (lines: development episodes)")
+
+
+def _finish(axes: Axes, result: Result, theme: Theme) -> None:
+    for name, line in (("expert", ":"), ("random", "--")):
+        rate = result["references"].get(name, {}).get("success_rate")
+        if rate is not None:
+            axes.axhline(100 * rate, color=theme.series[7], linestyle=line, linewidth=1.2, label=f"{name} actions")
+    axes.set_ylim(-3, 103)
+    axes.set_ylabel("success rate, %")
+    style_axes(axes, theme)
