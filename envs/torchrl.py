@@ -11,8 +11,6 @@ import torch
 from torchrl.envs import DTypeCastTransform, EnvBase, GymWrapper, TransformedEnv
 
 from playslot_rl import keys
-from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.envs import make_env
 
 View = dict[str, npt.NDArray[Any]]
 
@@ -69,25 +67,5 @@ class TensorView(gym.Wrapper[View, npt.NDArray[np.float32], dict[str, npt.NDArra
 
 def wrap(view: gym.Env[Any, Any]) -> EnvBase:
     """A `GymWrapper` whose `keys.SUCCESS` entry is boolean."""
-    base = GymWrapper(view, device="cpu")
-    cast = DTypeCastTransform(torch.int8, torch.bool, in_keys=[keys.SUCCESS])
-    return TransformedEnv(base, cast)
-
-
-def make_torchrl_env(env: EnvConfig, render: RenderConfig) -> EnvBase:
-    """Make a task for TorchRL.
-
-    Args:
-        env: the task.
-        render: how frames are drawn.
-
-    Returns:
-        Environment with batch size () that reads `keys.ACTION` float32 (A,) and writes `keys.PIXELS` uint8 (3, H, W),
-        `keys.STATE` float32 (S,), `keys.SUCCESS` bool (1,), reward, done, terminated and truncated. `set_seed(s)`
-        makes `s` the seed of the next episode; later resets draw theirs from the environment's generator.
-
-    Raises:
-        ConfigError: unknown environment name.
-        RenderError: there is no working GL backend.
-    """
-    return wrap(TensorView(make_env(env, render)))
+    boolean = DTypeCastTransform(torch.int8, torch.bool, in_keys=[keys.SUCCESS])
+    return TransformedEnv(GymWrapper(view, device="cpu"), boolean)
