@@ -159,7 +159,7 @@ def episode_parts(spec: Any, episodes: int, folder: Path) -> tuple[dict[str, flo
 def _record_and_export(watch: Stopwatch, journal: Any, out: Path) -> None:
     from playslot_rl.collectors import export, image_set
     from playslot_rl.collectors import journal as journal_module
-    from playslot_rl.collectors.episodes import EpisodeCollector, Job, SeededView
+    from playslot_rl.collectors.episodes import EpisodeCollector, SeededView
     from playslot_rl.envs.rendering import FrameRenderer
 
     spec = journal.spec
@@ -181,7 +181,7 @@ def _record_and_export(watch: Stopwatch, journal: Any, out: Path) -> None:
             stack.enter_context(watch.watching(owner, method, name))
         try:
             for index in range(spec.episodes):
-                journal.add(collector.record(Job(index, spec.episode_seed(index))))
+                journal.add(collector.record(index))
         finally:
             collector.shutdown()
         export.export(journal, out)
