@@ -173,7 +173,7 @@ def _record_and_export(watch: Stopwatch, journal: Any, out: Path) -> None:
             (journal_module, "encode", "encoding (PNG)"),
             (journal_module, "write_bytes", "journal writing"),
             (export, "_write", "export: other"),
-            (journal_module, "read", "export: reading"),
+            (journal_module.Journal, "read_with_images", "export: reading"),
             (image_set.ImageSetWriter, "_stats", "export: statistics"),
             (image_set.ImageSetWriter, "_flush", "export: writing"),
             (export, "_check", "export: checking"),

@@ -86,17 +86,12 @@ class SeededView(TensorView):
     """
 
     def __init__(self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]] = ()) -> None:
-        super().__init__(env)
+        counter = gym.spaces.Box(0, 2**62, (1,), np.int64)
+        counters = dict.fromkeys((EPISODE_INDEX, EPISODE_SEED, EPISODE_STEP, REDRAWN), counter)
+        super().__init__(env, {keys.EXPERT_ACTION: env.action_space, **counters})
         self.jobs = deque(jobs)
         self._running: tuple[int, int] | None = None
         self._episode_seed = self._redrawn = self._step = 0
-        counter = gym.spaces.Box(0, 2**62, (1,), np.int64)
-        self.declare(
-            {
-                keys.EXPERT_ACTION: env.action_space,
-                **dict.fromkeys((EPISODE_INDEX, EPISODE_SEED, EPISODE_STEP, REDRAWN), counter),
-            }
-        )
 
     def view(self, observation: dict[str, npt.NDArray[Any]], info: dict[str, Any]) -> View:
         """One observation, the expert's action for it, and which episode it belongs to."""
@@ -135,9 +130,8 @@ class SeededView(TensorView):
     def step(self, action: npt.NDArray[np.float32]) -> tuple[View, Any, bool, bool, dict[str, Any]]:
         """Gymnasium's step."""
         self._step += 1
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        result = self.view(observation, info), reward, terminated, truncated, info
-        if terminated or truncated:
+        result = super().step(action)
+        if result[2] or result[3]:
             self._running = None
         return result
 

@@ -33,8 +33,6 @@ ARRAYS: Final = ("states", "actions", "rewards", "success")
 PNG_LEVEL: Final = 6
 """Compression that LeRobot uses for stored images."""
 
-Frames = npt.NDArray[np.uint8]
-
 
 @dataclass(frozen=True)
 class RecordedEpisode:
@@ -61,25 +59,13 @@ class RecordedEpisode:
     success: npt.NDArray[np.bool_]
 
 
-def png(frame: Frames) -> bytes:
+def png(frame: npt.NDArray[np.uint8]) -> bytes:
     """PNG of a frame uint8 (H, W, 3)."""
     from PIL import Image
 
     buffer = io.BytesIO()
     Image.fromarray(frame).save(buffer, format="PNG", compress_level=PNG_LEVEL)
     return buffer.getvalue()
-
-
-def decode_png(content: bytes) -> Frames:
-    """Frame uint8 (H, W, 3) of a PNG.
-
-    Raises:
-        OSError: damaged.
-    """
-    from PIL import Image
-
-    with Image.open(io.BytesIO(content)) as image:
-        return np.asarray(image)
 
 
 def encode(episode: RecordedEpisode) -> bytes:
@@ -97,33 +83,11 @@ def encode(episode: RecordedEpisode) -> bytes:
     return buffer.getvalue()
 
 
-def read(path: Path, decode: bool = True) -> tuple[RecordedEpisode, list[bytes]]:
-    """The episode in a file, and the PNGs of its frames.
+def _pixels(content: bytes) -> npt.NDArray[np.uint8]:
+    from PIL import Image
 
-    Args:
-        path: the file.
-        decode: False leaves `frames` empty, (0,).
-
-    Raises:
-        OutputError: the file is missing or damaged.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            numbers = [int(n) for n in file["numbers"]]
-            arrays = {name: file[name] for name in ARRAYS}
-            if "frames" in file.files:  # written by version 0.1
-                frames = file["frames"]
-                images = [png(frame) for frame in frames]
-            else:
-                ends = np.cumsum(file["image_sizes"]).tolist()
-                content = file["images"].tobytes()
-                images = [content[start:end] for start, end in zip([0, *ends], ends, strict=False)]
-                frames = np.stack([decode_png(i) for i in images]) if decode else np.zeros(0, np.uint8)
-        return RecordedEpisode(numbers[0], numbers[1], numbers[2], frames, **arrays), images
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise OutputError(
-            f"{path}: got a damaged file ({error}), expected an episode; delete it and run the same command again"
-        ) from error
+    with Image.open(io.BytesIO(content)) as image:
+        return np.asarray(image)
 
 
 def journal_path(out: Path) -> Path:
@@ -213,13 +177,28 @@ class Journal:
         Raises:
             OutputError: its file is missing or damaged, or holds another episode.
         """
-        episode, images = read(self.path(index), decode)
-        if episode.index != index:
+        path = self.path(index)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                there, seed, redrawn = (int(n) for n in file["numbers"])
+                arrays = {name: file[name] for name in ARRAYS}
+                if "frames" in file.files:  # written by version 0.1
+                    frames = file["frames"]
+                    images = [png(frame) for frame in frames]
+                else:
+                    ends = np.cumsum(file["image_sizes"]).tolist()
+                    content = file["images"].tobytes()
+                    images = [content[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+                    frames = np.stack([_pixels(i) for i in images]) if decode else np.zeros(0, np.uint8)
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise OutputError(
-                f"{self.path(index)}: got episode {episode.index}, expected {index}; delete it and run the same "
-                "command again"
+                f"{path}: got a damaged file ({error}), expected an episode; delete it and run the same command again"
+            ) from error
+        if there != index:
+            raise OutputError(
+                f"{path}: got episode {there}, expected {index}; delete it and run the same command again"
             )
-        return episode, images
+        return RecordedEpisode(index, seed, redrawn, frames, **arrays), images
 
     def missing(self) -> list[int]:
         """Episodes that are not stored yet."""

@@ -131,7 +131,12 @@ def _connect(journal: Journal, count: int, address: str) -> Any:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray announces a change of its own
     where = address or os.environ.get("RAY_ADDRESS", "")
     alone = not where
-    _check_reachable(where)
+    host, colon, port = where.removeprefix("ray://").rpartition(":")
+    if colon and port.isdigit():  # "auto" and the like are Ray's to judge
+        try:  # whether anybody listens: Ray itself would try for minutes
+            socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
+        except (OSError, OverflowError) as error:
+            raise PlaySlotError(_no_cluster(where, error)) from error
     from torchrl.collectors.distributed import RayCollector
 
     init: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "logging_level": "error"}
@@ -157,21 +162,6 @@ def _connect(journal: Journal, count: int, address: str) -> Any:
             if not alone or attempt == STARTS - 1:
                 raise PlaySlotError(_no_cluster(where, error)) from error
     raise AssertionError("unreachable")
-
-
-def _check_reachable(where: str) -> None:
-    """Look whether anybody listens at HOST:PORT; Ray itself would try for minutes.
-
-    Raises:
-        PlaySlotError: nobody does.
-    """
-    host, colon, port = where.removeprefix("ray://").rpartition(":")
-    if not colon or not port.isdigit():
-        return  # "auto" and the like are Ray's to judge
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
-    except (OSError, OverflowError) as error:
-        raise PlaySlotError(_no_cluster(where, error)) from error
 
 
 def _no_cluster(where: str, error: Exception) -> str:

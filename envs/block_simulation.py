@@ -45,11 +45,6 @@ SUBSTEPS: Final = 20
 ROBOT_START: Final = {"robot0:slide0": 0.405, "robot0:slide1": 0.48, "robot0:slide2": 0.0}
 
 
-def parking_place(index: int, half: float) -> tuple[float, float, float]:
-    """Where cube `index` with half the side `half` is parked."""
-    return PARKING_X, 0.25 * index, half
-
-
 def build_spec(cubes: int = 0, spheres: int = 0, pick: bool = False) -> mujoco.MjSpec:
     """The scene.
 
@@ -70,7 +65,7 @@ def build_spec(cubes: int = 0, spheres: int = 0, pick: bool = False) -> mujoco.M
         world.add_site(name=f"sphere{i}", rgba=_INVISIBLE, **sphere)
     half = SMALL_CUBE if pick else CUBE
     for i in range(cubes):
-        body = world.add_body(name=f"object{i}", pos=parking_place(i, half))
+        body = world.add_body(name=f"object{i}", pos=(PARKING_X, 0.25 * i, half))
         body.add_joint(name=f"object{i}:joint", type=mujoco.mjtJoint.mjJNT_FREE, damping=0.01)
         body.add_geom(
             name=f"object{i}",
@@ -119,12 +114,10 @@ class BlockSimulation(MujocoFetchEnv):
 
     def __init__(self, variant: Variant, count: int) -> None:
         self.variant, self.count = variant, count
-        self.half = SMALL_CUBE if variant == "pick" else CUBE
         self._cubes = 0 if variant == "reach" else count
-        parked = {f"object{i}:joint": [*parking_place(i, self.half), 1, 0, 0, 0] for i in range(self._cubes)}
         super().__init__(
             model_path=str(SCENES / "push.xml"),  # only looked for: `_initialize_simulation` builds the scene
-            initial_qpos={**ROBOT_START, **parked},
+            initial_qpos=ROBOT_START,  # the cubes start where the scene parks them
             n_substeps=SUBSTEPS,
             has_object=variant != "reach",
             block_gripper=variant != "pick",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, cast
 
 import gymnasium as gym
@@ -20,23 +21,24 @@ class TensorView(gym.Wrapper[View, npt.NDArray[np.float32], dict[str, npt.NDArra
 
     `keys.PIXELS` uint8 [0, 255] (3, H, W), `keys.STATE` float32 (S,), `keys.SUCCESS` bool (1,): whether the last agent
     step solved the task (after a reset: whether the episode starts solved).
+
+    Args:
+        env: the task.
+        more: spaces of what a subclass's `view` adds.
     """
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, env: gym.Env[Any, Any], more: Mapping[str, gym.Space[Any]] | None = None) -> None:
         super().__init__(env)
         spaces = cast(gym.spaces.Dict, env.observation_space)
         height, width, channels = spaces["pixels"].shape or ()
-        self.spaces: dict[str, gym.Space[Any]] = {
+        shown: dict[str, gym.Space[Any]] = {
             keys.PIXELS: gym.spaces.Box(0, 255, (channels, height, width), np.uint8),
             keys.STATE: spaces["state"],
             keys.SUCCESS: gym.spaces.MultiBinary(1),
+            **(more or {}),
         }
-        self.declare({})
+        self.observation_space = cast(gym.Space[View], gym.spaces.Dict(shown))
         self._seed: int | None = None
-
-    def declare(self, more: dict[str, gym.Space[Any]]) -> None:
-        """Set the observation space: the view's own entries and `more`."""
-        self.observation_space = cast(gym.Space[View], gym.spaces.Dict({**self.spaces, **more}))
 
     def view(self, observation: dict[str, npt.NDArray[Any]], info: dict[str, Any]) -> View:
         """One observation and its info under the new names."""
