@@ -151,11 +151,10 @@ class FrameRenderer:
                 self._renderer.scene.flags[flag] = 0
         self._camera: Any = camera
         if isinstance(camera, Camera):
-            self._camera = mj.MjvCamera()
-            self._camera.type = mj.mjtCamera.mjCAMERA_FREE
-            self._camera.lookat[:] = camera.lookat
-            for name in ("distance", "azimuth", "elevation"):
-                setattr(self._camera, name, getattr(camera, name))
+            self._camera = view = mj.MjvCamera()
+            view.type = mj.mjtCamera.mjCAMERA_FREE
+            view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
+            view.lookat[:] = camera.lookat
         self._culler: FrustumCuller | None = None
         if fast:
             data = mj.MjData(model)
