@@ -8,7 +8,7 @@ from pathlib import Path
 
 from playslot_rl.collectors.export import META_NAME, export
 from playslot_rl.collectors.journal import SPEC_NAME, Journal, journal_path, read_spec
-from playslot_rl.collectors.spec import CollectionSpec, completed, difference
+from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.config import CollectorConfig, ExperimentConfig
 from playslot_rl.errors import DataError, OutputError
 from playslot_rl.progress import StageProgress
@@ -30,8 +30,7 @@ def is_complete(out: Path, spec: CollectionSpec) -> bool:
     record = out / META_NAME
     if not record.is_file():
         raise OutputError(f"{out}: got a folder or file of something else, expected none; choose another out=")
-    stored = read_spec(record).get("spec")
-    differs = difference(completed(stored), spec.to_dict())
+    differs = spec.difference(read_spec(record).get("spec"))
     if differs:
         raise OutputError(f"{out} was collected with other settings ({differs}); repeat them or choose another out=")
     try:

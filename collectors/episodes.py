@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import gymnasium as gym
@@ -23,6 +22,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from playslot_rl import keys
+from playslot_rl.collectors.journal import RecordedEpisode
 from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.envs import make_env, task_env
 from playslot_rl.envs.torchrl import TensorView, View, wrap
@@ -35,84 +35,39 @@ EPISODE_SEED: Final = "episode_seed"
 """Seed of the running episode: int64 (1,)."""
 EPISODE_STEP: Final = "episode_step"
 """Agent steps since its reset: int64 (1,)."""
-EXPERT_ACTION: Final = "expert_action"
-"""The scripted expert's action for the present state: float32 (A,)."""
 POLICY_STREAM: Final = 2
 """Spawn key of the policy's random numbers; the environment uses 0 and 1 of the same seed."""
 MAX_REDRAWS: Final = 20
 
 
-def step_generator(seed: int, step: int) -> np.random.Generator:
-    """Generator of one step of one episode."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(POLICY_STREAM, step)))
-
-
-class RandomActions(nn.Module):
-    """Uniform actions in [-1, 1]."""
-
-    def forward(self, expert: Tensor, seed: Tensor, step: Tensor) -> Tensor:
-        """Action float32 (A,) from the expert's (A,), of which only the width is used, seed (1,) and step (1,)."""
-        rng = step_generator(int(seed), int(step))
-        return torch.from_numpy(rng.uniform(-1.0, 1.0, expert.shape[-1]).astype(np.float32))
-
-
-class ExpertActions(nn.Module):
-    """The expert's actions, with Gaussian noise.
+class CollectionPolicy(nn.Module):
+    """Uniform actions in [-1, 1], or the expert's with Gaussian noise.
 
     Args:
-        noise: standard deviation; the sum is clipped to [-1, 1].
+        name: `random` or `expert`.
+        noise: standard deviation for the expert's actions; the sum is clipped to [-1, 1].
     """
 
-    def __init__(self, noise: float) -> None:
+    def __init__(self, name: str, noise: float = 0.0) -> None:
         super().__init__()
-        self.noise = noise
+        self.name, self.noise = name, noise
 
     def forward(self, expert: Tensor, seed: Tensor, step: Tensor) -> Tensor:
-        """Action float32 (A,) from the expert's (A,), seed (1,) and step (1,)."""
+        """Action float32 (A,) from the expert's (A,), the episode's seed (1,) and its step (1,)."""
+        rng = np.random.default_rng(np.random.SeedSequence(int(seed), spawn_key=(POLICY_STREAM, int(step))))
+        width = expert.shape[-1]
+        if self.name == "random":
+            return torch.from_numpy(rng.uniform(-1.0, 1.0, width).astype(np.float32))
         if self.noise == 0.0:
             return expert.clone()
-        rng = step_generator(int(seed), int(step))
-        noise = rng.normal(0.0, self.noise, expert.shape[-1]).astype(np.float32)
+        noise = rng.normal(0.0, self.noise, width).astype(np.float32)
         return (expert + torch.from_numpy(noise)).clamp(-1.0, 1.0)
 
 
-def make_policy(name: str, noise: float = 0.0) -> TensorDictModule:
-    """Policy of a collector: reads `EXPERT_ACTION`, `EPISODE_SEED`, `EPISODE_STEP` and writes `keys.ACTION`."""
-    module = RandomActions() if name == "random" else ExpertActions(noise)
-    return TensorDictModule(module, in_keys=[EXPERT_ACTION, EPISODE_SEED, EPISODE_STEP], out_keys=[keys.ACTION])
-
-
-@dataclass(frozen=True)
-class Job:
-    """An episode to record: its place in the collection and its seed."""
-
-    index: int
-    seed: int
-
-
-@dataclass(frozen=True)
-class RecordedEpisode:
-    """One recorded episode.
-
-    Attributes:
-        index: its place in the collection.
-        seed: the seed it ran with.
-        redrawn: seeds passed over because the episode started solved.
-        frames: uint8 [0, 255] (T + 1, H, W, 3).
-        states: float32 (T + 1, S).
-        actions: float32 (T, A) in [-1, 1].
-        rewards: float32 (T,).
-        success: bool (T,): whether the agent step solved the task.
-    """
-
-    index: int
-    seed: int
-    redrawn: int
-    frames: npt.NDArray[np.uint8]
-    states: npt.NDArray[np.float32]
-    actions: npt.NDArray[np.float32]
-    rewards: npt.NDArray[np.float32]
-    success: npt.NDArray[np.bool_]
+def make_policy(spec: CollectionSpec) -> TensorDictModule:
+    """A collection's policy: reads `keys.EXPERT_ACTION`, `EPISODE_SEED`, `EPISODE_STEP` and writes `keys.ACTION`."""
+    reads = [keys.EXPERT_ACTION, EPISODE_SEED, EPISODE_STEP]
+    return TensorDictModule(CollectionPolicy(spec.policy, spec.noise), in_keys=reads, out_keys=[keys.ACTION])
 
 
 class SeededView(TensorView):
@@ -127,28 +82,23 @@ class SeededView(TensorView):
         jobs: the first episodes.
 
     Attributes:
-        jobs: episodes that have not been started.
+        jobs: episodes that have not been started: place in the collection and seed of each.
     """
 
     def __init__(self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]] = ()) -> None:
-        super().__init__(env)
-        self.jobs: deque[Job] = deque(Job(*job) for job in jobs)
-        self._running: Job | None = None
-        self._episode_seed = self._redrawn = self._step = 0
         counter = gym.spaces.Box(0, 2**62, (1,), np.int64)
-        self.declare(
-            {
-                EXPERT_ACTION: env.action_space,
-                **dict.fromkeys((EPISODE_INDEX, EPISODE_SEED, EPISODE_STEP, REDRAWN), counter),
-            }
-        )
+        counters = dict.fromkeys((EPISODE_INDEX, EPISODE_SEED, EPISODE_STEP, REDRAWN), counter)
+        super().__init__(env, {keys.EXPERT_ACTION: env.action_space, **counters})
+        self.jobs = deque(jobs)
+        self._running: tuple[int, int] | None = None
+        self._episode_seed = self._redrawn = self._step = 0
 
     def view(self, observation: dict[str, npt.NDArray[Any]], info: dict[str, Any]) -> View:
         """One observation, the expert's action for it, and which episode it belongs to."""
         return {
             **super().view(observation, info),
-            EXPERT_ACTION: task_env(self.env).expert_action(),
-            EPISODE_INDEX: np.array([self._running.index if self._running else 0], np.int64),
+            keys.EXPERT_ACTION: task_env(self.env).expert_action(),
+            EPISODE_INDEX: np.array([self._running[0] if self._running else 0], np.int64),
             EPISODE_SEED: np.array([self._episode_seed], np.int64),
             EPISODE_STEP: np.array([self._step], np.int64),
             REDRAWN: np.array([self._redrawn], np.int64),
@@ -165,7 +115,7 @@ class SeededView(TensorView):
             if not self.jobs:
                 return self._idle(), {"success": False}
             self._running = self.jobs.popleft()
-        first, self._step = self._running.seed, 0
+        first, self._step = self._running[1], 0
         for attempt in range(MAX_REDRAWS):
             self._episode_seed, self._redrawn = first + attempt * redraw_stride(first), attempt
             observation, info = self.env.reset(seed=self._episode_seed)
@@ -180,9 +130,8 @@ class SeededView(TensorView):
     def step(self, action: npt.NDArray[np.float32]) -> tuple[View, Any, bool, bool, dict[str, Any]]:
         """Gymnasium's step."""
         self._step += 1
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        result = self.view(observation, info), reward, terminated, truncated, info
-        if terminated or truncated:
+        result = super().step(action)
+        if result[2] or result[3]:
             self._running = None
         return result
 
@@ -207,10 +156,10 @@ class TaskMaker:
         self._view = SeededView(make_env(self.spec.env, self.spec.render))
         return wrap(self._view)
 
-    def add(self, job: Job) -> None:
-        """Queue an episode."""
+    def add(self, index: int) -> None:
+        """Queue episode `index` of the collection."""
         assert self._view is not None
-        self._view.jobs.append(job)
+        self._view.jobs.append((index, self.spec.episode_seed(index)))
 
 
 class EpisodeCollector(Collector):
@@ -229,16 +178,16 @@ class EpisodeCollector(Collector):
     @classmethod
     def make(cls, spec: CollectionSpec) -> EpisodeCollector:
         """A collector in this process."""
-        return cls(TaskMaker(spec), make_policy(spec.policy, spec.noise), **collector_settings(spec))
+        return cls(TaskMaker(spec), make_policy(spec), total_frames=-1, **collector_settings(spec))
 
-    def record(self, job: Job) -> RecordedEpisode:
-        """Record one episode.
+    def record(self, index: int) -> RecordedEpisode:
+        """Record episode `index` of the collection.
 
         Raises:
             RenderError: there is no working GL backend.
             ConfigError: every draw of the episode starts solved.
         """
-        self._maker.add(job)
+        self._maker.add(index)
         return _episode(self.next())
 
 
@@ -246,7 +195,6 @@ def collector_settings(spec: CollectionSpec) -> dict[str, Any]:
     """TorchRL's settings for batches of shape (T,) that are one episode each."""
     return {
         "frames_per_batch": spec.steps,
-        "total_frames": -1,
         "reset_at_each_iter": True,
         "split_trajs": False,
         "trust_policy": True,
@@ -284,6 +232,6 @@ def record(spec: CollectionSpec, indices: Sequence[int]) -> Iterator[RecordedEpi
     collector = EpisodeCollector.make(spec)
     try:
         for index in indices:
-            yield collector.record(Job(index, spec.episode_seed(index)))
+            yield collector.record(index)
     finally:
         collector.shutdown()

@@ -16,10 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.collectors.episodes import RecordedEpisode
 from playslot_rl.collectors.image_set import ImageSetWriter
-from playslot_rl.collectors.journal import Journal
+from playslot_rl.collectors.journal import Journal, RecordedEpisode
 from playslot_rl.collectors.spec import CollectionSpec
+from playslot_rl.envs import PROCEDURAL, task_metadata
+from playslot_rl.envs.grid_shapes import METADATA
 from playslot_rl.errors import OutputError
 from playslot_rl.progress import quiet_datasets
 from playslot_rl.storage.atomic import write_json
@@ -64,37 +65,24 @@ def features(spec: CollectionSpec, state_dim: int) -> dict[str, dict[str, Any]]:
     }
 
 
-def rows(episode: RecordedEpisode, task: str) -> Iterator[dict[str, Any]]:
-    """LeRobot frames of an episode: T transitions and then the last observation, whose action is padding.
+def columns(episode: RecordedEpisode) -> dict[str, npt.NDArray[Any]]:
+    """LeRobot features of an episode, (T + 1, ...): T transitions, then the last observation, whose action is padding.
 
     Reward, success and done of row t belong to the agent step from frame t to t + 1; done is true on the last
     transition and stays true on the last observation.
     """
     steps = len(episode.actions)
-    for t in range(steps + 1):
-        last = t == steps
-        yield {
-            keys.FEATURE_IMAGE: episode.frames[t],
-            keys.FEATURE_STATE: episode.states[t],
-            keys.FEATURE_ACTION: np.zeros_like(episode.actions[0]) if last else episode.actions[t],
-            keys.FEATURE_REWARD: np.array([0.0 if last else episode.rewards[t]], np.float32),
-            keys.FEATURE_SUCCESS: np.array([episode.success[min(t, steps - 1)]], np.bool_),
-            keys.FEATURE_DONE: np.array([t >= steps - 1], np.bool_),
-            keys.FEATURE_SEED: np.array([episode.seed], np.int64),
-            keys.FEATURE_LAST: np.array([last], np.bool_),
-            "task": task,
-        }
-
-
-def env_metadata(spec: CollectionSpec) -> dict[str, Any]:
-    """Gymnasium's metadata of the task, or those of an environment without a simulator."""
-    from playslot_rl.envs import PROCEDURAL, task_metadata
-
-    if spec.env.name in PROCEDURAL:
-        from playslot_rl.envs.grid_shapes import METADATA
-
-        return METADATA
-    return task_metadata(spec.env)
+    index = np.arange(steps + 1)
+    return {
+        keys.FEATURE_IMAGE: episode.frames,
+        keys.FEATURE_STATE: episode.states,
+        keys.FEATURE_ACTION: np.concatenate([episode.actions, np.zeros_like(episode.actions[:1])]),
+        keys.FEATURE_REWARD: np.append(episode.rewards, np.float32(0.0))[:, None],
+        keys.FEATURE_SUCCESS: np.append(episode.success, episode.success[-1])[:, None],
+        keys.FEATURE_DONE: (index >= steps - 1)[:, None],
+        keys.FEATURE_SEED: np.full((steps + 1, 1), episode.seed, np.int64),
+        keys.FEATURE_LAST: (index == steps)[:, None],
+    }
 
 
 def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str, Any]]:
@@ -102,7 +90,7 @@ def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str,
     from lerobot.configs.video import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    metadata = env_metadata(spec)
+    metadata = METADATA if spec.env.name in PROCEDURAL else task_metadata(spec.env)
     video = spec.storage == "video"
     dataset = LeRobotDataset.create(
         repo_id(spec),
@@ -117,52 +105,46 @@ def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str,
         metadata_buffer_size=METADATA_ROWS,
     )
     write = _write_video if video else _write_images
+    records = []
     try:
-        return write(dataset, spec, journal, metadata["task"])
+        for episode in write(dataset, journal, metadata["task"]):
+            solved = bool(episode.success.any())
+            records.append(
+                {
+                    "seed": episode.seed,
+                    "success": solved,
+                    "steps_to_success": int(episode.success.argmax()) + 1 if solved else None,
+                    "redrawn": episode.redrawn,
+                }
+            )
+        dataset.finalize()
     except BaseException:
         # LeRobot's destructors would finish the files later, in a folder that has been removed or made anew.
         dataset.writer._finalized = dataset.meta._finalized = True
         raise
+    return records
 
 
-def _write_images(dataset: Any, spec: CollectionSpec, journal: Journal, task: str) -> list[dict[str, Any]]:
+def _write_images(dataset: Any, journal: Journal, task: str) -> Iterator[RecordedEpisode]:
     """The journal's PNGs go into the data set as they are."""
-    records = []
     with contextlib.closing(ImageSetWriter(dataset.meta, dataset.root, task)) as writer:
-        for index in range(spec.episodes):
+        for index in range(journal.spec.episodes):
             episode, images = journal.read_with_images(index)
-            columns: dict[str, list[Any]] = {}
-            for row in rows(episode, task):
-                for name, value in row.items():
-                    columns.setdefault(name, []).append(value)
-            del columns["task"], columns[keys.FEATURE_IMAGE]
-            writer.add({name: np.stack(values) for name, values in columns.items()}, episode.frames, images)
-            records.append(_outcome(episode))
-    dataset.finalize()
-    return records
+            values = columns(episode)
+            frames = values.pop(keys.FEATURE_IMAGE)
+            writer.add(values, frames, images)
+            yield episode
 
 
-def _write_video(dataset: Any, spec: CollectionSpec, journal: Journal, task: str) -> list[dict[str, Any]]:
+def _write_video(dataset: Any, journal: Journal, task: str) -> Iterator[RecordedEpisode]:
     """LeRobot encodes."""
-    records = []
-    for index in range(spec.episodes):
+    for index in range(journal.spec.episodes):
         episode = journal.read(index)
-        for row in rows(episode, task):
-            dataset.add_frame(row)
+        values = columns(episode)
+        for t in range(len(episode.frames)):
+            dataset.add_frame({name: column[t] for name, column in values.items()} | {"task": task})
         dataset.save_episode()
-        records.append(_outcome(episode))
-    dataset.finalize()
-    return records
-
-
-def _outcome(episode: RecordedEpisode) -> dict[str, Any]:
-    solved = bool(episode.success.any())
-    return {
-        "seed": episode.seed,
-        "success": solved,
-        "steps_to_success": int(episode.success.argmax()) + 1 if solved else None,
-        "redrawn": episode.redrawn,
-    }
+        yield episode
 
 
 def _check(root: Path, spec: CollectionSpec, journal: Journal) -> None:
@@ -232,16 +214,6 @@ def _check_video(root: Path, spec: CollectionSpec, journal: Journal) -> None:
             )
 
 
-def _collection_record(spec: CollectionSpec, records: list[dict[str, Any]]) -> dict[str, Any]:
-    return {
-        "spec": spec.to_dict(),
-        "success_rate": sum(r["success"] for r in records) / len(records),
-        "redrawn": sum(r["redrawn"] for r in records),
-        "versions": {name: version(name) for name in PACKAGES},
-        "episodes": records,
-    }
-
-
 def export(journal: Journal, out: Path) -> None:
     """Make the LeRobot data set `out` from a complete journal. A kill leaves `out` whole or not there.
 
@@ -253,15 +225,18 @@ def export(journal: Journal, out: Path) -> None:
         with new_folder(out, create=False) as temporary, quiet_datasets():
             records = _write(temporary, spec, journal)
             _check(temporary, spec, journal)
-            write_json(temporary / META_NAME, _collection_record(spec, records))
+            record = {
+                "spec": spec.to_dict(),
+                "success_rate": sum(r["success"] for r in records) / len(records),
+                "redrawn": sum(r["redrawn"] for r in records),
+                "versions": {name: version(name) for name in PACKAGES},
+                "episodes": records,
+            }
+            write_json(temporary / META_NAME, record)
     except Exception as error:
-        _explain_full_disk(out, error)
-        raise
-
-
-def _explain_full_disk(out: Path, error: Exception) -> None:
-    """LeRobot swallows errors of writing images and fails later with others."""
-    if not isinstance(error, OutputError) and shutil.disk_usage(out.parent).free < FREE_BYTES:
+        # LeRobot swallows errors of writing images and fails later with others.
+        if isinstance(error, OutputError) or shutil.disk_usage(out.parent).free >= FREE_BYTES:
+            raise
         raise OutputError(
             f"cannot write {out}: the disk is full, expected free space; free some, the same command carries on"
         ) from error

@@ -1,43 +1,98 @@
-"""The journal: one file per finished episode, each whole or not there, beside the data set that is being made."""
+"""The journal: one file per finished episode, each whole or not there, beside the data set that is being made.
+
+A file is an uncompressed npz: the episode's arrays, and its frames as the PNGs that the data set will hold. They are
+encoded once, where they were recorded; the export copies the bytes.
+
+Shapes: T agent steps, A action dim, S proprioception, H W image height and width.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import shutil
+import zipfile
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from playslot_rl.collectors.encoding import encode, read
-from playslot_rl.collectors.episodes import RecordedEpisode
-from playslot_rl.collectors.spec import CollectionSpec, completed, difference
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.errors import OutputError
 from playslot_rl.storage.atomic import explain_write_errors, write_bytes, write_json
 from playslot_rl.storage.locks import locked
 
 SPEC_NAME = "collection.json"
 LOCK_NAME = "lock"
+ARRAYS: Final = ("states", "actions", "rewards", "success")
+PNG_LEVEL: Final = 6
+"""Compression that LeRobot uses for stored images."""
+
+
+@dataclass(frozen=True)
+class RecordedEpisode:
+    """One recorded episode.
+
+    Attributes:
+        index: its place in the collection.
+        seed: the seed it ran with.
+        redrawn: seeds passed over because the episode started solved.
+        frames: uint8 [0, 255] (T + 1, H, W, 3).
+        states: float32 (T + 1, S).
+        actions: float32 (T, A) in [-1, 1].
+        rewards: float32 (T,).
+        success: bool (T,): whether the agent step solved the task.
+    """
+
+    index: int
+    seed: int
+    redrawn: int
+    frames: npt.NDArray[np.uint8]
+    states: npt.NDArray[np.float32]
+    actions: npt.NDArray[np.float32]
+    rewards: npt.NDArray[np.float32]
+    success: npt.NDArray[np.bool_]
+
+
+def png(frame: npt.NDArray[np.uint8]) -> bytes:
+    """PNG of a frame uint8 (H, W, 3)."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(frame).save(buffer, format="PNG", compress_level=PNG_LEVEL)
+    return buffer.getvalue()
+
+
+def encode(episode: RecordedEpisode) -> bytes:
+    """Content of the episode's file."""
+    images = [png(frame) for frame in episode.frames]
+    arrays: dict[str, Any] = {name: getattr(episode, name) for name in ARRAYS}
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        numbers=np.array([episode.index, episode.seed, episode.redrawn], np.int64),
+        images=np.frombuffer(b"".join(images), np.uint8),
+        image_sizes=np.array([len(image) for image in images], np.int64),
+        **arrays,
+    )
+    return buffer.getvalue()
+
+
+def _pixels(content: bytes) -> npt.NDArray[np.uint8]:
+    from PIL import Image
+
+    with Image.open(io.BytesIO(content)) as image:
+        return np.asarray(image)
 
 
 def journal_path(out: Path) -> Path:
     """Folder of the journal of the data set `out`."""
     return out.with_name(f"{out.name}.journal")
-
-
-def episode_path(folder: Path, index: int) -> Path:
-    """File of episode `index` in a journal's folder."""
-    return folder / f"episode_{index:06d}.npz"
-
-
-def store(folder: Path, episode: RecordedEpisode) -> None:
-    """Write an episode's file into a journal's folder; when this returns it survives a kill and a power cut.
-
-    Raises:
-        OutputError: full disk.
-    """
-    write_bytes(episode_path(folder, episode.index), encode(episode))
 
 
 class Journal:
@@ -57,8 +112,7 @@ class Journal:
             folder.mkdir(parents=True, exist_ok=True)
         stored = folder / SPEC_NAME
         if stored.is_file():
-            found = read_spec(stored)
-            differs = difference(completed(found), spec.to_dict())
+            differs = spec.difference(read_spec(stored))
             if differs:
                 raise OutputError(
                     f"{folder} holds an unfinished collection with other settings ({differs}); "
@@ -77,13 +131,14 @@ class Journal:
             OutputError: another process is collecting into this folder.
         """
         busy = f"{self.folder}: got another process collecting into it, expected none; wait for it or choose out="
+        spec = self.folder / SPEC_NAME
         with contextlib.ExitStack() as stack:
             try:
                 stack.enter_context(locked(self.folder / LOCK_NAME, busy))
             except OutputError:
-                if self._is_there():
+                if spec.is_file():
                     raise
-            if not self._is_there():  # its owner finished, and removed what we have locked
+            if not spec.is_file():  # its owner finished, and removed what we have locked
                 raise OutputError(
                     f"{self.folder}: got a journal that another process has just removed, expected ours; "
                     "run the same command again"
@@ -92,12 +147,9 @@ class Journal:
                 half.unlink(missing_ok=True)
             yield
 
-    def _is_there(self) -> bool:
-        return (self.folder / SPEC_NAME).is_file()
-
     def path(self, index: int) -> Path:
         """File of episode `index`."""
-        return episode_path(self.folder, index)
+        return self.folder / f"episode_{index:06d}.npz"
 
     def add(self, episode: RecordedEpisode) -> None:
         """Store an episode; when this returns it survives a kill and a power cut.
@@ -105,7 +157,7 @@ class Journal:
         Raises:
             OutputError: full disk.
         """
-        store(self.folder, episode)
+        self.add_encoded(episode.index, encode(episode))
 
     def add_encoded(self, index: int, content: bytes) -> None:
         """Store an episode that was encoded elsewhere (see `add`)."""
@@ -125,13 +177,28 @@ class Journal:
         Raises:
             OutputError: its file is missing or damaged, or holds another episode.
         """
-        episode, images = read(self.path(index), decode)
-        if episode.index != index:
+        path = self.path(index)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                there, seed, redrawn = (int(n) for n in file["numbers"])
+                arrays = {name: file[name] for name in ARRAYS}
+                if "frames" in file.files:  # written by version 0.1
+                    frames = file["frames"]
+                    images = [png(frame) for frame in frames]
+                else:
+                    ends = np.cumsum(file["image_sizes"]).tolist()
+                    content = file["images"].tobytes()
+                    images = [content[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+                    frames = np.stack([_pixels(i) for i in images]) if decode else np.zeros(0, np.uint8)
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise OutputError(
-                f"{self.path(index)}: got episode {episode.index}, expected {index}; delete it and run the same "
-                "command again"
+                f"{path}: got a damaged file ({error}), expected an episode; delete it and run the same command again"
+            ) from error
+        if there != index:
+            raise OutputError(
+                f"{path}: got episode {there}, expected {index}; delete it and run the same command again"
             )
-        return episode, images
+        return RecordedEpisode(index, seed, redrawn, frames, **arrays), images
 
     def missing(self) -> list[int]:
         """Episodes that are not stored yet."""

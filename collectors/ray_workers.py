@@ -13,10 +13,9 @@ import socket
 import warnings
 from typing import Any
 
-from playslot_rl.collectors.encoding import encode
-from playslot_rl.collectors.episodes import EpisodeCollector, Job, TaskMaker, collector_settings, make_policy
-from playslot_rl.collectors.journal import Journal
-from playslot_rl.collectors.workers import Report
+from playslot_rl.collectors.episodes import EpisodeCollector, TaskMaker, collector_settings, make_policy
+from playslot_rl.collectors.journal import Journal, encode
+from playslot_rl.collectors.recording import Report
 from playslot_rl.errors import ConfigError, PlaySlotError
 
 CONNECT_S = 10.0
@@ -27,12 +26,12 @@ STARTS = 3
 class RemoteEpisodeCollector(EpisodeCollector):
     """The collector in a Ray actor."""
 
-    def record_encoded(self, job: Job) -> tuple[int, bytes]:
+    def record_encoded(self, index: int) -> tuple[int, bytes]:
         """Index and encoded content of one episode (see `EpisodeCollector.record`)."""
         import torch
 
         torch.set_num_threads(1)
-        return job.index, encode(self.record(job))
+        return index, encode(self.record(index))
 
 
 class RayWorkers:
@@ -60,19 +59,18 @@ class RayWorkers:
         self._pool = _connect(journal, count, address)
 
     def start(self, slot: int) -> None:
-        """See `playslot_rl.collectors.workers.Workers`."""
+        """See `playslot_rl.collectors.recording.Workers`."""
         spec = self.journal.spec
-        self._pool.add_collectors(
-            [TaskMaker(spec)], 1, make_policy(spec.policy, spec.noise), [_inner_settings(self.journal)], [_resources()]
-        )
+        resources = {"num_cpus": 1, "max_restarts": 0}  # we start another one ourselves, and know its episodes
+        self._pool.add_collectors([TaskMaker(spec)], 1, make_policy(spec), [collector_settings(spec)], [resources])
         self._actors[slot] = self._pool.remote_collectors[-1]
 
-    def submit(self, slot: int, job: Job) -> None:
-        """See `playslot_rl.collectors.workers.Workers`."""
-        self._tasks[self._actors[slot].record_encoded.remote(job)] = slot
+    def submit(self, slot: int, index: int) -> None:
+        """See `playslot_rl.collectors.recording.Workers`."""
+        self._tasks[self._actors[slot].record_encoded.remote(index)] = slot
 
     def reports(self, timeout: float) -> list[Report]:
-        """See `playslot_rl.collectors.workers.Workers`."""
+        """See `playslot_rl.collectors.recording.Workers`."""
         import ray
 
         waiting = list(self._tasks)
@@ -90,7 +88,14 @@ class RayWorkers:
         except ray.exceptions.ActorDiedError as error:
             text = str(error)
             if "ModuleNotFoundError" in text or "creation task" in text:
-                return Report(slot, error=PlaySlotError(_cannot_start(text)))
+                last = next((line for line in reversed(text.splitlines()) if line.strip()), "no reason given")
+                return Report(
+                    slot,
+                    error=PlaySlotError(
+                        f"collector.backend=ray: a worker could not start, got {last.strip()}, expected playslot_rl of "
+                        "this version and a GL backend on every machine of the cluster; install them there"
+                    ),
+                )
             self.kill(slot)
             return Report(slot, dead="on Ray died")
         except ray.exceptions.RayTaskError as error:
@@ -105,7 +110,7 @@ class RayWorkers:
         return Report(slot, index=index)
 
     def kill(self, slot: int) -> None:
-        """See `playslot_rl.collectors.workers.Workers`."""
+        """See `playslot_rl.collectors.recording.Workers`."""
         import ray
 
         actor, self._actors[slot] = self._actors[slot], None
@@ -126,7 +131,12 @@ def _connect(journal: Journal, count: int, address: str) -> Any:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray announces a change of its own
     where = address or os.environ.get("RAY_ADDRESS", "")
     alone = not where
-    _check_reachable(where)
+    host, colon, port = where.removeprefix("ray://").rpartition(":")
+    if colon and port.isdigit():  # "auto" and the like are Ray's to judge
+        try:  # whether anybody listens: Ray itself would try for minutes
+            socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
+        except (OSError, OverflowError) as error:
+            raise PlaySlotError(_no_cluster(where, error)) from error
     from torchrl.collectors.distributed import RayCollector
 
     init: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "logging_level": "error"}
@@ -137,7 +147,7 @@ def _connect(journal: Journal, count: int, address: str) -> Any:
                 warnings.simplefilter("ignore")  # of weight updates: these policies have no weights
                 return RayCollector(
                     [],
-                    make_policy(journal.spec.policy, journal.spec.noise),
+                    make_policy(journal.spec),
                     collector_class=RemoteEpisodeCollector,
                     frames_per_batch=journal.spec.steps,
                     collector_kwargs=[],
@@ -154,21 +164,6 @@ def _connect(journal: Journal, count: int, address: str) -> Any:
     raise AssertionError("unreachable")
 
 
-def _check_reachable(where: str) -> None:
-    """Look whether anybody listens at HOST:PORT; Ray itself would try for minutes.
-
-    Raises:
-        PlaySlotError: nobody does.
-    """
-    host, colon, port = where.removeprefix("ray://").rpartition(":")
-    if not colon or not port.isdigit():
-        return  # "auto" and the like are Ray's to judge
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
-    except (OSError, OverflowError) as error:
-        raise PlaySlotError(_no_cluster(where, error)) from error
-
-
 def _no_cluster(where: str, error: Exception) -> str:
     text = " ".join(str(error).split())
     if not where:
@@ -176,24 +171,4 @@ def _no_cluster(where: str, error: Exception) -> str:
     return (
         f"collector.backend=ray: got {text}, expected a cluster at {where!r}; "
         "check collector.ray_address, or leave it out to use this machine alone"
-    )
-
-
-def _resources() -> dict[str, Any]:
-    """What an actor takes of the cluster. `max_restarts` 0: we start another one and know its episodes."""
-    return {"num_cpus": 1, "max_restarts": 0}
-
-
-def _inner_settings(journal: Journal) -> dict[str, Any]:
-    """Settings of a remote collector; TorchRL itself gives it the number of frames."""
-    settings = collector_settings(journal.spec)
-    del settings["total_frames"]
-    return settings
-
-
-def _cannot_start(text: str) -> str:
-    last = next((line for line in reversed(text.splitlines()) if line.strip()), "no reason given")
-    return (
-        f"collector.backend=ray: a worker could not start, got {last.strip()}, expected playslot_rl of this version "
-        "and a GL backend on every machine of the cluster; install them there"
     )

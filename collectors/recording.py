@@ -1,29 +1,167 @@
-"""Hands episodes out to workers, and replaces workers that die or hang."""
+"""Hands episodes out to workers, and replaces workers that die or hang.
+
+Each worker process records the episodes it is given and writes their files itself, so that only small messages pass:
+nothing waits for the parent, and a process that stops in the middle of an episode cannot block it.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import multiprocessing
+import os
+import signal
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from typing import Any, Protocol
 
 import numpy as np
+import torch
 
-from playslot_rl.collectors.episodes import Job, RecordedEpisode, record
-from playslot_rl.collectors.journal import Journal
+from playslot_rl.collectors.episodes import EpisodeCollector, record
+from playslot_rl.collectors.journal import Journal, RecordedEpisode
 from playslot_rl.collectors.spec import CollectionSpec
-from playslot_rl.collectors.workers import LocalWorkers, Report, Workers
 from playslot_rl.config import CollectorConfig
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.envs.rendering import check_rendering
 from playslot_rl.errors import PlaySlotError
 
+PR_SET_PDEATHSIG = 1
 AHEAD = 2
 """Episodes in a worker's hands: while it records one, the next is there already."""
 POLL_S = 1.0
 START_S = 300.0
 """What a worker is given to import everything, beyond `collector.timeout_s`."""
 CLIPS_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class Report:
+    """News of a worker: it stored episode `index`; or ended with an `error`; or died, and of what (`dead`).
+
+    With none of them, it is ready.
+    """
+
+    slot: int
+    index: int | None = None
+    error: Exception | None = None
+    dead: str = ""
+
+
+class Workers(Protocol):
+    """Places (slots) where episodes are recorded."""
+
+    def start(self, slot: int) -> None:
+        """Start the worker of a place, empty or left by a dead one."""
+
+    def submit(self, slot: int, index: int) -> None:
+        """Hand an episode to a worker, which records its episodes in the order they come."""
+
+    def reports(self, timeout: float) -> list[Report]:
+        """What the workers say; empty after `timeout` seconds of silence."""
+
+    def kill(self, slot: int) -> None:
+        """End a worker at once, also one that hangs."""
+
+    def close(self) -> None:
+        """End all of them."""
+
+
+def serve(pipe: Connection[Any, Any], journal: Journal) -> None:
+    """Body of a worker process: record and store what comes through the pipe, until it closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's
+    torch.set_num_threads(1)
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() == 1:  # the parent died before the line above
+            os._exit(1)
+    try:
+        collector = EpisodeCollector.make(journal.spec)
+        pipe.send(None)  # ready
+        while True:
+            index: int = pipe.recv()
+            journal.add(collector.record(index))
+            pipe.send(index)
+    except (EOFError, ConnectionError):
+        return
+    except Exception as error:  # noqa: BLE001  told to the parent, which ends with it
+        with contextlib.suppress(ConnectionError):
+            pipe.send(error if isinstance(error, PlaySlotError) else RuntimeError(f"{type(error).__name__}: {error}"))
+
+
+class LocalWorkers:
+    """Worker processes.
+
+    Args:
+        journal: where they store episodes.
+        count: how many.
+    """
+
+    def __init__(self, journal: Journal, count: int) -> None:
+        self.journal = journal
+        self._context = multiprocessing.get_context("spawn")
+        self._processes: list[SpawnProcess | None] = [None] * count
+        self._pipes: list[Connection[Any, Any] | None] = [None] * count
+
+    def start(self, slot: int) -> None:
+        """See `Workers`."""
+        ours, theirs = self._context.Pipe()
+        process = self._context.Process(target=serve, args=(theirs, self.journal), daemon=True)
+        process.start()
+        theirs.close()
+        self._processes[slot], self._pipes[slot] = process, ours
+
+    def submit(self, slot: int, index: int) -> None:
+        """See `Workers`."""
+        pipe = self._pipes[slot]
+        assert pipe is not None
+        with contextlib.suppress(ConnectionError):  # `reports` says that it died
+            pipe.send(index)
+
+    def reports(self, timeout: float) -> list[Report]:
+        """See `Workers`."""
+        open_pipes = [pipe for pipe in self._pipes if pipe is not None]
+        ready = wait(open_pipes, timeout)
+        return [report for slot, pipe in enumerate(self._pipes) if pipe in ready for report in self._read(slot)]
+
+    def _read(self, slot: int) -> Iterator[Report]:
+        pipe, process = self._pipes[slot], self._processes[slot]
+        assert pipe is not None
+        assert process is not None
+        try:
+            while pipe.poll():
+                said = pipe.recv()
+                yield Report(slot, error=said) if isinstance(said, Exception) else Report(slot, index=said)
+        except (EOFError, OSError):
+            process.join(1.0)
+            code = process.exitcode
+            self.kill(slot)
+            ending = f"exit code {code}"
+            if code is not None and code < 0:
+                with contextlib.suppress(ValueError):
+                    ending = signal.Signals(-code).name
+            yield Report(slot, dead=f"ended with {ending}")
+
+    def kill(self, slot: int) -> None:
+        """See `Workers`."""
+        process, pipe = self._processes[slot], self._pipes[slot]
+        self._processes[slot] = self._pipes[slot] = None
+        if pipe is not None:
+            pipe.close()
+        if process is not None:
+            process.kill()  # SIGKILL: also ends one that is stopped
+            process.join()
+
+    def close(self) -> None:
+        """See `Workers`. Episodes in hand are lost: a file is whole or not there, so nothing else is."""
+        for slot in range(len(self._processes)):
+            self.kill(slot)
 
 
 def record_into(
@@ -146,7 +284,7 @@ class _Dispatch:
                 if len(held) <= depth and self.waiting:
                     index = self.waiting.popleft()
                     held.append(index)
-                    self.pool.submit(slot, Job(index, self.journal.spec.episode_seed(index)))
+                    self.pool.submit(slot, index)
 
     def _take(self, report: Report) -> int | None:
         """A report's episode, if it stored one."""

@@ -54,10 +54,17 @@ class CollectionSpec:
             near = difflib.get_close_matches(policy, OFFSETS, n=1)
             hint = f"; did you mean policy={near[0]}?" if near else "; choose one of these"
             raise ConfigError(f"unknown policy: got {policy!r}, expected one of {', '.join(sorted(OFFSETS))}{hint}")
-        if config.env.name in PROCEDURAL:
-            _check_procedural(config.env, policy)
-        else:
+        if config.env.name not in PROCEDURAL:
             gym_id(config.env.name)
+        elif policy != "random":
+            raise ConfigError(
+                f"policy: got {policy} for env={config.env.name}, expected random: its shapes move by themselves; "
+                "leave policy out"
+            )
+        else:
+            from playslot_rl.envs.grid_shapes import check_actions
+
+            check_actions(config.env)
         if not 1 <= episodes <= EPISODES // 2:
             raise ConfigError(f"episodes: got {episodes}, expected 1 to {EPISODES // 2}; split larger sets over seeds")
         if steps < 2:
@@ -81,30 +88,18 @@ class CollectionSpec:
         values["env"] = {k: v for k, v in values["env"].items() if not isinstance(v, dict) or v != default[k]}
         return values
 
+    def difference(self, stored: object) -> str:
+        """First setting in which a stored record differs, as `name: got X, expected Y`; empty if none does.
 
-def _check_procedural(env: EnvConfig, policy: str) -> None:
-    """Refuse what an environment without a simulator cannot give.
-
-    Raises:
-        ConfigError: an expert, or an action of the wrong width.
-    """
-    from playslot_rl.envs.grid_shapes import check_actions
-
-    if policy != "random":
-        raise ConfigError(
-            f"policy: got {policy} for env={env.name}, expected random: its shapes move by themselves; leave policy out"
-        )
-    check_actions(env)
-
-
-def completed(stored: object) -> dict[str, Any]:
-    """A stored record with the defaults of settings that did not exist when it was written."""
-    if not isinstance(stored, dict):
-        return {}
-    try:
-        return from_dict(CollectionSpec, stored).to_dict()
-    except (TypeError, ValueError):
-        return stored  # `difference` names what is foreign in it
+        The record may lack settings that did not exist when it was written.
+        """
+        found: dict[str, Any] = {}
+        if isinstance(stored, dict):
+            try:
+                found = from_dict(CollectionSpec, stored).to_dict()
+            except (TypeError, ValueError):
+                found = stored  # the difference names what is foreign in it
+        return difference(found, self.to_dict())
 
 
 def difference(got: dict[str, Any], expected: dict[str, Any]) -> str:

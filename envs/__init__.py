@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import difflib
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
-from playslot_rl.config import EnvConfig, RenderConfig
+from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
 from playslot_rl.errors import ConfigError
 
 if TYPE_CHECKING:
     import gymnasium as gym
-    import numpy as np
-    import numpy.typing as npt
     from torchrl.envs import EnvBase
+
+    from playslot_rl.envs.pixel_task import PixelTask
 
 ENVIRONMENTS: dict[str, tuple[str, str]] = {
     "button_press": ("PlaySlot/ButtonPress-v0", "playslot_rl.envs.button_press:ButtonPressEnv"),
@@ -21,7 +21,7 @@ ENVIRONMENTS: dict[str, tuple[str, str]] = {
     "block_reach": ("PlaySlot/BlockReach-v0", "playslot_rl.envs.block_push:BlockReachEnv"),
     "block_pick": ("PlaySlot/BlockPick-v0", "playslot_rl.envs.block_push:BlockPickEnv"),
 }
-"""Name in the configuration -> Gymnasium id and entry point; `block_ids.py` has more ids of the blocks family."""
+"""Name in the configuration -> Gymnasium id and entry point; `block_ids` has more ids of the blocks family."""
 
 PROCEDURAL = ("grid_shapes",)
 """Environments that are drawn, not simulated: they give videos, there is nothing to act on and no success."""
@@ -30,22 +30,30 @@ RECORDED = ("sketchy",)
 """Names of data sets recorded on real robots: settings for training on them."""
 
 
-class TaskEnv(Protocol):
-    """What the collectors and the evaluation need of an environment, beyond Gymnasium's own interface."""
+EASY: Final = BlocksConfig(distractors=0, colour="mediumblue")
+"""One cube, always of the same colour."""
 
-    config: EnvConfig
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start the episode of `seed`; `info["success"]` is True where it starts solved."""
+def block_config(name: str, blocks: BlocksConfig) -> EnvConfig:
+    """25 agent steps of two environment steps, without warm-up."""
+    return EnvConfig(name, frame_skip=2, max_steps=25, warmup_steps=0, blocks=blocks)
 
-    def step(self, action: npt.NDArray[np.float32]) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """One agent step; `info["success"]` says whether it solved the task."""
 
-    def expert_action(self) -> npt.NDArray[np.float32]:
-        """The scripted expert's action for the present state, (A,) in [-1, 1]."""
+def block_ids() -> dict[str, tuple[str, EnvConfig]]:
+    """Ids of the blocks family, every variant with every task and the easy setting, by Gymnasium id.
 
-    def close(self) -> None:
-        """Free the renderer."""
+    Returns:
+        Entry point and the configuration it starts from (three distractors, dense reward).
+    """
+    found = {}
+    for variant in ("Push", "Reach", "Pick"):
+        entry = f"playslot_rl.envs.block_push:Block{variant}Env"
+        for task, suffix in {"red": "Red", "reddest": "Reddest", "odd": "Odd", "odd_groups": "OddGroups"}.items():
+            config = block_config(f"block_{variant.lower()}", BlocksConfig(task=task))  # type: ignore[arg-type]
+            found[f"PlaySlot/Block{variant}{suffix}-v0"] = entry, config
+        found[f"PlaySlot/Block{variant}-v0"] = found[f"PlaySlot/Block{variant}Odd-v0"]
+    easy = block_config("block_push_easy", EASY)
+    return {**found, "PlaySlot/BlockPushEasy-v0": ("playslot_rl.envs.block_push:BlockPushEnv", easy)}
 
 
 def register() -> None:
@@ -53,10 +61,8 @@ def register() -> None:
     from gymnasium.envs.registration import register as gym_register
     from gymnasium.envs.registration import registry
 
-    from playslot_rl.envs.block_ids import family
-
     wanted: dict[str, tuple[str, dict[str, Any]]] = {name: (entry, {}) for name, entry in ENVIRONMENTS.values()}
-    wanted.update({name: (entry, {"env": config}) for name, (entry, config) in family().items()})
+    wanted.update({name: (entry, {"env": config}) for name, (entry, config) in block_ids().items()})
     for name, (entry, kwargs) in wanted.items():
         if name not in registry:
             gym_register(id=name, entry_point=entry, order_enforce=False, disable_env_checker=True, kwargs=kwargs)
@@ -99,9 +105,9 @@ def make_env(env: EnvConfig | None = None, render: RenderConfig | None = None) -
     return gymnasium.make(name, env=env, render=render or RenderConfig(), render_mode="rgb_array")
 
 
-def task_env(env: gym.Env[Any, Any]) -> TaskEnv:
+def task_env(env: gym.Env[Any, Any]) -> PixelTask:
     """The task under any Gymnasium wrappers."""
-    return cast(TaskEnv, env.unwrapped)
+    return cast("PixelTask", env.unwrapped)
 
 
 def task_metadata(env: EnvConfig) -> dict[str, Any]:
@@ -123,21 +129,22 @@ def task_metadata(env: EnvConfig) -> dict[str, Any]:
 
 
 def make_torchrl_env(env: EnvConfig | None = None, render: RenderConfig | None = None) -> EnvBase:
-    """Make a task in its TorchRL form; see `playslot_rl.envs.torchrl`."""
-    from playslot_rl.envs.torchrl import make_torchrl_env as make
+    """Make a task for TorchRL.
 
-    return make(env or EnvConfig(), render or RenderConfig())
+    Args:
+        env: the task; None means the defaults.
+        render: how frames are drawn; None means the defaults.
 
+    Returns:
+        Environment with batch size () that reads `keys.ACTION` float32 (A,) and writes `keys.PIXELS` uint8 (3, H, W),
+        `keys.STATE` float32 (S,), `keys.SUCCESS` bool (1,), reward, done, terminated and truncated. `set_seed(s)`
+        makes `s` the seed of the next episode; later resets draw theirs from the environment's generator.
 
-__all__ = [
-    "ENVIRONMENTS",
-    "PROCEDURAL",
-    "RECORDED",
-    "TaskEnv",
-    "gym_id",
-    "make_env",
-    "make_torchrl_env",
-    "register",
-    "task_env",
-    "task_metadata",
-]
+    Raises:
+        ConfigError: unknown environment name.
+        RenderError: there is no working GL backend.
+    """
+    task = make_env(env, render)  # before torchrl, which imports mujoco too
+    from playslot_rl.envs.torchrl import TensorView, wrap
+
+    return wrap(TensorView(task))

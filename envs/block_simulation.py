@@ -1,26 +1,104 @@
-"""The simulation of the blocks family: gymnasium-robotics' `MujocoFetchEnv` on our scene.
+"""The simulation of the blocks family: gymnasium-robotics' `MujocoFetchEnv` on a scene built with `mujoco.MjSpec`.
 
-Import it after `playslot_rl.envs.rendering.import_mujoco` was called.
+From the Fetch assets that gymnasium-robotics ships: a Fetch arm, a light grey table, cubes with free joints or spheres
+without collision, the goal (a red sphere), one directional light, a green sky, and the camera. All lengths are metres
+in world coordinates; z is up. Import it after `playslot_rl.envs.rendering.import_mujoco` was called.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
+import farama_notifications
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.envs.block_layout import Layout, Variant
-from playslot_rl.envs.block_scene import CUBE, SMALL_CUBE, asset, build_spec, import_fetch, parking_place
+from playslot_rl.envs.block_layout import CUBE, SMALL_CUBE, Layout, Variant, Vector
 
-SUBSTEPS = 20
+farama_notifications.notifications.pop("gymnasium_robotics", None)  # it prints about other environments
+from gymnasium_robotics.envs.fetch import fetch_env  # noqa: E402
+
+MujocoFetchEnv: Any = fetch_env.MujocoFetchEnv
+SCENES = Path(fetch_env.__file__).parents[1] / "assets" / "fetch"
+
+CAMERA: Final = "frontview"
+CAMERA_PLACE: Final = (1.9, 0.75, 0.8)
+CAMERA_EULER: Final = (0.0, 1.0, 1.571)
+"""Radians about x, y, z, each turning the next one's axes; a camera looks along its own -z."""
+SPHERE: Final = 0.04
+"""Radius of the goal, and of Reach's spheres."""
+PARKING_X: Final = 4.0
+"""Where cubes rest that the episode does not use: on the floor, behind the camera."""
+
+STILL: Final = ("robot0:base_link", "robot0:torso_lift_link", "robot0:torso_fixed_link")
+"""Parts of the robot that never move, mostly behind the table."""
+SCREEN: Final = "table0"
+UNSEEN: Final = ("estop_link", "laser_link", "head_pan_link", "head_tilt_link")
+"""Meshes of many facets that the camera never sees: the same pixels without them."""
+_FINGER: Final = (0.05775, 0.021, 0.02025)
+_DARK_GREY: Final = (0.2, 0.2, 0.2, 1.0)
+_INVISIBLE: Final = (0.0, 0.0, 0.0, 0.0)
+SUBSTEPS: Final = 20
 """Simulation steps of 2 ms in an environment step: 25 Hz."""
-ROBOT_START = {"robot0:slide0": 0.405, "robot0:slide1": 0.48, "robot0:slide2": 0.0}
+ROBOT_START: Final = {"robot0:slide0": 0.405, "robot0:slide1": 0.48, "robot0:slide2": 0.0}
 
-Vector = npt.NDArray[np.float64]
 
-MujocoFetchEnv: Any = import_fetch().MujocoFetchEnv
+def build_spec(cubes: int = 0, spheres: int = 0, pick: bool = False) -> mujoco.MjSpec:
+    """The scene.
+
+    Args:
+        cubes: cubes `object0`, `object1`, ... with joints `object0:joint`, ..., all parked.
+        spheres: sites `sphere0`, ... without collision, invisible until they are coloured.
+        pick: smaller cubes, and a gripper that opens and closes; otherwise its fingers are enlarged and are meant to be
+            locked.
+    """
+    spec = mujoco.MjSpec.from_file(str(SCENES / f"{'pick_and_place' if pick else 'push'}.xml"))
+    spec.detach_body(spec.body("object0"))
+    spec.detach_body(spec.body("floor0"))  # its site moves only when gymnasium-robotics renders; ours is the world's
+    world = spec.worldbody
+    # Not at the origin: MuJoCo would take the world's frame for theirs and ignore where they are moved to.
+    sphere = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [SPHERE] * 3, "pos": [0, 0, 1]}
+    world.add_site(name="target0", rgba=[1, 0, 0, 1], **sphere)
+    for i in range(spheres):
+        world.add_site(name=f"sphere{i}", rgba=_INVISIBLE, **sphere)
+    half = SMALL_CUBE if pick else CUBE
+    for i in range(cubes):
+        body = world.add_body(name=f"object{i}", pos=(PARKING_X, 0.25 * i, half))
+        body.add_joint(name=f"object{i}:joint", type=mujoco.mjtJoint.mjJNT_FREE, damping=0.01)
+        body.add_geom(
+            name=f"object{i}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=[half] * 3,
+            condim=3,
+            mass=2.0,
+            material="block_mat",
+            rgba=[1, 1, 1, 1],
+        )
+        body.add_site(name=f"object{i}", rgba=_INVISIBLE)
+    spec.body(SCREEN).geoms[0].name = SCREEN
+    for geom in spec.body("robot0:mocap").geoms:
+        geom.rgba = _INVISIBLE  # a marker with axes of a metre
+    for side in "rl":
+        finger = spec.geom(f"robot0:{side}_gripper_finger_link")
+        finger.rgba = _DARK_GREY
+        if not pick:
+            finger.size = _FINGER
+    camera = world.add_camera(name=CAMERA, pos=CAMERA_PLACE, fovy=60.0)
+    camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_EULER
+    camera.alt.euler = CAMERA_EULER
+    return spec
+
+
+def lighten(model: mujoco.MjModel) -> None:
+    """Make frames cheaper, before a renderer is made: without the unseen meshes, boxes of one quad a side.
+
+    The unseen meshes do not change a pixel; boxes lit at four points a side instead of 25 change a few, by one level.
+    """
+    for name in UNSEEN:
+        model.geom(f"robot0:{name}").rgba[3] = 0.0
+    model.vis.quality.numquads = 1
 
 
 class BlockSimulation(MujocoFetchEnv):
@@ -36,12 +114,10 @@ class BlockSimulation(MujocoFetchEnv):
 
     def __init__(self, variant: Variant, count: int) -> None:
         self.variant, self.count = variant, count
-        self.half = SMALL_CUBE if variant == "pick" else CUBE
         self._cubes = 0 if variant == "reach" else count
-        parked = {f"object{i}:joint": [*parking_place(i, self.half), 1, 0, 0, 0] for i in range(self._cubes)}
         super().__init__(
-            model_path=str(asset("push")),  # only looked for: `_initialize_simulation` builds the scene
-            initial_qpos={**ROBOT_START, **parked},
+            model_path=str(SCENES / "push.xml"),  # only looked for: `_initialize_simulation` builds the scene
+            initial_qpos=ROBOT_START,  # the cubes start where the scene parks them
             n_substeps=SUBSTEPS,
             has_object=variant != "reach",
             block_gripper=variant != "pick",

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.envs.pixel_task import ACTION_DIM, STATE_DIM, Action, Frame, PixelTask
+from playslot_rl.envs.pixel_task import ACTION_DIM, STATE_DIM, Action, PixelTask
 from playslot_rl.envs.rendering import Camera, FrameRenderer, import_mujoco
 
 CAMERA = Camera(distance=1.25, azimuth=145.0, elevation=-40.0, lookat=(-0.05, 0.75, 0.0))
@@ -61,37 +61,34 @@ class ButtonPressEnv(PixelTask):
         from metaworld.envs.sawyer_button_press_v3 import SawyerButtonPressEnvV3
         from metaworld.policies.sawyer_button_press_v3_policy import SawyerButtonPressV3Policy
 
-        self._env = SawyerButtonPressEnvV3()
-        self._env._set_task_called = True
-        self._env._freeze_rand_vec = False
-        self._env.seeded_rand_vec = True
+        self._simulation = SawyerButtonPressEnvV3()
+        self._simulation._set_task_called = True
+        self._simulation._freeze_rand_vec = False
+        self._simulation.seeded_rand_vec = True
         # Meta-World's own horizon counts environment steps; ours counts agent steps.
-        self._env.max_path_length = np.iinfo(np.int64).max
+        self._simulation.max_path_length = np.iinfo(np.int64).max
         self._expert = SawyerButtonPressV3Policy()
-        self._renderer = FrameRenderer(self._env.model, CAMERA, self.config.image_size, render or RenderConfig())
+        model = self._simulation.model
+        self._renderer = FrameRenderer(model, CAMERA, self.config.image_size, render or RenderConfig())
         self._full: npt.NDArray[np.float64] = np.zeros(0)
 
     def _begin(self, rng: np.random.Generator) -> None:
         """Meta-World's reset done once: its own `reset` runs the hand's 50 settling steps twice."""
         import mujoco
 
-        env = self._env
+        env = self._simulation
         env.np_random = rng
         env.curr_path_length = 0
         mujoco.mj_resetData(env.model, env.data)
         self._full = env.reset_model()
         env._prev_obs = self._full[:18].copy()
 
-    def _simulate(self, action: Action) -> tuple[float, bool]:
-        reward, success = 0.0, False
-        for _ in range(self.config.frame_skip):
-            self._full, step_reward, _, _, info = self._env.step(action)
-            reward += float(step_reward)
-            success |= bool(info["success"])
-        return reward / self.config.frame_skip, success
+    def _advance(self, action: Action) -> tuple[float, bool]:
+        self._full, reward, _, _, info = self._simulation.step(action)
+        return float(reward), bool(info["success"])
 
     def _solved(self) -> bool:
-        _, info = self._env.evaluate_state(self._full, np.zeros(ACTION_DIM, np.float32))
+        _, info = self._simulation.evaluate_state(self._full, np.zeros(ACTION_DIM, np.float32))
         return bool(info["success"])
 
     def _state(self) -> npt.NDArray[np.float32]:
@@ -103,12 +100,3 @@ class ButtonPressEnv(PixelTask):
             warnings.simplefilter("ignore")  # it warns that its gain exceeds the clip, which is how it is meant
             action = self._expert.get_action(self._full)
         return np.clip(action, -1.0, 1.0).astype(np.float32)
-
-    def draw(self) -> Frame:
-        """Draw the present state anew: uint8 (H, W, 3). `render` returns the frame that was last observed."""
-        return self._renderer(self._env.data)
-
-    def close(self) -> None:
-        """Free the GL context."""
-        self._renderer.close()
-        self._env.close()

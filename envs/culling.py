@@ -1,14 +1,20 @@
-"""View-frustum culling: geoms outside the camera's pyramid are not handed to the GPU, nor to its software stand-in.
+"""What a camera that is fixed in the world cannot see is not handed to the GPU, nor to its software stand-in.
 
 MuJoCo draws every visible geom of a scene, in view or not, and under software GL the vertices of an arm's base, behind
-the camera, cost a third of a frame. A geom is left out if its bounding box (centre x, half axes h_k) lies outside
-one of the pyramid's planes through the camera's position c, with inward unit normal n:
-n . (x - c) < -sum_k |n . h_k|. Without shadows and reflections such a geom cannot change a pixel.
+the camera, cost a third of a frame. Without shadows and reflections nothing that is left out here can change a pixel:
+
+- geoms outside the camera's pyramid. One is left out if its bounding box (centre x, half axes h_k) lies outside one of
+  the pyramid's planes through the camera's position c, with inward unit normal n: n . (x - c) < -sum_k |n . h_k|;
+- facets of parts that never move: most of a robot's base faces away or stands behind the table. Only what the GL
+  context is given shrinks: the model, and with it the simulation, stay as they are.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +26,12 @@ HIDDEN_GROUP = 5
 """A geom group that MuJoCo's default visualisation options do not draw."""
 SLACK: Final = 1e-4
 """Metres by which boxes are taken to be larger: the scene is drawn in single precision."""
+GRAZING: Final = 0.02
+"""Facets seen under a smaller sine are kept whichever way they face: joints give way by micrometres."""
+SHRINK: Final = 0.002
+"""Metres by which the screen is taken to be smaller."""
+
+Vector = npt.NDArray[np.float64]
 
 
 class FrustumCuller:
@@ -61,3 +73,75 @@ class FrustumCuller:
     def show(self) -> None:
         """Undo `hide`."""
         self._model.geom_group[:] = self._groups
+
+
+@dataclass(frozen=True)
+class Still:
+    """Parts at rest.
+
+    Attributes:
+        data: a state in which they stand where they always stand.
+        geoms: names of mesh geoms, each the only user of its mesh.
+        screen: name of a box geom at rest that may hide them.
+    """
+
+    data: mujoco.MjData
+    geoms: tuple[str, ...]
+    screen: str
+
+
+def facing(corners: Vector, camera: Vector) -> npt.NDArray[np.bool_]:
+    """Which facets show the camera (3,) their front: corners (F, 3, 3), counter-clockwise; bool (F,)."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    views = corners.mean(axis=1) - camera
+    size = np.linalg.norm(normals, axis=1) * np.linalg.norm(views, axis=1)
+    front: npt.NDArray[np.bool_] = (normals * views).sum(axis=1) < GRAZING * size
+    return front
+
+
+def screened(points: Vector, camera: Vector, half: Vector) -> npt.NDArray[np.bool_]:
+    """Which points (P, 3) a box with half sides (3,) about the origin hides from the camera (3,): bool (P,).
+
+    The shadow of a convex body is convex, so that a facet whose corners are all in it is hidden.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        planes = np.stack([-half - camera, half - camera])[:, None] / (points - camera)
+    enter, leave = planes.min(axis=0).max(axis=1), planes.max(axis=0).min(axis=1)
+    hidden: npt.NDArray[np.bool_] = (enter < leave) & (enter > 0.0) & (enter < 1.0)
+    return hidden
+
+
+def in_sight(model: mujoco.MjModel, still: Still, name: str, camera: Vector) -> npt.NDArray[np.bool_]:
+    """Which facets of the mesh of geom `name` the camera at (3,) sees: bool (facets,)."""
+    data, geom, box = still.data, model.geom(name).id, model.geom(still.screen).id
+    mesh = model.geom_dataid[geom]
+    start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    axes, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
+    vertices = model.mesh_vert[start : start + count].astype(np.float64) @ axes.T + place
+    first, facets = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+    faces = model.mesh_face[first : first + facets]
+    box_axes, box_place = data.geom_xmat[box].reshape(3, 3), data.geom_xpos[box]
+    hidden = screened((vertices - box_place) @ box_axes, (camera - box_place) @ box_axes, model.geom_size[box] - SHRINK)
+    seen: npt.NDArray[np.bool_] = facing(vertices[faces], camera) & ~hidden[faces].all(axis=1)
+    return seen
+
+
+@contextlib.contextmanager
+def only_in_sight(model: mujoco.MjModel, still: Still, camera: Vector) -> Iterator[None]:
+    """While a GL context is made of the model, its still parts have only the facets that the camera sees."""
+    tables: list[Any] = [model.mesh_face, model.mesh_facenormal, model.mesh_facetexcoord]
+    kept = [table.copy() for table in tables], model.mesh_facenum.copy()
+    try:
+        for name in still.geoms:
+            mesh = model.geom_dataid[model.geom(name).id]
+            seen = in_sight(model, still, name, camera)
+            rows = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
+            order = np.argsort(~seen, kind="stable")
+            for table in tables:
+                table[rows] = table[rows][order]
+            model.mesh_facenum[mesh] = seen.sum()
+        yield
+    finally:
+        for table, before in zip(tables, kept[0], strict=True):
+            table[:] = before
+        model.mesh_facenum[:] = kept[1]

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig
+from playslot_rl.envs.rendering import FrameRenderer
 from playslot_rl.errors import ConfigError
 
 ACTION_DIM: Final = 4
@@ -42,6 +43,9 @@ class PixelTask(gym.Env[Observation, Action]):
         ConfigError: `env.action_dim` is not 4.
     """
 
+    _simulation: Any  # MuJoCo's `model` and `data`, and `close`; made by the subclass, as is the next one
+    _renderer: FrameRenderer
+
     def __init__(self, config: EnvConfig, render_mode: str | None) -> None:
         if config.action_dim != ACTION_DIM:
             raise ConfigError(f"env.action_dim: got {config.action_dim}, expected {ACTION_DIM} for {config.name}")
@@ -64,8 +68,8 @@ class PixelTask(gym.Env[Observation, Action]):
         """Put the simulation into a new episode, drawn from `rng`."""
 
     @abstractmethod
-    def _simulate(self, action: Action) -> tuple[float, bool]:
-        """One agent step: its mean reward, and whether any of its environment steps solved the task."""
+    def _advance(self, action: Action) -> tuple[float, bool]:
+        """One environment step: its reward, and whether it solved the task."""
 
     @abstractmethod
     def _solved(self) -> bool:
@@ -79,9 +83,23 @@ class PixelTask(gym.Env[Observation, Action]):
     def expert_action(self) -> Action:
         """Action of the scripted expert for the present state: float32 (4,) in [-1, 1]."""
 
-    @abstractmethod
+    def _simulate(self, action: Action) -> tuple[float, bool]:
+        """One agent step: its mean reward, and whether any of its environment steps solved the task."""
+        reward, success = 0.0, False
+        for _ in range(self.config.frame_skip):
+            step_reward, solved = self._advance(action)
+            reward += step_reward
+            success |= solved
+        return reward / self.config.frame_skip, success
+
     def draw(self) -> Frame:
         """Draw the present state anew: uint8 (H, W, 3). `render` returns the frame that was last observed."""
+        return self._renderer(self._simulation.data)
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self._renderer.close()
+        self._simulation.close()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

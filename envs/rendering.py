@@ -20,8 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import RenderConfig
-from playslot_rl.envs.culling import FrustumCuller
-from playslot_rl.envs.facets import Still, only_in_sight
+from playslot_rl.envs.culling import FrustumCuller, Still, only_in_sight
 from playslot_rl.errors import RenderError
 
 if TYPE_CHECKING:
@@ -45,23 +44,6 @@ class Camera:
     azimuth: float
     elevation: float
     lookat: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class FixedCamera:
-    """A camera of the model.
-
-    Attributes:
-        name: its name in the model.
-        position: metres.
-        euler: radians about x, y, z, each turning the next one's axes; a camera looks along its own -z.
-        fovy: vertical field of view, degrees.
-    """
-
-    name: str
-    position: tuple[float, float, float]
-    euler: tuple[float, float, float]
-    fovy: float
 
 
 def import_mujoco() -> Any:
@@ -112,10 +94,6 @@ def _message(error: BaseException) -> str:
     return f"no GL backend: got MUJOCO_GL={backend!r} ({reason}), expected one that can draw off-screen; {CURE}"
 
 
-def _close(renderer: Any) -> None:
-    renderer.close()
-
-
 def box_mean(frame: npt.NDArray[np.uint8], factor: int) -> npt.NDArray[np.uint8]:
     """Average boxes of `factor` x `factor` pixels: uint8 (H * factor, W * factor, 3) to (H, W, 3).
 
@@ -129,24 +107,12 @@ def box_mean(frame: npt.NDArray[np.uint8], factor: int) -> npt.NDArray[np.uint8]
     return mean
 
 
-def _view(mj: Any, model: mujoco.MjModel, camera: Camera | FixedCamera) -> Any:
-    view = mj.MjvCamera()
-    if isinstance(camera, FixedCamera):
-        view.type = mj.mjtCamera.mjCAMERA_FIXED
-        view.fixedcamid = model.camera(camera.name).id
-        return view
-    view.type = mj.mjtCamera.mjCAMERA_FREE
-    view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
-    view.lookat[:] = camera.lookat
-    return view
-
-
 class FrameRenderer:
     """Draws the scene of one MuJoCo model.
 
     Args:
         model: the model; its off-screen buffer size and, for `fast`, its sample count are changed.
-        camera: the viewpoint; a fixed one must be in the model, at rest in the world.
+        camera: the viewpoint; or the name of a camera of the model that is at rest in the world.
         size: side of the frames, pixels.
         config: quality and supersampling.
         still: parts that never move, of which `fast` draws only what a fixed camera can see.
@@ -158,7 +124,7 @@ class FrameRenderer:
     def __init__(
         self,
         model: mujoco.MjModel,
-        camera: Camera | FixedCamera,
+        camera: Camera | str,
         size: int,
         config: RenderConfig,
         still: Still | None = None,
@@ -172,10 +138,10 @@ class FrameRenderer:
         if fast:
             model.vis.quality.offsamples = 0
         with contextlib.ExitStack() as stack:
-            if fast and still is not None and isinstance(camera, FixedCamera):
-                stack.enter_context(only_in_sight(model, still, np.array(camera.position)))
+            if fast and still is not None and isinstance(camera, str):
+                stack.enter_context(only_in_sight(model, still, model.camera(camera).pos))
             self._renderer = _make_renderer(mj, model, side)
-        self._finalizer = weakref.finalize(self, _close, self._renderer)
+        self._finalizer = weakref.finalize(self, self._renderer.close)
         # Handlers at exit run last in, first out: ours must precede EGL's own, registered with its first context, or
         # closing prints tracebacks. `finalize` may have registered its handler before both.
         self._finalizer.atexit = False
@@ -183,7 +149,12 @@ class FrameRenderer:
         if fast:
             for flag in (mj.mjtRndFlag.mjRND_SHADOW, mj.mjtRndFlag.mjRND_REFLECTION):
                 self._renderer.scene.flags[flag] = 0
-        self._camera = _view(mj, model, camera)
+        self._camera: Any = camera
+        if isinstance(camera, Camera):
+            self._camera = view = mj.MjvCamera()
+            view.type = mj.mjtCamera.mjCAMERA_FREE
+            view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
+            view.lookat[:] = camera.lookat
         self._culler: FrustumCuller | None = None
         if fast:
             data = mj.MjData(model)

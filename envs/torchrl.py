@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, cast
 
 import gymnasium as gym
@@ -11,8 +12,6 @@ import torch
 from torchrl.envs import DTypeCastTransform, EnvBase, GymWrapper, TransformedEnv
 
 from playslot_rl import keys
-from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.envs import make_env
 
 View = dict[str, npt.NDArray[Any]]
 
@@ -22,23 +21,24 @@ class TensorView(gym.Wrapper[View, npt.NDArray[np.float32], dict[str, npt.NDArra
 
     `keys.PIXELS` uint8 [0, 255] (3, H, W), `keys.STATE` float32 (S,), `keys.SUCCESS` bool (1,): whether the last agent
     step solved the task (after a reset: whether the episode starts solved).
+
+    Args:
+        env: the task.
+        more: spaces of what a subclass's `view` adds.
     """
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, env: gym.Env[Any, Any], more: Mapping[str, gym.Space[Any]] | None = None) -> None:
         super().__init__(env)
         spaces = cast(gym.spaces.Dict, env.observation_space)
         height, width, channels = spaces["pixels"].shape or ()
-        self.spaces: dict[str, gym.Space[Any]] = {
+        shown: dict[str, gym.Space[Any]] = {
             keys.PIXELS: gym.spaces.Box(0, 255, (channels, height, width), np.uint8),
             keys.STATE: spaces["state"],
             keys.SUCCESS: gym.spaces.MultiBinary(1),
+            **(more or {}),
         }
-        self.declare({})
+        self.observation_space = cast(gym.Space[View], gym.spaces.Dict(shown))
         self._seed: int | None = None
-
-    def declare(self, more: dict[str, gym.Space[Any]]) -> None:
-        """Set the observation space: the view's own entries and `more`."""
-        self.observation_space = cast(gym.Space[View], gym.spaces.Dict({**self.spaces, **more}))
 
     def view(self, observation: dict[str, npt.NDArray[Any]], info: dict[str, Any]) -> View:
         """One observation and its info under the new names."""
@@ -69,25 +69,5 @@ class TensorView(gym.Wrapper[View, npt.NDArray[np.float32], dict[str, npt.NDArra
 
 def wrap(view: gym.Env[Any, Any]) -> EnvBase:
     """A `GymWrapper` whose `keys.SUCCESS` entry is boolean."""
-    base = GymWrapper(view, device="cpu")
-    cast = DTypeCastTransform(torch.int8, torch.bool, in_keys=[keys.SUCCESS])
-    return TransformedEnv(base, cast)
-
-
-def make_torchrl_env(env: EnvConfig, render: RenderConfig) -> EnvBase:
-    """Make a task for TorchRL.
-
-    Args:
-        env: the task.
-        render: how frames are drawn.
-
-    Returns:
-        Environment with batch size () that reads `keys.ACTION` float32 (A,) and writes `keys.PIXELS` uint8 (3, H, W),
-        `keys.STATE` float32 (S,), `keys.SUCCESS` bool (1,), reward, done, terminated and truncated. `set_seed(s)`
-        makes `s` the seed of the next episode; later resets draw theirs from the environment's generator.
-
-    Raises:
-        ConfigError: unknown environment name.
-        RenderError: there is no working GL backend.
-    """
-    return wrap(TensorView(make_env(env, render)))
+    boolean = DTypeCastTransform(torch.int8, torch.bool, in_keys=[keys.SUCCESS])
+    return TransformedEnv(GymWrapper(view, device="cpu"), boolean)

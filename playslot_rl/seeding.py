@@ -29,11 +29,6 @@ def step_generator(seed: int, step: int, stream: str, device: torch.device | str
     return torch.Generator(device=device).manual_seed(derived_seed(seed, step, stream))
 
 
-def step_numpy(seed: int, step: int, stream: str) -> np.random.Generator:
-    """NumPy generator of one step and stream."""
-    return np.random.default_rng(derived_seed(seed, step, stream))
-
-
 @dataclass(frozen=True)
 class StepGenerators:
     """What the fit loop hands to a stage: generators of one step, made on demand by the name of their stream.
@@ -54,7 +49,7 @@ class StepGenerators:
 
     def numpy(self, stream: str) -> np.random.Generator:
         """NumPy generator of a stream."""
-        return step_numpy(self.seed, self.step, stream)
+        return np.random.default_rng(derived_seed(self.seed, self.step, stream))
 
 
 @contextlib.contextmanager

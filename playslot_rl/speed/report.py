@@ -44,7 +44,7 @@ def measure(
         PlaySlotError: a child died. RenderError: no GL backend.
     """
     from playslot_rl.allocator import tune_allocator
-    from playslot_rl.envs.block_ids import block_config
+    from playslot_rl.envs import block_config
     from playslot_rl.speed.frames import render_seconds, sampling_rates
     from playslot_rl.speed.race import race
 

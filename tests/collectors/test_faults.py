@@ -18,10 +18,8 @@ import pytest
 from small_sets import assert_whole, begin, small, spec_of
 
 from playslot_rl.collectors import recording
-from playslot_rl.collectors.episodes import Job
 from playslot_rl.collectors.journal import Journal
-from playslot_rl.collectors.recording import record_into
-from playslot_rl.collectors.workers import Report
+from playslot_rl.collectors.recording import Report, record_into
 from playslot_rl.config import CollectorConfig
 from playslot_rl.errors import ConfigError, OutputError, PlaySlotError
 
@@ -33,7 +31,7 @@ class ScriptedWorkers:
 
     def __init__(self, journal: Journal, count: int, dies: dict[int, int], hangs: dict[int, int]) -> None:
         self.journal, self.dies, self.hangs = journal, dies, hangs
-        self.queues: list[list[Job]] = [[] for _ in range(count)]
+        self.queues: list[list[int]] = [[] for _ in range(count)]
         self.alive = [False] * count
         self.recorded: list[int] = []
         self.killed: list[int] = []
@@ -44,17 +42,16 @@ class ScriptedWorkers:
         self.alive[slot], self.queues[slot] = True, []
         self.starts += 1
 
-    def submit(self, slot: int, job: Job) -> None:
+    def submit(self, slot: int, index: int) -> None:
         assert self.alive[slot]
-        assert job.seed == self.journal.spec.episode_seed(job.index)
-        self.queues[slot].append(job)
+        self.queues[slot].append(index)
 
     def reports(self, timeout: float) -> list[Report]:
         found = []
         for slot, queue in enumerate(self.queues):
             if not queue or not self.alive[slot]:
                 continue
-            index = queue[0].index
+            index = queue[0]
             if self.hangs.get(index, 0):
                 continue
             if self.dies.get(index, 0):
@@ -62,7 +59,7 @@ class ScriptedWorkers:
                 self.alive[slot] = False
                 found.append(Report(slot, dead="ended with SIGKILL"))
                 continue
-            self.recorded.append(queue.pop(0).index)
+            self.recorded.append(queue.pop(0))
             found.append(Report(slot, index=index))
         return found
 
@@ -70,7 +67,7 @@ class ScriptedWorkers:
         self.killed.append(slot)
         self.alive[slot] = False
         if self.queues[slot]:
-            self.hangs[self.queues[slot][0].index] -= 1
+            self.hangs[self.queues[slot][0]] -= 1
 
     def close(self) -> None:
         self.alive = [False] * len(self.alive)

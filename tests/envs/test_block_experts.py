@@ -9,7 +9,7 @@ import pytest
 
 from playslot_rl.config import BlocksConfig
 from playslot_rl.config.compose import compose
-from playslot_rl.envs.block_ids import block_config
+from playslot_rl.envs import block_config
 from playslot_rl.envs.block_push import BlockEnv, BlockPickEnv, BlockPushEnv, BlockReachEnv
 
 VARIANTS: dict[str, type[BlockEnv]] = {"push": BlockPushEnv, "reach": BlockReachEnv, "pick": BlockPickEnv}

@@ -10,8 +10,7 @@ import pytest
 
 from playslot_rl.config import BlocksConfig
 from playslot_rl.config.env import COLOURS
-from playslot_rl.envs.block_layout import LIFT, REACH_Z, Layout, Variant, draw_layout
-from playslot_rl.envs.colours import redness
+from playslot_rl.envs.block_layout import LIFT, REACH_Z, Layout, Variant, draw_layout, redness
 
 START = np.array([1.3419, 0.7491, 0.5347])
 

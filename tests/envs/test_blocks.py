@@ -11,8 +11,7 @@ import pytest
 
 from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
 from playslot_rl.config.compose import compose
-from playslot_rl.envs import ENVIRONMENTS, make_env
-from playslot_rl.envs.block_ids import EASY, block_config, family
+from playslot_rl.envs import EASY, ENVIRONMENTS, block_config, block_ids, make_env
 from playslot_rl.envs.block_push import BlockEnv, BlockPickEnv, BlockPushEnv, BlockReachEnv
 from playslot_rl.errors import ConfigError
 
@@ -176,7 +175,7 @@ def test_frames_are_the_same_without_what_the_camera_never_sees(
 
     monkeypatch.setattr(rendering, "only_in_sight", lambda *_: contextlib.nullcontext())
     monkeypatch.setattr(FrustumCuller, "hide", lambda self, data: None)
-    monkeypatch.setattr("playslot_rl.envs.block_scene.UNSEEN", ())
+    monkeypatch.setattr("playslot_rl.envs.block_simulation.UNSEEN", ())
     plain = BlockPushEnv()
     monkeypatch.undo()
     hide = FrustumCuller.hide
@@ -240,12 +239,12 @@ def test_every_id_starts_from_the_task_it_names() -> None:
     from playslot_rl.envs import register
 
     register()
-    assert len(family()) == 16
-    assert {gym_id for name, (gym_id, _) in ENVIRONMENTS.items() if name in NAMES} <= set(family())
-    for gym_id, (_, config) in family().items():
+    assert len(block_ids()) == 16
+    assert {gym_id for name, (gym_id, _) in ENVIRONMENTS.items() if name in NAMES} <= set(block_ids())
+    for gym_id, (_, config) in block_ids().items():
         assert gymnasium.spec(gym_id).kwargs == {"env": config}
-    assert family()["PlaySlot/BlockPush-v0"][1] == compose(["env=block_push"]).env
-    assert family()["PlaySlot/BlockPushEasy-v0"][1] == compose(["env=block_push_easy"]).env
+    assert block_ids()["PlaySlot/BlockPush-v0"][1] == compose(["env=block_push"]).env
+    assert block_ids()["PlaySlot/BlockPushEasy-v0"][1] == compose(["env=block_push_easy"]).env
     made = gymnasium.make("playslot_rl.envs:PlaySlot/BlockReachReddest-v0")
     assert isinstance(made.unwrapped, BlockReachEnv)
     assert made.unwrapped.config.blocks.task == "reddest"

@@ -39,7 +39,7 @@ def test_seeds_move_the_button_and_the_arm(env: ButtonPressEnv) -> None:
     boxes, hands = [], []
     for seed in range(4):
         observation, _ = env.reset(seed=seed)
-        boxes.append(env._env.model.body("box").pos.copy())
+        boxes.append(env._simulation.model.body("box").pos.copy())
         hands.append(observation["state"][:3])
     assert np.ptp(np.stack(boxes)[:, 0]) > 0.01
     assert np.ptp(np.stack(hands), axis=0).max() > 0.005
@@ -50,7 +50,7 @@ def test_warm_up_is_independent_of_the_buttons_place(env: ButtonPressEnv) -> Non
     places, hands = [], []
     for seed in range(24):
         observation, _ = env.reset(seed=seed)
-        places.append(env._env.model.body("box").pos[0])
+        places.append(env._simulation.model.body("box").pos[0])
         hands.append(observation["state"][0])
     assert abs(np.corrcoef(places, hands)[0, 1]) < 0.6
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from playslot_rl.config.env import COLOURS
-from playslot_rl.envs.colours import ciede2000, lab, redness
+from playslot_rl.envs.block_layout import ciede2000, lab, redness
 
 PAIRS = [
     ((50.0, 2.6772, -79.7751), (50.0, 0.0, -82.7485), 2.0425),

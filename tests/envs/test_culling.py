@@ -51,7 +51,7 @@ def test_frames_of_button_press_are_the_same_with_and_without_culling(monkeypatc
                 culled = env.step(action)[0]["pixels"]
                 culler = env._renderer._culler
                 assert culler is not None
-                hidden.append(culler.unseen(env._env.data).sum())
+                hidden.append(culler.unseen(env._simulation.data).sum())
                 with monkeypatch.context() as patch:
                     patch.setattr(FrustumCuller, "hide", lambda self, data: None)
                     np.testing.assert_array_equal(env.draw(), culled)

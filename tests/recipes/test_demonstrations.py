@@ -35,7 +35,8 @@ def test_a_set_begun_without_held_out_demonstrations_stays_as_it_is(
     if begun is not None:
         path = tmp_path / "data" / record
         path.parent.mkdir(parents=True)
-        path.write_text(json.dumps({"spec": {"episodes": begun}}))
+        spec = {"episodes": begun}
+        path.write_text(json.dumps(spec if path.name == "collection.json" else {"spec": spec}))  # as each is written
     data = collect_demos(compose(["preset=smoke", "env=button_press"]), tmp_path)
     assert (asked, data.held_out) == ([expected[0]], expected[1])
     assert data.demos == str(tmp_path / "data" / "expert")
