@@ -225,7 +225,7 @@ class SOLDConfig(OnlineConfig):
         head_layers: layers of the slot-aggregation transformers of reward, value and actor.
         bins: categories of the two-hot heads, evenly spaced in symlog from -`limit` to `limit`.
         limit: the grid's ends, in symlog.
-        mean: how a head's probabilities become a value, averaged in `symlog` or `linear` (see `heads.py`).
+        mean: how a head's probabilities become a value, averaged in `symlog` or `linear` (see `networks.py`).
         context: frames (C) that a rollout starts from, at most: 1 to C are drawn. The actor acts on its last C frames.
         horizon: imagined steps (H).
         starts: imagined rollouts in an update, from frames drawn from its batch.

@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from playslot_rl.errors import HubError
-from playslot_rl.hub.errors import Place, translate
+from playslot_rl.hub.errors import Place, checked_token, mask, masked_logs, translate
 from playslot_rl.hub.layout import same_content
-from playslot_rl.hub.secrets import checked_token, mask, masked_logs
 
 if TYPE_CHECKING:
     from huggingface_hub import RepoFile

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
-from playslot_rl.baselines.lapo.encoder import EncoderMLP
+from playslot_rl.baselines.lapo.model import EncoderMLP
 from playslot_rl.config.baselines import LAPOConfig
 from playslot_rl.config.plain import to_dict
 from playslot_rl.frames import normalise

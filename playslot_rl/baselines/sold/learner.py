@@ -19,9 +19,8 @@ from torchrl.modules import PercentileValueNorm
 
 from playslot_rl import keys
 from playslot_rl.baselines.sold import losses
-from playslot_rl.baselines.sold.acting import SOLDActor
-from playslot_rl.baselines.sold.imagination import imagine
-from playslot_rl.baselines.sold.networks import SOLDNetworks, acting_window
+from playslot_rl.baselines.sold.actor import SOLDActor
+from playslot_rl.baselines.sold.networks import SOLDNetworks
 from playslot_rl.config.baselines import SOLDConfig
 from playslot_rl.frames import normalise
 from playslot_rl.modules.savi import SAVi
@@ -44,9 +43,8 @@ class SOLDLearner:
         self.mean_actor = copy.deepcopy(networks.actor).requires_grad_(False)
         # The average of the returns' 5-95 percentile range; it starts at zero, as in DreamerV3.
         self.returns = PercentileValueNorm(rate=config.return_rate, min_scale=1.0).to(next(savi.parameters()).device)
-        window = acting_window(config)
-        self.exploring = SOLDActor(savi, networks.actor, window, action_dim)
-        self.acting = SOLDActor(savi, self.mean_actor, window, action_dim)
+        self.exploring = SOLDActor(savi, networks.actor, config.context, action_dim)
+        self.acting = SOLDActor(savi, self.mean_actor, config.context, action_dim)
         self.stored: tuple[str, ...] = (keys.SLOTS,) if config.image_weight == 0 else (keys.SLOTS, keys.PIXELS)
         rates = {"actor": config.actor_lr, "critic": config.critic_lr}
         self._adam = {
@@ -146,7 +144,7 @@ class SOLDLearner:
         context, actions = self._starts(batch, generators)
         frames = context.shape[1]
         noise = generators.torch("imagination")
-        imagined = imagine(networks.dynamics, networks.actor, context, actions, config.horizon, noise)
+        imagined = losses.imagine(networks.dynamics, networks.actor, context, actions, config.horizon, noise)
         logits = networks.critic(imagined.slots)[:, frames - 1 :]
         values = networks.critic.decode(logits)
         rewards = networks.reward.decode(networks.reward(imagined.slots)[:, frames:])

@@ -6,16 +6,15 @@ from typing import Literal
 
 import pytest
 import torch
-from torchrl.modules import SymExpTwoHot, symlog
+from torchrl.modules import SymExpTwoHot, TruncatedNormal, symlog
 from torchrl.objectives import two_hot_encode
 
-from playslot_rl.baselines.sold.aggregation import SlotAggregation
-from playslot_rl.baselines.sold.heads import (
+from playslot_rl.baselines.sold.networks import (
     MAX_STD,
     MIN_STD,
     ActorHead,
     ScalarHead,
-    action_distribution,
+    SlotAggregation,
     sample_action,
 )
 
@@ -87,7 +86,7 @@ def test_actions_are_within_bounds_and_their_mode_is_the_location() -> None:
     location, std, _ = head(torch.randn(50, 4, 4, 6))
     assert std.min() >= MIN_STD
     assert std.max() <= MAX_STD
-    distribution = action_distribution(location, std)
+    distribution = TruncatedNormal(location, std)
     action = sample_action(distribution, torch.Generator().manual_seed(0))
     assert action.shape == (50, 4, 3)
     assert action.abs().max() <= 1
@@ -97,7 +96,7 @@ def test_actions_are_within_bounds_and_their_mode_is_the_location() -> None:
 
 def test_samples_follow_the_distribution_and_repeat_with_the_generator() -> None:
     location, std = torch.full((40_000, 1), 0.6), torch.full((40_000, 1), 0.5)
-    distribution = action_distribution(location, std)
+    distribution = TruncatedNormal(location, std)
     drawn = sample_action(distribution, torch.Generator().manual_seed(3))
     assert torch.equal(drawn, sample_action(distribution, torch.Generator().manual_seed(3)))
     assert float(drawn.mean()) == pytest.approx(float(distribution.base_dist.mean[0]), abs=0.01)
@@ -106,7 +105,7 @@ def test_samples_follow_the_distribution_and_repeat_with_the_generator() -> None
 
 def test_samples_are_reparameterised() -> None:
     location = torch.full((1000, 1), 0.2, requires_grad=True)
-    drawn = sample_action(action_distribution(location, torch.full((1000, 1), 0.3)), torch.Generator().manual_seed(0))
+    drawn = sample_action(TruncatedNormal(location, torch.full((1000, 1), 0.3)), torch.Generator().manual_seed(0))
     (gradient,) = torch.autograd.grad(drawn.sum(), location)
     assert gradient.min() >= 0
     assert gradient.mean() > 0.5

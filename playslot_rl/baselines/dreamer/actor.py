@@ -1,4 +1,4 @@
-"""A trained DreamerV3 as an actor."""
+"""DreamerV3 as an actor: one step of acting, and a trained one from disk."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from tensordict import TensorDict, TensorDictBase
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
-from playslot_rl.baselines.dreamer.learner import act
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
 from playslot_rl.config import EnvConfig, from_dict
 from playslot_rl.config.baselines import DreamerConfig
@@ -19,6 +18,29 @@ from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
 
 NAME: Final = "dreamer"
+
+
+def act(networks: DreamerNetworks, memory: TensorDictBase, generator: torch.Generator | None) -> TensorDict:
+    """See a frame and choose an action.
+
+    Args:
+        networks: in eval mode.
+        memory: `state` (n, S), `belief` (n, H), `keys.ACTION` (n, A) and `keys.PIXELS` uint8 (n, 3, H, W).
+        generator: of state and action; None takes the most likely state and the mean action.
+
+    Returns:
+        The same keys anew; the frames reduced.
+    """
+    frames = networks.reduce(memory.get(keys.PIXELS))
+    state, belief = networks.filter(
+        memory.get("state"), memory.get("belief"), memory.get(keys.ACTION), frames, generator
+    )
+    mean, std = networks.actor(state, belief)
+    action = mean
+    if generator is not None:
+        action = mean + std * torch.randn(mean.shape, generator=generator, device=mean.device)
+    values = {"state": state, "belief": belief, keys.ACTION: action, keys.PIXELS: frames}
+    return TensorDict(values, memory.batch_size)
 
 
 class DreamerActor(Actor):
