@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from playslot_rl.config.plain import check
-from playslot_rl.config.roles import role
+from playslot_rl.config.roles import Checked, at_least, role, within
 
 
 @dataclass(frozen=True)
-class DataConfig:
+class DataConfig(Checked):
     """Where data come from.
 
     Attributes:
@@ -23,21 +22,18 @@ class DataConfig:
         validation: fraction of episodes held out from training.
     """
 
+    group = "data."
     root: str = field(default="", metadata=role("machine", "folder"))
     demos: str = field(default="", metadata=role("machine", "folder"))
-    held_out: int = field(default=0, metadata=role("machine"))
+    held_out: int = field(default=0, metadata=role("machine") | at_least(0, "0 or more"))
     camera: str = ""
     resize: bool = False
     cache: str = field(default="", metadata=role("machine", "folder"))
-    validation: float = 0.05
-
-    def __post_init__(self) -> None:
-        check(0.0 <= self.validation < 1.0, "data.validation", self.validation, "a fraction in [0, 1)")
-        check(self.held_out >= 0, "data.held_out", self.held_out, "0 or more")
+    validation: float = field(default=0.05, metadata=within(lambda value: 0 <= value < 1, "a fraction in [0, 1)"))
 
 
 @dataclass(frozen=True)
-class CollectConfig:
+class CollectConfig(Checked):
     """What the collectors record (agent steps; an episode has one more frame than actions).
 
     Attributes:
@@ -54,10 +50,11 @@ class CollectConfig:
         storage: `image` (PNG in parquet, lossless) or `video` (h264 yuv444p, crf 0).
     """
 
+    group = "collect."
     random_episodes: int = 400
     random_steps: int = 20
     expert_episodes: int = 150
-    validation_episodes: int = field(default=10, metadata=role("machine"))
+    validation_episodes: int = field(default=10, metadata=role("machine") | at_least(0, "0 or more"))
     expert_steps: int = 20
     noise: float = 0.0
     noisy_episodes: int = 0
@@ -65,12 +62,9 @@ class CollectConfig:
     learn_from_demos: bool = False
     storage: Literal["image", "video"] = "image"
 
-    def __post_init__(self) -> None:
-        check(self.validation_episodes >= 0, "collect.validation_episodes", self.validation_episodes, "0 or more")
-
 
 @dataclass(frozen=True)
-class CollectorConfig:
+class CollectorConfig(Checked):
     """How episodes are recorded, never what: the data do not depend on it.
 
     Attributes:
@@ -80,11 +74,8 @@ class CollectorConfig:
         ray_address: address of the Ray cluster; empty means `$RAY_ADDRESS`, or a cluster of this machine alone.
     """
 
+    group = "collector."
     backend: Literal["local", "ray"] = "local"
-    timeout_s: float = 120.0
-    restarts: int = 5
+    timeout_s: float = field(default=120.0, metadata=within(lambda value: value > 0, "a number of seconds above 0"))
+    restarts: int = field(default=5, metadata=at_least(0, "0 or more"))
     ray_address: str = ""
-
-    def __post_init__(self) -> None:
-        check(self.timeout_s > 0.0, "collector.timeout_s", self.timeout_s, "a number of seconds above 0")
-        check(self.restarts >= 0, "collector.restarts", self.restarts, "0 or more")

@@ -11,14 +11,13 @@ from playslot_rl.config.data import CollectConfig, CollectorConfig, DataConfig
 from playslot_rl.config.env import EnvConfig, RenderConfig
 from playslot_rl.config.methods import MethodName
 from playslot_rl.config.model import ModelConfig
-from playslot_rl.config.plain import check, check_seed
-from playslot_rl.config.roles import role
+from playslot_rl.config.roles import SEED, Checked, at_least, between, role
 from playslot_rl.config.stages import BehaviourStageConfig, DynamicsStageConfig, SlotsStageConfig
 from playslot_rl.episode_seeds import EVALUATION
 
 
 @dataclass(frozen=True)
-class EvaluationConfig:
+class EvaluationConfig(Checked):
     """Evaluation.
 
     Attributes:
@@ -27,12 +26,9 @@ class EvaluationConfig:
             Below that only the records of the training data sets, which are looked at, keep episodes apart.
     """
 
+    group = "evaluation."
     references: bool = True
-    seed_offset: int = EVALUATION
-
-    def __post_init__(self) -> None:
-        most = 2 * EVALUATION
-        check(0 <= self.seed_offset <= most, "evaluation.seed_offset", self.seed_offset, f"0 to {most}")
+    seed_offset: int = field(default=EVALUATION, metadata=between(0, 2 * EVALUATION, f"0 to {2 * EVALUATION}"))
 
 
 @dataclass(frozen=True)
@@ -62,7 +58,7 @@ class LoggingConfig:
 
 
 @dataclass(frozen=True)
-class ExperimentConfig:
+class ExperimentConfig(Checked):
     """Everything a command needs.
 
     Attributes:
@@ -82,16 +78,16 @@ class ExperimentConfig:
 
     preset: str = field(default="paper", metadata=role("machine"))
     policy: Literal["random", "expert"] = field(default="expert", metadata=role("call"))
-    episodes: int | None = field(default=None, metadata=role("call"))
-    seed: int = 0
-    workers: int = field(default=0, metadata=role("call", "machine"))
+    episodes: int | None = field(default=None, metadata=role("call") | at_least(1))
+    seed: int = field(default=0, metadata=SEED)
+    workers: int = field(default=0, metadata=role("call", "machine") | at_least(0, "0 (one per core) or more"))
     out: str = field(default="", metadata=role("call", "machine", "folder"))
     run: str = field(default="", metadata=role("call", "machine", "folder"))
     protocol: Literal["simulation", "imagination"] = field(default="simulation", metadata=role("call"))
     device: str = field(default="", metadata=role("call", "machine"))
     threads: int = field(default=0, metadata=role("machine"))
     method: MethodName = "playslot"
-    demos: int | None = None
+    demos: int | None = field(default=None, metadata=at_least(1))
     env: EnvConfig = field(default_factory=EnvConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     data: DataConfig = field(default_factory=DataConfig)
@@ -106,9 +102,3 @@ class ExperimentConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     logging: LoggingConfig = field(default_factory=LoggingConfig, metadata=role("machine"))
     export: ExportConfig = field(default_factory=ExportConfig, metadata=role("call"))
-
-    def __post_init__(self) -> None:
-        check(self.episodes is None or self.episodes >= 1, "episodes", self.episodes, "at least 1")
-        check_seed("seed", self.seed)
-        check(self.demos is None or self.demos >= 1, "demos", self.demos, "at least 1")
-        check(self.workers >= 0, "workers", self.workers, "0 (one per core) or more")

@@ -10,8 +10,6 @@ import types
 import typing
 from typing import Any, Literal, Union, get_args, get_origin
 
-from playslot_rl.episode_seeds import LARGEST_SEED
-
 
 def check(ok: bool, what: str, got: object, expected: str) -> None:
     """Refuse a value out of range.
@@ -21,16 +19,6 @@ def check(ok: bool, what: str, got: object, expected: str) -> None:
     """
     if not ok:
         raise ValueError(f"{what}: got {got!r}, expected {expected}")
-
-
-def check_seed(what: str, *seeds: int) -> None:
-    """Refuse seeds that are no non-negative 32-bit numbers.
-
-    Raises:
-        ValueError: one is not.
-    """
-    for seed in seeds:
-        check(0 <= seed <= LARGEST_SEED, what, seed, f"a non-negative integer of 32 bits, 0 to {LARGEST_SEED}")
 
 
 def to_dict(config: Any) -> dict[str, Any]:
