@@ -121,9 +121,6 @@ def module_device(module: nn.Module) -> torch.device:
     return next(module.parameters()).device
 
 
-# --- parse --------------------------------------------------------------------------------------------------------
-
-
 class _ParseFrame(nn.Module):
     def __init__(self, savi: SAVi, generator: torch.Generator | None) -> None:
         super().__init__()
@@ -156,9 +153,6 @@ def frame_parser_module(savi: SAVi, generator: torch.Generator | None = None) ->
         in_keys=[keys.PIXELS, keys.SLOT_STATE, keys.SLOT_AGE],
         out_keys=[keys.SLOTS, keys.SLOT_STATE, keys.SLOT_AGE],
     )
-
-
-# --- predict ------------------------------------------------------------------------------------------------------
 
 
 class _Step(nn.Module):
@@ -212,9 +206,6 @@ def dynamics_module(inverse_dynamics: InverseDynamics, predictor: Predictor) -> 
             out_keys=[keys.SLOTS, keys.SLOT_HISTORY, keys.ACTION_HISTORY, keys.HISTORY_LENGTH],
         )
     )
-
-
-# --- behave -------------------------------------------------------------------------------------------------------
 
 
 def latent_policy_module(policy: nn.Module) -> TensorDictModule:

@@ -11,13 +11,13 @@ from playslot_rl.config.baselines import OnlineConfig as OnlineConfig
 from playslot_rl.config.baselines import ResNetOracleConfig as ResNetOracleConfig
 from playslot_rl.config.baselines import SOLDConfig as SOLDConfig
 from playslot_rl.config.compare import CompareConfig as CompareConfig
-from playslot_rl.config.data import CollectConfig as CollectConfig
-from playslot_rl.config.data import CollectorConfig as CollectorConfig
-from playslot_rl.config.data import DataConfig as DataConfig
 from playslot_rl.config.env import BlocksConfig as BlocksConfig
 from playslot_rl.config.env import EnvConfig as EnvConfig
 from playslot_rl.config.env import GridConfig as GridConfig
 from playslot_rl.config.env import RenderConfig as RenderConfig
+from playslot_rl.config.experiment import CollectConfig as CollectConfig
+from playslot_rl.config.experiment import CollectorConfig as CollectorConfig
+from playslot_rl.config.experiment import DataConfig as DataConfig
 from playslot_rl.config.experiment import EvaluationConfig as EvaluationConfig
 from playslot_rl.config.experiment import ExperimentConfig as ExperimentConfig
 from playslot_rl.config.experiment import ExportConfig as ExportConfig

@@ -18,6 +18,7 @@ from typing import Any, Final
 
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.methods import MethodName, canonical_method
+from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import keys_of
 from playslot_rl.errors import ConfigError
 
@@ -152,24 +153,9 @@ def _unknown_key(key: str) -> str:
         group = group.rpartition(".")[0]
     level = _hint(group) if group else ExperimentConfig
     names = [f"{group}.{f.name}" if group else f.name for f in dataclasses.fields(level)]
-    near = difflib.get_close_matches(key, [*names, *_leaves()], n=1)
+    near = difflib.get_close_matches(key, [*names, *flatten(to_dict(ExperimentConfig()))], n=1)
     hint = f"; did you mean {near[0]}?" if near else ""
     return f"unknown key {key}: expected one of {', '.join(sorted(names))}{hint}"
-
-
-def _leaves() -> list[str]:
-    """All dotted keys of the config."""
-    leaves: list[str] = []
-
-    def walk(values: Mapping[str, Any], prefix: str) -> None:
-        for name, value in values.items():
-            if isinstance(value, dict):
-                walk(value, f"{prefix}{name}.")
-            else:
-                leaves.append(f"{prefix}{name}")
-
-    walk(to_dict(ExperimentConfig()), "")
-    return leaves
 
 
 def _check_choice(group: str, name: str) -> None:

@@ -18,7 +18,7 @@ from torchrl.objectives import LossModule
 from playslot_rl import keys
 from playslot_rl.config import DynamicsStageConfig
 from playslot_rl.frames import normalise
-from playslot_rl.losses.common import freeze, psnr
+from playslot_rl.losses.common import psnr
 from playslot_rl.modules.inverse_dynamics import InverseDynamics, LatentActions
 from playslot_rl.modules.predictors import Predictor
 from playslot_rl.modules.quantizer import usage
@@ -86,7 +86,7 @@ class DynamicsLoss(LossModule):
         super().__init__()
         self.inverse_dynamics = inverse_dynamics
         self.predictor = predictor
-        self.savi = freeze(savi)
+        self.savi = savi.eval().requires_grad_(False)
         self.config = config
         self.needs_actions = inverse_dynamics.config.mode == "ground_truth"
 

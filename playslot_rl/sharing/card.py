@@ -17,10 +17,10 @@ import yaml
 from playslot_rl import keys
 from playslot_rl.config import EvaluationConfig, ExperimentConfig, to_dict
 from playslot_rl.config.compose import compose
+from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import keys_of
 from playslot_rl.envs import ENVIRONMENTS, task_metadata
 from playslot_rl.sharing.folder import LICENCE, TAGS, SharedPolicyConfig, shared_modules
-from playslot_rl.storage.resume import flatten
 from playslot_rl.visualization.markdown import table
 
 if TYPE_CHECKING:

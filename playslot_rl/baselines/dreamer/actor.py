@@ -12,10 +12,10 @@ from tensordict import TensorDict, TensorDictBase
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
-from playslot_rl.config import EnvConfig, from_dict
+from playslot_rl.config import EnvConfig
 from playslot_rl.config.baselines import DreamerConfig
-from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
+from playslot_rl.training.runs import freeze_on, stage_config
 
 NAME: Final = "dreamer"
 
@@ -73,15 +73,9 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> DreamerActor:
         CheckpointError: no finished training there, or a damaged one.
     """
     checkpoint = read_stage(checkpoint_folder(run, NAME), NAME)
-    try:
-        env = from_dict(EnvConfig, checkpoint.config["env"], "env.")
-        config = from_dict(DreamerConfig, checkpoint.config[NAME], f"{NAME}.")
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(
-            f"{checkpoint.path}/config.json: {error}; expected the config of this version: train dreamer again"
-        ) from error
+    config, env = stage_config(checkpoint, DreamerConfig, NAME), stage_config(checkpoint, EnvConfig, "env")
     with torch.random.fork_rng(devices=[]):
         networks = DreamerNetworks(config, env)
     load_weights(checkpoint, {"networks": networks})
-    networks.to(device).eval().requires_grad_(False)
+    freeze_on(networks, device)
     return DreamerActor(networks)

@@ -17,9 +17,9 @@ from torchrl.modules import TruncatedNormal
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
 from playslot_rl.baselines.sold.networks import ActorHead, SOLDNetworks, sample_action
-from playslot_rl.config import from_dict
+from playslot_rl.config import EnvConfig
 from playslot_rl.config.baselines import SOLDConfig
-from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.errors import ConfigError
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.storage.checkpoints import (
     StageCheckpoint,
@@ -28,7 +28,7 @@ from playslot_rl.storage.checkpoints import (
     read_stage,
     require_parents,
 )
-from playslot_rl.training.runs import load_savi, run_folder, stage_model, world_model_folder
+from playslot_rl.training.runs import freeze_on, load_savi, run_folder, stage_config, stage_model, world_model_folder
 from playslot_rl.world_model import frame_parser_module, module_device
 
 
@@ -153,16 +153,9 @@ def load_actor(run: Path | str, device: torch.device | str = "cpu") -> SOLDActor
     checkpoint = read_stage(checkpoint_folder(run_folder(run), NAME), NAME)
     slots = slots_checkpoint(run)
     require_parents(checkpoint, {"slots": slots})
-    try:
-        config = from_dict(SOLDConfig, checkpoint.config[NAME], f"baselines.{NAME}.")
-        action_dim = int(checkpoint.config["env"]["action_dim"])
-        max_steps = int(checkpoint.config["env"]["max_steps"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(
-            f"{checkpoint.path}/config.json: {error}; expected the config of this version of playslot_rl: train again"
-        ) from error
+    config, env = stage_config(checkpoint, SOLDConfig, NAME), stage_config(checkpoint, EnvConfig, "env")
     with torch.random.fork_rng(devices=[]):
-        networks = build_networks(config, slots, action_dim, max_steps)
+        networks = build_networks(config, slots, env.action_dim, env.max_steps)
     load_weights(checkpoint, networks.parts)
-    networks.to(device).eval().requires_grad_(False)
-    return SOLDActor(load_savi(run, device), networks.actor, config.context, action_dim).eval()
+    freeze_on(networks, device)
+    return SOLDActor(load_savi(run, device), networks.actor, config.context, env.action_dim).eval()

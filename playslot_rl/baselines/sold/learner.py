@@ -86,8 +86,6 @@ class SOLDLearner:
             metrics |= self._behaviour(batch, generators)
         return metrics
 
-    # --- dynamics and reward --------------------------------------------------------------------------------------
-
     def _model(self, batch: TensorDict, generators: StepGenerators) -> dict[str, Tensor]:
         """Section 3.2: the autoregressive rollout from C frames, and the reward on parsed and on predicted slots.
 
@@ -135,8 +133,6 @@ class SOLDLearner:
             predicted, pixels, valid = predicted[:, picked], pixels[:, picked], valid[:, picked]
         decoded = self.savi.decode(predicted).frames
         return losses.masked_mean((decoded - normalise(pixels)).square().mean(dim=(-3, -2, -1)), valid)
-
-    # --- actor and critic -----------------------------------------------------------------------------------------
 
     def _behaviour(self, batch: TensorDict, generators: StepGenerators) -> dict[str, Tensor]:
         """Section 3.3: imagine, judge, improve."""
@@ -192,8 +188,6 @@ class SOLDLearner:
         row, first_frame = row[picked, None], (end[picked] - c + 1)[:, None]
         steps = torch.arange(c, device=row.device)
         return slots[row, first_frame + steps], actions[row, first_frame + steps[1:]]
-
-    # --- optimisers -----------------------------------------------------------------------------------------------
 
     def _step(self, name: str, loss: Tensor, keep: bool = False) -> Tensor:
         """Move one network by a loss; its gradient's norm before clipping. `keep` leaves the graph for another loss."""
