@@ -158,4 +158,6 @@ def load_actor(run: Path | str, device: torch.device | str = "cpu") -> SOLDActor
         networks = build_networks(config, slots, env.action_dim, env.max_steps)
     load_weights(checkpoint, networks.parts)
     freeze_on(networks, device)
-    return SOLDActor(load_savi(run, device), networks.actor, config.context, env.action_dim).eval()
+    actor = SOLDActor(load_savi(run, device), networks.actor, config.context, env.action_dim)
+    actor.eval()
+    return actor

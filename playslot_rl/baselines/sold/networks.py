@@ -23,7 +23,6 @@ the size of the value and is too low where the head is uncertain (between 10 and
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -120,36 +119,25 @@ INITIAL_STD_LOGIT = 2.0
 """Added to the logit of the deviation: an untrained actor starts near MAX_STD and explores."""
 
 
+def _backbone(config: SOLDConfig, slot_dim: int) -> SlotAggregation:
+    return SlotAggregation(slot_dim, config.dim, config.head_layers, config.heads, config.mlp_dim)
+
+
 class ScalarHead(nn.Module):
-    """Reward or value of every step, as logits over a symlog grid.
+    """Reward or value of every step, as logits over a symlog grid; what lies beyond its ends is encoded as the end.
 
     Args:
-        backbone: the slot-aggregation transformer.
-        dim: its width.
-        bins: categories; odd, so that one of them is zero.
-        limit: the grid's ends, in symlog; what lies beyond is encoded as the end.
-        mean: how probabilities become a value.
-
-    Raises:
-        ValueError: bins even, or fewer than 3.
+        config: sizes, grid and mean.
+        slot_dim: D.
     """
 
     grid: Tensor
 
-    def __init__(
-        self,
-        backbone: SlotAggregation,
-        dim: int,
-        bins: int,
-        limit: float = 20.0,
-        mean: Literal["symlog", "linear"] = "symlog",
-    ) -> None:
+    def __init__(self, config: SOLDConfig, slot_dim: int) -> None:
         super().__init__()
-        if bins < 3 or bins % 2 == 0:
-            raise ValueError(f"bins: got {bins}, expected an odd number from 3 on")
-        self.backbone, self.mean = backbone, mean
-        self.register_buffer("grid", torch.linspace(-limit, limit, bins), persistent=False)
-        self.out = nn.Linear(dim, bins)
+        self.backbone, self.mean = _backbone(config, slot_dim), config.mean
+        self.register_buffer("grid", torch.linspace(-config.limit, config.limit, config.bins), persistent=False)
+        self.out = nn.Linear(config.dim, config.bins)
         # Zero logits decode to zero: an untrained head promises nothing (DreamerV3).
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
@@ -178,15 +166,15 @@ class ActorHead(nn.Module):
     """Distribution of the action of every step.
 
     Args:
-        backbone: the slot-aggregation transformer.
-        dim: its width.
+        config: sizes.
+        slot_dim: D.
         action_dim: A.
     """
 
-    def __init__(self, backbone: SlotAggregation, dim: int, action_dim: int) -> None:
+    def __init__(self, config: SOLDConfig, slot_dim: int, action_dim: int) -> None:
         super().__init__()
-        self.backbone = backbone
-        self.out = nn.Linear(dim, 2 * action_dim)
+        self.backbone = _backbone(config, slot_dim)
+        self.out = nn.Linear(config.dim, 2 * action_dim)
         # Near zero: the first actions are centred whatever the slots are.
         nn.init.uniform_(self.out.weight, -1e-2, 1e-2)
         nn.init.zeros_(self.out.bias)
@@ -234,13 +222,9 @@ class SOLDNetworks(nn.Module):
             context=max(frames, c.context + c.horizon),
         )
         self.dynamics = OCVPSeq(sizes, slot_dim, action_dim)
-        self.reward = ScalarHead(self._backbone(c, slot_dim), c.dim, c.bins, c.limit, c.mean)
-        self.critic = ScalarHead(self._backbone(c, slot_dim), c.dim, c.bins, c.limit, c.mean)
-        self.actor = ActorHead(self._backbone(c, slot_dim), c.dim, action_dim)
-
-    @staticmethod
-    def _backbone(c: SOLDConfig, slot_dim: int) -> SlotAggregation:
-        return SlotAggregation(slot_dim, c.dim, c.head_layers, c.heads, c.mlp_dim)
+        self.reward = ScalarHead(c, slot_dim)
+        self.critic = ScalarHead(c, slot_dim)
+        self.actor = ActorHead(c, slot_dim, action_dim)
 
     @property
     def parts(self) -> Mapping[str, nn.Module]:

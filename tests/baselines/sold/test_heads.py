@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import pytest
@@ -14,17 +15,15 @@ from playslot_rl.baselines.sold.networks import (
     MIN_STD,
     ActorHead,
     ScalarHead,
-    SlotAggregation,
     sample_action,
 )
+from playslot_rl.config import SOLDConfig
 
-
-def _backbone() -> SlotAggregation:
-    return SlotAggregation(slot_dim=6, dim=16, layers=1, heads=2, mlp_dim=16)
+SIZES = SOLDConfig(dim=16, head_layers=1, heads=2, mlp_dim=16)
 
 
 def _scalar_head(bins: int, mean: Literal["symlog", "linear"] = "symlog") -> ScalarHead:
-    return ScalarHead(_backbone(), 16, bins, mean=mean)
+    return ScalarHead(replace(SIZES, bins=bins, mean=mean), slot_dim=6)
 
 
 def test_two_hot_round_trip() -> None:
@@ -81,7 +80,7 @@ def test_an_untrained_scalar_head_says_zero() -> None:
 
 def test_actions_are_within_bounds_and_their_mode_is_the_location() -> None:
     torch.manual_seed(0)
-    head = ActorHead(_backbone(), 16, 3)
+    head = ActorHead(SIZES, 6, 3)
     torch.nn.init.normal_(head.out.weight, std=3.0)
     location, std, _ = head(torch.randn(50, 4, 4, 6))
     assert std.min() >= MIN_STD
