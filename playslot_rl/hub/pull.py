@@ -102,7 +102,7 @@ def pull(repo_id: str, root: Path, *, revision: str | None = None, token: str | 
                         hub.name, str(root), name, why, commit, record.episodes, record.frames, len(wanted), size,
                         record.fingerprint, compared,
                     )  # fmt: skip
-                    _finish(_partial(root, commit), root, result, hub.place.endpoint)
+                    _finish(_partial(root, commit), root, result, hub.endpoint)
             finally:
                 lock.unlink(missing_ok=True)
     return result

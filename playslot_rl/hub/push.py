@@ -17,8 +17,7 @@ from playslot_rl.datasets.info import DatasetSummary, info
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, HubError
 from playslot_rl.hub.layout import CARD_NAME, REMOTE_RECORD, HubRecord, is_data, local_files
-from playslot_rl.hub.sending import MAIN, Pushed, few, send
-from playslot_rl.hub.session import open_repository
+from playslot_rl.hub.session import MAIN, Pushed, few, open_repository, send
 from playslot_rl.sharing.card import facts_table, front_matter
 
 MARK = "<!-- made by `playslot dataset push`; remove this line to keep your own text -->"
