@@ -64,18 +64,17 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
     try:
         run = _expand_home(_unquote(pairs.get("run", "")))
         continues = command in CONTINUES and run != "" and not shipped(run)
-        config = _from_run(Path(run), pairs) if continues else _from_preset(pairs)
+        if continues:
+            config = _from_run(Path(run), pairs)
+        else:
+            groups = [f"{group}={pairs[group]}" for group in GROUPS if group in pairs]
+            config = from_dict(ExperimentConfig, _hydra("config", groups + _assignments(pairs)))
     except ConfigError:
         raise
     except ValueError as error:
         raise ConfigError(str(error)) from error
     _check_choice("env", config.env.name)
     return config
-
-
-def _from_preset(pairs: Mapping[str, str]) -> ExperimentConfig:
-    groups = [f"{group}={pairs[group]}" for group in GROUPS if group in pairs]
-    return from_dict(ExperimentConfig, _hydra("config", groups + _assignments(pairs)))
 
 
 def _parse(overrides: Sequence[str]) -> dict[str, str]:

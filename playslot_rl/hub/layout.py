@@ -7,7 +7,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -106,10 +106,6 @@ class HubRecord:
     def of(cls, fingerprint: str, episodes: int, frames: int) -> HubRecord:
         """The record of a checked data set, made by this version."""
         return cls(fingerprint, episodes, frames, SCHEME, __version__)
-
-    def to_bytes(self) -> bytes:
-        """As a file."""
-        return (json.dumps(asdict(self), indent=2) + "\n").encode()
 
 
 def read_record(root: Path) -> HubRecord | None:

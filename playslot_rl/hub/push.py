@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,9 @@ def make_card(data: DatasetSummary, repo_id: str, fingerprint: str) -> str:
         repo_id: `user/name`.
         fingerprint: content hash.
     """
-    note = _note(Path(data.root))
+    path = Path(data.root) / META_NAME
+    note = json.loads(path.read_text()) if path.is_file() else {}
+    note = note if isinstance(note, dict) else {}
     made = _made(note)
     header = {
         # Ours are free, as this package is; of others' data we know nothing.
@@ -68,13 +70,6 @@ def make_card(data: DatasetSummary, repo_id: str, fingerprint: str) -> str:
     if made:
         lines += ["## How it was made", "", "Recorded by `playslot collect` of playslot_rl.", "", facts_table(made), ""]
     return "\n".join([*lines, USE.format(repo_id=repo_id)])
-
-
-def _note(root: Path) -> dict[str, Any]:
-    """What the collectors noted; empty if it was not they who recorded."""
-    path = root / META_NAME
-    note = json.loads(path.read_text()) if path.is_file() else {}
-    return note if isinstance(note, dict) else {}
 
 
 def _made(note: dict[str, Any]) -> dict[str, str]:
@@ -163,14 +158,18 @@ def push(
         HubError: bad names, no or bad token, offline, no network, an error of the Hub, or a tag that is taken.
     """
     root = Path(root).expanduser()
-    record = _checked(root)
+    result = verify(root)  # all of it: others will build on the data set
+    if not result.ok:
+        more = f" (and {len(result.errors) - 1} more)" if len(result.errors) > 1 else ""
+        raise DataError(f"{result.errors[0]}{more}; run `playslot dataset verify {root}` for all of it, then `repair`")
+    record = HubRecord.of(result.fingerprint, result.episodes, result.frames)
     summary = info(root)
     target = branch or MAIN
     _check_names(target, tag, summary.format)
     paths, left = local_files(root)
     with open_repository(repo_id, root, token=token, writing=True, revision=target) as hub:
         files: dict[str, Path | bytes] = {path: root / path for path in paths}
-        files[REMOTE_RECORD] = record.to_bytes()
+        files[REMOTE_RECORD] = (json.dumps(asdict(record), indent=2) + "\n").encode()
         files[CARD_NAME] = make_card(summary, hub.name, record.fingerprint).encode()
         message = f"{record.episodes} episodes, {record.frames} frames, fingerprint {record.fingerprint}"
         sent = send(
@@ -178,15 +177,6 @@ def push(
             version=summary.format if target == MAIN else "", owned=is_data,
         )  # fmt: skip
     return PushResult(**vars(sent), record=record, left=tuple(left))
-
-
-def _checked(root: Path) -> HubRecord:
-    """Everything `playslot dataset verify` checks: others will build on it."""
-    result = verify(root)
-    if not result.ok:
-        more = f" (and {len(result.errors) - 1} more)" if len(result.errors) > 1 else ""
-        raise DataError(f"{result.errors[0]}{more}; run `playslot dataset verify {root}` for all of it, then `repair`")
-    return HubRecord.of(result.fingerprint, result.episodes, result.frames)
 
 
 def _check_names(branch: str, tag: str | None, version: str) -> None:

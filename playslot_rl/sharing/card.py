@@ -166,7 +166,16 @@ def make_card(
         "model_name": name,
     }
     parameters = sum(p.numel() for part in shared_modules(agent).values() for p in part.parameters())
-    evaluation = experiment.evaluation if experiment else EvaluationConfig()
+    commands, evaluation = "Not recorded: saved from Python. `playslot export` writes the commands.", EvaluationConfig()
+    if experiment:
+        lines = "\n".join(reproduce(experiment, policy.source, results))
+        commands, evaluation = f"```bash\n{lines}\n```\n\n{REPEATS}", experiment.evaluation
+    versions = {
+        "exported with": _numbers(policy.source.get("versions", {})),
+        "trained with": _numbers(policy.source.get("trained_with", {})),
+        "weights": f"fingerprint `{policy.fingerprint}`",
+        "licence": "Apache License 2.0, of the weights and of this card",
+    }
     return Template(Path(__file__).with_name("card.md").read_text()).substitute(
         front=front_matter(header, MARK),
         name=name,
@@ -176,8 +185,8 @@ def make_card(
         data=facts_table(_data(policy.source)),
         results=_results(results),
         seed=evaluation.seed_offset,
-        commands=_reproduce(experiment, policy.source, results),
-        versions=facts_table(_versions(policy)),
+        commands=commands,
+        versions=facts_table(versions),
     )
 
 
@@ -261,22 +270,6 @@ def _share(rate: float) -> str:
 
 def _interval(ends: tuple[float, float]) -> str:
     return f"{100 * ends[0]:.0f} to {100 * ends[1]:.0f} %"
-
-
-def _reproduce(experiment: ExperimentConfig | None, source: dict[str, Any], results: Sequence[Result]) -> str:
-    if experiment is None:
-        return "Not recorded: saved from Python. `playslot export` writes the commands."
-    commands = "\n".join(reproduce(experiment, source, results))
-    return f"```bash\n{commands}\n```\n\n{REPEATS}"
-
-
-def _versions(policy: SharedPolicyConfig) -> dict[str, str]:
-    return {
-        "exported with": _numbers(policy.source.get("versions", {})),
-        "trained with": _numbers(policy.source.get("trained_with", {})),
-        "weights": f"fingerprint `{policy.fingerprint}`",
-        "licence": "Apache License 2.0, of the weights and of this card",
-    }
 
 
 def _numbers(versions: dict[str, str]) -> str:

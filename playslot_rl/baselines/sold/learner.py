@@ -105,11 +105,10 @@ class SOLDLearner:
             loss, metrics["image_mse"] = loss + self.config.image_weight * image, image.detach()
         metrics["dynamics_grad_norm"] = self._step("dynamics", loss)
 
-        imagined = torch.cat((slots[:, :c], predicted[:, c - 1 :]), dim=1)
-        rewards, arrived = batch[keys.REWARD].squeeze(-1), valid & ~is_first
-        reward = losses.reward_loss(
-            self.networks.reward, torch.cat((slots, imagined)), rewards.repeat(2, 1), arrived.repeat(2, 1)
-        )
+        imagined = torch.cat((slots[:, :c], predicted[:, c - 1 :]), dim=1).detach()
+        head, arrived = self.networks.reward, valid & ~is_first
+        entropy = head.cross_entropy(head(torch.cat((slots, imagined))), batch[keys.REWARD].squeeze(-1).repeat(2, 1))
+        reward = losses.masked_mean(entropy, arrived.repeat(2, 1))
         return metrics | {"loss_reward": reward.detach(), "reward_grad_norm": self._step("reward", reward)}
 
     def _window(self, batch: TensorDict, generators: StepGenerators) -> tuple[TensorDict, int]:
@@ -146,7 +145,7 @@ class SOLDLearner:
         rewards = networks.reward.decode(networks.reward(imagined.slots)[:, frames:])
         returns = losses.imagined_returns(rewards, values[:, 1:], config.gamma, config.lmbda)
         self.returns.update(returns.detach().unsqueeze(-1))
-        weights = losses.discounts(config.gamma, config.horizon, returns)
+        weights = config.gamma ** torch.arange(config.horizon, device=returns.device, dtype=returns.dtype)
         actor = losses.actor_loss(
             imagined, returns, values[:, :-1], self.returns.scale(), weights, config.entropy, config.actor_gradient
         )

@@ -96,19 +96,6 @@ def slot_loss(predicted: Tensor, slots: Tensor, valid: Tensor) -> Tensor:
     return masked_mean((predicted - slots).square().mean(dim=(-2, -1)), valid)
 
 
-def reward_loss(head: ScalarHead, slots: Tensor, rewards: Tensor, valid: Tensor) -> Tensor:
-    """Cross entropy of the rewards (B, T) received on the way to the frames of slots (B, T, N, D).
-
-    No gradient runs into the slots.
-    """
-    return masked_mean(head.cross_entropy(head(slots.detach()), rewards), valid)
-
-
-def discounts(gamma: float, horizon: int, like: Tensor) -> Tensor:
-    """gamma^0 ... gamma^(H-1), (H,): how much an imagined step weighs."""
-    return gamma ** torch.arange(horizon, device=like.device, dtype=like.dtype)
-
-
 def imagined_returns(rewards: Tensor, values: Tensor, gamma: float, lmbda: float) -> Tensor:
     """Lambda returns R_0 ... R_{H-1} (B, H) of rewards r_1 ... r_H and values v_1 ... v_H, each (B, H).
 
@@ -138,7 +125,7 @@ def actor_loss(
         returns: R_0 ... R_{H-1} (B, H), differentiable in the actions for `dynamics`.
         baselines: v_0 ... v_{H-1} (B, H).
         scale: S, a number of at least 1.
-        weights: w (H,).
+        weights: w (H,), gamma^0 ... gamma^(H-1): how much an imagined step weighs.
         entropy: weight of the entropy.
         gradient: which estimator.
     """
