@@ -26,8 +26,6 @@ CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
 CONTINUES: Final = frozenset({"evaluate", "export", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
-COMPARE: Final = "compare"
-"""The command whose `methods=`, `demos=` and `seeds=` are lists, and which takes `hydra.` keys."""
 SHIPPED: Final = "pretrained"
 """`run=pretrained` names the task's shipped world model, `run=pretrained/ENV` one of them: no run folders."""
 
@@ -57,7 +55,7 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         ConfigError: an argument that is not `key=value`, an unknown environment, preset or key, a value outside its
             range, or a run folder without a usable `config.json`.
     """
-    pairs = _parse(_compare_keys(overrides) if command == COMPARE else overrides)
+    pairs = _parse(_compare_keys(overrides) if command == "compare" else overrides)
     for group in GROUPS:
         if group in pairs:
             _check_choice(group, pairs[group])

@@ -28,7 +28,6 @@ LOCAL_RECORD = "meta/playslot_pull.json"
 
 _SUFFIXES = {"data": {".parquet"}, "meta": {".parquet", ".json", ".jsonl"}, "videos": {".mp4"}}
 _GENERATED = {REMOTE_RECORD, LOCAL_RECORD}
-_PIECE = 8 << 20
 
 
 def is_data(path: str) -> bool:
@@ -71,8 +70,7 @@ def same_content(item: Path | bytes, remote: RepoFile) -> bool:
         return False
     digest = hashlib.sha256() if remote.lfs else hashlib.sha1(b"blob %d\0" % remote.size, usedforsecurity=False)
     with io.BytesIO(item) if isinstance(item, bytes) else item.open("rb") as stream:
-        while piece := stream.read(_PIECE):
-            digest.update(piece)
+        hashlib.file_digest(stream, lambda: digest)
     return digest.hexdigest() == (remote.lfs.sha256 if remote.lfs else remote.blob_id)
 
 

@@ -251,17 +251,15 @@ def _results(results: Sequence[Result]) -> str:
     for result in results:
         steps = "–" if result.mean_steps is None else f"{result.mean_steps:.1f}"
         title = f"this policy, {PROTOCOL_NAMES[result.protocol]}"
-        rows.append([title, _share(result.success_rate), _interval(result.ci95), steps, *_played(result)])
+        rows.append(
+            [title, _share(result.success_rate), _interval(result.ci95), steps, str(result.episodes), str(result.seed)]
+        )
     first = results[0]
     for name, (rate, ci95) in first.references.items():
         title = REFERENCES.get(name, name.replace("_", " "))
-        rows.append([title, _share(rate), _interval(ci95), "–", *_played(first)])
+        rows.append([title, _share(rate), _interval(ci95), "–", str(first.episodes), str(first.seed)])
     titles = ["", "success", "95 % interval", "mean agent steps to success", "episodes", "seed"]
     return f"{table(titles, rows)}\n\n{MEASURED}"
-
-
-def _played(result: Result) -> list[str]:
-    return [str(result.episodes), str(result.seed)]
 
 
 def _share(rate: float) -> str:

@@ -11,7 +11,8 @@ from typing import Any, Final
 
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.data.contents import read_info
+from playslot_rl.errors import CheckpointError, ConfigError, DataError
 from playslot_rl.evaluation.success import PROTOCOLS, run_facts
 from playslot_rl.sharing.card import Result, make_card
 from playslot_rl.sharing.folder import SharedPolicyConfig, save_pretrained
@@ -160,16 +161,11 @@ def camera(config: ExperimentConfig) -> str:
     names = [name.strip() for name in config.data.camera.split(",") if name.strip()]
     if not names:
         root = (config.data.demos or config.data.root).partition(",")[0].strip()
-        names = _cameras(Path(root)) if root else []
+        try:
+            features = read_info(Path(root))["features"] if root else {}
+        except DataError:
+            features = {}
+        names = [name for name, feature in features.items() if feature["dtype"] in ("image", "video")]
     if len(names) > 1:
         raise ConfigError(f"data.camera: got {', '.join(names)}, expected the one the policy is to look at: name it")
     return names[0] if names else keys.FEATURE_IMAGE
-
-
-def _cameras(root: Path) -> list[str]:
-    """Image and video features of a LeRobot data set; none where it cannot be read."""
-    try:
-        features = json.loads((root / "meta" / "info.json").read_text())["features"]
-    except (OSError, ValueError, KeyError):
-        return []
-    return [name for name, feature in features.items() if feature.get("dtype") in ("image", "video")]

@@ -148,11 +148,8 @@ class ForwardModel(nn.Module):
         outs = (*channels[-2::-1], 3)
         ins = (channels[-1], *(2 * c for c in channels[-2::-1]))
         self.ups = nn.ModuleList(nn.Conv2d(a, 4 * b, 3, padding=1) for a, b in zip(ins, outs, strict=True))
-        last = self.ups[-1]
-        assert isinstance(last, nn.Conv2d)
-        nn.init.zeros_(last.weight)
-        assert last.bias is not None
-        nn.init.zeros_(last.bias)
+        for parameter in self.ups[-1].parameters():
+            nn.init.zeros_(parameter)
 
     def forward(self, frame: Tensor, z: Tensor) -> Tensor:
         """Frames (B, 3, H, W), uint8 or float [0, 1], and latents (B, Z) to next frames, float, about [0, 1]."""
