@@ -44,14 +44,18 @@ class COCVP(AutoregressivePredictor):
         self.head = nn.Linear(c.dim, slot_dim)
         self._start_still()
 
-    def _predict(
-        self, slots: Tensor, condition: Condition, code: Tensor, mask: Tensor | None, past: Layers | None
-    ) -> tuple[Tensor, Layers]:
-        (p, v), n = condition, slots.shape[2]
+    def _tokens(self, slots: Tensor, p: Tensor, v: Tensor, code: Tensor) -> Tensor:
         action = self.embed_prototype(p) + self.embed_variability(v)
         if p.dim() == 3:
             action = action.unsqueeze(2)
-        x = (self.embed_slots(slots) + action + code).flatten(1, 2)
+        tokens: Tensor = self.embed_slots(slots) + action + code
+        return tokens.flatten(1, 2)
+
+    def _predict(
+        self, slots: Tensor, condition: Condition, code: Tensor, mask: Tensor | None, past: Layers | None
+    ) -> tuple[Tensor, Layers]:
+        p, v = condition
+        x, n = self._tokens(slots, p, v, code), slots.shape[2]
         if mask is not None:
             mask = mask.repeat_interleave(n, dim=-2).repeat_interleave(n, dim=-1)
         kept: Layers = []
