@@ -38,7 +38,7 @@ from playslot_rl.world_model import Agent, WorldModel, module_device
 if TYPE_CHECKING:
     from torchrl.envs import TransformedEnv
 
-    from playslot_rl.sharing.config import SharedPolicyConfig
+    from playslot_rl.sharing.folder import SharedPolicyConfig
 
 Array = npt.NDArray[Any] | Tensor
 
@@ -61,7 +61,7 @@ def load(run: str | Path = "pretrained", device: str = "", seed: int = 0) -> Pla
         >>> model.world_model.slot_shape[0]
         4
     """
-    from playslot_rl.sharing.config import is_model_folder
+    from playslot_rl.sharing.folder import is_model_folder
     from playslot_rl.storage.checkpoints import checkpoint_folder
     from playslot_rl.training.runs import load_agent, load_world_model, run_folder
 
@@ -149,9 +149,8 @@ class PlaySlot:
         from dataclasses import replace
 
         from playslot_rl.sharing.card import make_card
-        from playslot_rl.sharing.config import SharedPolicyConfig
-        from playslot_rl.sharing.folder import save_pretrained
-        from playslot_rl.sharing.source import versions
+        from playslot_rl.sharing.folder import SharedPolicyConfig, save_pretrained
+        from playslot_rl.sharing.run import versions
 
         if self.agent is None:
             raise CheckpointError(

@@ -121,9 +121,6 @@ def module_device(module: nn.Module) -> torch.device:
     return next(module.parameters()).device
 
 
-# --- parse --------------------------------------------------------------------------------------------------------
-
-
 class _ParseFrame(nn.Module):
     def __init__(self, savi: SAVi, generator: torch.Generator | None) -> None:
         super().__init__()
@@ -158,9 +155,6 @@ def frame_parser_module(savi: SAVi, generator: torch.Generator | None = None) ->
     )
 
 
-# --- predict ------------------------------------------------------------------------------------------------------
-
-
 class _Step(nn.Module):
     """One step of the predictor on right-aligned histories: the arithmetic of the imagination environment."""
 
@@ -177,7 +171,11 @@ class _Step(nn.Module):
         actions = action_history.reshape(-1, *action_history.shape[len(batch) :])
         actions = torch.cat([actions[:, :-1], z.reshape(-1, 1, *z.shape[len(batch) :])], 1)
         lengths = length.reshape(-1)
-        predicted = self._predict(slots, actions, lengths)
+        # Frames before the longest episode's first carry nothing: leaving them out makes short imaginations cheap.
+        window = int(lengths.max())
+        valid = torch.arange(window, device=slots.device) >= window - lengths[:, None]
+        p, v = self.inverse_dynamics.split(actions[:, -window:])
+        predicted = self.predictor(slots[:, -window:], p, v, valid=None if bool(valid.all()) else valid)[:, -1]
         slots = torch.cat([slots[:, 1:], predicted[:, None]], 1)
         actions = torch.cat([actions[:, 1:], torch.zeros_like(actions[:, :1])], 1)
         return (
@@ -186,15 +184,6 @@ class _Step(nn.Module):
             actions.reshape(*batch, *actions.shape[1:]),
             (length + 1).clamp(max=context),
         )
-
-    def _predict(self, slots: Tensor, actions: Tensor, lengths: Tensor) -> Tensor:
-        # Frames before the longest episode's first carry nothing: leaving them out makes short imaginations cheap.
-        window = int(lengths.max())
-        slots, actions = slots[:, -window:], actions[:, -window:]
-        valid = torch.arange(window, device=slots.device) >= window - lengths[:, None]
-        p, v = self.inverse_dynamics.split(actions)
-        predicted: Tensor = self.predictor(slots, p, v, valid=None if bool(valid.all()) else valid)
-        return predicted[:, -1]
 
 
 def dynamics_module(inverse_dynamics: InverseDynamics, predictor: Predictor) -> TensorDictSequential:
@@ -212,9 +201,6 @@ def dynamics_module(inverse_dynamics: InverseDynamics, predictor: Predictor) -> 
             out_keys=[keys.SLOTS, keys.SLOT_HISTORY, keys.ACTION_HISTORY, keys.HISTORY_LENGTH],
         )
     )
-
-
-# --- behave -------------------------------------------------------------------------------------------------------
 
 
 def latent_policy_module(policy: nn.Module) -> TensorDictModule:

@@ -22,9 +22,8 @@ def main(config: ExperimentConfig) -> None:
         HubError: the push failed; the folder stays.
     """
     run, folder = evaluate.check_run(replace(config, out="")), check_out(config)
-    from playslot_rl.sharing.config import is_model_folder, read_config
-    from playslot_rl.sharing.run import export_run
-    from playslot_rl.sharing.source import read_source
+    from playslot_rl.sharing.folder import is_model_folder, read_config
+    from playslot_rl.sharing.run import export_run, read_source
 
     source = read_source(run)
     there = folder.exists() or folder.is_symlink()

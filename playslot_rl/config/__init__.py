@@ -4,23 +4,20 @@
 `to_dict` is its inverse; `fingerprint` names a config by its content (all three: `playslot_rl.config.plain`).
 """
 
-from playslot_rl.config.baselines import BaselinesConfig as BaselinesConfig
 from playslot_rl.config.baselines import DreamerConfig as DreamerConfig
 from playslot_rl.config.baselines import LAPOConfig as LAPOConfig
 from playslot_rl.config.baselines import OnlineConfig as OnlineConfig
 from playslot_rl.config.baselines import ResNetOracleConfig as ResNetOracleConfig
 from playslot_rl.config.baselines import SOLDConfig as SOLDConfig
 from playslot_rl.config.compare import CompareConfig as CompareConfig
-from playslot_rl.config.data import CollectConfig as CollectConfig
-from playslot_rl.config.data import CollectorConfig as CollectorConfig
-from playslot_rl.config.data import DataConfig as DataConfig
 from playslot_rl.config.env import BlocksConfig as BlocksConfig
 from playslot_rl.config.env import EnvConfig as EnvConfig
 from playslot_rl.config.env import GridConfig as GridConfig
 from playslot_rl.config.env import RenderConfig as RenderConfig
+from playslot_rl.config.experiment import CollectorConfig as CollectorConfig
+from playslot_rl.config.experiment import DataConfig as DataConfig
 from playslot_rl.config.experiment import EvaluationConfig as EvaluationConfig
 from playslot_rl.config.experiment import ExperimentConfig as ExperimentConfig
-from playslot_rl.config.experiment import ExportConfig as ExportConfig
 from playslot_rl.config.experiment import LoggingConfig as LoggingConfig
 from playslot_rl.config.methods import MethodName as MethodName
 from playslot_rl.config.model import ActionDecoderConfig as ActionDecoderConfig

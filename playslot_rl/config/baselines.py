@@ -9,8 +9,12 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import role
+from playslot_rl.config.roles import Checked, at_least, between, role, within
 from playslot_rl.config.stages import OptimConfig, StageConfig
+
+SHARE = between(0, 1, "a number in [0, 1]")
+ABOVE_ZERO = within(lambda value: value > 0, "above 0")
+SEQUENCE = within(lambda value: value == 0 or value >= 2, "0 (whole episodes), or at least 2")
 
 
 @dataclass(frozen=True)
@@ -24,17 +28,14 @@ class ResNetOracleConfig(StageConfig):
         shift: frames are shifted by up to so many pixels either way in training, edges repeated; 0 does not.
     """
 
-    steps: int = 20_000
-    batch_size: int = 64
+    group = "baselines.resnet_oracle."
+    steps: int = field(default=20_000, metadata=at_least(1))
+    batch_size: int = field(default=64, metadata=at_least(1))
     optim: OptimConfig = field(
         default_factory=lambda: OptimConfig(lr=2e-4, warmup_steps=0, schedule="constant", grad_clip=0.0)
     )
     weights: str = "auto"
-    shift: int = 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check(0 <= self.shift <= 16, "baselines.resnet_oracle.shift", self.shift, "0 to 16 pixels")
+    shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
 
 
 def _stage(steps: int, lr: float, schedule: Literal["cosine", "constant"]) -> StageConfig:
@@ -44,7 +45,7 @@ def _stage(steps: int, lr: float, schedule: Literal["cosine", "constant"]) -> St
 
 
 @dataclass(frozen=True)
-class LAPOConfig:
+class LAPOConfig(Checked):
     """Sizes and schedule of LAPO. The action decoder's size is `model.action_decoder`, its inputs
     `behaviour.decoder_inputs`, its labels `behaviour.labelled_demos`: as for PlaySlot.
 
@@ -66,29 +67,26 @@ class LAPOConfig:
         world: another run of LAPO whose inverse and forward model are taken; empty trains them on `data.root`.
     """
 
+    group = "baselines.lapo."
     channels: tuple[int, ...] = (64, 128, 128)
     hidden: int = 256
-    groups: int = 8
+    groups: int = field(default=8, metadata=at_least(1))
     code_dim: int = 16
-    codes: int = 64
-    decay: float = 0.99
+    codes: int = field(default=64, metadata=at_least(2))
+    decay: float = field(default=0.99, metadata=within(lambda value: 0 < value < 1, "a number in (0, 1)"))
     dead_threshold: float = 1.0
     commitment: float = 0.05
     loss: Literal["l2", "l1"] = "l2"
-    shift: int = 0
+    shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
     model: StageConfig = field(default_factory=lambda: _stage(200_000, 3e-4, "cosine"))
     policy: StageConfig = field(default_factory=lambda: _stage(20_000, 2e-4, "constant"))
-    decoder_steps: int = 20_000
+    decoder_steps: int = field(default=20_000, metadata=at_least(1))
     decoder_lr: float = 2e-4
     world: str = field(default="", metadata=role("machine", "folder"))
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check(1 <= len(self.channels) <= 5, "baselines.lapo.channels", self.channels, "1 to 5 widths")
-        check(self.groups >= 1, "baselines.lapo.groups", self.groups, "at least 1")
-        check(self.codes >= 2, "baselines.lapo.codes", self.codes, "at least 2")
-        check(0.0 < self.decay < 1.0, "baselines.lapo.decay", self.decay, "a number in (0, 1)")
-        check(0 <= self.shift <= 16, "baselines.lapo.shift", self.shift, "0 to 16 pixels")
-        check(self.decoder_steps >= 1, "baselines.lapo.decoder_steps", self.decoder_steps, "at least 1")
 
     @property
     def latent_dim(self) -> int:
@@ -97,7 +95,7 @@ class LAPOConfig:
 
 
 @dataclass(frozen=True)
-class OnlineConfig:
+class OnlineConfig(Checked):
     """Acting, replay and schedule of a method that learns by acting.
 
     A step is an agent step: `env.frame_skip` environment steps of the same action.
@@ -122,31 +120,23 @@ class OnlineConfig:
         log_every: updates between lines of `metrics.jsonl`.
     """
 
-    steps: int = 1_000_000
-    minutes: float = field(default=0.0, metadata=role("free"))
-    prefill: int = 1000
-    envs: int = 1
-    update_ratio: float = 0.5
-    batch_size: int = 16
-    sequence: int = 64
-    reward_scale: float = 1.0
-    capacity: int = 1_000_000
+    steps: int = field(default=1_000_000, metadata=at_least(1))
+    minutes: float = field(default=0.0, metadata=role("free") | at_least(0))
+    prefill: int = field(default=1000, metadata=at_least(1))
+    envs: int = field(default=1, metadata=at_least(1))
+    update_ratio: float = field(default=0.5, metadata=ABOVE_ZERO)
+    batch_size: int = field(default=16, metadata=at_least(1))
+    sequence: int = field(default=64, metadata=SEQUENCE)
+    reward_scale: float = field(default=1.0, metadata=ABOVE_ZERO)
+    capacity: int = field(default=1_000_000, metadata=at_least(1))
     replay_on_disk: bool = field(default=False, metadata=role("free"))
-    evaluate_every: int = field(default=10_000, metadata=role("free"))
-    evaluation_episodes: int = 20
-    checkpoint_every: int = field(default=10_000, metadata=role("free"))
-    log_every: int = field(default=100, metadata=role("free"))
+    evaluate_every: int = field(default=10_000, metadata=role("free") | at_least(1))
+    evaluation_episodes: int = field(default=20, metadata=at_least(1))
+    checkpoint_every: int = field(default=10_000, metadata=role("free") | at_least(1))
+    log_every: int = field(default=100, metadata=role("free") | at_least(1))
 
     def __post_init__(self) -> None:
-        for name in (
-            "steps", "prefill", "envs", "batch_size", "capacity",
-            "evaluate_every", "evaluation_episodes", "checkpoint_every", "log_every",
-        ):  # fmt: skip
-            check(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
-        check(self.minutes >= 0, "minutes", self.minutes, "at least 0")
-        check(self.reward_scale > 0, "reward_scale", self.reward_scale, "above 0")
-        check(self.update_ratio > 0, "update_ratio", self.update_ratio, "above 0")
-        check(self.sequence == 0 or self.sequence >= 2, "sequence", self.sequence, "0 (whole episodes), or at least 2")
+        super().__post_init__()
         check(self.prefill <= self.steps, "prefill", self.prefill, f"at most steps ({self.steps})")
 
 
@@ -179,7 +169,8 @@ class DreamerConfig(OnlineConfig):
     """
 
     update_ratio: float = 0.25
-    frame_size: int = 0
+    group = "baselines.dreamer."
+    frame_size: int = field(default=0, metadata=at_least(0, "0 (the environment's) or pixels"))
     depth: int = 16
     mults: tuple[int, ...] = (2, 3, 4, 4)
     kernel: int = 5
@@ -196,19 +187,15 @@ class DreamerConfig(OnlineConfig):
     free_nats: float = 1.0
     representation_weight: float = 0.1
     replay_value_weight: float = 0.3
-    horizon: int = 15
-    gamma: float = 1 - 1 / 333
-    lmbda: float = 0.95
+    horizon: int = field(default=15, metadata=at_least(1))
+    gamma: float = field(default=1 - 1 / 333, metadata=within(lambda value: 0 < value < 1, "between 0 and 1"))
+    lmbda: float = field(default=0.95, metadata=between(0, 1, "0 to 1"))
     entropy: float = 3e-4
     critic_rate: float = 0.02
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check(self.belief % self.blocks == 0, "belief", self.belief, f"a multiple of blocks ({self.blocks})")
-        check(0 < self.gamma < 1, "gamma", self.gamma, "between 0 and 1")
-        check(0 <= self.lmbda <= 1, "lmbda", self.lmbda, "0 to 1")
-        check(self.horizon >= 1, "horizon", self.horizon, "at least 1")
-        check(self.frame_size >= 0, "frame_size", self.frame_size, "0 (the environment's) or pixels")
 
 
 @dataclass(frozen=True)
@@ -225,7 +212,7 @@ class SOLDConfig(OnlineConfig):
         head_layers: layers of the slot-aggregation transformers of reward, value and actor.
         bins: categories of the two-hot heads, evenly spaced in symlog from -`limit` to `limit`.
         limit: the grid's ends, in symlog.
-        mean: how a head's probabilities become a value, averaged in `symlog` or `linear` (see `heads.py`).
+        mean: how a head's probabilities become a value, averaged in `symlog` or `linear` (see `networks.py`).
         context: frames (C) that a rollout starts from, at most: 1 to C are drawn. The actor acts on its last C frames.
         horizon: imagined steps (H).
         starts: imagined rollouts in an update, from frames drawn from its batch.
@@ -243,26 +230,29 @@ class SOLDConfig(OnlineConfig):
         savi_steps: agent steps of the data that SAVi was trained on; None reads them from its checkpoint.
     """
 
-    batch_size: int = 16
-    sequence: int = 18
+    group = "baselines.sold."
+    batch_size: int = field(default=16, metadata=at_least(1))
+    sequence: int = field(default=18, metadata=SEQUENCE)
     dim: int = 256
     heads: int = 8
     mlp_dim: int = 512
     dynamics_layers: int = 4
     head_layers: int = 3
-    bins: int = 255
-    limit: float = 20.0
+    bins: int = field(
+        default=255, metadata=within(lambda value: value >= 3 and value % 2 == 1, "an odd number from 3 on")
+    )
+    limit: float = field(default=20.0, metadata=ABOVE_ZERO)
     mean: Literal["symlog", "linear"] = "symlog"
-    context: int = 3
-    horizon: int = 15
-    starts: int = 256
-    gamma: float = 0.96
-    lmbda: float = 0.95
+    context: int = field(default=3, metadata=at_least(1))
+    horizon: int = field(default=15, metadata=at_least(1))
+    starts: int = field(default=256, metadata=at_least(1))
+    gamma: float = field(default=0.96, metadata=SHARE)
+    lmbda: float = field(default=0.95, metadata=SHARE)
     entropy: float = 3e-4
     actor_gradient: Literal["dynamics", "reinforce"] = "dynamics"
-    return_rate: float = 0.01
-    critic_decay: float = 0.98
-    actor_average: float = 0.0
+    return_rate: float = field(default=0.01, metadata=SHARE)
+    critic_decay: float = field(default=0.98, metadata=SHARE)
+    actor_average: float = field(default=0.0, metadata=SHARE)
     slot_weight: float = 1.0
     image_weight: float = 1.0
     decoded_frames: int = 0
@@ -271,24 +261,16 @@ class SOLDConfig(OnlineConfig):
     model_lr: float = 1e-4
     grad_clip: float = 10.0
     world_model_updates: int = 0
-    savi_steps: int | None = None
+    savi_steps: int | None = field(default=None, metadata=at_least(0, "0 or more"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        group = "baselines.sold"
-        check(self.dim % self.heads == 0, f"{group}.heads", self.heads, f"a divisor of {group}.dim={self.dim}")
-        check(self.context >= 1, f"{group}.context", self.context, "at least 1")
-        check(self.horizon >= 1, f"{group}.horizon", self.horizon, "at least 1")
-        check(self.starts >= 1, f"{group}.starts", self.starts, "at least 1")
-        check(self.bins >= 3 and self.bins % 2 == 1, f"{group}.bins", self.bins, "an odd number from 3 on")
-        check(self.limit > 0, f"{group}.limit", self.limit, "above 0")
+        group = self.group
+        check(self.dim % self.heads == 0, f"{group}heads", self.heads, f"a divisor of {group}dim={self.dim}")
         longer = self.sequence == 0 or self.sequence > self.context
-        check(longer, f"{group}.sequence", self.sequence, f"0, or more than {group}.context={self.context}")
-        for name in ("gamma", "lmbda", "critic_decay", "actor_average", "return_rate"):
-            check(0 <= getattr(self, name) <= 1, f"{group}.{name}", getattr(self, name), "a number in [0, 1]")
+        check(longer, f"{group}sequence", self.sequence, f"0, or more than {group}context={self.context}")
         learns = self.slot_weight + self.image_weight > 0 and min(self.slot_weight, self.image_weight) >= 0
-        check(learns, f"{group}.slot_weight", self.slot_weight, "slot_weight or image_weight above 0, none below")
-        check(self.savi_steps is None or self.savi_steps >= 0, f"{group}.savi_steps", self.savi_steps, "0 or more")
+        check(learns, f"{group}slot_weight", self.slot_weight, "slot_weight or image_weight above 0, none below")
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from playslot_rl.config.methods import MethodName
-from playslot_rl.config.plain import check, check_seed
+from playslot_rl.config.plain import check
+from playslot_rl.config.roles import SEED, Checked, at_least
 
 LAUNCHERS: dict[str, str] = {
     "basic": "hydra",
@@ -18,7 +19,7 @@ LAUNCHERS: dict[str, str] = {
 
 
 @dataclass(frozen=True)
-class CompareConfig:
+class CompareConfig(Checked):
     """What is compared. On the command line of `playslot compare` the keys are `methods=`, `demos=`, `seeds=` and
     `hydra.launcher=`, without the group's name.
 
@@ -32,15 +33,17 @@ class CompareConfig:
         hydra: further overrides for Hydra, such as `hydra.launcher.n_jobs=2`.
     """
 
+    group = "compare."
     methods: tuple[MethodName, ...] = ("playslot", "lapo", "slot_oracle", "resnet_oracle", "dreamer", "sold")
-    demos: tuple[int, ...] = (10, 50, 100, 150)
-    seeds: tuple[int, ...] = (0, 1, 2)
+    demos: tuple[int, ...] = field(default=(10, 50, 100, 150), metadata=at_least(1, "numbers of at least 1"))
+    seeds: tuple[int, ...] = field(default=(0, 1, 2), metadata=SEED)
     online_seeds: tuple[int, ...] = ()
-    evaluation_seed: int = 100
+    evaluation_seed: int = field(default=100, metadata=SEED)
     launcher: str = ""
     hydra: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("methods", "demos", "seeds"):
             values = getattr(self, name)
             check(len(values) > 0, name, values, "at least one")
@@ -48,9 +51,6 @@ class CompareConfig:
         online = self.online_seeds
         check(set(online) <= set(self.seeds), "compare.online_seeds", online, f"some of seeds={self.seeds}")
         check(len(set(online)) == len(online), "compare.online_seeds", online, "each one once")
-        check(all(n >= 1 for n in self.demos), "demos", self.demos, "numbers of at least 1")
-        check_seed("seeds", *self.seeds)
-        check_seed("compare.evaluation_seed", self.evaluation_seed)
         known = ", ".join(LAUNCHERS)
         check(self.launcher in ("", *LAUNCHERS), "hydra.launcher", self.launcher, f"one of {known}")
         check(not self.hydra or bool(self.launcher), "hydra", self.hydra, "hydra.launcher=NAME with it")

@@ -18,6 +18,7 @@ from typing import Any, Final
 
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.methods import MethodName, canonical_method
+from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import keys_of
 from playslot_rl.errors import ConfigError
 
@@ -25,8 +26,6 @@ CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
 CONTINUES: Final = frozenset({"evaluate", "export", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
-COMPARE: Final = "compare"
-"""The command whose `methods=`, `demos=` and `seeds=` are lists, and which takes `hydra.` keys."""
 SHIPPED: Final = "pretrained"
 """`run=pretrained` names the task's shipped world model, `run=pretrained/ENV` one of them: no run folders."""
 
@@ -56,25 +55,24 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         ConfigError: an argument that is not `key=value`, an unknown environment, preset or key, a value outside its
             range, or a run folder without a usable `config.json`.
     """
-    pairs = _parse(_compare_keys(overrides) if command == COMPARE else overrides)
+    pairs = _parse(_compare_keys(overrides) if command == "compare" else overrides)
     for group in GROUPS:
         if group in pairs:
             _check_choice(group, pairs[group])
     try:
         run = _expand_home(_unquote(pairs.get("run", "")))
         continues = command in CONTINUES and run != "" and not shipped(run)
-        config = _from_run(Path(run), pairs) if continues else _from_preset(pairs)
+        if continues:
+            config = _from_run(Path(run), pairs)
+        else:
+            groups = [f"{group}={pairs[group]}" for group in GROUPS if group in pairs]
+            config = from_dict(ExperimentConfig, _hydra("config", groups + _assignments(pairs)))
     except ConfigError:
         raise
     except ValueError as error:
         raise ConfigError(str(error)) from error
     _check_choice("env", config.env.name)
     return config
-
-
-def _from_preset(pairs: Mapping[str, str]) -> ExperimentConfig:
-    groups = [f"{group}={pairs[group]}" for group in GROUPS if group in pairs]
-    return from_dict(ExperimentConfig, _hydra("config", groups + _assignments(pairs)))
 
 
 def _parse(overrides: Sequence[str]) -> dict[str, str]:
@@ -152,24 +150,9 @@ def _unknown_key(key: str) -> str:
         group = group.rpartition(".")[0]
     level = _hint(group) if group else ExperimentConfig
     names = [f"{group}.{f.name}" if group else f.name for f in dataclasses.fields(level)]
-    near = difflib.get_close_matches(key, [*names, *_leaves()], n=1)
+    near = difflib.get_close_matches(key, [*names, *flatten(to_dict(ExperimentConfig()))], n=1)
     hint = f"; did you mean {near[0]}?" if near else ""
     return f"unknown key {key}: expected one of {', '.join(sorted(names))}{hint}"
-
-
-def _leaves() -> list[str]:
-    """All dotted keys of the config."""
-    leaves: list[str] = []
-
-    def walk(values: Mapping[str, Any], prefix: str) -> None:
-        for name, value in values.items():
-            if isinstance(value, dict):
-                walk(value, f"{prefix}{name}.")
-            else:
-                leaves.append(f"{prefix}{name}")
-
-    walk(to_dict(ExperimentConfig()), "")
-    return leaves
 
 
 def _check_choice(group: str, name: str) -> None:

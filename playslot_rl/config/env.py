@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from playslot_rl.config.plain import check
+from playslot_rl.config.roles import Checked, at_least, between, within
 
 Rgb = tuple[int, int, int]
 
@@ -31,7 +32,7 @@ COLOURS: Final[dict[str, Rgb]] = {
 
 
 @dataclass(frozen=True)
-class RenderConfig:
+class RenderConfig(Checked):
     """How frames are rendered, for data and for evaluation alike.
 
     Attributes:
@@ -39,15 +40,13 @@ class RenderConfig:
         supersample: side factor of the `fast` path; 2 renders at twice the size and averages 2x2 boxes.
     """
 
+    group = "render."
     quality: Literal["fast", "full"] = "fast"
-    supersample: int = 2
-
-    def __post_init__(self) -> None:
-        check(1 <= self.supersample <= 8, "render.supersample", self.supersample, "an integer from 1 to 8")
+    supersample: int = field(default=2, metadata=between(1, 8, "an integer from 1 to 8"))
 
 
 @dataclass(frozen=True)
-class GridConfig:
+class GridConfig(Checked):
     """GridShapes, read by `env=grid_shapes` only.
 
     Attributes:
@@ -57,20 +56,15 @@ class GridConfig:
         change: probability that a shape draws a new direction at a step.
     """
 
-    objects: int = 2
-    size: int = 15
-    speed: int = 2
-    change: float = 0.25
-
-    def __post_init__(self) -> None:
-        check(1 <= self.objects <= 5, "env.grid.objects", self.objects, "1 to 5")
-        check(self.size >= 3, "env.grid.size", self.size, "at least 3 pixels")
-        check(self.speed >= 1, "env.grid.speed", self.speed, "at least 1 pixel")
-        check(0.0 <= self.change <= 1.0, "env.grid.change", self.change, "a probability")
+    group = "env.grid."
+    objects: int = field(default=2, metadata=between(1, 5, "1 to 5"))
+    size: int = field(default=15, metadata=at_least(3, "at least 3 pixels"))
+    speed: int = field(default=2, metadata=at_least(1, "at least 1 pixel"))
+    change: float = field(default=0.25, metadata=between(0, 1, "a probability"))
 
 
 @dataclass(frozen=True)
-class BlocksConfig:
+class BlocksConfig(Checked):
     """The blocks family, read by `env=block_push`, `block_push_easy`, `block_reach` and `block_pick` only.
 
     Attributes:
@@ -82,14 +76,15 @@ class BlocksConfig:
         reward: `dense` or `sparse`.
     """
 
+    group = "env.blocks."
     task: Literal["red", "reddest", "odd", "odd_groups"] = "odd"
-    distractors: int = 3
+    distractors: int = field(default=3, metadata=between(0, 4, "0 to 4"))
     distractors_to: int | None = None
     colour: str = ""
     reward: Literal["dense", "sparse"] = "dense"
 
     def __post_init__(self) -> None:
-        check(0 <= self.distractors <= 4, "env.blocks.distractors", self.distractors, "0 to 4")
+        super().__post_init__()
         last = self.distractors if self.distractors_to is None else self.distractors_to
         limits = f"{self.distractors} (env.blocks.distractors) to 4, or null"
         check(self.distractors <= last <= 4, "env.blocks.distractors_to", last, limits)
@@ -100,7 +95,7 @@ class BlocksConfig:
 
 
 @dataclass(frozen=True)
-class EnvConfig:
+class EnvConfig(Checked):
     """The task.
 
     Attributes:
@@ -114,18 +109,17 @@ class EnvConfig:
         blocks: settings of the `block_*` environments.
     """
 
+    group = "env."
     name: str = "button_press"
-    image_size: int = 64
+    image_size: int = field(default=64, metadata=within((32, 64, 128).__contains__, "32, 64 or 128"))
     action_dim: int = 4
-    frame_skip: int = 5
-    max_steps: int = 20
+    frame_skip: int = field(default=5, metadata=at_least(1))
+    max_steps: int = field(default=20, metadata=at_least(2))
     warmup_steps: int = 12
     grid: GridConfig = field(default_factory=GridConfig)
     blocks: BlocksConfig = field(default_factory=BlocksConfig)
 
     def __post_init__(self) -> None:
-        check(self.image_size in (32, 64, 128), "env.image_size", self.image_size, "32, 64 or 128")
-        check(self.frame_skip >= 1, "env.frame_skip", self.frame_skip, "at least 1")
-        check(self.max_steps >= 2, "env.max_steps", self.max_steps, "at least 2")
+        super().__post_init__()
         used = self.name.startswith("block_") or self.blocks == BlocksConfig()
         check(used, "env.blocks", self.blocks, f"no changes with env.name={self.name}, which has no blocks")

@@ -1,4 +1,4 @@
-"""Config of a command: everything that can be set (re-exported by `playslot_rl.config`)."""
+"""Config of a command: data, collection, evaluation, logging, and everything together."""
 
 from __future__ import annotations
 
@@ -7,18 +7,89 @@ from typing import Literal
 
 from playslot_rl.config.baselines import BaselinesConfig
 from playslot_rl.config.compare import CompareConfig
-from playslot_rl.config.data import CollectConfig, CollectorConfig, DataConfig
 from playslot_rl.config.env import EnvConfig, RenderConfig
 from playslot_rl.config.methods import MethodName
 from playslot_rl.config.model import ModelConfig
-from playslot_rl.config.plain import check, check_seed
-from playslot_rl.config.roles import role
+from playslot_rl.config.roles import SEED, Checked, at_least, between, role, within
 from playslot_rl.config.stages import BehaviourStageConfig, DynamicsStageConfig, SlotsStageConfig
 from playslot_rl.episode_seeds import EVALUATION
 
 
 @dataclass(frozen=True)
-class EvaluationConfig:
+class DataConfig(Checked):
+    """Where data come from.
+
+    Attributes:
+        root: LeRobot v3.0 data set(s) of unlabelled videos; several are separated by commas.
+        demos: data set of demonstrations; empty means `root`.
+        held_out: how many of its last episodes are neither trained on nor shown to the world model: they measure.
+        camera: image feature(s) to read, separated by commas; empty means the only one.
+        resize: resize frames of another size than `env.image_size` (area averaging) instead of refusing them.
+        cache: folder of the frame and slot caches; empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
+        validation: fraction of episodes held out from training.
+    """
+
+    group = "data."
+    root: str = field(default="", metadata=role("machine", "folder"))
+    demos: str = field(default="", metadata=role("machine", "folder"))
+    held_out: int = field(default=0, metadata=role("machine") | at_least(0, "0 or more"))
+    camera: str = ""
+    resize: bool = False
+    cache: str = field(default="", metadata=role("machine", "folder"))
+    validation: float = field(default=0.05, metadata=within(lambda value: 0 <= value < 1, "a fraction in [0, 1)"))
+
+
+@dataclass(frozen=True)
+class CollectConfig(Checked):
+    """What the collectors record (agent steps; an episode has one more frame than actions).
+
+    Attributes:
+        random_episodes: episodes of the random policy that `pipeline` collects.
+        random_steps: agent steps of each.
+        expert_episodes: demonstrations that `pipeline` collects for the policy.
+        validation_episodes: further ones that only measure: `demo`, `pipeline` and `compare` record so many more. Of
+            any data set, at most so many of its last episodes, beyond those trained on, are looked at in validation.
+        expert_steps: agent steps of each; clips go on past success.
+        noise: standard deviation of Gaussian noise added to the expert's actions.
+        noisy_episodes: episodes of the noisy expert that `pipeline` adds to the world model's videos.
+        exploration_noise: standard deviation of its noise.
+        learn_from_demos: whether the world model learns from the demonstrations' videos too (never their actions).
+        storage: `image` (PNG in parquet, lossless) or `video` (h264 yuv444p, crf 0).
+    """
+
+    group = "collect."
+    random_episodes: int = 400
+    random_steps: int = 20
+    expert_episodes: int = 150
+    validation_episodes: int = field(default=10, metadata=role("machine") | at_least(0, "0 or more"))
+    expert_steps: int = 20
+    noise: float = 0.0
+    noisy_episodes: int = 0
+    exploration_noise: float = 0.5
+    learn_from_demos: bool = False
+    storage: Literal["image", "video"] = "image"
+
+
+@dataclass(frozen=True)
+class CollectorConfig(Checked):
+    """How episodes are recorded, never what: the data do not depend on it.
+
+    Attributes:
+        backend: `local` processes of this machine, or actors of a `ray` cluster.
+        timeout_s: seconds without an episode after which a worker counts as hanging and is started again.
+        restarts: how many dead or hanging workers are replaced before the collection gives up.
+        ray_address: address of the Ray cluster; empty means `$RAY_ADDRESS`, or a cluster of this machine alone.
+    """
+
+    group = "collector."
+    backend: Literal["local", "ray"] = "local"
+    timeout_s: float = field(default=120.0, metadata=within(lambda value: value > 0, "a number of seconds above 0"))
+    restarts: int = field(default=5, metadata=at_least(0, "0 or more"))
+    ray_address: str = ""
+
+
+@dataclass(frozen=True)
+class EvaluationConfig(Checked):
     """Evaluation.
 
     Attributes:
@@ -27,12 +98,9 @@ class EvaluationConfig:
             Below that only the records of the training data sets, which are looked at, keep episodes apart.
     """
 
+    group = "evaluation."
     references: bool = True
-    seed_offset: int = EVALUATION
-
-    def __post_init__(self) -> None:
-        most = 2 * EVALUATION
-        check(0 <= self.seed_offset <= most, "evaluation.seed_offset", self.seed_offset, f"0 to {most}")
+    seed_offset: int = field(default=EVALUATION, metadata=between(0, 2 * EVALUATION, f"0 to {2 * EVALUATION}"))
 
 
 @dataclass(frozen=True)
@@ -62,7 +130,7 @@ class LoggingConfig:
 
 
 @dataclass(frozen=True)
-class ExperimentConfig:
+class ExperimentConfig(Checked):
     """Everything a command needs.
 
     Attributes:
@@ -82,16 +150,16 @@ class ExperimentConfig:
 
     preset: str = field(default="paper", metadata=role("machine"))
     policy: Literal["random", "expert"] = field(default="expert", metadata=role("call"))
-    episodes: int | None = field(default=None, metadata=role("call"))
-    seed: int = 0
-    workers: int = field(default=0, metadata=role("call", "machine"))
+    episodes: int | None = field(default=None, metadata=role("call") | at_least(1))
+    seed: int = field(default=0, metadata=SEED)
+    workers: int = field(default=0, metadata=role("call", "machine") | at_least(0, "0 (one per core) or more"))
     out: str = field(default="", metadata=role("call", "machine", "folder"))
     run: str = field(default="", metadata=role("call", "machine", "folder"))
     protocol: Literal["simulation", "imagination"] = field(default="simulation", metadata=role("call"))
     device: str = field(default="", metadata=role("call", "machine"))
     threads: int = field(default=0, metadata=role("machine"))
     method: MethodName = "playslot"
-    demos: int | None = None
+    demos: int | None = field(default=None, metadata=at_least(1))
     env: EnvConfig = field(default_factory=EnvConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     data: DataConfig = field(default_factory=DataConfig)
@@ -106,9 +174,3 @@ class ExperimentConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     logging: LoggingConfig = field(default_factory=LoggingConfig, metadata=role("machine"))
     export: ExportConfig = field(default_factory=ExportConfig, metadata=role("call"))
-
-    def __post_init__(self) -> None:
-        check(self.episodes is None or self.episodes >= 1, "episodes", self.episodes, "at least 1")
-        check_seed("seed", self.seed)
-        check(self.demos is None or self.demos >= 1, "demos", self.demos, "at least 1")
-        check(self.workers >= 0, "workers", self.workers, "0 (one per core) or more")

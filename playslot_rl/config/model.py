@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from playslot_rl.config.plain import check
+from playslot_rl.config.roles import Checked, at_least, within
 
 LatentMode = Literal["hybrid", "discrete", "continuous", "ground_truth"]
 
 
 @dataclass(frozen=True)
-class SAViConfig:
+class SAViConfig(Checked):
     """Sizes of SAVi (paper, appendix A.1).
 
     Attributes:
@@ -36,7 +37,8 @@ class SAViConfig:
             handing slots on as they are, so that no two of them learn to change places at every frame).
     """
 
-    n_slots: int = 4
+    group = "model.savi."
+    n_slots: int = field(default=4, metadata=at_least(1))
     slot_dim: int = 128
     initial: Literal["gaussian", "learned"] = "gaussian"
     encoder: Literal["full", "strided"] = "full"
@@ -55,7 +57,7 @@ class SAViConfig:
     transition_start: Literal["xavier", "identity"] = "xavier"
 
     def __post_init__(self) -> None:
-        check(self.n_slots >= 1, "model.savi.n_slots", self.n_slots, "at least 1")
+        super().__post_init__()
         check(
             len(self.encoder_channels) == len(self.encoder_strides),
             "model.savi.encoder_strides",
@@ -83,7 +85,7 @@ class SAViConfig:
 
 
 @dataclass(frozen=True)
-class InverseDynamicsConfig:
+class InverseDynamicsConfig(Checked):
     """Sizes of InvDyn and its quantiser (paper, appendix A.2).
 
     Attributes:
@@ -98,27 +100,24 @@ class InverseDynamicsConfig:
         sample: sample z at evaluation too (training always samples).
     """
 
+    group = "model.inverse_dynamics."
     variant: Literal["single", "multi"] = "single"
     mode: LatentMode = "hybrid"
     latent_dim: int = 16
-    n_prototypes: int = 8
+    n_prototypes: int = field(default=8, metadata=at_least(2))
     dim: int = 256
     layers: int = 4
     heads: int = 4
     head_dim: int = 64
     mlp_dim: int = 1024
-    decay: float = 0.99
+    decay: float = field(default=0.99, metadata=within(lambda value: 0 < value < 1, "a number in (0, 1)"))
     dead_threshold: float = 1.0
     commitment: float = 0.25
     sample: bool = False
 
-    def __post_init__(self) -> None:
-        check(0.0 < self.decay < 1.0, "model.inverse_dynamics.decay", self.decay, "a number in (0, 1)")
-        check(self.n_prototypes >= 2, "model.inverse_dynamics.n_prototypes", self.n_prototypes, "at least 2")
-
 
 @dataclass(frozen=True)
-class PredictorConfig:
+class PredictorConfig(Checked):
     """Kind and sizes of the predictor (paper, appendix A.3).
 
     Attributes:
@@ -128,6 +127,7 @@ class PredictorConfig:
         context: frames it attends to; past them the window slides and is recomputed.
     """
 
+    group = "model.predictor."
     kind: Literal["cocvp", "ocvp_seq"] = "cocvp"
     dim: int = 256
     layers: int = 4
@@ -135,10 +135,7 @@ class PredictorConfig:
     head_dim: int = 64
     mlp_dim: int = 1024
     residual: bool = False
-    context: int = 24
-
-    def __post_init__(self) -> None:
-        check(self.context >= 2, "model.predictor.context", self.context, "at least 2 frames")
+    context: int = field(default=24, metadata=at_least(2, "at least 2 frames"))
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ import hashlib
 import json
 import types
 import typing
+from collections.abc import Mapping
 from typing import Any, Literal, Union, get_args, get_origin
-
-from playslot_rl.episode_seeds import LARGEST_SEED
 
 
 def check(ok: bool, what: str, got: object, expected: str) -> None:
@@ -23,20 +22,19 @@ def check(ok: bool, what: str, got: object, expected: str) -> None:
         raise ValueError(f"{what}: got {got!r}, expected {expected}")
 
 
-def check_seed(what: str, *seeds: int) -> None:
-    """Refuse seeds that are no non-negative 32-bit numbers.
-
-    Raises:
-        ValueError: one is not.
-    """
-    for seed in seeds:
-        check(0 <= seed <= LARGEST_SEED, what, seed, f"a non-negative integer of 32 bits, 0 to {LARGEST_SEED}")
-
-
 def to_dict(config: Any) -> dict[str, Any]:
     """Nested plain dict of a config (tuples become lists, as in JSON)."""
     plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
     return plain
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested dicts as one dict with dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        flat.update(flatten(value, f"{name}.") if isinstance(value, Mapping) else {name: value})
+    return flat
 
 
 def fingerprint(config: Any) -> str:
@@ -85,10 +83,6 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         if not isinstance(value, (list, tuple)):
             raise ValueError(f"{where}: got {value!r}, expected a list")
         return tuple(_convert(get_args(hint)[0], v, where) for v in value)
-    return _convert_scalar(hint, value, where)
-
-
-def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if hint is str and value is None:

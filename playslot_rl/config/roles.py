@@ -1,4 +1,5 @@
-"""What a key of the config counts for, said where the key is declared: `field(default=0, metadata=role("machine"))`.
+"""What a key of the config counts for and which values it takes, said where the key is declared:
+`field(default=0, metadata=role("machine") | at_least(0))`.
 
 A key without a role says what is computed: it is stored with a run, handed on, and part of every identity.
 """
@@ -7,10 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Mapping
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Final, Literal
 
-from playslot_rl.config.plain import to_dict
+from playslot_rl.config.plain import check, to_dict
+from playslot_rl.episode_seeds import LARGEST_SEED
 
 Role = Literal["call", "machine", "free", "folder"]
 """`call`: what one invocation does; a stored run does not hand it on.
@@ -21,9 +23,47 @@ Role = Literal["call", "machine", "free", "folder"]
 """
 
 
-def role(*roles: Role) -> dict[str, frozenset[Role]]:
+def role(*roles: Role) -> dict[str, Any]:
     """Metadata of a field that has these roles; those of a group hold for all of its keys."""
     return {"roles": frozenset(roles)}
+
+
+def within(accepts: Callable[[Any], bool], expected: str) -> dict[str, Any]:
+    """Metadata of a field that takes the values, each of a tuple, that `accepts` is true for, and None."""
+    return {"range": (accepts, expected)}
+
+
+def at_least(smallest: float, expected: str = "") -> dict[str, Any]:
+    """Metadata of a field that takes numbers from `smallest` on."""
+    return within(lambda value: value >= smallest, expected or f"at least {smallest}")
+
+
+def between(smallest: float, largest: float, expected: str) -> dict[str, Any]:
+    """Metadata of a field that takes numbers from `smallest` to `largest`, both included."""
+    return within(lambda value: smallest <= value <= largest, expected)
+
+
+SEED: Final = between(0, LARGEST_SEED, f"a non-negative integer of 32 bits, 0 to {LARGEST_SEED}")
+"""Metadata of a field that takes seeds."""
+
+
+class Checked:
+    """A config whose fields are checked against the ranges in their metadata when it is made.
+
+    Raises:
+        ValueError: a value outside its range.
+    """
+
+    group: ClassVar[str] = ""
+    """Dotted name with a dot at its end, for the messages; empty where several groups are of this class."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            if "range" in field.metadata:
+                accepts, expected = field.metadata["range"]
+                value = getattr(self, field.name)
+                for one in value if isinstance(value, tuple) else (value,):
+                    check(one is None or accepts(one), self.group + field.name, one, expected)
 
 
 def keys_of(cls: type, wanted: Role) -> frozenset[str]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from playslot_rl.config.plain import check
-from playslot_rl.config.roles import role
+from playslot_rl.config.roles import Checked, at_least, between, role
 
 Precision = Literal["fp32", "bf16"]
 
@@ -29,7 +28,7 @@ class OptimConfig:
 
 
 @dataclass(frozen=True)
-class StageConfig:
+class StageConfig(Checked):
     """What every training stage has.
 
     Attributes:
@@ -42,18 +41,13 @@ class StageConfig:
         log_every: steps between log lines.
     """
 
-    steps: int = 200_000
-    batch_size: int = 64
+    steps: int = field(default=200_000, metadata=at_least(1))
+    batch_size: int = field(default=64, metadata=at_least(1))
     optim: OptimConfig = field(default_factory=OptimConfig)
     precision: Precision = "fp32"
-    checkpoint_every: int = field(default=1000, metadata=role("free"))
+    checkpoint_every: int = field(default=1000, metadata=role("free") | at_least(1))
     validate_every: int = field(default=1000, metadata=role("free"))
     log_every: int = field(default=50, metadata=role("free"))
-
-    def __post_init__(self) -> None:
-        check(self.steps >= 1, "steps", self.steps, "at least 1")
-        check(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
-        check(self.checkpoint_every >= 1, "checkpoint_every", self.checkpoint_every, "at least 1")
 
 
 @dataclass(frozen=True)
@@ -65,6 +59,7 @@ class SlotsStageConfig(StageConfig):
         start_from: run (or `pretrained/ENV`) whose SAVi this one starts from; empty starts from scratch (paper).
     """
 
+    group = "slots."
     clip_frames: int = 8
     start_from: str = field(default="", metadata=role("folder"))
 
@@ -82,19 +77,15 @@ class DynamicsStageConfig(StageConfig):
         image_weight, slot_weight, vq_weight: loss weights (lambda of Eq. "full loss").
     """
 
-    seed_frames: int = 6
-    predicted_frames: int = 8
+    group = "dynamics."
+    seed_frames: int = field(default=6, metadata=at_least(1))
+    predicted_frames: int = field(default=8, metadata=at_least(1))
     from_start: float = 0.0
     teacher_steps: int = 0
     decoded_frames: int = 0
     image_weight: float = 1.0
     slot_weight: float = 1.0
     vq_weight: float = 0.25
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check(self.seed_frames >= 1, "dynamics.seed_frames", self.seed_frames, "at least 1")
-        check(self.predicted_frames >= 1, "dynamics.predicted_frames", self.predicted_frames, "at least 1")
 
 
 @dataclass(frozen=True)
@@ -117,18 +108,14 @@ class BehaviourStageConfig(StageConfig):
         oracle: also train the slot oracle (same network on the real actions of all demos).
     """
 
+    group = "behaviour."
     labelled_demos: int = 50
     imagined: bool = True
     loss: Literal["l2", "l1"] = "l2"
     slot_noise: float = 0.0
-    shift: int = 0
-    shifted_copies: int = 8
+    shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
+    shifted_copies: int = field(default=8, metadata=between(1, 8, "1 to 8"))
     decoder_inputs: Literal["inverse_dynamics", "policy", "both"] = "inverse_dynamics"
     decoder_steps: int = 2000
     decoder_lr: float = 2e-4
     oracle: bool = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check(0 <= self.shift <= 16, "behaviour.shift", self.shift, "0 to 16 pixels")
-        check(1 <= self.shifted_copies <= 8, "behaviour.shifted_copies", self.shifted_copies, "1 to 8")

@@ -1,88 +1,125 @@
-"""What went wrong at the Hub, in one line that says what to do."""
+"""What went wrong at the Hub, in one line that says what to do, and without a token in anything that is printed, logged
+or raised.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import contextlib
+import copy
+import logging
+import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from playslot_rl.errors import DEBUG, HubError, OutputError, PlaySlotError
 from playslot_rl.storage.atomic import explain_write_errors
 
+if TYPE_CHECKING:
+    from playslot_rl.hub.session import Repository
+
+MASK = "<token>"
+_SHAPED = re.compile(r"\bhf_[A-Za-z0-9]{16,}\b")
+_BEARER = re.compile(r"(?i)\b(bearer|basic)(\s+|%20)[^\s'\",;]+")
+_IN_ADDRESS = re.compile(r"(?<=://)[^/\s@'\"]+@")
+_CHARACTERS = re.compile(r"[A-Za-z0-9._~+/=-]+")
+
+
+def checked_token(token: str | None) -> str | None:
+    """A token as it can be sent: stripped, and of characters that stand for themselves in every message.
+
+    Raises:
+        HubError: it has spaces, line breaks or other characters inside; a library would print it in its complaint.
+    """
+    token = (token or "").strip()
+    if token and not _CHARACTERS.fullmatch(token):
+        raise HubError(
+            "bad token: got one with characters that no token has (a space or a line break?), expected hf_ and letters "
+            "and digits: copy it again from the Hub's settings/tokens"
+        )
+    return token or None
+
+
+def mask(text: str, token: str | None = None) -> str:
+    """`text` without `token`, and without anything shaped like a token or a password."""
+    if token:
+        text = text.replace(token, MASK)
+    text = _SHAPED.sub(MASK, text)
+    return _IN_ADDRESS.sub(f"{MASK}@", _BEARER.sub(rf"\1\2{MASK}", text))
+
+
+@contextlib.contextmanager
+def masked_logs(token: str | None) -> Iterator[None]:
+    """Mask what the handlers of the root and of the Hub's client write inside; the log records stay as they are."""
+
+    def masked(record: logging.LogRecord) -> logging.LogRecord:
+        shown = copy.copy(record)
+        shown.msg, shown.args = mask(record.getMessage(), token), ()
+        if record.exc_info:
+            shown.exc_info, text = None, logging.Formatter().formatException(record.exc_info)
+            shown.exc_text = mask(text, token)
+        return shown
+
+    handlers = [*logging.getLogger().handlers, *logging.getLogger("huggingface_hub").handlers]
+    for handler in handlers:
+        handler.addFilter(masked)
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            handler.removeFilter(masked)
+
+
 LOG_IN = "run `hf auth login` once, or set HF_TOKEN"
 
 
-@dataclass(frozen=True)
-class Place:
-    """What was being done, for the messages.
-
-    Attributes:
-        repo_id: the repository on the Hub, `user/name`.
-        endpoint: address of the Hub.
-        root: local folder.
-        writing: a push (a pull otherwise).
-        has_token: whether a token was sent.
-        revision: the revision asked for; empty if none was.
-        what: what the repository is, in words.
-    """
-
-    repo_id: str
-    endpoint: str
-    root: Path
-    writing: bool
-    has_token: bool
-    revision: str = ""
-    what: str = "data set"
-
-
-def translate(error: BaseException, place: Place) -> PlaySlotError:
+def translate(error: BaseException, hub: Repository) -> PlaySlotError:
     """One line about an error of the Hub's client.
 
     The error itself is looked at first, then what caused it: uploads and downloads wrap the errors of their threads.
     """
     link: BaseException | None = error
     while link is not None:
-        known = _one(link, place)
+        known = _one(link, hub)
         if known is not None:
             return known
         link = link.__cause__ or link.__context__
     return HubError(
-        f"{place.repo_id}: got {type(error).__name__}: {' '.join(str(error).split())} (unexpected; {DEBUG}=1 shows "
-        f"where), expected the {'push' if place.writing else 'pull'} to go on"
+        f"{hub.name}: got {type(error).__name__}: {' '.join(str(error).split())} (unexpected; {DEBUG}=1 shows "
+        f"where), expected the {'push' if hub.writing else 'pull'} to go on"
     )
 
 
-def _one(error: BaseException, place: Place) -> PlaySlotError | None:
+def _one(error: BaseException, hub: Repository) -> PlaySlotError | None:
     import httpx
-    from huggingface_hub import errors as hub
+    from huggingface_hub import errors
 
-    name = place.repo_id
+    name = hub.name
     if isinstance(error, PlaySlotError):
         return error
-    if isinstance(error, hub.OfflineModeIsEnabled):
+    if isinstance(error, errors.OfflineModeIsEnabled):
         return HubError(
             f"{name}: got offline mode (HF_HUB_OFFLINE is set), expected access to the Hub: unset HF_HUB_OFFLINE and "
             "run the same command again"
         )
-    if isinstance(error, hub.LocalTokenNotFoundError):
+    if isinstance(error, errors.LocalTokenNotFoundError):
         return HubError(f"{name}: got no token, expected one with write access to push: {LOG_IN}")
-    if isinstance(error, hub.HfHubHTTPError):
-        return _http(error, place)
-    if isinstance(error, hub.HFValidationError | hub.HfUriError):
+    if isinstance(error, errors.HfHubHTTPError):
+        return _http(error, hub)
+    if isinstance(error, errors.HFValidationError | errors.HfUriError):
         return HubError(
-            f"got the {place.what} name {name!r}, expected user/name of letters, digits, '-', '_' and '.': your name "
-            f"on the Hub, a slash, and a name for the {place.what}"
+            f"got the {hub.what} name {name!r}, expected user/name of letters, digits, '-', '_' and '.': your name "
+            f"on the Hub, a slash, and a name for the {hub.what}"
         )
     if isinstance(error, httpx.UnsupportedProtocol | httpx.InvalidURL):
-        return HubError(
-            f"got HF_ENDPOINT={place.endpoint}, expected the address of a Hub: unset HF_ENDPOINT or mend it"
-        )
+        return HubError(f"got HF_ENDPOINT={hub.endpoint}, expected the address of a Hub: unset HF_ENDPOINT or mend it")
     if isinstance(error, httpx.TransportError | ConnectionError | TimeoutError):
         return HubError(
-            f"{name}: got no connection to {place.endpoint} ({type(error).__name__}), expected the network: check it "
+            f"{name}: got no connection to {hub.endpoint} ({type(error).__name__}), expected the network: check it "
             "and run the same command again, it carries on"
         )
     if isinstance(error, OSError):
-        return _disk(error, place.root)
+        return _disk(error, hub.root)
     if "xet" in f"{type(error).__module__}.{type(error).__name__}".lower():
         return HubError(
             f"{name}: got a failed transfer ({error}), expected the files to be moved: run the same command again, "
@@ -101,32 +138,32 @@ def _disk(error: OSError, root: Path) -> PlaySlotError | None:
         return None
 
 
-def _http(error: BaseException, place: Place) -> HubError:
-    from huggingface_hub import errors as hub
+def _http(error: BaseException, hub: Repository) -> HubError:
+    from huggingface_hub import errors
 
     status = int(error.response.status_code)  # type: ignore[attr-defined]
-    if isinstance(error, hub.RevisionNotFoundError):
+    if isinstance(error, errors.RevisionNotFoundError):
         said = (
-            f"no revision {place.revision or 'main'!r}, expected a branch, a tag or a commit: see its page on the Hub, "
+            f"no revision {hub.revision or 'main'!r}, expected a branch, a tag or a commit: see its page on the Hub, "
             "or leave the revision out"
         )
-    elif isinstance(error, hub.GatedRepoError):
-        said = f"a gated {place.what}, expected access to it: ask for access on its page, then {LOG_IN}"
-    elif status == 401 and place.has_token and not isinstance(error, hub.RepositoryNotFoundError):
+    elif isinstance(error, errors.GatedRepoError):
+        said = f"a gated {hub.what}, expected access to it: ask for access on its page, then {LOG_IN}"
+    elif status == 401 and hub.has_token and not isinstance(error, errors.RepositoryNotFoundError):
         said = (
             "401, a bad token (invalid or expired), expected a valid one: make a new one in the Hub's "
             f"settings/tokens, then {LOG_IN}"
         )
     elif status in (401, 404):
         # 401 also stands for a repository that is not there, for those who sent no token.
-        who = "your token" if place.has_token else "you: no token was sent"
+        who = "your token" if hub.has_token else "you: no token was sent"
         said = (
-            f"no such {place.what} on {place.endpoint}, or one hidden from {who}; expected user/name of a {place.what}:"
-            " check the name" + ("" if place.has_token else f"; if it is private, {LOG_IN}")
+            f"no such {hub.what} on {hub.endpoint}, or one hidden from {who}; expected user/name of a {hub.what}:"
+            " check the name" + ("" if hub.has_token else f"; if it is private, {LOG_IN}")
         )
     elif status == 403:
         said = (
-            f"403, the token may not {'write to' if place.writing else 'read'} it; expected one with that right: check "
+            f"403, the token may not {'write to' if hub.writing else 'read'} it; expected one with that right: check "
             "the owner's name, and the token's rights in the Hub's settings/tokens"
         )
     elif status == 412:
@@ -141,4 +178,4 @@ def _http(error: BaseException, place: Place) -> HubError:
     else:
         reason = " ".join(str(getattr(error, "server_message", None) or error).split())[:300]
         said = f"{status} from the Hub ({reason}), expected the request to be taken"
-    return HubError(f"{place.repo_id}: got {said}")
+    return HubError(f"{hub.name}: got {said}")

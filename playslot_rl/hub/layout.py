@@ -1,14 +1,22 @@
-"""Which files of a LeRobot data set travel, and how a file is compared with what the Hub says about it."""
+"""Which files of a LeRobot data set travel, how a file is compared with what the Hub says about it, and the small file
+that a push puts beside the data: what whoever pulls it has to find again.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import io
+import json
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
+from playslot_rl import __version__
+from playslot_rl.errors import HubError
+
 if TYPE_CHECKING:
     from huggingface_hub import RepoFile
+
 
 FORMAT_TAG = "v3.0"
 """Tag that LeRobot looks for on the Hub; equal to its CODEBASE_VERSION, whose import costs seconds."""
@@ -20,7 +28,6 @@ LOCAL_RECORD = "meta/playslot_pull.json"
 
 _SUFFIXES = {"data": {".parquet"}, "meta": {".parquet", ".json", ".jsonl"}, "videos": {".mp4"}}
 _GENERATED = {REMOTE_RECORD, LOCAL_RECORD}
-_PIECE = 8 << 20
 
 
 def is_data(path: str) -> bool:
@@ -63,11 +70,55 @@ def same_content(item: Path | bytes, remote: RepoFile) -> bool:
         return False
     digest = hashlib.sha256() if remote.lfs else hashlib.sha1(b"blob %d\0" % remote.size, usedforsecurity=False)
     with io.BytesIO(item) if isinstance(item, bytes) else item.open("rb") as stream:
-        while piece := stream.read(_PIECE):
-            digest.update(piece)
+        hashlib.file_digest(stream, lambda: digest)
     return digest.hexdigest() == (remote.lfs.sha256 if remote.lfs else remote.blob_id)
 
 
 def size_of(item: Path | bytes) -> int:
     """Bytes of a file's content."""
     return len(item) if isinstance(item, bytes) else item.stat().st_size
+
+
+SCHEME = 1
+"""Version of `datasets/fingerprint.py`, to be raised when that changes: those of another version are not compared."""
+
+
+@dataclass(frozen=True)
+class HubRecord:
+    """What was pushed; equal to another record of the same content.
+
+    Attributes:
+        fingerprint: content hash of the data set, as `playslot dataset verify` prints it.
+        episodes, frames: counts.
+        scheme: how the fingerprint is made.
+        playslot_rl: version that pushed.
+    """
+
+    fingerprint: str
+    episodes: int
+    frames: int
+    scheme: int = field(compare=False)
+    playslot_rl: str = field(compare=False)
+
+    @classmethod
+    def of(cls, fingerprint: str, episodes: int, frames: int) -> HubRecord:
+        """The record of a checked data set, made by this version."""
+        return cls(fingerprint, episodes, frames, SCHEME, __version__)
+
+
+def read_record(root: Path) -> HubRecord | None:
+    """The record of a pulled data set; None where it was pushed by something else.
+
+    Raises:
+        HubError: it is there and damaged.
+    """
+    path = root / REMOTE_RECORD
+    if not path.is_file():
+        return None
+    try:
+        return HubRecord(**json.loads(path.read_text()))
+    except (ValueError, TypeError) as error:
+        raise HubError(
+            f"{REMOTE_RECORD}: got a damaged record ({type(error).__name__}), expected what `playslot dataset push` "
+            "writes: ask its owner to push again"
+        ) from error

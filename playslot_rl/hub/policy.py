@@ -8,11 +8,9 @@ from pathlib import Path
 
 from playslot_rl.data.cache import build_once, cache_folder
 from playslot_rl.errors import CheckpointError
-from playslot_rl.hub.sending import MAIN, Pushed, send
-from playslot_rl.hub.session import open_repository
+from playslot_rl.hub.session import MAIN, Pushed, open_repository, send
 from playslot_rl.sharing.card import MARK
-from playslot_rl.sharing.config import CONFIG, WEIGHTS
-from playslot_rl.sharing.folder import FILES, load_pretrained
+from playslot_rl.sharing.folder import CONFIG, FILES, WEIGHTS, load_pretrained
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, HubError, OutputError
-from playslot_rl.hub.layout import FORMAT_TAG, LOCAL_RECORD, is_pulled
-from playslot_rl.hub.record import SCHEME, HubRecord, read_record
+from playslot_rl.hub.layout import FORMAT_TAG, LOCAL_RECORD, SCHEME, HubRecord, is_pulled, read_record
 from playslot_rl.hub.session import Repository, open_repository
 from playslot_rl.storage.atomic import explain_write_errors, replace_dir, write_json
 from playslot_rl.storage.locks import locked
@@ -97,13 +96,19 @@ def pull(repo_id: str, root: Path, *, revision: str | None = None, token: str | 
         with locked(lock, f"{root}: got another pull into it running, expected one at a time: wait"):
             try:
                 with explain_write_errors(root):
-                    record, compared = _fetch(hub, root, commit, wanted)
+                    _refuse_existing(root)
+                    # Where the files gather, also over several calls; those of another commit are never mixed in.
+                    partial = root.with_name(f".{root.name}.pull-{commit[:16]}")
+                    _check_version(hub, partial, commit)
+                    _check_room(root, partial, wanted)
+                    hub.download(wanted, commit, partial)
+                    record, compared = _check_content(hub, partial, commit)
                     size = sum(file.size for file in wanted.values())
                     result = PullResult(
                         hub.name, str(root), name, why, commit, record.episodes, record.frames, len(wanted), size,
                         record.fingerprint, compared,
                     )  # fmt: skip
-                    _finish(_partial(root, commit), root, result, hub.place.endpoint)
+                    _finish(partial, root, result, hub.endpoint)
             finally:
                 lock.unlink(missing_ok=True)
     return result
@@ -134,21 +139,6 @@ def _choose(hub: Repository, revision: str | None) -> tuple[str, str, str]:
     if branches.get("main", commit) != commit:
         why += f"; main is another commit, {branches['main'][:12]}: revision=main for that"
     return FORMAT_TAG, why, commit
-
-
-def _partial(root: Path, commit: str) -> Path:
-    """Where the files of a commit gather, also over several calls; those of another commit are never mixed in."""
-    return root.with_name(f".{root.name}.pull-{commit[:16]}")
-
-
-def _fetch(hub: Repository, root: Path, commit: str, wanted: Mapping[str, RepoFile]) -> tuple[HubRecord, bool]:
-    """What has arrived, checked; and whether the Hub named a fingerprint to compare it with."""
-    _refuse_existing(root)
-    partial = _partial(root, commit)
-    _check_version(hub, partial, commit)
-    _check_room(root, partial, wanted)
-    hub.download(wanted, commit, partial)
-    return _check_content(hub, partial, commit)
 
 
 def _check_version(hub: Repository, partial: Path, commit: str) -> None:
@@ -183,7 +173,15 @@ def _check_content(hub: Repository, partial: Path, commit: str) -> tuple[HubReco
     """
     shutil.rmtree(partial / ".cache", ignore_errors=True)
     try:
-        found = _read_content(hub, partial, commit)
+        # Counts, indices and every frame. Statistics are not compared: others' may be made in another way.
+        seen = verify(partial, statistics=False)
+        if not seen.ok:
+            first = seen.errors[0].replace(f"{partial}/", "").partition(";")[0]
+            raise DataError(
+                f"{hub.name}: got a data set at commit {commit[:12]} whose files disagree ({first}), expected a sound "
+                "one: an earlier push may have left files behind; ask its owner to push it by `playslot dataset push`"
+            )
+        found = HubRecord.of(seen.fingerprint, seen.episodes, seen.frames)
         record = read_record(partial)
         if record is None or record.scheme != SCHEME:
             return found, False
@@ -197,18 +195,6 @@ def _check_content(hub: Repository, partial: Path, commit: str) -> tuple[HubReco
         shutil.rmtree(partial, ignore_errors=True)
         raise
     return found, True
-
-
-def _read_content(hub: Repository, partial: Path, commit: str) -> HubRecord:
-    """Counts, indices and every frame. Statistics are not compared: others' may be made in another way."""
-    found = verify(partial, statistics=False)
-    if not found.ok:
-        first = found.errors[0].replace(f"{partial}/", "").partition(";")[0]
-        raise DataError(
-            f"{hub.name}: got a data set at commit {commit[:12]} whose files disagree ({first}), expected a sound one: "
-            "an earlier push may have left files behind; ask its owner to push it by `playslot dataset push`"
-        )
-    return HubRecord.of(found.fingerprint, found.episodes, found.frames)
 
 
 def _finish(partial: Path, root: Path, result: PullResult, endpoint: str) -> None:

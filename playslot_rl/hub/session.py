@@ -1,5 +1,7 @@
 """One conversation with the Hub: checked before it starts, retried while it lasts, its errors translated.
 
+What every push does in it: one commit, compared with what the Hub then lists; cards by hand stay, and tags never move.
+
 Everything of `huggingface_hub` that this package uses is called here; it is imported when a conversation starts, not
 before, because it reads HF_ENDPOINT, HF_HOME, HF_TOKEN and HF_HUB_OFFLINE when it is imported.
 """
@@ -9,20 +11,21 @@ from __future__ import annotations
 import contextlib
 import glob
 import re
+import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from playslot_rl.errors import HubError
-from playslot_rl.hub.errors import Place, translate
-from playslot_rl.hub.layout import same_content
-from playslot_rl.hub.secrets import checked_token, mask, masked_logs
+from playslot_rl.hub.errors import checked_token, mask, masked_logs, translate
+from playslot_rl.hub.layout import CARD_NAME, same_content, size_of
 
 if TYPE_CHECKING:
     from huggingface_hub import RepoFile
+
 
 WAITS = (1.0, 2.0, 4.0)
 """Seconds before each further attempt after a server error."""
@@ -30,8 +33,6 @@ SECONDS = 120.0
 """Longest silence of the Hub; the client's own default is to wait for ever."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*/[A-Za-z0-9][A-Za-z0-9._-]*")
 Kind = Literal["dataset", "model"]
-WORDS: Final[dict[Kind, str]] = {"dataset": "data set", "model": "model"}
-_PAGES: Final[dict[Kind, str]] = {"dataset": "datasets/", "model": ""}
 
 
 @dataclass(frozen=True)
@@ -39,24 +40,39 @@ class Repository:
     """A data set or model on the Hub, and how to talk about it.
 
     Attributes:
-        place: for messages.
-        api: `huggingface_hub.HfApi` with the token.
+        name: `user/name`.
+        endpoint: address of the Hub.
+        root: local folder.
+        writing: a push (a pull otherwise).
+        has_token: whether a token was sent.
+        revision: the revision asked for; empty if none was.
         kind: what it is.
+        api: `huggingface_hub.HfApi` with the token.
     """
 
-    place: Place
+    name: str
+    endpoint: str
+    root: Path
+    writing: bool
+    has_token: bool
+    revision: str
+    kind: Kind
     api: Any
-    kind: Kind = "dataset"
 
     @property
-    def name(self) -> str:
-        """`user/name`."""
-        return self.place.repo_id
+    def what(self) -> str:
+        """What it is, in words."""
+        return "data set" if self.kind == "dataset" else "model"
+
+    @property
+    def here(self) -> dict[str, str]:
+        """The arguments of the client's calls that name it."""
+        return {"repo_id": self.name, "repo_type": self.kind}
 
     @property
     def address(self) -> str:
         """Its page."""
-        return f"{self.place.endpoint}/{_PAGES[self.kind]}{self.name}"
+        return f"{self.endpoint}/{'datasets/' if self.kind == 'dataset' else ''}{self.name}"
 
     def call(self, function: Callable[..., Any], **arguments: Any) -> Any:
         """Call the Hub, again after a server error or a broken connection (not where there is none).
@@ -73,14 +89,6 @@ class Repository:
                 time.sleep(wait)
         raise AssertionError("unreachable")
 
-    def check_token(self) -> None:
-        """Ask the Hub who we are: tells a bad token from every other 401.
-
-        Raises:
-            HubError: it is not valid.
-        """
-        self.call(self.api.whoami)
-
     def create(self, private: bool) -> bool:
         """Make the repository if it is not there.
 
@@ -90,24 +98,24 @@ class Repository:
         Raises:
             HubError: it is there and public, though `private` is asked for.
         """
-        self.call(self.api.create_repo, repo_id=self.name, repo_type=self.kind, private=private, exist_ok=True)
-        is_private = bool(self.call(self.api.repo_info, repo_id=self.name, repo_type=self.kind).private)
+        self.call(self.api.create_repo, **self.here, private=private, exist_ok=True)
+        is_private = bool(self.call(self.api.repo_info, **self.here).private)
         if private and not is_private:
             raise HubError(
-                f"{self.name}: got a public {self.place.what}, expected a private one: make it private in its settings "
+                f"{self.name}: got a public {self.what}, expected a private one: make it private in its settings "
                 "on the Hub, or push to another name"
             )
         return is_private
 
     def refs(self) -> tuple[dict[str, str], dict[str, str]]:
         """Commits of the branches and of the tags, by name."""
-        refs = self.call(self.api.list_repo_refs, repo_id=self.name, repo_type=self.kind)
+        refs = self.call(self.api.list_repo_refs, **self.here)
         return ({ref.name: ref.target_commit for ref in refs.branches},
                 {ref.name: ref.target_commit for ref in refs.tags})  # fmt: skip
 
     def commit_of(self, revision: str) -> str:
         """Full commit of a branch, tag or commit."""
-        info = self.call(self.api.repo_info, repo_id=self.name, repo_type=self.kind, revision=revision)
+        info = self.call(self.api.repo_info, **self.here, revision=revision)
         return str(info.sha)
 
     def tree(self, commit: str) -> dict[str, RepoFile]:
@@ -119,15 +127,11 @@ class Repository:
 
         return {entry.path: entry for entry in self.call(listed) if isinstance(entry, RepoFile)}
 
-    def make_branch(self, branch: str) -> None:
-        """A branch from main."""
-        self.call(self.api.create_branch, repo_id=self.name, repo_type=self.kind, branch=branch, exist_ok=True)
-
     def set_tag(self, tag: str, commit: str, *, replace: bool) -> None:
         """Name a commit. Moving a tag is two requests: after a failure in between the same push sets it."""
         if replace:
-            self.call(self.api.delete_tag, repo_id=self.name, repo_type=self.kind, tag=tag)
-        self.call(self.api.create_tag, repo_id=self.name, repo_type=self.kind, tag=tag, revision=commit, exist_ok=True)
+            self.call(self.api.delete_tag, **self.here, tag=tag)
+        self.call(self.api.create_tag, **self.here, tag=tag, revision=commit, exist_ok=True)
 
     def commit(self, files: dict[str, Path | bytes], stale: Sequence[str], message: str, branch: str, head: str) -> str:
         """Add `files` and delete `stale` in one commit on top of `head`; nothing is visible before it.
@@ -143,7 +147,7 @@ class Repository:
         def send() -> str:
             operations: list[Any] = [CommitOperationDelete(path, is_folder=False) for path in stale]
             operations += [CommitOperationAdd(path, content) for path, content in files.items()]
-            info = self.api.create_commit(repo_id=self.name, repo_type=self.kind, operations=operations,
+            info = self.api.create_commit(**self.here, operations=operations,
                                           revision=branch, commit_message=message, parent_commit=head)  # fmt: skip
             return str(info.oid)
 
@@ -151,8 +155,7 @@ class Repository:
 
     def read(self, path: str, commit: str, folder: Path) -> bytes:
         """Content of one file, downloaded below `folder`."""
-        got = self.call(self.api.hf_hub_download, repo_id=self.name, repo_type=self.kind, filename=path,
-                        revision=commit, local_dir=folder)  # fmt: skip
+        got = self.call(self.api.hf_hub_download, **self.here, filename=path, revision=commit, local_dir=folder)
         return Path(got).read_bytes()
 
     def download(self, files: Mapping[str, RepoFile], commit: str, folder: Path) -> None:
@@ -164,7 +167,7 @@ class Repository:
         Raises:
             HubError: the size or hash of a file is another; such files are removed.
         """
-        self.call(self.api.snapshot_download, repo_id=self.name, repo_type=self.kind, revision=commit, local_dir=folder,
+        self.call(self.api.snapshot_download, **self.here, revision=commit, local_dir=folder,
                   allow_patterns=[glob.escape(path) for path in files])  # fmt: skip
         damaged = [path for path, file in files.items() if not same_content(folder / path, file)]
         for path in damaged:
@@ -221,7 +224,8 @@ def open_repository(
 
     token = checked_token(token) or checked_token(get_token())
     name, endpoint = mask(repo_id, token), mask(constants.ENDPOINT, token)
-    place = Place(name, endpoint, root, writing, token is not None, revision, WORDS[kind])
+    api = HfApi(token=token or False, library_name="playslot_rl")
+    hub = Repository(name, endpoint, root, writing, token is not None, revision, kind, api)
     try:
         if not _NAME.fullmatch(repo_id):
             raise errors.HFValidationError(repo_id)
@@ -230,10 +234,10 @@ def open_repository(
         if writing and token is None:
             raise errors.LocalTokenNotFoundError
         with masked_logs(token):
-            yield Repository(place, HfApi(token=token or False, library_name="playslot_rl"), kind)
+            yield hub
         return
     except Exception as error:  # noqa: BLE001 - nothing that may hold a token goes on as it is
-        known = translate(error, place)
+        known = translate(error, hub)
         failure = type(known)(mask(str(known), token))
         failure.add_note(mask("".join(traceback.format_exception(error)), token))
     # A server may repeat the token it was sent, and the client's errors hold its answer: their masked text goes along
@@ -242,3 +246,149 @@ def open_repository(
         raise failure
     finally:
         failure.__context__ = None
+
+
+MAIN: Final = "main"
+Owned = Callable[[str], bool]
+"""Whether a path belongs to what is pushed."""
+
+
+@dataclass(frozen=True)
+class Pushed:
+    """What every push says.
+
+    Attributes:
+        repo_id: `user/name`.
+        address: its page.
+        branch: pushed to.
+        commit: what the branch now is.
+        changed: whether there was anything to send.
+        private: whether the repository is.
+        tags: set on the commit.
+        files, size: how many files and bytes were compared.
+        stale: files deleted on the Hub because they are no longer part of what is pushed.
+        card_kept: whether the card is one that somebody wrote by hand.
+    """
+
+    repo_id: str
+    address: str
+    branch: str
+    commit: str
+    changed: bool
+    private: bool
+    tags: tuple[str, ...]
+    files: int
+    size: int
+    stale: tuple[str, ...]
+    card_kept: bool
+
+    def report(self, what: str, more: Iterable[str] = ()) -> list[str]:
+        """For people: `what` was sent, and `more` to say of it."""
+        done = "pushed" if self.changed else "nothing to push: the Hub has the same files already"
+        lines = [
+            f"{done}: {what}",
+            f"to: {self.address} ({'private' if self.private else 'public'}), branch {self.branch}",
+            f"commit: {self.commit}",
+        ]
+        if self.tags:
+            lines.append(f"tag: {', '.join(self.tags)}")
+        lines += more
+        if self.card_kept:
+            lines.append(f"card: the one written by hand is kept ({CARD_NAME})")
+        return lines
+
+
+def few(paths: tuple[str, ...]) -> str:
+    """The first three, and how many more."""
+    more = f" and {len(paths) - 3} more" if len(paths) > 3 else ""
+    return ", ".join(paths[:3]) + more
+
+
+def send(
+    hub: Repository,
+    root: Path,
+    files: dict[str, Path | bytes],
+    *,
+    mark: str,
+    message: str,
+    private: bool,
+    branch: str,
+    tag: str | None,
+    version: str = "",
+    owned: Owned = lambda _: False,
+) -> Pushed:
+    """Push, or find that everything is there already. Nothing is visible on the Hub before the one commit.
+
+    Args:
+        hub: opened for writing.
+        root: local folder, which may hold a card written by hand.
+        files: what to send, by path, with the card as it is made here.
+        mark: line of a card by which those made here are known.
+        message: of the commit.
+        private: make it private; refused where it is public.
+        branch: made from main if it is not there.
+        tag: one more tag for the commit; never moved.
+        version: tag that moves to the commit; empty for none.
+        owned: which paths there must be part of `files`; others are left alone.
+
+    Raises:
+        HubError: what the Hub then lists is not what was sent, or the tag is on something else.
+    """
+    hub.call(hub.api.whoami)  # tells a bad token from every other 401
+    is_private = hub.create(private)
+    branches, tags = hub.refs()
+    if branch not in branches:
+        hub.call(hub.api.create_branch, **hub.here, branch=branch, exist_ok=True)
+    head = hub.commit_of(branch)
+    remote = hub.tree(head)
+    local = root / CARD_NAME
+    by_hand = local.is_file() and mark not in local.read_text(errors="replace")
+    if by_hand:
+        files = {**files, CARD_NAME: local}
+    elif CARD_NAME in remote and mark not in _read(hub, CARD_NAME, head):
+        by_hand = True
+        files = {path: item for path, item in files.items() if path != CARD_NAME}
+    if tag is not None and tag in tags:
+        _check_tag(hub, tag, tags[tag], files, owned)
+    stale = tuple(sorted(path for path in remote if owned(path) and path not in files))
+    sizes = {path: size_of(item) for path, item in files.items()}
+    commit = hub.commit(files, stale, message, branch, head)
+    _check_remote(hub, commit, sizes, owned)
+    if version and tags.get(version) != commit:
+        hub.set_tag(version, commit, replace=version in tags)
+    if tag is not None and tag not in tags:
+        hub.set_tag(tag, commit, replace=False)
+    return Pushed(
+        hub.name, hub.address, branch, commit, commit != head, is_private,
+        tuple(name for name in (version, tag) if name), len(sizes), sum(sizes.values()), stale, by_hand,
+    )  # fmt: skip
+
+
+def _read(hub: Repository, path: str, commit: str) -> str:
+    with tempfile.TemporaryDirectory(prefix="playslot-card-") as folder:
+        return hub.read(path, commit, Path(folder)).decode(errors="replace")
+
+
+def _check_tag(hub: Repository, tag: str, commit: str, files: Mapping[str, Path | bytes], owned: Owned) -> None:
+    """A tag never moves: it may be there already only where it names exactly what is pushed."""
+    tagged = hub.tree(commit)
+    same = {path for path in tagged if owned(path)} <= files.keys() and all(
+        path in tagged and same_content(item, tagged[path]) for path, item in files.items()
+    )
+    if not same:
+        raise HubError(
+            f"tag={tag}: {hub.name} has it on commit {commit[:12]}, which holds something else, expected a new name: "
+            "tags are not moved, choose another"
+        )
+
+
+def _check_remote(hub: Repository, commit: str, sizes: Mapping[str, int], owned: Owned) -> None:
+    """Compare the commit's tree with what was sent: bytes by path, and no further path that is owned."""
+    listed = hub.tree(commit)
+    wrong = [path for path, size in sizes.items() if path not in listed or listed[path].size != size]
+    extra = [path for path in listed if owned(path) and path not in sizes]
+    if wrong or extra:
+        raise HubError(
+            f"{hub.name}: got commit {commit[:12]} with {len(wrong)} missing or different and {len(extra)} foreign "
+            f"files ({few(tuple(wrong + extra))}), expected exactly the local ones: run the same command again"
+        )

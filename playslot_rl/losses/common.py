@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 
 def total_loss(losses: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
@@ -24,8 +24,3 @@ def total_loss(losses: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
 def psnr(mse: Tensor) -> Tensor:
     """Peak signal-to-noise ratio in dB of a mean squared error on frames in [0, 1]."""
     return -10 * mse.detach().clamp(min=1e-12).log10()
-
-
-def freeze[Module: nn.Module](module: Module) -> Module:
-    """Put a module into evaluation mode and stop its parameters' gradients; its inputs still get theirs."""
-    return module.eval().requires_grad_(False)

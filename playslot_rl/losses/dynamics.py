@@ -18,7 +18,7 @@ from torchrl.objectives import LossModule
 from playslot_rl import keys
 from playslot_rl.config import DynamicsStageConfig
 from playslot_rl.frames import normalise
-from playslot_rl.losses.common import freeze, psnr
+from playslot_rl.losses.common import psnr
 from playslot_rl.modules.inverse_dynamics import InverseDynamics, LatentActions
 from playslot_rl.modules.predictors import Predictor
 from playslot_rl.modules.quantizer import usage
@@ -86,7 +86,7 @@ class DynamicsLoss(LossModule):
         super().__init__()
         self.inverse_dynamics = inverse_dynamics
         self.predictor = predictor
-        self.savi = freeze(savi)
+        self.savi = savi.eval().requires_grad_(False)
         self.config = config
         self.needs_actions = inverse_dynamics.config.mode == "ground_truth"
 
@@ -119,7 +119,14 @@ class DynamicsLoss(LossModule):
         seed = self.config.seed_frames
         if slots.shape[1] <= seed:
             raise ValueError(f"clip: got {slots.shape[1]} frames, expected more than dynamics.seed_frames={seed}")
-        latent = self.inverse_dynamics(slots, self._actions(tensordict, slots.shape[1] - 1), generator)
+        actions: Tensor | None = None
+        if self.needs_actions:
+            key = self.tensor_keys.action
+            actions = tensordict.get(key, None)
+            if actions is None:
+                raise ValueError(f"mode ground_truth: got no {key!r}, expected (B, T, A); use a data set with actions")
+            actions = actions[:, : slots.shape[1] - 1]
+        latent = self.inverse_dynamics(slots, actions, generator)
         p, v = latent.prototype, latent.variability
         if teacher:
             predicted = self.predictor(slots[:, :-1], p, v)
@@ -128,15 +135,6 @@ class DynamicsLoss(LossModule):
         mse_slot = (predicted - slots[:, 1:]).square().mean()
         mse_image = self._image(predicted, tensordict.get(self.tensor_keys.pixels)[:, 1:], generator)
         return self._collect(mse_image, mse_slot, latent)
-
-    def _actions(self, tensordict: TensorDictBase, steps: int) -> Tensor | None:
-        if not self.needs_actions:
-            return None
-        actions: Tensor | None = tensordict.get(self.tensor_keys.action, None)
-        if actions is None:
-            key = self.tensor_keys.action
-            raise ValueError(f"mode ground_truth: got no {key!r}, expected (B, T, A); use a data set with actions")
-        return actions[:, :steps]
 
     def _image(self, predicted: Tensor, pixels: Tensor, generator: torch.Generator | None) -> Tensor:
         """Image error of predictions (B, T-1, N, D) against the frames (B, T-1, 3, H, W) that follow."""

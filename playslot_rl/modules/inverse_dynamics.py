@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from playslot_rl.config import InverseDynamicsConfig
 from playslot_rl.modules.quantizer import ActionQuantizer
-from playslot_rl.modules.token_encoder import SlotTokenEncoder
+from playslot_rl.modules.transformer import SlotTokenEncoder
 
 
 class LatentActions(NamedTuple):

@@ -8,7 +8,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from playslot_rl.config import PolicyConfig
-from playslot_rl.modules.token_encoder import SlotTokenEncoder
+from playslot_rl.modules.transformer import SlotTokenEncoder
 
 
 class LatentPolicy(nn.Module):

@@ -1,8 +1,13 @@
-"""The model card: what the policy does, what it was trained on, how well it does, and how to make it again."""
+"""The model card: what the policy does, what it was trained on, how well it does, and the commands that make it again
+from its run's config, never from a folder of this machine.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any, Final
@@ -10,16 +15,113 @@ from typing import TYPE_CHECKING, Any, Final
 import yaml
 
 from playslot_rl import keys
-from playslot_rl.config import EvaluationConfig, ExperimentConfig
+from playslot_rl.config import EvaluationConfig, ExperimentConfig, to_dict
+from playslot_rl.config.compose import compose
+from playslot_rl.config.plain import flatten
+from playslot_rl.config.roles import keys_of
 from playslot_rl.envs import ENVIRONMENTS, task_metadata
-from playslot_rl.sharing.commands import reproduce
-from playslot_rl.sharing.config import LICENCE, TAGS, SharedPolicyConfig
-from playslot_rl.sharing.folder import shared_modules
-from playslot_rl.sharing.source import Result
+from playslot_rl.sharing.folder import LICENCE, TAGS, SharedPolicyConfig, shared_modules
 from playslot_rl.visualization.document import table
 
 if TYPE_CHECKING:
     from playslot_rl.world_model import Agent
+
+
+RUN: Final = "runs/again"
+WORLD: Final = "runs/world"
+GROUPS: Final = ("env", "render", "collect", "model", "slots", "dynamics", "behaviour", "evaluation")
+"""Parts of a config that a result depends on; intervals of logging and the like do no harm in between."""
+BEHAVIOUR: Final = ("env", "render", "collect", "model.policy", "model.action_decoder", "behaviour", "evaluation")
+"""Those a policy on the shipped world model depends on."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """A measured success rate.
+
+    Attributes:
+        protocol: `simulation` or `imagination`.
+        episodes: how many, one for each seed.
+        seed: block of evaluation seeds.
+        success_rate: 0 to 1.
+        ci95: Wilson's interval.
+        mean_steps: agent steps to the first success, of the episodes that had one; None without any.
+        references: success rate and interval of other policies in simulation, on the same seeds, by name.
+    """
+
+    protocol: str
+    episodes: int
+    seed: int
+    success_rate: float
+    ci95: tuple[float, float]
+    mean_steps: float | None
+    references: dict[str, tuple[float, tuple[float, float]]]
+
+
+def reproduce(config: ExperimentConfig, source: Mapping[str, Any], results: Sequence[Result]) -> list[str]:
+    """Command lines from nothing to the evaluated policy.
+
+    Args:
+        config: of the run.
+        source: see `playslot_rl.sharing.run.read_source`.
+        results: what was measured of it.
+    """
+    seed = source.get("seed")
+    base = [f"env={config.env.name}", f"preset={config.preset}"]
+    seeded = [] if seed is None else [f"seed={seed}"]
+    evaluate = [
+        _line("evaluate", f"run={RUN}", f"protocol={r.protocol}", f"episodes={r.episodes}", f"seed={r.seed}")
+        for r in results
+    ]
+    changed, recorded, demos = changes(config, BEHAVIOUR), source.get("recorded") or {}, source.get("demos")
+    episodes = recorded.get("episodes") or demos
+    first = [f"demos={demos}"] if demos is not None and demos != episodes else []
+    if not source.get("shipped_world_model"):
+        world = source.get("world_model_seed", seed)
+        if world in (None, seed) and not first:
+            return [_line("pipeline", *base, *seeded, *changes(config, GROUPS), f"out={RUN}"), *evaluate]
+        again = [] if world is None else [f"seed={world}"]
+        collected = f"data.demos={WORLD}/data/expert"
+        return [
+            _line("pipeline", *base, *again, *changes(config, GROUPS), f"out={WORLD}"),
+            _line("train-policy", f"run={WORLD}", *base, *seeded, *first, *changed, collected, f"out={RUN}"),
+            *evaluate,
+        ]
+    count = [] if episodes is None else [f"episodes={episodes}"]
+    start = [f"seed={recorded['seed']}"] if recorded else seeded
+    where = "data/demonstrations"
+    recording = [text for text in changed if text.startswith(("env.", "render.", "collect."))]
+    return [
+        _line("collect", *base, "policy=expert", *count, *start, *recording, f"out={where}"),
+        _line("train-policy", "run=pretrained", *base, *seeded, *first, *changed, f"data.demos={where}", f"out={RUN}"),
+        *evaluate,
+    ]
+
+
+def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
+    """`key=value` of what differs from the run's preset, in some groups of keys.
+
+    Raises:
+        ConfigError: the preset or the environment is not one of this version.
+    """
+    free = keys_of(ExperimentConfig, "free")
+    preset = flatten(to_dict(compose([f"env={config.env.name}", f"preset={config.preset}"])))
+    return [
+        f"{key}={_value(value)}"
+        for key, value in flatten(to_dict(config)).items()
+        if any(key.startswith(f"{group}.") for group in groups)
+        and key not in free
+        and (key not in preset or preset[key] != value)
+    ]
+
+
+def _value(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+
+
+def _line(command: str, *arguments: str) -> str:
+    return shlex.join(["playslot", command, *arguments])
+
 
 MARK: Final = "<!-- made by `playslot export`; remove this line to keep your own text -->"
 """A card with this line was made here and not edited by hand."""
@@ -64,7 +166,16 @@ def make_card(
         "model_name": name,
     }
     parameters = sum(p.numel() for part in shared_modules(agent).values() for p in part.parameters())
-    evaluation = experiment.evaluation if experiment else EvaluationConfig()
+    commands, evaluation = "Not recorded: saved from Python. `playslot export` writes the commands.", EvaluationConfig()
+    if experiment:
+        lines = "\n".join(reproduce(experiment, policy.source, results))
+        commands, evaluation = f"```bash\n{lines}\n```\n\n{REPEATS}", experiment.evaluation
+    versions = {
+        "exported with": _numbers(policy.source.get("versions", {})),
+        "trained with": _numbers(policy.source.get("trained_with", {})),
+        "weights": f"fingerprint `{policy.fingerprint}`",
+        "licence": "Apache License 2.0, of the weights and of this card",
+    }
     return Template(Path(__file__).with_name("card.md").read_text()).substitute(
         front=front_matter(header, MARK),
         name=name,
@@ -74,8 +185,8 @@ def make_card(
         data=facts_table(_data(policy.source)),
         results=_results(results),
         seed=evaluation.seed_offset,
-        commands=_reproduce(experiment, policy.source, results),
-        versions=facts_table(_versions(policy)),
+        commands=commands,
+        versions=facts_table(versions),
     )
 
 
@@ -140,17 +251,15 @@ def _results(results: Sequence[Result]) -> str:
     for result in results:
         steps = "–" if result.mean_steps is None else f"{result.mean_steps:.1f}"
         title = f"this policy, {PROTOCOL_NAMES[result.protocol]}"
-        rows.append([title, _share(result.success_rate), _interval(result.ci95), steps, *_played(result)])
+        rows.append(
+            [title, _share(result.success_rate), _interval(result.ci95), steps, str(result.episodes), str(result.seed)]
+        )
     first = results[0]
     for name, (rate, ci95) in first.references.items():
         title = REFERENCES.get(name, name.replace("_", " "))
-        rows.append([title, _share(rate), _interval(ci95), "–", *_played(first)])
+        rows.append([title, _share(rate), _interval(ci95), "–", str(first.episodes), str(first.seed)])
     titles = ["", "success", "95 % interval", "mean agent steps to success", "episodes", "seed"]
     return f"{table(titles, rows)}\n\n{MEASURED}"
-
-
-def _played(result: Result) -> list[str]:
-    return [str(result.episodes), str(result.seed)]
 
 
 def _share(rate: float) -> str:
@@ -159,22 +268,6 @@ def _share(rate: float) -> str:
 
 def _interval(ends: tuple[float, float]) -> str:
     return f"{100 * ends[0]:.0f} to {100 * ends[1]:.0f} %"
-
-
-def _reproduce(experiment: ExperimentConfig | None, source: dict[str, Any], results: Sequence[Result]) -> str:
-    if experiment is None:
-        return "Not recorded: saved from Python. `playslot export` writes the commands."
-    commands = "\n".join(reproduce(experiment, source, results))
-    return f"```bash\n{commands}\n```\n\n{REPEATS}"
-
-
-def _versions(policy: SharedPolicyConfig) -> dict[str, str]:
-    return {
-        "exported with": _numbers(policy.source.get("versions", {})),
-        "trained with": _numbers(policy.source.get("trained_with", {})),
-        "weights": f"fingerprint `{policy.fingerprint}`",
-        "licence": "Apache License 2.0, of the weights and of this card",
-    }
 
 
 def _numbers(versions: dict[str, str]) -> str:

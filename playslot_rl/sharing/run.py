@@ -1,19 +1,122 @@
-"""From a run to a model folder."""
+"""From a run to a model folder: where the policy came from and how well it does, which goes into `config.json` and the
+card. Nothing of the machine is taken along: no folder, no command line, no host.
+"""
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.errors import ConfigError
-from playslot_rl.sharing.card import make_card
-from playslot_rl.sharing.config import SharedPolicyConfig
-from playslot_rl.sharing.folder import save_pretrained
-from playslot_rl.sharing.source import read_results, read_source
-from playslot_rl.training.runs import load_agent
+from playslot_rl.data.contents import read_info
+from playslot_rl.errors import CheckpointError, ConfigError, DataError
+from playslot_rl.evaluation.success import PROTOCOLS, run_facts
+from playslot_rl.sharing.card import Result, make_card
+from playslot_rl.sharing.folder import SharedPolicyConfig, save_pretrained
+from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+from playslot_rl.training.runs import load_agent, pretrained_folder, world_model_checkpoints
+
+LIBRARIES: Final = ("torch", "torchrl", "tensordict", "lerobot", "gymnasium", "mujoco", "metaworld")
+"""Named on the card with their versions."""
+
+
+def read_source(run: Path) -> dict[str, Any]:
+    """Plain values: fingerprints of weights and data, demonstrations, labels, commit, seed, versions.
+
+    Raises:
+        CheckpointError: the run has no policy, or its checkpoints are damaged or do not belong together.
+    """
+    run_facts(run)  # a run without a policy is refused with what to do
+    policy = read_stage(checkpoint_folder(run, "policy"), "policy")
+    parents = world_model_checkpoints(run)
+    meta = policy.meta
+    prints = {name: checkpoint.fingerprint for name, checkpoint in parents.items()}
+    return {
+        "fingerprints": {**prints, "policy": policy.fingerprint},
+        "data": {
+            "world_model": parents["dynamics"].meta.get("data", {}).get("train", ""),
+            "demonstrations": meta.get("data", {}).get("demos", ""),
+        },
+        "demos": meta.get("demos"),
+        "labelled_demos": meta.get("labelled_demos"),
+        "seed": meta.get("seed"),
+        "world_model_seed": parents["slots"].meta.get("seed"),
+        "commit": meta.get("commit", ""),
+        "shipped_world_model": _is_shipped(str(policy.config.get("env", {}).get("name", "")), prints),
+        "trained_with": {"playslot_rl": meta.get("version", ""), "torch": meta.get("torch", "")},
+        "recorded": _recorded(Path(str(meta.get("data_root", "")))),
+        "versions": versions(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package and of the libraries it stands on."""
+    from playslot_rl import __version__
+
+    return {"playslot_rl": __version__, **{name: importlib.metadata.version(name) for name in LIBRARIES}}
+
+
+def _is_shipped(env: str, prints: dict[str, str]) -> bool:
+    """Whether the world model is the one that ships with the package."""
+    try:
+        shipped = world_model_checkpoints(pretrained_folder(env))
+    except CheckpointError:
+        return False
+    return prints == {name: checkpoint.fingerprint for name, checkpoint in shipped.items()}
+
+
+def _recorded(root: Path) -> dict[str, Any]:
+    """How our collectors recorded the demonstrations, where they are still there; else empty."""
+    try:
+        spec = json.loads((root / "meta" / "playslot.json").read_text())["spec"]
+        return {name: spec[name] for name in ("policy", "episodes", "steps", "seed", "noise")}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def read_results(run: Path, source: dict[str, Any]) -> list[Result]:
+    """Evaluations of exactly this policy, from `RUN/evaluation/*/eval_info.json`; those of an older one are left out.
+
+    Raises:
+        CheckpointError: a file is damaged.
+    """
+    results = []
+    for protocol in PROTOCOLS:
+        path = run / "evaluation" / protocol / "eval_info.json"
+        if not path.is_file():
+            continue
+        try:
+            info = json.loads(path.read_text())
+            if info["fingerprints"] == source["fingerprints"]:
+                results.append(_result(info))
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(
+                f"{path} is damaged ({error!r}), expected the result of `playslot evaluate`: run that again"
+            ) from error
+    return results
+
+
+def _result(info: dict[str, Any]) -> Result:
+    def interval(values: Any) -> tuple[float, float]:
+        return float(values[0]), float(values[1])
+
+    steps = info.get("mean_steps_to_success")
+    return Result(
+        protocol=str(info["protocol"]),
+        episodes=int(info["episodes"]),
+        seed=int(info["seed"]),
+        success_rate=float(info["success_rate"]),
+        ci95=interval(info["ci95"]),
+        mean_steps=None if steps is None else float(steps),
+        references={
+            name: (float(row["success_rate"]), interval(row["ci95"]))
+            for name, row in info["references"].items()
+            if row["success_rate"] is not None
+        },
+    )
 
 
 def export_run(
@@ -58,16 +161,11 @@ def camera(config: ExperimentConfig) -> str:
     names = [name.strip() for name in config.data.camera.split(",") if name.strip()]
     if not names:
         root = (config.data.demos or config.data.root).partition(",")[0].strip()
-        names = _cameras(Path(root)) if root else []
+        try:
+            features = read_info(Path(root))["features"] if root else {}
+        except DataError:
+            features = {}
+        names = [name for name, feature in features.items() if feature["dtype"] in ("image", "video")]
     if len(names) > 1:
         raise ConfigError(f"data.camera: got {', '.join(names)}, expected the one the policy is to look at: name it")
     return names[0] if names else keys.FEATURE_IMAGE
-
-
-def _cameras(root: Path) -> list[str]:
-    """Image and video features of a LeRobot data set; none where it cannot be read."""
-    try:
-        features = json.loads((root / "meta" / "info.json").read_text())["features"]
-    except (OSError, ValueError, KeyError):
-        return []
-    return [name for name, feature in features.items() if feature.get("dtype") in ("image", "video")]

@@ -16,6 +16,7 @@ from typing import Any, Final
 import torch
 from torch import Tensor, nn
 
+from playslot_rl.config.plain import flatten
 from playslot_rl.errors import CheckpointError, OutputError
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.folders import new_folder
@@ -41,15 +42,6 @@ class TrainingState:
     step: int = 0
     seconds: float = 0.0
     metrics: dict[str, float] = field(default_factory=dict)
-
-
-def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested dicts as one dict with dotted keys."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        name = f"{prefix}{key}"
-        flat.update(flatten(value, f"{name}.") if isinstance(value, Mapping) else {name: value})
-    return flat
 
 
 ADDED: Final[Mapping[str, Any]] = {"reward_scale": 1.0, "actor_average": 0.0, "kind": "cocvp"}

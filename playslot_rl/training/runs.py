@@ -165,35 +165,28 @@ def world_model_checkpoints(run: Path | str) -> dict[str, StageCheckpoint]:
     return stages
 
 
+def stage_config[Group](checkpoint: StageCheckpoint, cls: type[Group], name: str) -> Group:
+    """A group of the config a stage was trained with; all stages store `env`.
+
+    Raises:
+        CheckpointError: its config.json is not one of this version.
+    """
+    try:
+        return from_dict(cls, checkpoint.config[name], f"{name}.")
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{checkpoint.path}/config.json: {error}; expected the {name} of this version of playslot_rl: train that "
+            "stage again"
+        ) from error
+
+
 def stage_model(checkpoint: StageCheckpoint) -> tuple[ModelConfig, EnvConfig]:
     """The model and environment config a stage was trained with.
 
     Raises:
         CheckpointError: its config.json is not one of this version.
     """
-    try:
-        config = checkpoint.config
-        return from_dict(ModelConfig, config["model"], "model."), from_dict(EnvConfig, config["env"], "env.")
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(
-            f"{checkpoint.path}/config.json: {error}; expected the model and env of this version of playslot_rl: "
-            "train that stage again"
-        ) from error
-
-
-def stage_env(checkpoint: StageCheckpoint) -> EnvConfig:
-    """The environment config a stage was trained with; all stages store it, also those without a `model`.
-
-    Raises:
-        CheckpointError: its config.json is not one of this version.
-    """
-    try:
-        return from_dict(EnvConfig, checkpoint.config["env"], "env.")
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(
-            f"{checkpoint.path}/config.json: {error}; expected the env of this version of playslot_rl: "
-            "train that stage again"
-        ) from error
+    return stage_config(checkpoint, ModelConfig, "model"), stage_config(checkpoint, EnvConfig, "env")
 
 
 def freeze_on(module: nn.Module, device: torch.device | str) -> None:

@@ -23,8 +23,8 @@ def main(config: ExperimentConfig) -> None:
     require_online(config, own, "dreamer")  # before anything is written or computed
     run = open_run(config)
 
+    from playslot_rl.baselines.dreamer.actor import NAME
     from playslot_rl.baselines.dreamer.learner import DreamerLearner
-    from playslot_rl.baselines.dreamer.load import NAME
     from playslot_rl.baselines.dreamer.networks import DreamerNetworks
     from playslot_rl.seeding import global_seed
 

@@ -24,8 +24,8 @@ def main(config: ExperimentConfig) -> None:
     require_online(config, own, "sold")  # before anything is written or computed
     run = open_run(config)
 
+    from playslot_rl.baselines.sold.actor import NAME, build_networks, prior_steps, slots_checkpoint
     from playslot_rl.baselines.sold.learner import SOLDLearner
-    from playslot_rl.baselines.sold.load import NAME, build_networks, prior_steps, slots_checkpoint
     from playslot_rl.seeding import global_seed
     from playslot_rl.storage.checkpoints import require_config
     from playslot_rl.training.runs import load_savi, require_adoptable, use_world_model

@@ -44,7 +44,7 @@ def lapo() -> Actor:
 
 
 def dreamer() -> Actor:
-    from playslot_rl.baselines.dreamer.load import DreamerActor
+    from playslot_rl.baselines.dreamer.actor import DreamerActor
     from playslot_rl.baselines.dreamer.networks import DreamerNetworks
 
     config = compose(["preset=smoke"])
@@ -52,7 +52,7 @@ def dreamer() -> Actor:
 
 
 def sold() -> Actor:
-    from playslot_rl.baselines.sold.acting import SOLDActor
+    from playslot_rl.baselines.sold.actor import SOLDActor
     from playslot_rl.baselines.sold.networks import SOLDNetworks
 
     config = compose(["preset=smoke"]).baselines.sold

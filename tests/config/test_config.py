@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from playslot_rl.config import (
     to_dict,
 )
 from playslot_rl.config.compose import choices, compose
-from playslot_rl.config.roles import fixed_keys, keys_of, without
+from playslot_rl.config.roles import Checked, fixed_keys, keys_of, without
 from playslot_rl.errors import ConfigError
 from playslot_rl.storage.resume import flatten
 
@@ -223,3 +224,36 @@ def test_a_config_checks_its_values() -> None:
         SAViConfig(transition_heads=5)
     with pytest.raises(ValueError, match=r"unknown key nslots.*did you mean n_slots"):
         from_dict(SAViConfig, {"nslots": 3})
+
+
+def test_a_group_checks_its_ranges_under_its_own_name() -> None:
+    def groups(config: object, prefix: str = "") -> Iterator[tuple[str, object]]:
+        yield prefix, config
+        for field in dataclasses.fields(config):  # type: ignore[arg-type]
+            value = getattr(config, field.name)
+            if dataclasses.is_dataclass(value):
+                yield from groups(value, f"{prefix}{field.name}.")
+
+    checked = {prefix: config for prefix, config in groups(compose()) if isinstance(config, Checked)}
+    shared = {"baselines.lapo.model.", "baselines.lapo.policy."}
+    assert {prefix: config.group for prefix, config in checked.items()} == {
+        prefix: "" if prefix in shared else prefix for prefix in checked
+    }
+    assert {"", "env.", "env.grid.", "model.savi.", "dynamics.", "baselines.sold."} <= checked.keys()
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("env.max_steps=1", "env.max_steps: got 1, expected at least 2"),
+        ("env.grid.change=1.5", "env.grid.change: got 1.5, expected a probability"),
+        ("model.inverse_dynamics.decay=1.0", r"model.inverse_dynamics.decay: got 1.0, expected a number in \(0, 1\)"),
+        ("behaviour.steps=0", "behaviour.steps: got 0, expected at least 1"),
+        ("baselines.dreamer.sequence=1", r"baselines.dreamer.sequence: got 1, expected 0 \(whole episodes\), or"),
+        ("baselines.sold.savi_steps=-1", "baselines.sold.savi_steps: got -1, expected 0 or more"),
+        ("compare.seeds=[0,-1]", "compare.seeds: got -1, expected a non-negative integer"),
+    ],
+)
+def test_a_value_outside_its_range_is_refused_by_its_full_name(argument: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{message}"):
+        compose([argument])

@@ -10,8 +10,7 @@ import pytest
 from fake_hub import READ_TOKEN, FakeHub, Fault
 
 from playslot_rl.sharing.card import MARK
-from playslot_rl.sharing.config import SharedPolicyConfig
-from playslot_rl.sharing.folder import FILES, load_pretrained, save_pretrained
+from playslot_rl.sharing.folder import FILES, SharedPolicyConfig, load_pretrained, save_pretrained
 from playslot_rl.testing import tiny_agent
 
 pytestmark = pytest.mark.slow  # a process of its own imports torch and huggingface_hub

@@ -21,8 +21,7 @@ from playslot_rl.envs import task_env
 # The evaluation's imports first: MuJoCo has to find its GL backend before LeRobot imports anything that imports it.
 from playslot_rl.envs.lerobot import LeRobotTask, frames_a_second
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.sharing.config import SharedPolicyConfig
-from playslot_rl.sharing.folder import FILES, save_pretrained
+from playslot_rl.sharing.folder import FILES, SharedPolicyConfig, save_pretrained
 from playslot_rl.testing import tiny_agent
 
 SEED = 1_000_000_000

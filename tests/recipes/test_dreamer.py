@@ -10,7 +10,7 @@ import torch
 from commands import killed_at_first_checkpoint
 
 from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
-from playslot_rl.baselines.dreamer.load import load_actor
+from playslot_rl.baselines.dreamer.actor import load_actor
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes.baselines import dreamer

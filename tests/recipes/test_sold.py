@@ -14,8 +14,8 @@ from safetensors.torch import load_file
 
 from playslot_rl import keys
 from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
+from playslot_rl.baselines.sold.actor import load_actor, prior_steps, slots_checkpoint
 from playslot_rl.baselines.sold.learner import SOLDLearner
-from playslot_rl.baselines.sold.load import load_actor, prior_steps, slots_checkpoint
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError, TrainingError

@@ -10,8 +10,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 
-from playslot_rl.sharing.config import SharedPolicyConfig
-from playslot_rl.sharing.folder import save_pretrained
+from playslot_rl.sharing.folder import SharedPolicyConfig, save_pretrained
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.testing import tiny_agent
 from playslot_rl.world_model import Agent

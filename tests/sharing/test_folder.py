@@ -14,8 +14,14 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from playslot_rl.errors import CheckpointError, OutputError
-from playslot_rl.sharing.config import SharedPolicyConfig, is_model_folder, read_config
-from playslot_rl.sharing.folder import FILES, load_pretrained, save_pretrained
+from playslot_rl.sharing.folder import (
+    FILES,
+    SharedPolicyConfig,
+    is_model_folder,
+    load_pretrained,
+    read_config,
+    save_pretrained,
+)
 from playslot_rl.world_model import Agent
 
 OLD = Path(__file__).parents[1] / "assets" / "policy_of_0_1"

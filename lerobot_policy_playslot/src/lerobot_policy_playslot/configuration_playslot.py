@@ -1,4 +1,4 @@
-"""The policy's config as LeRobot reads and writes it. What the values mean: `playslot_rl.sharing.config`."""
+"""The policy's config as LeRobot reads and writes it. What the values mean: `playslot_rl.sharing.folder`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 
 from playslot_rl.config import EnvConfig, ModelConfig, to_dict
-from playslot_rl.sharing.config import LICENCE, OURS, TYPE, SharedPolicyConfig, camera_of
+from playslot_rl.sharing.folder import LICENCE, OURS, TYPE, SharedPolicyConfig, camera_of
 
 NOT_TRAINED_HERE = (
     "playslot: got a call to train, expected one to act: its three stages are trained from videos by `playslot "

@@ -11,8 +11,7 @@ from torch import Tensor
 from lerobot_policy_playslot.configuration_playslot import NOT_TRAINED_HERE, PlaySlotConfig
 from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop
-from playslot_rl.sharing.config import WEIGHTS
-from playslot_rl.sharing.folder import build_agent, load_weights, write_weights
+from playslot_rl.sharing.folder import WEIGHTS, build_agent, load_weights, write_weights
 
 
 class PlaySlotPolicy(PreTrainedPolicy):

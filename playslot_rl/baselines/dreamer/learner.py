@@ -1,4 +1,10 @@
-"""DreamerV3 as a learner of the online loop."""
+"""DreamerV3 as a learner of the online loop: TorchRL's model, actor and value losses on our networks.
+
+A record of the replay is (a_{t-1}, o_t, r_t, is_first_t): TorchRL's rollout reads a_{t-1} at the root and o_t, r_t
+under `next`, and the state it writes under `next` is that of o_t.
+
+Shapes: B sequences of T frames, S and H widths of z and h.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +12,132 @@ from collections.abc import Mapping
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.objectives import DreamerV3Loss, SoftUpdate
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs.model_based.dreamer import DreamerEnv
+from torchrl.modules import RSSMRolloutV3, WorldModelWrapper
+from torchrl.objectives import DreamerV3ActorLoss, DreamerV3Loss, DreamerV3ModelLoss, DreamerV3ValueLoss, SoftUpdate
+from torchrl.objectives.utils import ValueEstimators
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper, DreamerV3Optimizer
 
 from playslot_rl import keys
-from playslot_rl.baselines.dreamer.losses import build_loss, records
-from playslot_rl.baselines.dreamer.networks import DreamerNetworks
+from playslot_rl.baselines.dreamer.actor import act
+from playslot_rl.baselines.dreamer.networks import BINS, UNIMIX, DreamerNetworks, actor_module
 from playslot_rl.config.baselines import DreamerConfig
 from playslot_rl.losses.common import total_loss
 from playslot_rl.seeding import StepGenerators
+
+
+def world_model(networks: DreamerNetworks) -> TensorDictSequential:
+    """Encoder, RSSM over the sequence, decoder and reward head, on records [B, T]."""
+    latent = [("next", "state"), ("next", "belief")]
+    prior = TensorDictModule(
+        networks.prior,
+        in_keys=["state", "belief", keys.ACTION],
+        out_keys=[("next", "prior_logits"), *latent],
+    )
+    posterior = TensorDictModule(
+        networks.posterior,
+        in_keys=[("next", "belief"), ("next", "encoded_latents")],
+        out_keys=[("next", "posterior_logits"), ("next", "state")],
+    )
+    return TensorDictSequential(
+        TensorDictModule(networks.encoder, [("next", keys.PIXELS)], [("next", "encoded_latents")]),
+        RSSMRolloutV3(prior, posterior, reset_key=keys.IS_FIRST),
+        TensorDictModule(networks.decoder, latent, [("next", "reco_pixels")]),
+        TensorDictModule(networks.reward, latent, [("next", "reward_logits"), ("next", keys.REWARD)]),
+    )
+
+
+def imagination(networks: DreamerNetworks) -> DreamerEnv:
+    """The environment that the prior and the reward head make."""
+    dynamics = TensorDictModule(networks.prior, ["state", "belief", keys.ACTION], ["_", "state", "belief"])
+    reward = TensorDictModule(networks.reward, ["state", "belief"], ["_", keys.REWARD])
+    device = next(networks.parameters()).device
+    env = DreamerEnv(
+        WorldModelWrapper(dynamics, reward),
+        prior_shape=(networks.state_dim,),
+        belief_shape=(networks.belief_dim,),
+        device=device,
+    )
+    env.observation_spec = Composite(
+        state=Unbounded(networks.state_dim, device=device), belief=Unbounded(networks.belief_dim, device=device)
+    )
+    env.state_spec = env.observation_spec.clone()
+    env.action_spec = Bounded(-1, 1, (networks.action_dim,), device=device)
+    env.reward_spec = Unbounded((1,), device=device)
+    return env
+
+
+def build_loss(networks: DreamerNetworks, config: DreamerConfig) -> DreamerV3Loss:
+    """The sum of all terms.
+
+    Note: there is no continuation head. Our tasks end by their time limit only, so the source's would learn the
+    constant that `gamma` is here.
+    """
+    model = DreamerV3ModelLoss(
+        world_model(networks),
+        lambda_reco=config.reconstruction_weight,
+        kl_mode="separate",
+        lambda_representation=config.representation_weight,
+        unimix=UNIMIX,
+        free_bits=config.free_nats,
+        reco_symlog=False,
+        num_reward_bins=BINS,
+        detach_output=False,
+    )
+    model.set_keys(pixels=keys.PIXELS, reward=keys.REWARD)
+    critic = TensorDictModule(networks.value, ["state", "belief"], ["state_value_logits", "state_value"])
+    actor = DreamerV3ActorLoss(
+        actor_module(networks.actor),
+        critic,
+        imagination(networks),
+        imagination_horizon=config.horizon,
+        entropy_bonus=config.entropy,
+        use_reinforce=True,
+    )
+    # TorchRL 0.14.1 hands its estimator a TensorDict without batch size, whose time is then taken to be the last axis,
+    # of length one: without `time_dim` the lambda returns are one-step returns.
+    actor.make_value_estimator(ValueEstimators.TDLambda, gamma=config.gamma, lmbda=config.lmbda, time_dim=-2)
+    value = DreamerV3ValueLoss(
+        critic, value_loss="two_hot", num_value_bins=BINS, actor_loss=actor, slow_critic_regularization=1.0
+    )
+    loss = DreamerV3Loss(
+        model,
+        actor,
+        value,
+        replay_value_loss_weight=config.replay_value_weight,
+        continuation_horizon=1 / (1 - config.gamma),
+        lmbda=config.lmbda,
+    )
+    loss.set_keys(is_init=keys.IS_FIRST)
+    return loss
+
+
+def records(batch: TensorDictBase, networks: DreamerNetworks) -> TensorDict:
+    """A batch of the replay [B, T] as TorchRL's losses take it. Sequences start from zero states.
+
+    Note: the source keeps its latent states in the replay, to start a sequence within an episode from; here it starts
+    from zero, which is exact where sequences are whole episodes.
+    """
+    blank = networks.blank(1).to(batch.device).unsqueeze(1).expand(*batch.batch_size)
+    last = batch.get(keys.IS_LAST)
+    return TensorDict(
+        {
+            "state": blank.get("state").contiguous(),
+            "belief": blank.get("belief").contiguous(),
+            keys.ACTION: batch.get(keys.ACTION),
+            keys.IS_FIRST: batch.get(keys.IS_FIRST),
+            "next": {
+                keys.PIXELS: batch.get(keys.PIXELS),
+                keys.REWARD: batch.get(keys.REWARD),
+                "done": last,
+                "terminated": torch.zeros_like(last),
+            },
+        },
+        batch.batch_size,
+    )
 
 
 class DreamerLearner:
@@ -78,26 +200,3 @@ class _Slow(nn.Module):
         super().__init__()
         self.critic = loss.value_loss.target_value_model_params
         self.returns = loss.actor_loss.retnorm
-
-
-def act(networks: DreamerNetworks, memory: TensorDictBase, generator: torch.Generator | None) -> TensorDict:
-    """See a frame and choose an action.
-
-    Args:
-        networks: in eval mode.
-        memory: `state` (n, S), `belief` (n, H), `keys.ACTION` (n, A) and `keys.PIXELS` uint8 (n, 3, H, W).
-        generator: of state and action; None takes the most likely state and the mean action.
-
-    Returns:
-        The same keys anew; the frames reduced.
-    """
-    frames = networks.reduce(memory.get(keys.PIXELS))
-    state, belief = networks.filter(
-        memory.get("state"), memory.get("belief"), memory.get(keys.ACTION), frames, generator
-    )
-    mean, std = networks.actor(state, belief)
-    action = mean
-    if generator is not None:
-        action = mean + std * torch.randn(mean.shape, generator=generator, device=mean.device)
-    values = {"state": state, "belief": belief, keys.ACTION: action, keys.PIXELS: frames}
-    return TensorDict(values, memory.batch_size)

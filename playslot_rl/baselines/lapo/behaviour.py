@@ -18,17 +18,17 @@ from torch import Tensor
 
 from playslot_rl import keys
 from playslot_rl.baselines.frame_inputs import FrameInputs, demonstrated_frames
-from playslot_rl.baselines.lapo.load import LAPOPolicy, stored_config
+from playslot_rl.baselines.lapo.load import NAME, LAPOPolicy
 from playslot_rl.baselines.lapo.model import InverseModel
 from playslot_rl.baselines.lapo.stage import infer_latents
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.config import ExperimentConfig, LAPOConfig
 from playslot_rl.data.demonstrations import DemonstrationSplit, transitions
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeding import global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
-from playslot_rl.training.runs import freeze_on, stage_model
+from playslot_rl.training.runs import freeze_on, stage_config, stage_model
 from playslot_rl.training.stage_regression import RegressionStage, TensorInputs, apply_rows
 
 
@@ -123,7 +123,7 @@ def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseM
     """
     from playslot_rl.baselines.lapo.model import ForwardModel
 
-    config, (_, env) = stored_config(model.config, model.path), stage_model(model)
+    config, (_, env) = stage_config(model, LAPOConfig, NAME), stage_model(model)
     with torch.random.fork_rng(devices=[]):
         inverse, forward = InverseModel(config, env.image_size), ForwardModel(config)
     load_weights(model, {"inverse": inverse, "forward": forward})

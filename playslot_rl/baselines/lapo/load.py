@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
-from playslot_rl.baselines.lapo.encoder import EncoderMLP
+from playslot_rl.baselines.lapo.model import EncoderMLP
 from playslot_rl.config.baselines import LAPOConfig
 from playslot_rl.config.plain import to_dict
 from playslot_rl.frames import normalise
@@ -55,23 +55,6 @@ def lapo_actor(policy: LAPOPolicy, decoder: ActionDecoder) -> Actor:
     return ReactiveActor(TensorDictSequential(choose, action_decoder_module(decoder)))
 
 
-def stored_config(config: dict[str, Any], where: Path) -> LAPOConfig:
-    """LAPO's part of a checkpoint's config.
-
-    Raises:
-        CheckpointError: it is not one of this version.
-    """
-    from playslot_rl.config import from_dict
-    from playslot_rl.errors import CheckpointError
-
-    try:
-        return from_dict(LAPOConfig, config[NAME], f"{NAME}.")
-    except (KeyError, ValueError) as error:
-        raise CheckpointError(
-            f"{where}/config.json: {error}; expected LAPO's config of this version of playslot_rl: train it again"
-        ) from error
-
-
 def sizes_of(config: LAPOConfig) -> dict[str, Any]:
     """The part of the config that inverse and forward model are built from."""
     names = ("channels", "hidden", "groups", "code_dim", "codes", "decay", "dead_threshold", "commitment")
@@ -102,11 +85,11 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
         CheckpointError: it is missing or damaged, or was trained on another inverse model.
     """
     from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage, require_parents
-    from playslot_rl.training.runs import freeze_on, stage_model
+    from playslot_rl.training.runs import freeze_on, stage_config, stage_model
 
     done = read_stage(checkpoint_folder(run, NAME), NAME)
     require_parents(done, {MODEL: read_stage(checkpoint_folder(run, MODEL), MODEL)})
-    config, (model, env) = stored_config(done.config, done.path), stage_model(done)
+    config, (model, env) = stage_config(done, LAPOConfig, NAME), stage_model(done)
     with torch.random.fork_rng(devices=[]):
         policy = LAPOPolicy(config, env.image_size)
         decoder = ActionDecoder(model.action_decoder, config.latent_dim, env.action_dim)

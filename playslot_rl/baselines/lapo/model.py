@@ -1,4 +1,5 @@
-"""LAPO's inverse and forward model on pixels (Schmidt and Jiang, 2024, "Learning to Act without Actions", section 4).
+"""LAPO's inverse and forward model on pixels (Schmidt and Jiang, 2024, "Learning to Act without Actions", section 4),
+and the convolutional encoder that its three networks share in form (not in weights).
 
     z_t = VQ(IDM(o_t, o_{t+1})),   o^_{t+1} = FDM(o_t, z_t)
 
@@ -10,7 +11,7 @@ is standardised over the batch (BatchNorm without weights) before it is quantise
 each other, and otherwise all of them fall to one code, from which nothing is learned. The forward model predicts the
 change of the frame and starts from no change at all.
 
-Shapes: B batch, H W image height and width, G groups, Z = G times the width of a code.
+Shapes: B batch, C input channels, H W image height and width, G groups, Z = G times the width of a code.
 """
 
 from __future__ import annotations
@@ -21,10 +22,75 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from playslot_rl.baselines.lapo.encoder import ConvEncoder, EncoderMLP, ResidualBlock
 from playslot_rl.config.baselines import LAPOConfig
 from playslot_rl.frames import normalise
 from playslot_rl.modules.quantizer import ActionQuantizer
+
+
+class ResidualBlock(nn.Module):
+    """x + conv(relu(conv(relu(x)))), 3x3, same channels.
+
+    Args:
+        channels: of input and output.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(channels, channels, 3, padding=1)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to the same shape."""
+        out: Tensor = x + self.second(F.relu(self.first(F.relu(x))))
+        return out
+
+
+class ConvEncoder(nn.Module):
+    """Levels of halved resolution, each a strided 3x3 conv and a residual block (after IMPALA, Espeholt et al., 2018).
+
+    Args:
+        in_channels: C.
+        channels: of each level.
+    """
+
+    def __init__(self, in_channels: int, channels: tuple[int, ...]) -> None:
+        super().__init__()
+        ins = (in_channels, *channels[:-1])
+        self.levels = nn.ModuleList(
+            nn.Sequential(nn.Conv2d(a, b, 3, stride=2, padding=1), ResidualBlock(b))
+            for a, b in zip(ins, channels, strict=True)
+        )
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """(B, C, H, W) to the outputs of all levels, (B, channels[i], H / 2^(i+1), W / 2^(i+1)), after a ReLU."""
+        outputs = []
+        for level in self.levels:
+            x = F.relu(level(x))
+            outputs.append(x)
+        return outputs
+
+
+class EncoderMLP(nn.Module):
+    """A ConvEncoder's last level, flattened, through one hidden layer to a vector.
+
+    Args:
+        in_channels: C.
+        channels: of the encoder's levels.
+        image_size: H = W.
+        hidden: width of the hidden layer.
+        out_dim: width of the output.
+    """
+
+    def __init__(self, in_channels: int, channels: tuple[int, ...], image_size: int, hidden: int, out_dim: int) -> None:
+        super().__init__()
+        self.encoder = ConvEncoder(in_channels, channels)
+        side = image_size // 2 ** len(channels)
+        self.mlp = nn.Sequential(nn.Linear(channels[-1] * side * side, hidden), nn.ReLU(), nn.Linear(hidden, out_dim))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to (B, out_dim)."""
+        out: Tensor = self.mlp(self.encoder(x)[-1].flatten(1))
+        return out
 
 
 class Inferred(NamedTuple):
@@ -82,11 +148,8 @@ class ForwardModel(nn.Module):
         outs = (*channels[-2::-1], 3)
         ins = (channels[-1], *(2 * c for c in channels[-2::-1]))
         self.ups = nn.ModuleList(nn.Conv2d(a, 4 * b, 3, padding=1) for a, b in zip(ins, outs, strict=True))
-        last = self.ups[-1]
-        assert isinstance(last, nn.Conv2d)
-        nn.init.zeros_(last.weight)
-        assert last.bias is not None
-        nn.init.zeros_(last.bias)
+        for parameter in self.ups[-1].parameters():
+            nn.init.zeros_(parameter)
 
     def forward(self, frame: Tensor, z: Tensor) -> Tensor:
         """Frames (B, 3, H, W), uint8 or float [0, 1], and latents (B, Z) to next frames, float, about [0, 1]."""

@@ -26,6 +26,9 @@ from playslot_rl.config import PolicyConfig
 from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import normalise
 from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
+from playslot_rl.storage.tensors import load_tensors
+from playslot_rl.training.runs import freeze_on, stage_model
 from playslot_rl.world_model import oracle_module
 
 NAME = "resnet_oracle"
@@ -125,8 +128,6 @@ def _download(path: Path) -> None:
 
 def _read(path: Path) -> dict[str, Tensor]:
     if path.suffix == ".safetensors":
-        from playslot_rl.storage.tensors import load_tensors
-
         return load_tensors(path)
     try:
         # Published as a pickle; read as tensors only.
@@ -150,9 +151,6 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
     Raises:
         CheckpointError: it is missing or damaged.
     """
-    from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
-    from playslot_rl.training.runs import freeze_on, stage_model
-
     done = read_stage(checkpoint_folder(run, NAME), NAME)
     model, env = stage_model(done)
     with torch.random.fork_rng(devices=[]):

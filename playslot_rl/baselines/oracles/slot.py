@@ -14,6 +14,8 @@ import torch
 
 from playslot_rl.acting.actor import Actor, SlotActor
 from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage, require_parents
+from playslot_rl.training.runs import freeze_on, load_savi, stage_model, world_model_folder
 from playslot_rl.world_model import oracle_module
 
 NAME = "slot_oracle"
@@ -25,9 +27,6 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
     Raises:
         CheckpointError: the run or its SAVi is missing or damaged, or it was trained on other slots.
     """
-    from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage, require_parents
-    from playslot_rl.training.runs import freeze_on, load_savi, stage_model, world_model_folder
-
     done = read_stage(checkpoint_folder(run, NAME), NAME)
     slots = read_stage(checkpoint_folder(world_model_folder(run), "slots"), "slots")
     require_parents(done, {"slots": slots})

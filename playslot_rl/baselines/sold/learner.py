@@ -19,9 +19,8 @@ from torchrl.modules import PercentileValueNorm
 
 from playslot_rl import keys
 from playslot_rl.baselines.sold import losses
-from playslot_rl.baselines.sold.acting import SOLDActor
-from playslot_rl.baselines.sold.imagination import imagine
-from playslot_rl.baselines.sold.networks import SOLDNetworks, acting_window
+from playslot_rl.baselines.sold.actor import SOLDActor
+from playslot_rl.baselines.sold.networks import SOLDNetworks
 from playslot_rl.config.baselines import SOLDConfig
 from playslot_rl.frames import normalise
 from playslot_rl.modules.savi import SAVi
@@ -44,9 +43,8 @@ class SOLDLearner:
         self.mean_actor = copy.deepcopy(networks.actor).requires_grad_(False)
         # The average of the returns' 5-95 percentile range; it starts at zero, as in DreamerV3.
         self.returns = PercentileValueNorm(rate=config.return_rate, min_scale=1.0).to(next(savi.parameters()).device)
-        window = acting_window(config)
-        self.exploring = SOLDActor(savi, networks.actor, window, action_dim)
-        self.acting = SOLDActor(savi, self.mean_actor, window, action_dim)
+        self.exploring = SOLDActor(savi, networks.actor, config.context, action_dim)
+        self.acting = SOLDActor(savi, self.mean_actor, config.context, action_dim)
         self.stored: tuple[str, ...] = (keys.SLOTS,) if config.image_weight == 0 else (keys.SLOTS, keys.PIXELS)
         rates = {"actor": config.actor_lr, "critic": config.critic_lr}
         self._adam = {
@@ -88,8 +86,6 @@ class SOLDLearner:
             metrics |= self._behaviour(batch, generators)
         return metrics
 
-    # --- dynamics and reward --------------------------------------------------------------------------------------
-
     def _model(self, batch: TensorDict, generators: StepGenerators) -> dict[str, Tensor]:
         """Section 3.2: the autoregressive rollout from C frames, and the reward on parsed and on predicted slots.
 
@@ -109,11 +105,10 @@ class SOLDLearner:
             loss, metrics["image_mse"] = loss + self.config.image_weight * image, image.detach()
         metrics["dynamics_grad_norm"] = self._step("dynamics", loss)
 
-        imagined = torch.cat((slots[:, :c], predicted[:, c - 1 :]), dim=1)
-        rewards, arrived = batch[keys.REWARD].squeeze(-1), valid & ~is_first
-        reward = losses.reward_loss(
-            self.networks.reward, torch.cat((slots, imagined)), rewards.repeat(2, 1), arrived.repeat(2, 1)
-        )
+        imagined = torch.cat((slots[:, :c], predicted[:, c - 1 :]), dim=1).detach()
+        head, arrived = self.networks.reward, valid & ~is_first
+        entropy = head.cross_entropy(head(torch.cat((slots, imagined))), batch[keys.REWARD].squeeze(-1).repeat(2, 1))
+        reward = losses.masked_mean(entropy, arrived.repeat(2, 1))
         return metrics | {"loss_reward": reward.detach(), "reward_grad_norm": self._step("reward", reward)}
 
     def _window(self, batch: TensorDict, generators: StepGenerators) -> tuple[TensorDict, int]:
@@ -138,21 +133,19 @@ class SOLDLearner:
         decoded = self.savi.decode(predicted).frames
         return losses.masked_mean((decoded - normalise(pixels)).square().mean(dim=(-3, -2, -1)), valid)
 
-    # --- actor and critic -----------------------------------------------------------------------------------------
-
     def _behaviour(self, batch: TensorDict, generators: StepGenerators) -> dict[str, Tensor]:
         """Section 3.3: imagine, judge, improve."""
         config, networks = self.config, self.networks
         context, actions = self._starts(batch, generators)
         frames = context.shape[1]
         noise = generators.torch("imagination")
-        imagined = imagine(networks.dynamics, networks.actor, context, actions, config.horizon, noise)
+        imagined = losses.imagine(networks.dynamics, networks.actor, context, actions, config.horizon, noise)
         logits = networks.critic(imagined.slots)[:, frames - 1 :]
         values = networks.critic.decode(logits)
         rewards = networks.reward.decode(networks.reward(imagined.slots)[:, frames:])
         returns = losses.imagined_returns(rewards, values[:, 1:], config.gamma, config.lmbda)
         self.returns.update(returns.detach().unsqueeze(-1))
-        weights = losses.discounts(config.gamma, config.horizon, returns)
+        weights = config.gamma ** torch.arange(config.horizon, device=returns.device, dtype=returns.dtype)
         actor = losses.actor_loss(
             imagined, returns, values[:, :-1], self.returns.scale(), weights, config.entropy, config.actor_gradient
         )
@@ -194,8 +187,6 @@ class SOLDLearner:
         row, first_frame = row[picked, None], (end[picked] - c + 1)[:, None]
         steps = torch.arange(c, device=row.device)
         return slots[row, first_frame + steps], actions[row, first_frame + steps[1:]]
-
-    # --- optimisers -----------------------------------------------------------------------------------------------
 
     def _step(self, name: str, loss: Tensor, keep: bool = False) -> Tensor:
         """Move one network by a loss; its gradient's norm before clipping. `keep` leaves the graph for another loss."""

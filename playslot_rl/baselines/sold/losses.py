@@ -1,18 +1,82 @@
-"""SOLD's losses on plain tensors (Mosbach et al., 2025, sections 3.2 and 3.3; DreamerV3's returns and critic).
+"""SOLD's imagined rollouts, and its losses on plain tensors (Mosbach et al., 2025, sections 3.2 and 3.3; DreamerV3's
+returns and critic).
 
-Shapes: B sequences of T frames or rollouts, C context frames, H imagined steps, N slots, D slot width, K bins.
+    a_t ~ pi(. | sg(S_1, ..., S_t)),   S_{t+1} = dynamics(S_1, ..., S_t, a_1, ..., a_t)
+
+Shapes: B sequences of T frames or rollouts, C context frames, H imagined steps, N slots, D slot width, A action width,
+K bins.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torchrl.modules import TruncatedNormal
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
-from playslot_rl.baselines.sold.heads import ScalarHead
-from playslot_rl.baselines.sold.imagination import Imagined
+from playslot_rl.baselines.sold.networks import ActorHead, ScalarHead, sample_action
+from playslot_rl.modules.predictors.ocvp_seq import OCVPSeq
+
+
+class Imagined(NamedTuple):
+    """A batch of imagined rollouts.
+
+    Attributes:
+        slots: (B, C + H, N, D); the context, then what follows from the actions. Differentiable in the actions.
+        actions: (B, H, A) in [-1, 1], reparameterised.
+        log_probs: (B, H) of the actions, as constants, summed over A.
+        entropies: (B, H), summed over A.
+        locations: (B, H, A), the modes of the actions' distributions, as constants.
+    """
+
+    slots: Tensor
+    actions: Tensor
+    log_probs: Tensor
+    entropies: Tensor
+    locations: Tensor
+
+
+def imagine(
+    dynamics: OCVPSeq,
+    actor: ActorHead,
+    context: Tensor,
+    actions: Tensor,
+    horizon: int,
+    generator: torch.Generator | None = None,
+) -> Imagined:
+    """Unfold H steps from the context's last frame.
+
+    The actor reads slots without their gradient (as in Dreamer): an action is judged by what the dynamics make of it.
+
+    Args:
+        dynamics: predicts the next frame's slots.
+        actor: chooses the actions.
+        context: parsed slots (B, C, N, D).
+        actions: (B, C - 1, A) taken between them.
+        horizon: H.
+        generator: of the sampled actions.
+    """
+    memory = None
+    if context.shape[1] > 1:
+        with torch.no_grad():  # no action that is judged leads there
+            _, memory = dynamics.step(context[:, :-1], actions)
+    location, std, past = actor(context.detach())
+    frames, chosen, log_probs, entropies, locations = [context], [], [], [], []
+    current = context[:, -1:]
+    for step in range(horizon):
+        distribution = TruncatedNormal(location[:, -1:], std[:, -1:])
+        action = sample_action(distribution, generator)
+        current, memory = dynamics.step(current, action, past=memory)
+        frames.append(current)
+        chosen.append(action)
+        log_probs.append(distribution.log_prob(action.detach()))
+        entropies.append(distribution.base_dist.entropy().sum(dim=-1))
+        locations.append(location[:, -1:].detach())
+        if step + 1 < horizon:
+            location, std, past = actor(current.detach(), past)
+    return Imagined(*(torch.cat(parts, dim=1) for parts in (frames, chosen, log_probs, entropies, locations)))
 
 
 def same_episode(is_first: Tensor) -> Tensor:
@@ -30,19 +94,6 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
 def slot_loss(predicted: Tensor, slots: Tensor, valid: Tensor) -> Tensor:
     """Mean squared error of predicted slots (B, T, N, D) on the frames that `valid` (B, T) names."""
     return masked_mean((predicted - slots).square().mean(dim=(-2, -1)), valid)
-
-
-def reward_loss(head: ScalarHead, slots: Tensor, rewards: Tensor, valid: Tensor) -> Tensor:
-    """Cross entropy of the rewards (B, T) received on the way to the frames of slots (B, T, N, D).
-
-    No gradient runs into the slots.
-    """
-    return masked_mean(head.cross_entropy(head(slots.detach()), rewards), valid)
-
-
-def discounts(gamma: float, horizon: int, like: Tensor) -> Tensor:
-    """gamma^0 ... gamma^(H-1), (H,): how much an imagined step weighs."""
-    return gamma ** torch.arange(horizon, device=like.device, dtype=like.dtype)
 
 
 def imagined_returns(rewards: Tensor, values: Tensor, gamma: float, lmbda: float) -> Tensor:
@@ -74,7 +125,7 @@ def actor_loss(
         returns: R_0 ... R_{H-1} (B, H), differentiable in the actions for `dynamics`.
         baselines: v_0 ... v_{H-1} (B, H).
         scale: S, a number of at least 1.
-        weights: w (H,).
+        weights: w (H,), gamma^0 ... gamma^(H-1): how much an imagined step weighs.
         entropy: weight of the entropy.
         gradient: which estimator.
     """

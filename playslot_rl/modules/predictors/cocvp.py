@@ -12,8 +12,8 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from playslot_rl.config import PredictorConfig
-from playslot_rl.modules.predictors.predictor import AutoregressivePredictor
-from playslot_rl.modules.transformer import KeysValues, TransformerBlock
+from playslot_rl.modules.predictors.predictor import AutoregressivePredictor, Condition, Layers
+from playslot_rl.modules.transformer import TransformerBlock
 
 
 class COCVP(AutoregressivePredictor):
@@ -52,18 +52,13 @@ class COCVP(AutoregressivePredictor):
         return tokens.flatten(1, 2)
 
     def _predict(
-        self,
-        slots: Tensor,
-        condition: tuple[Tensor, ...],
-        code: Tensor,
-        mask: Tensor | None,
-        past: list[KeysValues] | None,
-    ) -> tuple[Tensor, list[KeysValues]]:
+        self, slots: Tensor, condition: Condition, code: Tensor, mask: Tensor | None, past: Layers | None
+    ) -> tuple[Tensor, Layers]:
         p, v = condition
         x, n = self._tokens(slots, p, v, code), slots.shape[2]
         if mask is not None:
             mask = mask.repeat_interleave(n, dim=-2).repeat_interleave(n, dim=-1)
-        kept: list[KeysValues] = []
+        kept: Layers = []
         for i, block in enumerate(self.blocks):
             x, keys_values = block(x, mask, None if past is None else past[i])
             kept.append(keys_values)

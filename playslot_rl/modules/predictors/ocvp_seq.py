@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.config import PredictorConfig
-from playslot_rl.modules.predictors.predictor import AutoregressivePredictor
-from playslot_rl.modules.transformer import KeysValues, TransformerBlock
+from playslot_rl.modules.predictors.predictor import AutoregressivePredictor, Condition, Layers
+from playslot_rl.modules.transformer import TransformerBlock
 
 
 class OCVPSeq(AutoregressivePredictor):
@@ -46,19 +46,14 @@ class OCVPSeq(AutoregressivePredictor):
         self._start_still()
 
     def _predict(
-        self,
-        slots: Tensor,
-        condition: tuple[Tensor, ...],
-        code: Tensor,
-        mask: Tensor | None,
-        past: list[KeysValues] | None,
-    ) -> tuple[Tensor, list[KeysValues]]:
+        self, slots: Tensor, condition: Condition, code: Tensor, mask: Tensor | None, past: Layers | None
+    ) -> tuple[Tensor, Layers]:
         b, s, n = slots.shape[:3]
         action = self.embed_action(torch.cat(condition, dim=-1)).unsqueeze(2)
         x = torch.cat((self.embed_slots(slots), action), dim=2) + code
         if mask is not None and mask.dim() > 2:
             mask = mask.repeat_interleave(n + 1, dim=0)
-        kept: list[KeysValues] = []
+        kept: Layers = []
         for i, (objects, time) in enumerate(zip(self.objects, self.time, strict=True)):
             y, _ = objects(x.reshape(b * s, n + 1, -1))
             y = y.view(b, s, n + 1, -1).transpose(1, 2).reshape(b * (n + 1), s, -1)

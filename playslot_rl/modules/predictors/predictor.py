@@ -20,6 +20,9 @@ from torch import Tensor, nn
 from playslot_rl.config import PredictorConfig
 from playslot_rl.modules.transformer import KeysValues, sinusoidal_code
 
+Condition = tuple[Tensor, ...]
+Layers = list[KeysValues]
+
 
 class Predictor(Protocol):
     """Predicts the slots of the next frame.
@@ -58,7 +61,7 @@ class Past(NamedTuple):
     """Keys and values of each layer, of so many frames."""
 
     frames: int
-    layers: list[KeysValues]
+    layers: Layers
 
 
 class AutoregressivePredictor(nn.Module):
@@ -135,7 +138,7 @@ class AutoregressivePredictor(nn.Module):
         s, _ = self._check_rollout(seed, condition)
         return self._slide(seed, self.forward(seed, *(c[:, :s] for c in condition)), condition, s)
 
-    def _slide(self, seed: Tensor, predicted: Tensor, condition: tuple[Tensor, ...], start: int) -> Tensor:
+    def _slide(self, seed: Tensor, predicted: Tensor, condition: Condition, start: int) -> Tensor:
         """Predictions from frame `start` on by recomputing the window of the last `context` frames."""
         frames = torch.cat((seed, predicted[:, seed.shape[1] - 1 :]), dim=1)
         for i in range(start, condition[0].shape[1]):
@@ -150,7 +153,7 @@ class AutoregressivePredictor(nn.Module):
                 f"frames: got {frames}, expected at most model.predictor.context={self.context}; use rollout"
             )
 
-    def _check_rollout(self, seed: Tensor, condition: tuple[Tensor, ...]) -> tuple[int, int]:
+    def _check_rollout(self, seed: Tensor, condition: Condition) -> tuple[int, int]:
         s, t = seed.shape[1], condition[0].shape[1]
         if not 1 <= s <= min(t, self.context):
             raise ValueError(
@@ -159,13 +162,8 @@ class AutoregressivePredictor(nn.Module):
         return s, t
 
     def _predict(
-        self,
-        slots: Tensor,
-        condition: tuple[Tensor, ...],
-        code: Tensor,
-        mask: Tensor | None,
-        past: list[KeysValues] | None,
-    ) -> tuple[Tensor, list[KeysValues]]:
+        self, slots: Tensor, condition: Condition, code: Tensor, mask: Tensor | None, past: Layers | None
+    ) -> tuple[Tensor, Layers]:
         """Predictions (B, S, N, D) and the layers' keys and values.
 
         Args:

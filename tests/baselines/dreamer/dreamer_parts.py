@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torchrl.objectives import DreamerV3Loss
 
 from playslot_rl import keys
-from playslot_rl.baselines.dreamer.losses import build_loss
+from playslot_rl.baselines.dreamer.learner import build_loss
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
 from playslot_rl.config import EnvConfig
 from playslot_rl.config.baselines import DreamerConfig

@@ -90,7 +90,7 @@ def test_frames_are_reduced_by_their_mean() -> None:
 
 
 def test_filtering_frame_by_frame_is_the_rollout_of_the_sequence(parts: Parts) -> None:
-    from playslot_rl.baselines.dreamer.losses import records, world_model
+    from playslot_rl.baselines.dreamer.learner import records, world_model
 
     batch = random_batch()
     with global_seed(0, 0), torch.no_grad():

@@ -7,7 +7,7 @@ from dreamer_parts import A, B, Parts, T, random_batch
 from tensordict import TensorDict
 
 from playslot_rl import keys
-from playslot_rl.baselines.dreamer.losses import records, world_model
+from playslot_rl.baselines.dreamer.learner import records, world_model
 from playslot_rl.baselines.sold.losses import imagined_returns
 from playslot_rl.seeding import global_seed
 

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from playslot_rl import keys
-from playslot_rl.baselines.sold.acting import SOLDActor
+from playslot_rl.baselines.sold.actor import SOLDActor
 from playslot_rl.baselines.sold.learner import SOLDLearner
 
 Make = Callable[..., SOLDLearner]

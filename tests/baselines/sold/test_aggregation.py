@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from playslot_rl.baselines.sold.aggregation import SlotAggregation, alibi_bias, alibi_slopes
+from playslot_rl.baselines.sold.networks import SlotAggregation, alibi_bias, alibi_slopes
 
 
 @pytest.fixture

@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import pytest
 import torch
-from torchrl.modules import SymExpTwoHot, symlog
+from torchrl.modules import SymExpTwoHot, TruncatedNormal, symlog
 from torchrl.objectives import two_hot_encode
 
-from playslot_rl.baselines.sold.aggregation import SlotAggregation
-from playslot_rl.baselines.sold.heads import (
+from playslot_rl.baselines.sold.networks import (
     MAX_STD,
     MIN_STD,
     ActorHead,
     ScalarHead,
-    action_distribution,
     sample_action,
 )
+from playslot_rl.config import SOLDConfig
 
-
-def _backbone() -> SlotAggregation:
-    return SlotAggregation(slot_dim=6, dim=16, layers=1, heads=2, mlp_dim=16)
+SIZES = SOLDConfig(dim=16, head_layers=1, heads=2, mlp_dim=16)
 
 
 def _scalar_head(bins: int, mean: Literal["symlog", "linear"] = "symlog") -> ScalarHead:
-    return ScalarHead(_backbone(), 16, bins, mean=mean)
+    return ScalarHead(replace(SIZES, bins=bins, mean=mean), slot_dim=6)
 
 
 def test_two_hot_round_trip() -> None:
@@ -82,12 +80,12 @@ def test_an_untrained_scalar_head_says_zero() -> None:
 
 def test_actions_are_within_bounds_and_their_mode_is_the_location() -> None:
     torch.manual_seed(0)
-    head = ActorHead(_backbone(), 16, 3)
+    head = ActorHead(SIZES, 6, 3)
     torch.nn.init.normal_(head.out.weight, std=3.0)
     location, std, _ = head(torch.randn(50, 4, 4, 6))
     assert std.min() >= MIN_STD
     assert std.max() <= MAX_STD
-    distribution = action_distribution(location, std)
+    distribution = TruncatedNormal(location, std)
     action = sample_action(distribution, torch.Generator().manual_seed(0))
     assert action.shape == (50, 4, 3)
     assert action.abs().max() <= 1
@@ -97,7 +95,7 @@ def test_actions_are_within_bounds_and_their_mode_is_the_location() -> None:
 
 def test_samples_follow_the_distribution_and_repeat_with_the_generator() -> None:
     location, std = torch.full((40_000, 1), 0.6), torch.full((40_000, 1), 0.5)
-    distribution = action_distribution(location, std)
+    distribution = TruncatedNormal(location, std)
     drawn = sample_action(distribution, torch.Generator().manual_seed(3))
     assert torch.equal(drawn, sample_action(distribution, torch.Generator().manual_seed(3)))
     assert float(drawn.mean()) == pytest.approx(float(distribution.base_dist.mean[0]), abs=0.01)
@@ -106,7 +104,7 @@ def test_samples_follow_the_distribution_and_repeat_with_the_generator() -> None
 
 def test_samples_are_reparameterised() -> None:
     location = torch.full((1000, 1), 0.2, requires_grad=True)
-    drawn = sample_action(action_distribution(location, torch.full((1000, 1), 0.3)), torch.Generator().manual_seed(0))
+    drawn = sample_action(TruncatedNormal(location, torch.full((1000, 1), 0.3)), torch.Generator().manual_seed(0))
     (gradient,) = torch.autograd.grad(drawn.sum(), location)
     assert gradient.min() >= 0
     assert gradient.mean() > 0.5

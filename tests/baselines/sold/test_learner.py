@@ -8,12 +8,13 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.modules import TruncatedNormal
 
 from playslot_rl import keys
 from playslot_rl.baselines.sold import losses
-from playslot_rl.baselines.sold.heads import action_distribution, sample_action
-from playslot_rl.baselines.sold.imagination import imagine
 from playslot_rl.baselines.sold.learner import SOLDLearner
+from playslot_rl.baselines.sold.losses import imagine
+from playslot_rl.baselines.sold.networks import sample_action
 from playslot_rl.seeding import StepGenerators
 
 Make = Callable[..., SOLDLearner]
@@ -100,7 +101,7 @@ def test_the_last_weights_explore_and_their_average_is_evaluated(make_learner: M
     slots = learner.act(memory, torch.Generator().manual_seed(0), explore=False)[keys.SLOTS].unsqueeze(1)
     best, _, _ = learner.mean_actor(slots)
     location, std, _ = learner.networks.actor(slots)
-    sampled = sample_action(action_distribution(location[:, 0], std[:, 0]), torch.Generator().manual_seed(0))
+    sampled = sample_action(TruncatedNormal(location[:, 0], std[:, 0]), torch.Generator().manual_seed(0))
     for explore, expected in ((False, best[:, 0]), (True, sampled)):
         seen = learner.act(memory, torch.Generator().manual_seed(0), explore)
         torch.testing.assert_close(seen[keys.ACTION], expected)
@@ -151,9 +152,7 @@ def test_imagined_steps_follow_from_the_dynamics_and_the_actors_history(make_lea
     whole = networks.dynamics(out.slots[:, :-1], torch.cat((taken, out.actions), dim=1))
     torch.testing.assert_close(out.slots[:, 3:], whole[:, 2:])
     location, std, _ = networks.actor(out.slots)
-    from playslot_rl.baselines.sold.heads import action_distribution
-
-    expected = action_distribution(location[:, 2:-1], std[:, 2:-1]).log_prob(out.actions)
+    expected = TruncatedNormal(location[:, 2:-1], std[:, 2:-1]).log_prob(out.actions)
     torch.testing.assert_close(out.log_probs, expected, atol=1e-4, rtol=1e-4)
 
 

@@ -7,7 +7,7 @@ import torch
 from torchrl.modules import PercentileValueNorm
 
 from playslot_rl.baselines.sold import losses
-from playslot_rl.baselines.sold.imagination import Imagined
+from playslot_rl.baselines.sold.losses import Imagined
 
 
 def _imagined(batch: int = 2, horizon: int = 3) -> Imagined:

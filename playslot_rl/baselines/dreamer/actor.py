@@ -1,4 +1,4 @@
-"""A trained DreamerV3 as an actor."""
+"""DreamerV3 as an actor: one step of acting, and a trained one from disk."""
 
 from __future__ import annotations
 
@@ -11,14 +11,36 @@ from tensordict import TensorDict, TensorDictBase
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
-from playslot_rl.baselines.dreamer.learner import act
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
-from playslot_rl.config import EnvConfig, from_dict
+from playslot_rl.config import EnvConfig
 from playslot_rl.config.baselines import DreamerConfig
-from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
+from playslot_rl.training.runs import freeze_on, stage_config
 
 NAME: Final = "dreamer"
+
+
+def act(networks: DreamerNetworks, memory: TensorDictBase, generator: torch.Generator | None) -> TensorDict:
+    """See a frame and choose an action.
+
+    Args:
+        networks: in eval mode.
+        memory: `state` (n, S), `belief` (n, H), `keys.ACTION` (n, A) and `keys.PIXELS` uint8 (n, 3, H, W).
+        generator: of state and action; None takes the most likely state and the mean action.
+
+    Returns:
+        The same keys anew; the frames reduced.
+    """
+    frames = networks.reduce(memory.get(keys.PIXELS))
+    state, belief = networks.filter(
+        memory.get("state"), memory.get("belief"), memory.get(keys.ACTION), frames, generator
+    )
+    mean, std = networks.actor(state, belief)
+    action = mean
+    if generator is not None:
+        action = mean + std * torch.randn(mean.shape, generator=generator, device=mean.device)
+    values = {"state": state, "belief": belief, keys.ACTION: action, keys.PIXELS: frames}
+    return TensorDict(values, memory.batch_size)
 
 
 class DreamerActor(Actor):
@@ -51,15 +73,9 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> DreamerActor:
         CheckpointError: no finished training there, or a damaged one.
     """
     checkpoint = read_stage(checkpoint_folder(run, NAME), NAME)
-    try:
-        env = from_dict(EnvConfig, checkpoint.config["env"], "env.")
-        config = from_dict(DreamerConfig, checkpoint.config[NAME], f"{NAME}.")
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(
-            f"{checkpoint.path}/config.json: {error}; expected the config of this version: train dreamer again"
-        ) from error
+    config, env = stage_config(checkpoint, DreamerConfig, NAME), stage_config(checkpoint, EnvConfig, "env")
     with torch.random.fork_rng(devices=[]):
         networks = DreamerNetworks(config, env)
     load_weights(checkpoint, {"networks": networks})
-    networks.to(device).eval().requires_grad_(False)
+    freeze_on(networks, device)
     return DreamerActor(networks)
