@@ -9,7 +9,7 @@ from pathlib import Path
 from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.envs import PROCEDURAL, gym_id
 from playslot_rl.recipes import evaluate, train_dynamics, train_policy, train_slots
-from playslot_rl.recipes.run import open_run, store_config
+from playslot_rl.recipes.run import open_run
 
 
 def main(config: ExperimentConfig) -> None:
@@ -18,6 +18,8 @@ def main(config: ExperimentConfig) -> None:
     With `data.root` set nothing is collected but missing demonstrations (`data.demos`). Where nothing can be acted on
     (GridShapes) there are neither demonstrations nor a policy, and slots and latent actions are scored instead.
     """
+    from playslot_rl.training.runs import store_config
+
     began = time.monotonic()
     behaves = config.env.name not in PROCEDURAL
     if behaves:

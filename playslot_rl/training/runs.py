@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import nn
 
-from playslot_rl.config import EnvConfig, ModelConfig, from_dict
+from playslot_rl.config import EnvConfig, ExperimentConfig, ModelConfig, from_dict, to_dict
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_bytes, write_json
 from playslot_rl.storage.checkpoints import (
@@ -79,6 +79,15 @@ def run_folder(run: Path | str) -> Path:
     if not str(run) or not folder.is_dir():
         raise CheckpointError(f"run={run}: no such folder, expected a run folder or `{PRETRAINED}`: check run=")
     return folder
+
+
+def store_config(config: ExperimentConfig, run: Path) -> None:
+    """Write the run's config. Called when everything fits, so that a refused command leaves the stored one as it was.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    write_json(run / "config.json", to_dict(config))
 
 
 def adopt_stage(checkpoint: StageCheckpoint, run: Path) -> None:
@@ -201,13 +210,13 @@ def freeze_on(module: nn.Module, device: torch.device | str) -> None:
     module.to(device).eval().requires_grad_(False)
 
 
-def slots_fingerprint(run: Path | str) -> str:
-    """Fingerprint of a run's SAVi.
+def slots_checkpoint(run: Path | str) -> StageCheckpoint:
+    """The finished SAVi that a run builds on.
 
     Raises:
-        CheckpointError: it has none.
+        CheckpointError: there is none.
     """
-    return read_stage(checkpoint_folder(world_model_folder(run), "slots"), "slots").fingerprint
+    return read_stage(checkpoint_folder(world_model_folder(run), "slots"), "slots")
 
 
 def load_savi(run: Path | str, device: torch.device | str = "cpu") -> SAVi:

@@ -13,9 +13,12 @@ from playslot_rl import keys
 from playslot_rl.config import SlotsStageConfig
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips, IntArray
+from playslot_rl.errors import CheckpointError
 from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.seeding import StepGenerators, step_generator
+
+INITIAL_SLOTS = "initializer.mean"
 
 
 class SlotsStage:
@@ -68,3 +71,39 @@ class SlotsStage:
 
     def _batch(self, rows: IntArray) -> TensorDict:
         return TensorDict({keys.PIXELS: self.source.pixels(rows).to(self.device)}, [len(rows)])
+
+
+def warm_start(savi: SAVi, source: SAVi, where: str) -> None:
+    """Copy weights in place. With another number of learned initial slots the first ones are copied and the rest kept.
+
+    Note: the paper trains each SAVi from scratch. Slot Attention first fits what all frames share and only then takes
+    scenes apart; where objects are small and of any colour, that plateau outlasts what a CPU can pay for, and a SAVi
+    that has learned elsewhere to take scenes apart leaves it early.
+
+    Args:
+        savi: what will be trained.
+        source: what it starts from; all sizes but the number of slots must be equal.
+        where: its name, for the error.
+
+    Raises:
+        CheckpointError: sizes differ.
+    """
+    own, other = savi.state_dict(), source.state_dict()
+    shapes = [
+        (
+            name,
+            tuple(other[name].shape) if name in other else "nothing",
+            tuple(own[name].shape) if name in own else "nothing",
+        )
+        for name in sorted({*own, *other} - {INITIAL_SLOTS})
+    ]
+    for name, got, expected in shapes:
+        if got != expected:
+            raise CheckpointError(
+                f"slots.start_from={where}: got {name} of {got}, expected {expected}: give model.savi.* its sizes"
+            )
+    with torch.no_grad():
+        rows = min(len(own[INITIAL_SLOTS]), len(other[INITIAL_SLOTS]))
+        initial = own[INITIAL_SLOTS].clone()
+        initial[:rows] = other[INITIAL_SLOTS][:rows]
+    savi.load_state_dict({**other, INITIAL_SLOTS: initial})

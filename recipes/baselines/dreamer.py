@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.recipes.baselines.online import online_record, train_and_save
-from playslot_rl.recipes.run import open_device, open_run, store_config
+from playslot_rl.recipes.run import open_device, open_run
 
 
 def main(config: ExperimentConfig) -> None:
@@ -28,7 +26,7 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.baselines.dreamer.networks import DreamerNetworks
     from playslot_rl.seeding import global_seed
 
-    record = online_record(config, own, run, NAME, ready=partial(store_config, config, run))
+    record = online_record(config, own, run, NAME)
     if record.finished():
         return
     device = open_device(config)

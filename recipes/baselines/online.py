@@ -24,7 +24,7 @@ def online_record(
     run: Path,
     name: str,
     *,
-    ready: Callable[[], None],
+    ready: Callable[[], None] = lambda: None,
     parents: Mapping[str, StageCheckpoint] | None = None,
 ) -> StageRecord:
     """The record of a method whose part of the config is `own`; it learns from no data set."""
@@ -38,6 +38,7 @@ def online_record(
         counts=("env",),
         identity={"render": to_dict(config.render)},
         parents=parents or {},
+        role="",
         ready=ready,
     )
 
@@ -76,7 +77,7 @@ def train_and_save(
         title=METHODS[name].title,
         device=device,
         identity=record.resumes(),
-        ready=record.ready,
+        ready=record.begin,
         prior_steps=prior_steps,
     )
     state, random = result.state, result.random

@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.recipes.baselines.online import online_record, train_and_save
-from playslot_rl.recipes.run import open_device, open_run, parent_run, store_config
+from playslot_rl.recipes.run import open_device, open_run, parent_run, require_parent
 
 
 def main(config: ExperimentConfig) -> None:
@@ -25,20 +27,14 @@ def main(config: ExperimentConfig) -> None:
     run = open_run(config)
 
     from playslot_rl.baselines.sold.learner import SOLDLearner
-    from playslot_rl.baselines.sold.load import NAME, build_networks, prior_steps, slots_checkpoint
+    from playslot_rl.baselines.sold.load import NAME, build_networks, prior_steps
     from playslot_rl.seeding import global_seed
-    from playslot_rl.storage.checkpoints import require_config
-    from playslot_rl.training.runs import load_savi, require_adoptable, use_world_model
+    from playslot_rl.training.runs import load_savi, slots_checkpoint, use_world_model
 
     parent = parent_run(config, run)
     slots = slots_checkpoint(parent)
-    require_adoptable(slots, run)
-    require_config(slots, {"env": {"image_size": config.env.image_size}})
-
-    def ready() -> None:
-        use_world_model(run, parent)
-        store_config(config, run)
-
+    require_parent(config, run, slots, "image_size")
+    ready = partial(use_world_model, run, parent)
     record = online_record(config, own, run, NAME, ready=ready, parents={"slots": slots})
     if record.finished():
         return
