@@ -17,7 +17,7 @@ from playslot_rl.modules.predictors.cocvp import COCVP
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.modules.savi.decoder import BroadcastDecoder
 from playslot_rl.speed.spec import Sizes, Variant
-from playslot_rl.training.optim import build_adam, clip_gradients, trainable_parameters
+from playslot_rl.training.fit import build_adam, clip_gradients, trainable_parameters
 
 Step = Callable[[], Tensor]
 """Computes once and returns a scalar, the loss where there is one."""

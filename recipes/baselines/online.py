@@ -66,30 +66,24 @@ def train_and_save(
     """
     from playslot_rl.baselines.online.loop import train_online
     from playslot_rl.config.methods import METHODS
+    from playslot_rl.storage.atomic import write_bytes
+    from playslot_rl.visualization.charts import learning_chart
+    from playslot_rl.visualization.palette import DARK, LIGHT
 
     name = record.name
-    result = train_online(
-        learner,
-        own,
-        record.config,
-        record.folder,
-        name=name,
-        title=METHODS[name].title,
-        device=device,
-        identity=record.resumes(),
-        ready=record.begin,
-        prior_steps=prior_steps,
-    )
-    state, random = result.state, result.random
+    state, _ = train_online(learner, own, record, title=METHODS[name].title, device=device, prior_steps=prior_steps)
+    for theme in (LIGHT, DARK):
+        chart = learning_chart({name: state.curve}, state.random, theme)
+        write_bytes(record.folder / f"curve_{theme.name}.png", chart)
     extra = {
         "env_steps": state.step + prior_steps,
         "savi_steps": prior_steps,
         "episodes": state.episodes,
-        "random_policy": random,
+        "random_policy": state.random,
         "parameters": sum(p.numel() for module in modules.values() for p in module.parameters()),
     }
     record.save(modules, state.metrics, state.updates, state.seconds, extra)
-    last, prior = state.curve[-1], f" and {prior_steps} of SAVi's data" if prior_steps else ""
+    last, random, prior = state.curve[-1], state.random, f" and {prior_steps} of SAVi's data" if prior_steps else ""
     print(
         f"{name}: {state.step} agent steps{prior}, {state.updates} updates; development episodes: return "
         f"{last['return_mean']:.2f} (random {random['return_mean']:.2f}), success {100 * last['success_rate']:.0f} % "

@@ -42,6 +42,8 @@ def test_a_run_leaves_weights_a_curve_and_its_config(run: Path) -> None:
     assert meta["parameters"] > 0
     curve = json.loads((run / "dreamer" / "curve.json").read_text())
     assert [row["env_steps"] for row in curve["rows"]] == [12, 24, 36]
+    for theme in ("light", "dark"):
+        assert (run / "dreamer" / f"curve_{theme}.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((run / "config.json").read_text())["method"] == "dreamer"
     assert {path.name for path in run.iterdir()} == {"config.json", "dreamer"}
 
