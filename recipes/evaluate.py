@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.config import EnvConfig, ExperimentConfig
 from playslot_rl.config.compose import shipped
 from playslot_rl.config.methods import METHODS
 from playslot_rl.envs import PROCEDURAL
@@ -72,11 +72,11 @@ def evaluate_baseline(config: ExperimentConfig, run: Path) -> None:
     from playslot_rl.evaluation.success import check_baseline_protocol, evaluate_actor, run_facts
     from playslot_rl.recipes.run import open_device
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
-    from playslot_rl.training.runs import stage_env
+    from playslot_rl.training.runs import stage_config
 
     check_baseline_protocol(config)
     run_facts(run, config.method)  # a run without a policy is refused before anything is loaded
-    env = stage_env(read_stage(checkpoint_folder(run, config.method), config.method))
+    env = stage_config(read_stage(checkpoint_folder(run, config.method), config.method), EnvConfig, "env")
     check_environment(config, env.image_size, env.action_dim)
     device = open_device(config)
     module, _, function = METHODS[config.method].actor.partition(":")

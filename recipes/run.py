@@ -89,7 +89,7 @@ def demonstration_views(
         savi: parses the frames, on its device.
         slots_print: fingerprint of SAVi's checkpoint.
     """
-    from playslot_rl.data.shifted import shifted_copies
+    from playslot_rl.data.demonstrations import shifted_copies
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.world_model import module_device
 

@@ -23,6 +23,7 @@ import torch
 from torch import nn
 
 from playslot_rl.config import EnvConfig, ExperimentConfig, ModelConfig, from_dict, to_dict
+from playslot_rl.config.compose import SHIPPED
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_bytes, write_json
 from playslot_rl.storage.checkpoints import (
@@ -38,8 +39,6 @@ from playslot_rl.storage.folders import new_folder
 if TYPE_CHECKING:
     from playslot_rl.modules.savi import SAVi
     from playslot_rl.world_model import Agent, WorldModel
-
-PRETRAINED = "pretrained"
 
 
 def pretrained_folder(env: str = "button_press") -> Path:
@@ -63,7 +62,7 @@ def pretrained_folder(env: str = "button_press") -> Path:
 def shipped_env(run: Path | str) -> str | None:
     """Environment of the shipped world model that `pretrained/ENV` or `pretrained` (ButtonPress) names, else None."""
     name, _, env = str(run).partition("/")
-    return (env or "button_press") if name == PRETRAINED else None
+    return (env or "button_press") if name == SHIPPED else None
 
 
 def run_folder(run: Path | str) -> Path:
@@ -77,7 +76,7 @@ def run_folder(run: Path | str) -> Path:
         return pretrained_folder(env)
     folder = Path(run)
     if not str(run) or not folder.is_dir():
-        raise CheckpointError(f"run={run}: no such folder, expected a run folder or `{PRETRAINED}`: check run=")
+        raise CheckpointError(f"run={run}: no such folder, expected a run folder or `{SHIPPED}`: check run=")
     return folder
 
 
@@ -123,17 +122,6 @@ def require_adoptable(checkpoint: StageCheckpoint, run: Path) -> None:
         )
 
 
-def link_world_model(run: Path, source: Path | str) -> None:
-    """Say that the world model of `run` is the one of another run, or a shipped one (`pretrained/ENV`).
-
-    Raises:
-        OutputError: full disk.
-    """
-    env = shipped_env(source)
-    text = os.path.relpath(source, run) if env is None else f"{PRETRAINED}/{env}"
-    write_json(run / "world_model.json", {"source": text})
-
-
 def use_world_model(run: Path, parent: Path | str) -> None:
     """Have `run` build on the world model of `parent`: its own, another run's, or a shipped one (`pretrained/ENV`).
 
@@ -141,9 +129,9 @@ def use_world_model(run: Path, parent: Path | str) -> None:
         CheckpointError: no such parent.
         OutputError: full disk.
     """
-    home = world_model_folder(parent)
+    home, env = world_model_folder(parent), shipped_env(parent)
     if run.resolve() not in (home.resolve(), Path(parent).resolve()):
-        link_world_model(run, parent if shipped_env(parent) else home)
+        write_json(run / "world_model.json", {"source": f"{SHIPPED}/{env}" if env else os.path.relpath(home, run)})
 
 
 def world_model_folder(run: Path | str) -> Path:
@@ -158,7 +146,7 @@ def world_model_folder(run: Path | str) -> Path:
         return folder
     source = read_json(link).get("source")
     if not isinstance(source, str):
-        raise CheckpointError(f'{link}: got no "source", expected "{PRETRAINED}/ENV" or a path: train again')
+        raise CheckpointError(f'{link}: got no "source", expected "{SHIPPED}/ENV" or a path: train again')
     return run_folder(folder / source if shipped_env(source) is None else source)
 
 
@@ -174,35 +162,28 @@ def world_model_checkpoints(run: Path | str) -> dict[str, StageCheckpoint]:
     return stages
 
 
+def stage_config[Group](checkpoint: StageCheckpoint, cls: type[Group], name: str) -> Group:
+    """A group of the config a stage was trained with; all stages store `env`.
+
+    Raises:
+        CheckpointError: its config.json is not one of this version.
+    """
+    try:
+        return from_dict(cls, checkpoint.config[name], f"{name}.")
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{checkpoint.path}/config.json: {error}; expected the {name} of this version of playslot_rl: train that "
+            "stage again"
+        ) from error
+
+
 def stage_model(checkpoint: StageCheckpoint) -> tuple[ModelConfig, EnvConfig]:
     """The model and environment config a stage was trained with.
 
     Raises:
         CheckpointError: its config.json is not one of this version.
     """
-    try:
-        config = checkpoint.config
-        return from_dict(ModelConfig, config["model"], "model."), from_dict(EnvConfig, config["env"], "env.")
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(
-            f"{checkpoint.path}/config.json: {error}; expected the model and env of this version of playslot_rl: "
-            "train that stage again"
-        ) from error
-
-
-def stage_env(checkpoint: StageCheckpoint) -> EnvConfig:
-    """The environment config a stage was trained with; all stages store it, also those without a `model`.
-
-    Raises:
-        CheckpointError: its config.json is not one of this version.
-    """
-    try:
-        return from_dict(EnvConfig, checkpoint.config["env"], "env.")
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(
-            f"{checkpoint.path}/config.json: {error}; expected the env of this version of playslot_rl: "
-            "train that stage again"
-        ) from error
+    return stage_config(checkpoint, ModelConfig, "model"), stage_config(checkpoint, EnvConfig, "env")
 
 
 def freeze_on(module: nn.Module, device: torch.device | str) -> None:

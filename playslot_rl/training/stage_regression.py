@@ -18,8 +18,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from playslot_rl.config import Precision
-from playslot_rl.data.demonstrations import real_actions, transitions
-from playslot_rl.data.shifted import shift_frames
+from playslot_rl.data.demonstrations import real_actions, shift_frames, transitions
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.seeding import StepGenerators

@@ -64,7 +64,7 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
         inputs,
         actions,
         own.batch_size,
-        held_out=split.held_out and demonstrated_frames(split.held_out, width, device),
+        held_out=None if split.held_out is None else demonstrated_frames(split.held_out, width, device),
         validated=256,
         precision=own.precision,
     )
