@@ -4,8 +4,8 @@ Shifted copies of the videos (every frame of a copy is moved by the same few pix
 augmentation where a policy is cloned from few demonstrations. SAVi reads videos, so a copy keeps one offset from its
 first frame to its last, and its slots are parsed and cached like those of any other video.
 
-Shapes: M transitions of all demonstrations in a row, N slots, D slot width, Z latent-action width, A action width, F frames,
-H W image height and width.
+Shapes: M transitions of all demonstrations in a row, N slots, D slot width, Z latent-action width, A action width,
+F frames, H W image height and width.
 """
 
 from __future__ import annotations
