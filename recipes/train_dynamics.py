@@ -36,19 +36,19 @@ def main(config: ExperimentConfig) -> None:
         config,
         stored={"env": to_dict(config.env), "model": to_dict(model), "dynamics": to_dict(config.dynamics)},
         counts=("model.inverse_dynamics", "model.predictor"),
-        identity={"data.validation": config.data.validation},
         parents={"slots": slots},
         ready=partial(adopt_stage, slots, run),
     )
 
     def prepare() -> Training:
-        device, source, own, data = open_device(config), record.data, config.dynamics, config.data
+        device, source, own = open_device(config), record.data, config.dynamics
         with global_seed(config.seed, 0, "dynamics"):
             world = WorldModel(model, config.env)
         load_weights(slots, {"savi": world.savi})
         world.to(device)
-        cached = slot_cache(source, world.savi, slots.fingerprint, data.cache, device, config.logging.progress)
-        stage = DynamicsStage(world, source, cached, own, validation=data.validation, seed=config.seed, device=device)
+        cached = slot_cache(source, world.savi, slots.fingerprint, config.data.cache, device, config.logging.progress)
+        clips = record.clips(own.seed_frames + own.predicted_frames)
+        stage = DynamicsStage(world, clips, cached, own)
         return Training([Part("dynamics", stage, own)], device, said, extra={"episodes": source.episodes})
 
     def said(metrics: Mapping[str, float]) -> str:

@@ -26,7 +26,6 @@ def main(config: ExperimentConfig) -> None:
         config,
         stored={"env": to_dict(config.env), "model": to_dict(config.model), "slots": to_dict(own)},
         counts=("env.image_size", "model.savi"),
-        identity={"data.validation": config.data.validation},
     )
 
     def prepare() -> Training:
@@ -37,9 +36,8 @@ def main(config: ExperimentConfig) -> None:
         if own.start_from:
             warm_start(savi, load_savi(own.start_from, device), own.start_from)
             started = {"started_from": slots_checkpoint(own.start_from).fingerprint}
-        stage = SlotsStage(savi, source, own, validation=config.data.validation, seed=config.seed, device=device)
         return Training(
-            [Part("slots", stage, own)],
+            [Part("slots", SlotsStage(savi, record.clips(own.clip_frames), own), own)],
             device,
             lambda metrics: f"slots: {metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {record.folder}",
             extra={"episodes": source.episodes, "agent_steps": int((source.lengths - 1).sum()), **started},

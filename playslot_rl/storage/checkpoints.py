@@ -6,7 +6,6 @@ A child names its parents by the fingerprints of their weights and refuses any o
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import subprocess
@@ -22,7 +21,7 @@ from torch import nn
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.folders import new_folder
-from playslot_rl.storage.resume import first_difference, flatten
+from playslot_rl.storage.resume import first_difference, flatten, read_json
 from playslot_rl.storage.tensors import (
     load_modules,
     load_tensors,
@@ -146,16 +145,6 @@ def read_stage(path: Path, stage: str) -> StageCheckpoint:
     if not weights.is_file():
         raise CheckpointError(f"{weights} is missing, expected the stage's weights: train {stage} again")
     return StageCheckpoint(path, stage, config, meta, weights_fingerprint(weights))
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    try:
-        values = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path} is damaged ({error}), expected a JSON object: train that stage again") from error
-    if not isinstance(values, dict):
-        raise CheckpointError(f"{path}: got {type(values).__name__}, expected a JSON object: train that stage again")
-    return values
 
 
 def load_weights(checkpoint: StageCheckpoint, modules: Mapping[str, nn.Module]) -> None:

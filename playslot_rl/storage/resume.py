@@ -152,7 +152,16 @@ class TrainingCheckpoints:
         last = self.last()
         if last is None:
             return None
-        stored = self._read(last)
+        path, cure = last / "state.json", f"delete {last.name} to resume from the checkpoint before it"
+        stored = read_json(path, cure)
+        if stored.get("format", FORMAT) != FORMAT:
+            raise CheckpointError(
+                f"{last}: got format {stored['format']!r}, expected {FORMAT!r}: "
+                "use the version of playslot_rl that wrote it, or another out="
+            )
+        missing = {"format", "step", "seconds", "metrics", "identity"} - stored.keys()
+        if missing:
+            raise CheckpointError(f"{path} is damaged (no {', '.join(sorted(missing))}): {cure}")
         difference = first_difference(stored["identity"], self.identity)
         if difference is not None:
             key, old, new = difference
@@ -162,23 +171,20 @@ class TrainingCheckpoints:
             )
         return last, stored
 
-    @staticmethod
-    def _read(path: Path) -> dict[str, Any]:
-        try:
-            stored: dict[str, Any] = json.loads((path / "state.json").read_text())
-            if stored["format"] != FORMAT:
-                raise CheckpointError(
-                    f"{path}: got format {stored['format']!r}, expected {FORMAT!r}: "
-                    "use the version of playslot_rl that wrote it, or another out="
-                )
-            if not {"step", "seconds", "metrics", "identity"} <= stored.keys():
-                raise KeyError("step, seconds, metrics or identity")
-        except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
-            raise CheckpointError(
-                f"{path}/state.json is damaged ({error}), expected a whole JSON file: delete {path.name} to resume "
-                "from the checkpoint before it"
-            ) from error
-        return stored
+
+def read_json(path: Path, cure: str = "train that stage again") -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        CheckpointError: it is missing or damaged; ends with the `cure`.
+    """
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path} is damaged ({error}), expected a JSON object: {cure}") from error
+    if not isinstance(values, dict):
+        raise CheckpointError(f"{path} is damaged ({type(values).__name__}), expected a JSON object: {cure}")
+    return values
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer, names: Sequence[str] = ()) -> dict[str, Tensor]:

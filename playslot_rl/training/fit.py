@@ -59,23 +59,6 @@ class Part:
     identity: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class FitResult:
-    """What `fit` did.
-
-    Attributes:
-        step: finished steps.
-        resumed_from: step this process started at; equal to `step` if there was nothing left to do.
-        seconds: wall-clock seconds of all steps, over all processes.
-        metrics: the last validation.
-    """
-
-    step: int
-    resumed_from: int
-    seconds: float
-    metrics: dict[str, float]
-
-
 def fit(
     part: Part,
     folder: Path,
@@ -85,7 +68,7 @@ def fit(
     logging: LoggingConfig | None = None,
     identity: Mapping[str, Any] | None = None,
     ready: Callable[[], None] | None = None,
-) -> FitResult:
+) -> tuple[TrainingState, int]:
     """Train to `part.config.steps`, carrying on from the newest checkpoint if there is one.
 
     Writes `checkpoints/step_*`, `logs/` and `metrics.jsonl` in the part's folder, nothing else.
@@ -98,6 +81,9 @@ def fit(
         logging: backend and progress bar; None logs to `metrics.jsonl` only, silently.
         identity: further plain values a resumed run must share (model config, data and parent fingerprints).
         ready: called once, before the first step, when a stage begun before was found to be the same.
+
+    Returns:
+        Where it ended, and the step this process started at: the same if there was nothing left to do.
 
     Raises:
         TrainingError: a loss or gradient is not finite; the last good checkpoint stays.
@@ -116,7 +102,7 @@ def fit(
         with run.watch.running(logging, start), progress:
             for step in range(start, config.steps):
                 run.advance(step, progress)
-    return FitResult(run.state.step, start, run.state.seconds, run.state.metrics)
+    return run.state, start
 
 
 class _Run:

@@ -15,6 +15,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.roles import fixed_keys
 from playslot_rl.data.demonstrations import DemonstrationSplit, episode_range, split_demonstrations
 from playslot_rl.data.source import EpisodeFrames, concatenate, open_sources
+from playslot_rl.data.windows import Clips
 from playslot_rl.errors import CheckpointError, DataError
 from playslot_rl.storage.checkpoints import (
     StageCheckpoint,
@@ -25,7 +26,7 @@ from playslot_rl.storage.checkpoints import (
     save_stage,
     training_command,
 )
-from playslot_rl.training.fit import FitResult, Part, fit
+from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.runs import store_config
 
 
@@ -111,6 +112,14 @@ class StageRecord:
         config = self.config
         return split_demonstrations(self.videos, config.demos, config.data.held_out, config.collect.validation_episodes)
 
+    def clips(self, frames: int, shown: int = 32) -> Clips:
+        """Clips of the videos, some of their episodes (`data.validation`) held out; `shown` of these at most validate.
+
+        Raises:
+            DataError: no episode has so many frames.
+        """
+        return Clips(self.videos, frames, self.config.data.validation, self.config.seed, shown)
+
     @property
     def data(self) -> EpisodeFrames:
         """What the stage learns from."""
@@ -145,7 +154,9 @@ class StageRecord:
 
     def resumes(self) -> dict[str, Any]:
         """Plain values that a half-finished stage must share, beside its settings and the seed."""
-        data = {"data": self.data.fingerprint} if self.role else {}
+        data: dict[str, Any] = {"data": self.data.fingerprint} if self.role else {}
+        if self.role == "train":
+            data["data.validation"] = self.config.data.validation
         return {**self._of_stored(*self.counts), **data, **self.prints, **self.identity}
 
     def begin(self) -> None:
@@ -235,9 +246,9 @@ def run_stage(record: StageRecord, prepare: Callable[[], Training]) -> StageChec
     training = prepare()
     modules: dict[str, nn.Module] = {}
     metrics: dict[str, float] = {}
-    results: list[FitResult] = []
+    steps, seconds = 0, 0.0
     for part in training.parts:
-        result = fit(
+        state, _ = fit(
             part,
             record.folder,
             seed=record.config.seed,
@@ -247,10 +258,9 @@ def run_stage(record: StageRecord, prepare: Callable[[], Training]) -> StageChec
             ready=record.begin,
         )
         prefix = f"{part.folder}_" if part.folder else ""
-        metrics |= {f"{prefix}{key}": value for key, value in result.metrics.items()}
+        metrics |= {f"{prefix}{key}": value for key, value in state.metrics.items()}
         modules |= part.stage.modules
-        results.append(result)
-    seconds = sum(result.seconds for result in results)
-    done = record.save(modules, metrics, results[0].step, seconds, training.extra)
+        steps, seconds = steps or state.step, seconds + state.seconds
+    done = record.save(modules, metrics, steps, seconds, training.extra)
     print(training.line(metrics), flush=True)
     return done

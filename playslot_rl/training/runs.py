@@ -30,11 +30,11 @@ from playslot_rl.storage.checkpoints import (
     StageCheckpoint,
     checkpoint_folder,
     load_weights,
-    read_json,
     read_stage,
     require_parents,
 )
 from playslot_rl.storage.folders import new_folder
+from playslot_rl.storage.resume import read_json
 
 if TYPE_CHECKING:
     from playslot_rl.modules.savi import SAVi

@@ -11,12 +11,12 @@ from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.config import SlotsStageConfig
-from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.errors import CheckpointError
 from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.seeding import StepGenerators, step_generator
+from playslot_rl.world_model import module_device
 
 INITIAL_SLOTS = "initializer.mean"
 
@@ -26,26 +26,13 @@ class SlotsStage:
 
     Args:
         savi: trained in place.
-        source: unlabelled videos.
-        config: clip length, batch, precision.
-        validation: fraction of episodes held out.
-        seed: of the split.
-        device: where `savi` is.
+        clips: of unlabelled videos.
+        config: batch, precision.
     """
 
-    def __init__(
-        self,
-        savi: SAVi,
-        source: EpisodeFrames,
-        config: SlotsStageConfig,
-        *,
-        validation: float,
-        seed: int,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        self.savi, self.source, self.config, self.device = savi, source, config, device
+    def __init__(self, savi: SAVi, clips: Clips, config: SlotsStageConfig) -> None:
+        self.savi, self.clips, self.config, self.device = savi, clips, config, module_device(savi)
         self.criterion = SlotsLoss(savi)
-        self.clips = Clips(source, config.clip_frames, validation, seed)
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -70,7 +57,7 @@ class SlotsStage:
         return {"mse": mse, "psnr": -10.0 * float(np.log10(max(mse, 1e-12)))}
 
     def _batch(self, rows: IntArray) -> TensorDict:
-        return TensorDict({keys.PIXELS: self.source.pixels(rows).to(self.device)}, [len(rows)])
+        return TensorDict({keys.PIXELS: self.clips.source.pixels(rows).to(self.device)}, [len(rows)])
 
 
 def warm_start(savi: SAVi, source: SAVi, where: str) -> None:

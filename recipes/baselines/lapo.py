@@ -77,7 +77,7 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import StageRecord, Training, run_stage
 
-    own, validation = config.baselines.lapo, config.data.validation
+    own = config.baselines.lapo
     record = StageRecord(
         MODEL,
         run,
@@ -85,16 +85,13 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
         stored={"env": to_dict(config.env), "model": to_dict(config.model), NAME: to_dict(own)},
         counts=tuple(f"{NAME}.{key}" for key in sizes_of(own)),
         settings=(f"{NAME}.model",),
-        identity={"data.validation": validation},
     )
 
     def prepare() -> Training:
-        device, source = open_device(config), record.data
+        device = open_device(config)
         with global_seed(config.seed, 0, MODEL):
             inverse, forward = InverseModel(own, config.env.image_size).to(device), ForwardModel(own).to(device)
-        stage = LAPOModelStage(
-            inverse, forward, source, own.model, validation=validation, seed=config.seed, device=device
-        )
+        stage = LAPOModelStage(inverse, forward, record.clips(2, shown=256), own.model)
         return Training(
             [Part("baselines.lapo.model", stage, own.model)],
             device,
@@ -102,7 +99,7 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
                 f"{MODEL}: {100 * metrics.get('unexplained', float('nan')):.0f} % of the change left on held-out "
                 f"pairs, {record.folder}"
             ),
-            extra={"episodes": source.episodes},
+            extra={"episodes": record.data.episodes},
         )
 
     return run_stage(record, prepare)
