@@ -12,7 +12,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from torch import nn
 
@@ -21,16 +21,6 @@ from playslot_rl.errors import ConfigError, TrainingError
 from playslot_rl.storage.atomic import explain_write_errors, write_text
 from playslot_rl.storage.resume import TrainingCheckpoints
 from playslot_rl.storage.tensors import module_tensors
-
-
-class MetricLogger(Protocol):
-    """A logging backend."""
-
-    def log(self, values: Mapping[str, float], step: int) -> None:
-        """Record named numbers at a step."""
-
-    def close(self) -> None:
-        """Flush and release."""
 
 
 class History:
@@ -95,7 +85,7 @@ class _RunLogger:
         self._module.finish()
 
 
-def open_logger(config: LoggingConfig, folder: Path, name: str, resumed: int) -> MetricLogger | None:
+def open_logger(config: LoggingConfig, folder: Path, name: str, resumed: int) -> _TensorBoardLogger | _RunLogger | None:
     """Open a backend; None where there is none.
 
     Args:
@@ -144,7 +134,7 @@ class Watch:
     def __init__(self, name: str, folder: Path, checkpoints: TrainingCheckpoints, cure: str) -> None:
         self.name, self.folder, self.checkpoints, self.cure = name, folder, checkpoints, cure
         self.history = History(folder / "metrics.jsonl")
-        self._logger: MetricLogger | None = None
+        self._logger: _TensorBoardLogger | _RunLogger | None = None
 
     @contextlib.contextmanager
     def running(self, logging: LoggingConfig, start: int) -> Iterator[None]:

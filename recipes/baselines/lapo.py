@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import held_out_text, open_device, open_run
+from playslot_rl.recipes.run import held_out_text, open_device, open_run, require_parent
 
 if TYPE_CHECKING:
     from playslot_rl.storage.checkpoints import StageCheckpoint
@@ -28,11 +28,17 @@ def main(config: ExperimentConfig) -> None:
         DataError: no videos, too few demonstrations, or none with actions.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.baselines.lapo.load import MODEL, NAME, given_model, sizes_of
+    from playslot_rl.baselines.lapo.load import MODEL, NAME, sizes_of
     from playslot_rl.data.demonstrations import require_labelled
-    from playslot_rl.storage.checkpoints import StageCheckpoint
+    from playslot_rl.storage.checkpoints import (
+        StageCheckpoint,
+        checkpoint_folder,
+        read_stage,
+        require_config,
+        require_whole,
+    )
     from playslot_rl.training.record import StageRecord, run_stage
-    from playslot_rl.training.runs import adopt_stage
+    from playslot_rl.training.runs import adopt_stage, run_folder
 
     run, own, parents = open_run(config), config.baselines.lapo, dict[str, StageCheckpoint]()
     stored = {
@@ -60,7 +66,14 @@ def main(config: ExperimentConfig) -> None:
     )
     record.data.require_actions(config.env.action_dim)
     require_labelled(config.behaviour.labelled_demos, record.data.episodes)  # before anything is computed
-    parents[MODEL] = given_model(own, config.env.image_size, run) if own.world else train_model(config, run)
+    if own.world:
+        model = read_stage(checkpoint_folder(run_folder(own.world), MODEL), MODEL)
+        require_whole(model)
+        require_parent(config, run, model, "image_size")
+        require_config(model, {NAME: sizes_of(own)})
+    else:
+        model = train_model(config, run)
+    parents[MODEL] = model
     run_stage(record, lambda: _training(config, record))
 
 
