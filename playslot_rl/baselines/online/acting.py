@@ -119,7 +119,8 @@ def play(
     outcomes = run_episodes(
         pool, actor, seeds, look_on, stop=False, see_last=True, draw=False, stride=stride, lockstep=len(seeds)
     )
-    received, frames = np.stack(rewards), torch.stack(kept, 1)
+    received = np.stack(rewards)
+    frames: TensorDictBase = torch.stack(kept, 1)
     first = torch.zeros(*frames.batch_size, 1, dtype=torch.bool)
     last = first.clone()
     first[:, 0], last[:, -1] = True, True
