@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from playslot_rl.config import DataConfig, ExperimentConfig, from_dict
 from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import ConfigError
-from playslot_rl.recipes.run import open_videos
 
 if TYPE_CHECKING:
     from playslot_rl.comparison.plan import Job
@@ -83,6 +82,7 @@ def _known(config: ExperimentConfig) -> DataConfig:
 
 def _check_demos(config: ExperimentConfig, out: Path) -> None:
     from playslot_rl.comparison.plan import check_demos, uses_demos
+    from playslot_rl.training.record import open_videos
 
     if uses_demos(config) and (config.data.demos or _recorded(out)):
         where = config.data.demos or str(out / RECORDED)
@@ -123,6 +123,7 @@ class Parents:
     def __init__(self, config: ExperimentConfig, out: Path) -> None:
         from playslot_rl.comparison.plan import uses_demos, uses_slots
         from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+        from playslot_rl.training.record import open_videos
         from playslot_rl.training.runs import world_model_checkpoints
 
         stages = world_model_checkpoints(config.run).items() if uses_slots(config) else ()

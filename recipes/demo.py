@@ -10,7 +10,7 @@ from playslot_rl.episode_seeds import LARGEST_SEED
 from playslot_rl.errors import ConfigError
 from playslot_rl.recipes import evaluate, train_policy
 from playslot_rl.recipes.pipeline import collect_demos
-from playslot_rl.recipes.run import open_run, parent_run, store_config
+from playslot_rl.recipes.run import open_run, parent_run
 
 FIRST_SEED = 7
 """Added to `seed`: the shipped model was trained on videos of the base seeds 0 and 1, and the demo sees new ones."""
@@ -19,7 +19,7 @@ FIRST_SEED = 7
 def main(config: ExperimentConfig) -> None:
     """Collect demonstrations, train policy and decoder, evaluate under both protocols, write the report."""
     from playslot_rl.envs import gym_id
-    from playslot_rl.training.runs import world_model_checkpoints
+    from playslot_rl.training.runs import store_config, world_model_checkpoints
 
     began = time.monotonic()
     gym_id(config.env.name)  # one without a simulator is refused before anything is written

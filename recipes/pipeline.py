@@ -9,7 +9,7 @@ from pathlib import Path
 from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.envs import PROCEDURAL, gym_id
 from playslot_rl.recipes import evaluate, train_dynamics, train_policy, train_slots
-from playslot_rl.recipes.run import open_run, store_config
+from playslot_rl.recipes.run import open_run
 
 
 def main(config: ExperimentConfig) -> None:
@@ -18,6 +18,8 @@ def main(config: ExperimentConfig) -> None:
     With `data.root` set nothing is collected but missing demonstrations (`data.demos`). Where nothing can be acted on
     (GridShapes) there are neither demonstrations nor a policy, and slots and latent actions are scored instead.
     """
+    from playslot_rl.training.runs import store_config
+
     began = time.monotonic()
     behaves = config.env.name not in PROCEDURAL
     if behaves:
@@ -38,15 +40,8 @@ def main(config: ExperimentConfig) -> None:
 
 def _collect(config: ExperimentConfig, folder: Path) -> DataConfig:
     """Record what is missing; returns where the data are."""
-    from playslot_rl.collectors import collect
-
-    if config.env.name in PROCEDURAL:
-        if config.data.root:
-            return config.data
-        random, want = folder / "data" / "random", config.collect
-        collect(config, "random", want.random_episodes, want.random_steps, random, config.seed, config.workers)
-        return replace(config.data, root=str(random))
-    config = replace(config, data=collect_demos(config, folder))
+    if config.env.name not in PROCEDURAL:
+        config = replace(config, data=collect_demos(config, folder))
     return config.data if config.data.root else collect_videos(config, folder)
 
 
@@ -74,6 +69,8 @@ def collect_videos(config: ExperimentConfig, folder: Path) -> DataConfig:
 
     random, want = folder / "data" / "random", config.collect
     collect(config, "random", want.random_episodes, want.random_steps, random, config.seed, config.workers)
+    if config.env.name in PROCEDURAL:
+        return replace(config.data, root=str(random))
     roots = [str(random)]
     if want.noisy_episodes:
         # Random actions never reach the object. Videos of a noisy expert (no action is read from them) show the world

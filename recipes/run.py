@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import SHIPPED, shipped
-from playslot_rl.errors import ConfigError, DataError, OutputError
+from playslot_rl.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from playslot_rl.data.demonstrations import DemonstrationSplit
     from playslot_rl.data.source import EpisodeFrames
     from playslot_rl.modules.savi import SAVi
+    from playslot_rl.storage.checkpoints import StageCheckpoint
 
     ParsedVideos = tuple[EpisodeFrames, npt.NDArray[np.float32]]
 
@@ -55,17 +56,6 @@ def _is_run(folder: Path) -> bool:
     return bool(collected) or any((folder / known).exists() for known in OURS)
 
 
-def store_config(config: ExperimentConfig, folder: Path) -> None:
-    """Write the run's config. Called when everything fits, so that a refused command leaves the stored one as it was.
-
-    Raises:
-        OutputError: the folder cannot be written.
-    """
-    from playslot_rl.storage.atomic import write_json
-
-    write_json(folder / "config.json", to_dict(config))
-
-
 def open_device(config: ExperimentConfig) -> torch.device:
     """The device that computes, after setting threads and the allocator.
 
@@ -87,47 +77,6 @@ def open_device(config: ExperimentConfig) -> torch.device:
     return device
 
 
-def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrames:
-    """Open the data sets of a stage; of `data.demos` among several, not the demonstrations that are held out.
-
-    Raises:
-        DataError: none is named, or one cannot be read.
-    """
-    from playslot_rl.data.demonstrations import episode_range
-    from playslot_rl.data.source import concatenate, open_sources
-
-    def opened(root: str) -> EpisodeFrames:
-        size, resize = config.env.image_size, config.data.resize
-        return open_sources(root, config.data.camera, config.data.cache, image_size=size, resize=resize)
-
-    if not roots:
-        raise DataError(f"{what}: got no data set, expected data.root=DIR; record one by `playslot collect`")
-    names = [name.strip() for name in roots.split(",")]
-    if not config.data.held_out or config.data.demos not in names or len(names) == 1:
-        return opened(roots)
-    parts = {name: opened(name) for name in names}
-    demos = parts[config.data.demos]
-    parts[config.data.demos] = episode_range(demos, 0, demos.episodes - config.data.held_out)
-    return concatenate([parts[name] for name in names])
-
-
-def demo_root(config: ExperimentConfig) -> str:
-    """Data set of the demonstrations: `data.demos`, or else `data.root`."""
-    return config.data.demos or config.data.root
-
-
-def open_demonstrations(config: ExperimentConfig, what: str) -> DemonstrationSplit:
-    """The demonstrations a stage trains on, and those that only measure.
-
-    Raises:
-        DataError: none are named, they cannot be read, or there are fewer than `demos`.
-    """
-    from playslot_rl.data.demonstrations import split_demonstrations
-
-    videos = open_videos(config, demo_root(config), what)
-    return split_demonstrations(videos, config.demos, config.data.held_out, config.collect.validation_episodes)
-
-
 def demonstration_views(
     config: ExperimentConfig, demos: DemonstrationSplit, savi: SAVi, slots_print: str
 ) -> tuple[list[ParsedVideos], list[ParsedVideos]]:
@@ -140,7 +89,7 @@ def demonstration_views(
         savi: parses the frames, on its device.
         slots_print: fingerprint of SAVi's checkpoint.
     """
-    from playslot_rl.data.shifted import shifted_copies
+    from playslot_rl.data.demonstrations import shifted_copies
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.world_model import module_device
 
@@ -160,3 +109,16 @@ def held_out_text(demos: DemonstrationSplit) -> str:
 def parent_run(config: ExperimentConfig, folder: Path) -> str:
     """Where a stage finds its parents: `run` if given (`pretrained` is the task's own), else the folder it writes."""
     return f"{SHIPPED}/{config.env.name}" if config.run == SHIPPED else config.run or str(folder)
+
+
+def require_parent(config: ExperimentConfig, run: Path, parent: StageCheckpoint, *sizes: str) -> None:
+    """Check that a parent is of the task's `image_size` or `action_dim`, and that `run` can build on it.
+
+    Raises:
+        CheckpointError: it is of others, or `run` has another one of its own.
+    """
+    from playslot_rl.storage.checkpoints import require_config
+    from playslot_rl.training.runs import require_adoptable
+
+    require_adoptable(parent, run)
+    require_config(parent, {"env": {key: getattr(config.env, key) for key in sizes}})

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
-from playslot_rl.config import ExperimentConfig, ModelConfig, to_dict
-from playslot_rl.recipes.run import open_device, open_run, open_videos, parent_run, store_config
-
-if TYPE_CHECKING:
-    from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.recipes.run import open_device, open_run, parent_run, require_parent
 
 
 def main(config: ExperimentConfig) -> None:
@@ -20,59 +17,44 @@ def main(config: ExperimentConfig) -> None:
         CheckpointError: no finished slots stage, or the run was begun otherwise.
         DataError, OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config
-    from playslot_rl.training.record import StageRecord, run_stage
-    from playslot_rl.training.runs import adopt_stage, require_adoptable, run_folder, stage_model
+    from playslot_rl.data.slot_cache import slot_cache
+    from playslot_rl.seeding import global_seed
+    from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
+    from playslot_rl.training.fit import Part
+    from playslot_rl.training.record import StageRecord, Training, run_stage
+    from playslot_rl.training.runs import adopt_stage, run_folder, stage_model
+    from playslot_rl.training.stage_dynamics import DynamicsStage
+    from playslot_rl.world_model import WorldModel
 
     run = open_run(config)
     slots = read_stage(checkpoint_folder(run_folder(parent_run(config, run)), "slots"), "slots")
-    require_config(slots, {"env": {"image_size": config.env.image_size}})
-    require_adoptable(slots, run)
+    require_parent(config, run, slots, "image_size")
     model = replace(config.model, savi=stage_model(slots)[0].savi)
-
-    def ready() -> None:
-        adopt_stage(slots, run)
-        store_config(config, run)
-
     record = StageRecord(
         "dynamics",
         run,
         config,
         stored={"env": to_dict(config.env), "model": to_dict(model), "dynamics": to_dict(config.dynamics)},
         counts=("model.inverse_dynamics", "model.predictor"),
-        identity={"data.validation": config.data.validation},
         parents={"slots": slots},
-        open_data=partial(open_videos, config, config.data.root, "train-dynamics"),
-        named=bool(config.data.root),
-        ready=ready,
+        ready=partial(adopt_stage, slots, run),
     )
-    run_stage(record, partial(_training, config, record, model))
 
+    def prepare() -> Training:
+        device, source, own = open_device(config), record.data, config.dynamics
+        with global_seed(config.seed, 0, "dynamics"):
+            world = WorldModel(model, config.env)
+        load_weights(slots, {"savi": world.savi})
+        world.to(device)
+        cached = slot_cache(source, world.savi, slots.fingerprint, config.data.cache, device, config.logging.progress)
+        clips = record.clips(own.seed_frames + own.predicted_frames)
+        stage = DynamicsStage(world, clips, cached, own)
+        return Training([Part("dynamics", stage, own)], device, said, extra={"episodes": source.episodes})
 
-def _training(config: ExperimentConfig, record: StageRecord, model: ModelConfig) -> Training:
-    from playslot_rl.data.slot_cache import slot_cache
-    from playslot_rl.seeding import global_seed
-    from playslot_rl.storage.checkpoints import load_weights
-    from playslot_rl.training.fit import Part
-    from playslot_rl.training.record import Training
-    from playslot_rl.training.stage_dynamics import DynamicsStage
-    from playslot_rl.world_model import WorldModel
-
-    device, source, slots = open_device(config), record.data, record.parents["slots"]
-    with global_seed(config.seed, 0, "dynamics"):
-        world = WorldModel(model, config.env)
-    load_weights(slots, {"savi": world.savi})
-    world.to(device)
-    cached = slot_cache(source, world.savi, slots.fingerprint, config.data.cache, device, config.logging.progress)
-    stage = DynamicsStage(
-        world, source, cached, config.dynamics, validation=config.data.validation, seed=config.seed, device=device
-    )
-    return Training(
-        [Part("dynamics", stage, config.dynamics)],
-        device,
-        lambda metrics: (
+    def said(metrics: Mapping[str, float]) -> str:
+        return (
             f"dynamics: {metrics.get('psnr', float('nan')):.2f} dB on held-out rollouts, "
             f"code perplexity {metrics.get('perplexity', float('nan')):.1f}, {record.folder}"
-        ),
-        extra={"episodes": source.episodes},
-    )
+        )
+
+    run_stage(record, prepare)

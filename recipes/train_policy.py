@@ -5,27 +5,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache, partial
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
-    demo_root,
     demonstration_views,
     held_out_text,
-    open_demonstrations,
     open_device,
     open_run,
     parent_run,
-    store_config,
+    require_parent,
 )
 
 if TYPE_CHECKING:
-    from playslot_rl.data.demonstrations import DemonstrationSplit
-    from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import StageRecord, Training
 
@@ -39,19 +34,15 @@ def main(config: ExperimentConfig) -> None:
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
     from playslot_rl.training.record import StageRecord, run_stage
-    from playslot_rl.training.runs import use_world_model, world_model_config
+    from playslot_rl.training.runs import use_world_model, world_model_checkpoints, world_model_config
 
     run = open_run(config)
     parent = parent_run(config, run)
-    parents = _world_model_of(config, parent, run)
+    parents = world_model_checkpoints(parent)
+    for checkpoint in parents.values():
+        require_parent(config, run, checkpoint, "image_size", "action_dim")
     model, env = world_model_config(parents)
     sizes = to_dict(replace(model, policy=config.model.policy, action_decoder=config.model.action_decoder))
-    demos = cache(partial(open_demonstrations, config, "train-policy"))
-
-    def ready() -> None:
-        use_world_model(run, parent)
-        store_config(config, run)
-
     record = StageRecord(
         "policy",
         run,
@@ -60,17 +51,13 @@ def main(config: ExperimentConfig) -> None:
         counts=("model.policy", "model.action_decoder"),
         identity={"model": sizes},
         parents=parents,
-        open_data=lambda: demos().trained,
-        named=bool(demo_root(config)),
         role="demos",
-        ready=ready,
+        ready=partial(use_world_model, run, parent),
     )
-    run_stage(record, lambda: _training(config, record, parent, demos))
+    run_stage(record, lambda: _training(config, record, parent))
 
 
-def _training(
-    config: ExperimentConfig, record: StageRecord, parent: str, opened: Callable[[], DemonstrationSplit]
-) -> Training:
+def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Training:
     """The frozen world model's view of the demonstrations; fresh policy, oracle and decoder on top of it."""
     from playslot_rl.data.demonstrations import label_demonstrations, require_labelled, with_copies
     from playslot_rl.seeding import global_seed
@@ -80,7 +67,7 @@ def _training(
     from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage
     from playslot_rl.world_model import Agent
 
-    device, split, behaviour = open_device(config), opened(), config.behaviour
+    device, split, behaviour = open_device(config), record.demos, config.behaviour
     require_labelled(behaviour.labelled_demos, split.trained.episodes)  # before anything is computed
     world = load_world_model(parent, device)
     world.config = replace(world.config, policy=config.model.policy, action_decoder=config.model.action_decoder)
@@ -113,19 +100,6 @@ def _training(
             "demos": len(demos.lengths),
             "labelled_demos": behaviour.labelled_demos,
             "held_out_demos": 0 if held_out is None else len(held_out.lengths),
-            "data_root": demo_root(config),
+            "data_root": record.roots,
         },
     )
-
-
-def _world_model_of(config: ExperimentConfig, parent: str | Path, run: Path) -> dict[str, StageCheckpoint]:
-    """The world model's checkpoints: whole, of this task's frames and actions, and fit for `run`."""
-    from playslot_rl.storage.checkpoints import require_config
-    from playslot_rl.training.runs import require_adoptable, world_model_checkpoints
-
-    parents = world_model_checkpoints(parent)
-    for checkpoint in parents.values():
-        require_adoptable(checkpoint, run)
-        env = {"image_size": config.env.image_size, "action_dim": config.env.action_dim}
-        require_config(checkpoint, {"env": env})
-    return parents

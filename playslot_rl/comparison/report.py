@@ -22,8 +22,7 @@ from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
 from playslot_rl.evaluation.success import hardware, run_references
 from playslot_rl.storage.atomic import write_bytes, write_json, write_text
-from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
-from playslot_rl.storage.provenance import provenance
+from playslot_rl.storage.checkpoints import checkpoint_folder, provenance, read_stage
 from playslot_rl.training.runs import world_model_checkpoints, world_model_folder
 from playslot_rl.visualization.charts import LIGHT, figure_bytes
 

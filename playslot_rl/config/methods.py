@@ -45,8 +45,8 @@ METHODS: Final[dict[str, Method]] = {
         aliases=("ResNet",),
     ),
     "lapo": Method("LAPO", "baselines.lapo", "playslot_rl.baselines.lapo.load:load_actor"),
-    "dreamer": Method("DreamerV3", "baselines.dreamer", "playslot_rl.baselines.dreamer.actor:load_actor", online=True),
-    "sold": Method("SOLD", "baselines.sold", "playslot_rl.baselines.sold.actor:load_actor", online=True, slots=True),
+    "dreamer": Method("DreamerV3", "baselines.online", "playslot_rl.baselines.dreamer.actor:load_actor", online=True),
+    "sold": Method("SOLD", "baselines.online", "playslot_rl.baselines.sold.actor:load_actor", online=True, slots=True),
 }
 
 

@@ -101,7 +101,7 @@ class BehaviourStageConfig(StageConfig):
             paper); slots have a standard deviation of about 0.7, and a prediction is about 0.03 off.
         shift: policy, oracle and decoder also learn from copies of the demonstrations moved by so many pixels, with the
             same actions (0 in the paper, none): from ten demonstrations a policy learns where it has been.
-        shifted_copies: how many, of the eight directions (`playslot_rl.data.shifted.DIRECTIONS`).
+        shifted_copies: how many, of the eight directions (`playslot_rl.data.demonstrations.DIRECTIONS`).
         decoder_inputs: `inverse_dynamics` (InvDyn's latents; paper), `policy` (the policy's outputs) or `both`.
         decoder_steps: optimiser steps of the action decoder.
         decoder_lr: its base learning rate; the rest of `optim` is shared.

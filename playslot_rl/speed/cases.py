@@ -21,7 +21,7 @@ from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.predictors.cocvp import COCVP
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.modules.savi.decoder import BroadcastDecoder
-from playslot_rl.training.optim import build_adam, clip_gradients, trainable_parameters
+from playslot_rl.training.fit import build_adam, clip_gradients, trainable_parameters
 
 Case = Literal["savi_step", "dynamics_step", "rollout_cache"]
 

@@ -6,19 +6,23 @@ A child names its parents by the fingerprints of their weights and refuses any o
 
 from __future__ import annotations
 
-import json
+import os
+import platform
+import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import nn
 
+from playslot_rl.config.plain import flatten
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.folders import new_folder
-from playslot_rl.storage.provenance import provenance
-from playslot_rl.storage.resume import first_difference
+from playslot_rl.storage.resume import first_difference, read_json
 from playslot_rl.storage.tensors import (
     load_modules,
     load_tensors,
@@ -144,16 +148,6 @@ def read_stage(path: Path, stage: str) -> StageCheckpoint:
     return StageCheckpoint(path, stage, config, meta, weights_fingerprint(weights))
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    try:
-        values = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path} is damaged ({error}), expected a JSON object: train that stage again") from error
-    if not isinstance(values, dict):
-        raise CheckpointError(f"{path}: got {type(values).__name__}, expected a JSON object: train that stage again")
-    return values
-
-
 def load_weights(checkpoint: StageCheckpoint, modules: Mapping[str, nn.Module]) -> None:
     """Load a finished stage into freshly built modules, in place.
 
@@ -200,7 +194,8 @@ def require_config(checkpoint: StageCheckpoint, wanted: Mapping[str, Any]) -> No
     Raises:
         CheckpointError: names the first key that differs.
     """
-    difference = first_difference(_restrict(checkpoint.config, wanted), wanted)
+    stored, keys = flatten(checkpoint.config), flatten(wanted).keys()
+    difference = first_difference({key: stored[key] for key in stored.keys() & keys}, wanted)
     if difference is not None:
         key, old, new = difference
         raise CheckpointError(
@@ -209,11 +204,33 @@ def require_config(checkpoint: StageCheckpoint, wanted: Mapping[str, Any]) -> No
         )
 
 
-def _restrict(values: Any, pattern: Mapping[str, Any]) -> dict[str, Any]:
+def provenance() -> dict[str, Any]:
+    """What made a checkpoint: version, commit, command line, Python, torch and processor."""
+    from playslot_rl import __version__
+
     return {
-        key: _restrict(values[key], part)
-        if isinstance(part, Mapping) and isinstance(values[key], Mapping)
-        else values[key]
-        for key, part in pattern.items()
-        if isinstance(values, Mapping) and key in values
+        "version": __version__,
+        "commit": source_commit(),
+        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else "",
     }
+
+
+def source_commit() -> str:
+    """Commit of this source tree, with `-dirty` if it has changes; empty where it is no git checkout."""
+    folder = Path(__file__).resolve().parents[1]
+    if not (folder.parent / ".git").exists():
+        return ""
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=20)
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    try:
+        commit = git("rev-parse", "HEAD")
+        return f"{commit}-dirty" if commit and git("status", "--porcelain", "--untracked-files=no") else commit
+    except (OSError, subprocess.TimeoutExpired):
+        return ""

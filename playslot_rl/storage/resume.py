@@ -2,13 +2,16 @@
 
 A folder appears by one rename after everything in it is on the disk, so the newest one is always good. The newest two
 are kept. No RNG state is stored: every draw is a function of the seed and the step (`seeding`).
+
+Note: optimisers are not stored by torch.distributed's `get_optimizer_state_dict`: where a parameter never had a
+gradient it steps with zeros to make a state, which a resumed run would then have and an uninterrupted one would not.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -20,7 +23,6 @@ from playslot_rl.config.plain import flatten
 from playslot_rl.errors import CheckpointError, OutputError
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.folders import new_folder
-from playslot_rl.storage.optimizers import optimizer_tensors, restore_optimizer
 from playslot_rl.storage.tensors import load_modules, load_tensors, module_tensors, save_tensors
 
 FORMAT = "playslot_rl.training/1"
@@ -134,11 +136,24 @@ class TrainingCheckpoints:
             CheckpointError: the config differs from the stored one, or the checkpoint is damaged.
             OutputError: a file stands where the folder should be.
         """
-        self._tidy()
+        if self.folder.exists() and not self.folder.is_dir():
+            raise OutputError(f"{self.folder} is a file, expected a folder of checkpoints: use another out=")
+        # A killed process leaves its unfinished folder; no one else writes here.
+        for leftover in self.folder.glob(".step_*.tmp-*"):
+            shutil.rmtree(leftover, ignore_errors=True)
         last = self.last()
         if last is None:
             return None
-        stored = self._read(last)
+        path, cure = last / "state.json", f"delete {last.name} to resume from the checkpoint before it"
+        stored = read_json(path, cure)
+        if stored.get("format", FORMAT) != FORMAT:
+            raise CheckpointError(
+                f"{last}: got format {stored['format']!r}, expected {FORMAT!r}: "
+                "use the version of playslot_rl that wrote it, or another out="
+            )
+        missing = {"format", "step", "seconds", "metrics", "identity"} - stored.keys()
+        if missing:
+            raise CheckpointError(f"{path} is damaged (no {', '.join(sorted(missing))}): {cure}")
         difference = first_difference(stored["identity"], self.identity)
         if difference is not None:
             key, old, new = difference
@@ -148,27 +163,70 @@ class TrainingCheckpoints:
             )
         return last, stored
 
-    def _tidy(self) -> None:
-        if self.folder.exists() and not self.folder.is_dir():
-            raise OutputError(f"{self.folder} is a file, expected a folder of checkpoints: use another out=")
-        # A killed process leaves its unfinished folder; no one else writes here.
-        for leftover in self.folder.glob(".step_*.tmp-*"):
-            shutil.rmtree(leftover, ignore_errors=True)
 
-    @staticmethod
-    def _read(path: Path) -> dict[str, Any]:
-        try:
-            stored: dict[str, Any] = json.loads((path / "state.json").read_text())
-            if stored["format"] != FORMAT:
-                raise CheckpointError(
-                    f"{path}: got format {stored['format']!r}, expected {FORMAT!r}: "
-                    "use the version of playslot_rl that wrote it, or another out="
-                )
-            if not {"step", "seconds", "metrics", "identity"} <= stored.keys():
-                raise KeyError("step, seconds, metrics or identity")
-        except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
+def read_json(path: Path, cure: str = "train that stage again") -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        CheckpointError: it is missing or damaged; ends with the `cure`.
+    """
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path} is damaged ({error}), expected a JSON object: {cure}") from error
+    if not isinstance(values, dict):
+        raise CheckpointError(f"{path} is damaged ({type(values).__name__}), expected a JSON object: {cure}")
+    return values
+
+
+def optimizer_tensors(optimizer: torch.optim.Optimizer, names: Sequence[str] = ()) -> dict[str, Tensor]:
+    """State as `PARAMETER/STATE` tensors, and `groupI/step` of groups that count their steps themselves.
+
+    Parameters that never had a gradient have none.
+
+    Args:
+        optimizer: any that keeps tensors and numbers by parameter.
+        names: of its parameters, in its order; empty takes their numbers.
+    """
+    stored = optimizer.state_dict()
+    tensors = {
+        f"{names[index] if names else index}/{key}": torch.as_tensor(value)
+        for index, values in stored["state"].items()
+        for key, value in values.items()
+    }
+    counted = {f"group{index}/step": group["step"] for index, group in enumerate(stored["param_groups"])
+               if "step" in group}  # fmt: skip
+    return tensors | {key: torch.tensor(value) for key, value in counted.items()}
+
+
+def restore_optimizer(
+    optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], where: str, names: Sequence[str] = ()
+) -> None:
+    """Put `optimizer_tensors` back; settings such as the learning rate stay those of `optimizer`.
+
+    Raises:
+        CheckpointError: a tensor is unexpected, missing, or of another shape.
+    """
+    groups = optimizer.state_dict()["param_groups"]
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    index = {name: i for i, name in enumerate(names or map(str, range(len(parameters))))}
+    state: dict[int, dict[str, Tensor]] = {}
+    counters = {f"group{i}/step": group for i, group in enumerate(groups) if "step" in group}
+    for key, value in tensors.items():
+        owner, _, what = key.rpartition("/")
+        if key in counters:
+            counters[key]["step"] = int(value)
+            continue
+        if owner not in index:
+            raise CheckpointError(f"{where} holds the unexpected tensor {key}: use another out= or delete it")
+        shape = () if what == "step" else tuple(parameters[index[owner]].shape)
+        if tuple(value.shape) != shape:
             raise CheckpointError(
-                f"{path}/state.json is damaged ({error}), expected a whole JSON file: delete {path.name} to resume "
-                "from the checkpoint before it"
-            ) from error
-        return stored
+                f"{where}: {key} has shape {tuple(value.shape)}, expected {shape}: delete that folder"
+            )
+        state.setdefault(index[owner], {})[what] = value
+    expected = sorted({what for values in state.values() for what in values})
+    for owner, i in index.items():
+        if i in state and len(state[i]) < len(expected):
+            raise CheckpointError(f"{where} misses a tensor of {owner}, expected {', '.join(expected)}: delete it")
+    optimizer.load_state_dict({"state": state, "param_groups": groups})

@@ -16,13 +16,12 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.config import LoggingConfig, StageConfig, to_dict
+from playslot_rl.config import LoggingConfig, OptimConfig, StageConfig, to_dict
 from playslot_rl.config.roles import fixed_keys
 from playslot_rl.progress import StageProgress
 from playslot_rl.seeding import StepGenerators, global_seed
 from playslot_rl.storage.resume import TrainingCheckpoints, TrainingState
-from playslot_rl.training.optim import build_adam, clip_gradients, learning_rate, trainable_parameters
-from playslot_rl.training.watch import Watch, finite
+from playslot_rl.training.logging import Watch, finite
 
 
 class Stage(Protocol):
@@ -60,23 +59,6 @@ class Part:
     identity: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class FitResult:
-    """What `fit` did.
-
-    Attributes:
-        step: finished steps.
-        resumed_from: step this process started at; equal to `step` if there was nothing left to do.
-        seconds: wall-clock seconds of all steps, over all processes.
-        metrics: the last validation.
-    """
-
-    step: int
-    resumed_from: int
-    seconds: float
-    metrics: dict[str, float]
-
-
 def fit(
     part: Part,
     folder: Path,
@@ -86,7 +68,7 @@ def fit(
     logging: LoggingConfig | None = None,
     identity: Mapping[str, Any] | None = None,
     ready: Callable[[], None] | None = None,
-) -> FitResult:
+) -> tuple[TrainingState, int]:
     """Train to `part.config.steps`, carrying on from the newest checkpoint if there is one.
 
     Writes `checkpoints/step_*`, `logs/` and `metrics.jsonl` in the part's folder, nothing else.
@@ -99,6 +81,9 @@ def fit(
         logging: backend and progress bar; None logs to `metrics.jsonl` only, silently.
         identity: further plain values a resumed run must share (model config, data and parent fingerprints).
         ready: called once, before the first step, when a stage begun before was found to be the same.
+
+    Returns:
+        Where it ended, and the step this process started at: the same if there was nothing left to do.
 
     Raises:
         TrainingError: a loss or gradient is not finite; the last good checkpoint stays.
@@ -117,7 +102,7 @@ def fit(
         with run.watch.running(logging, start), progress:
             for step in range(start, config.steps):
                 run.advance(step, progress)
-    return FitResult(run.state.step, start, run.state.seconds, run.state.metrics)
+    return run.state, start
 
 
 class _Run:
@@ -190,3 +175,40 @@ class _Run:
 
     def _log(self, split: str, step: int, values: Mapping[str, float]) -> None:
         self.watch.log(split, step, {**values, "seconds": round(self.state.seconds, 3)}, at=step)
+
+
+def learning_rate(config: OptimConfig, step: int, steps: int) -> float:
+    """Learning rate of step `step` (from 0) of `steps`: linear warm-up, then constant or cosine to zero.
+
+    Example:
+        >>> [learning_rate(OptimConfig(lr=1.0, warmup_steps=2), s, 4) for s in range(4)]
+        [0.5, 1.0, 1.0, 0.5]
+    """
+    if step < config.warmup_steps:
+        return config.lr * (step + 1) / config.warmup_steps
+    if config.schedule == "constant":
+        return config.lr
+    done = (step - config.warmup_steps) / max(1, steps - config.warmup_steps)
+    return config.lr * 0.5 * (1.0 + math.cos(math.pi * min(1.0, done)))
+
+
+def trainable_parameters(modules: Mapping[str, nn.Module]) -> dict[str, nn.Parameter]:
+    """Parameters with gradients by their full name, in a fixed order."""
+    return {
+        f"{name}.{key}": parameter
+        for name, module in modules.items()
+        for key, parameter in module.named_parameters()
+        if parameter.requires_grad
+    }
+
+
+def build_adam(parameters: Mapping[str, nn.Parameter], config: OptimConfig) -> torch.optim.Adam:
+    """Adam over `parameters`, fused: one kernel for all tensors, on CPU and GPU alike."""
+    if not parameters:
+        raise ValueError("got no trainable parameters, expected at least one: a stage's modules must not be frozen")
+    return torch.optim.Adam(list(parameters.values()), lr=config.lr, fused=True)
+
+
+def clip_gradients(parameters: Mapping[str, nn.Parameter], maximum: float) -> Tensor:
+    """Clip the gradient norm in place (0: leave it) and return the norm before clipping, a scalar tensor."""
+    return nn.utils.clip_grad_norm_(parameters.values(), maximum if maximum > 0 else math.inf)

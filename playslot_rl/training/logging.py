@@ -1,27 +1,26 @@
-"""Where a stage's numbers go: `metrics.jsonl` always, and TensorBoard, Weights & Biases or trackio by a setting."""
+"""What every training loop does beside learning: where its numbers go, and one line for what goes wrong.
+
+Numbers go to `metrics.jsonl` always, and to TensorBoard, Weights & Biases or trackio by a setting.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
+
+from torch import nn
 
 from playslot_rl.config import LoggingConfig
-from playslot_rl.errors import ConfigError
+from playslot_rl.errors import ConfigError, TrainingError
 from playslot_rl.storage.atomic import explain_write_errors, write_text
-
-
-class MetricLogger(Protocol):
-    """A logging backend."""
-
-    def log(self, values: Mapping[str, float], step: int) -> None:
-        """Record named numbers at a step."""
-
-    def close(self) -> None:
-        """Flush and release."""
+from playslot_rl.storage.resume import TrainingCheckpoints
+from playslot_rl.storage.tensors import module_tensors
 
 
 class History:
@@ -58,14 +57,6 @@ class History:
             file.write(json.dumps({"step": step, "split": split, **values}) + "\n")
 
 
-class _NoLogger:
-    def log(self, values: Mapping[str, float], step: int) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
-
-
 class _TensorBoardLogger:
     def __init__(self, folder: Path, resumed: int) -> None:
         from torch.utils.tensorboard import SummaryWriter
@@ -94,18 +85,8 @@ class _RunLogger:
         self._module.finish()
 
 
-def _optional(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ConfigError(
-            f"logging.backend={name}: the package {name} is not installed; install it by "
-            f"`pip install 'playslot_rl[{name}]'`, or use logging.backend=tensorboard"
-        ) from error
-
-
-def open_logger(config: LoggingConfig, folder: Path, name: str, resumed: int = 0) -> MetricLogger:
-    """Open a backend.
+def open_logger(config: LoggingConfig, folder: Path, name: str, resumed: int) -> _TensorBoardLogger | _RunLogger | None:
+    """Open a backend; None where there is none.
 
     Args:
         config: the backend and its project.
@@ -117,13 +98,99 @@ def open_logger(config: LoggingConfig, folder: Path, name: str, resumed: int = 0
         ConfigError: the backend's package is not installed.
     """
     if config.backend == "none":
-        return _NoLogger()
+        return None
     folder.mkdir(parents=True, exist_ok=True)
     if config.backend == "tensorboard":
         return _TensorBoardLogger(folder, resumed)
-    module = _optional(config.backend)
+    try:
+        module = importlib.import_module(config.backend)
+    except ImportError as error:
+        raise ConfigError(
+            f"logging.backend={config.backend}: the package {config.backend} is not installed; install it by "
+            f"`pip install 'playslot_rl[{config.backend}]'`, or use logging.backend=tensorboard"
+        ) from error
     run_name = f"{folder.resolve().parent.parent.name}-{name}"
     settings: dict[str, Any] = {"project": config.project, "name": run_name, "resume": "allow"}
     if config.backend == "wandb":
         settings |= {"dir": str(folder), "id": run_name, "mode": os.environ.get("WANDB_MODE", "online")}
     return _RunLogger(module, settings)
+
+
+def finite(values: Mapping[str, float]) -> dict[str, float]:
+    """JSON has no NaN; a number that could not be computed is left out, never invented."""
+    return {key: value for key, value in values.items() if math.isfinite(value)}
+
+
+class Watch:
+    """The numbers and the errors of one training.
+
+    Args:
+        name: the training, for messages and logs.
+        folder: gets `metrics.jsonl` and `logs/`.
+        checkpoints: of the training.
+        cure: what to try where a number is not finite.
+    """
+
+    def __init__(self, name: str, folder: Path, checkpoints: TrainingCheckpoints, cure: str) -> None:
+        self.name, self.folder, self.checkpoints, self.cure = name, folder, checkpoints, cure
+        self.history = History(folder / "metrics.jsonl")
+        self._logger: _TensorBoardLogger | _RunLogger | None = None
+
+    @contextlib.contextmanager
+    def running(self, logging: LoggingConfig, start: int) -> Iterator[None]:
+        """Log to the backend, too, inside the block; an interrupt in it says where the same command carries on.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C, with that message.
+            ConfigError: the backend's package is not installed.
+        """
+        self._logger = open_logger(logging, self.folder / "logs", self.name, start)
+        try:
+            yield
+        except KeyboardInterrupt:
+            last = self.checkpoints.last()
+            where = f"step {int(last.name.removeprefix('step_'))} ({last})" if last else "the beginning"
+            raise KeyboardInterrupt(f"{self.name} interrupted; the same command carries on from {where}") from None
+        finally:
+            if self._logger is not None:
+                self._logger.close()
+
+    def log(self, split: str, step: int, values: Mapping[str, float], *, at: int | None) -> None:
+        """Record numbers.
+
+        Args:
+            split: `train`, `validation` or `acting`.
+            step: of `metrics.jsonl`.
+            values: their names and values; those that are not finite are left out.
+            at: step of the backend; None leaves it out.
+
+        Raises:
+            OutputError: full disk.
+        """
+        kept = finite(values)
+        self.history.append(split, step, kept)
+        if self._logger is not None and at is not None:
+            # Numbers that say when a line was written, the backends know.
+            named = {
+                f"{self.name}/{split}/{key}": value for key, value in kept.items() if key not in ("seconds", "updates")
+            }
+            self._logger.log(named, at)
+
+    def require_finite(self, modules: Mapping[str, nn.Module], when: str) -> None:
+        """A finite loss may still have made an infinite weight or buffer: never keep that as a good checkpoint.
+
+        Raises:
+            TrainingError: names the tensor.
+        """
+        for key, value in module_tensors(modules).items():
+            if value.is_floating_point() and not bool(value.isfinite().all()):
+                raise self.not_finite(key, "not finite", when)
+
+    def not_finite(self, what: str, got: str, when: str) -> TrainingError:
+        """The error of a number that is not finite."""
+        last = self.checkpoints.last()
+        kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
+        return TrainingError(
+            f"{self.name}: {what} is {got} at {when}, expected a finite number; {kept}; {self.cure}, "
+            "and use another out="
+        )

@@ -6,15 +6,17 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import nn
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.roles import fixed_keys
-from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.errors import CheckpointError
+from playslot_rl.data.demonstrations import DemonstrationSplit, episode_range, split_demonstrations
+from playslot_rl.data.source import EpisodeFrames, concatenate, open_sources
+from playslot_rl.data.windows import Clips
+from playslot_rl.errors import CheckpointError, DataError
 from playslot_rl.storage.checkpoints import (
     StageCheckpoint,
     checkpoint_folder,
@@ -22,8 +24,32 @@ from playslot_rl.storage.checkpoints import (
     require_config,
     require_parents,
     save_stage,
+    training_command,
 )
-from playslot_rl.training.fit import FitResult, Part, fit
+from playslot_rl.training.fit import Part, fit
+from playslot_rl.training.runs import store_config
+
+
+def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrames:
+    """Open the data sets of a stage; of `data.demos` among several, not the demonstrations that are held out.
+
+    Raises:
+        DataError: none is named, or one cannot be read.
+    """
+
+    def opened(root: str) -> EpisodeFrames:
+        size, resize = config.env.image_size, config.data.resize
+        return open_sources(root, config.data.camera, config.data.cache, image_size=size, resize=resize)
+
+    if not roots:
+        raise DataError(f"{what}: got no data set, expected data.root=DIR; record one by `playslot collect`")
+    names = [name.strip() for name in roots.split(",")]
+    if not config.data.held_out or config.data.demos not in names or len(names) == 1:
+        return opened(roots)
+    parts = {name: opened(name) for name in names}
+    demos = parts[config.data.demos]
+    parts[config.data.demos] = episode_range(demos, 0, demos.episodes - config.data.held_out)
+    return concatenate([parts[name] for name in names])
 
 
 @dataclass(frozen=True)
@@ -40,10 +66,9 @@ class StageRecord:
             those of `NAME` if None.
         identity: further plain values that a half-finished stage must share.
         parents: checkpoints it is trained on, by stage.
-        open_data: opens what it learns from; None for what learns by acting.
-        named: whether the command names that data set; a finished stage can be asked for without.
-        role: of the data set in the checkpoint (`train` or `demos`).
-        ready: called before the first step, when nothing speaks against it; until then nothing is written.
+        role: of the data set, in the checkpoint, too: videos (`train`) or demonstrations (`demos`); empty for what
+            learns by acting.
+        ready: called by `begin`; puts what the stage builds on into the run.
     """
 
     name: str
@@ -54,9 +79,7 @@ class StageRecord:
     settings: tuple[str, ...] | None = None
     identity: Mapping[str, Any] = field(default_factory=dict)
     parents: Mapping[str, StageCheckpoint] = field(default_factory=dict)
-    open_data: Callable[[], EpisodeFrames] | None = None
-    named: bool = True
-    role: str = "train"
+    role: Literal["train", "demos", ""] = "train"
     ready: Callable[[], None] = lambda: None
 
     @property
@@ -64,15 +87,43 @@ class StageRecord:
         """`RUN/NAME`."""
         return self.run / self.name
 
+    @property
+    def roots(self) -> str:
+        """The data sets that the command names, `data.demos` or else `data.root` for demonstrations; may be none."""
+        data = self.config.data
+        return (data.demos or data.root) if self.role == "demos" else data.root
+
     @cached_property
-    def data(self) -> EpisodeFrames:
-        """What the stage learns from.
+    def videos(self) -> EpisodeFrames:
+        """What the command names.
 
         Raises:
-            DataError: none is named, or it cannot be read.
+            DataError: nothing, or it cannot be read.
         """
-        assert self.open_data is not None
-        return self.open_data()
+        return open_videos(self.config, self.roots, training_command(self.name).partition(" ")[0])
+
+    @cached_property
+    def demos(self) -> DemonstrationSplit:
+        """The demonstrations a stage trains on, and those that only measure.
+
+        Raises:
+            DataError: none are named, they cannot be read, or there are fewer than `demos`.
+        """
+        config = self.config
+        return split_demonstrations(self.videos, config.demos, config.data.held_out, config.collect.validation_episodes)
+
+    def clips(self, frames: int, shown: int = 32) -> Clips:
+        """Clips of the videos, some of their episodes (`data.validation`) held out; `shown` of these at most validate.
+
+        Raises:
+            DataError: no episode has so many frames.
+        """
+        return Clips(self.videos, frames, self.config.data.validation, self.config.seed, shown)
+
+    @property
+    def data(self) -> EpisodeFrames:
+        """What the stage learns from."""
+        return self.demos.trained if self.role == "demos" else self.videos
 
     @cached_property
     def prints(self) -> dict[str, str]:
@@ -93,7 +144,7 @@ class StageRecord:
         own = (self.name,) if self.settings is None else self.settings
         require_config(done, fixed_keys(self._of_stored(*self.counts, *own)))
         facts: list[tuple[str, object, object]] = [("seed", self.config.seed, done.meta.get("seed", self.config.seed))]
-        if self.open_data is not None and self.named:
+        if self.role and self.roots:  # a finished stage can be asked for without
             facts.append(("data", self.data.fingerprint, next(iter(done.meta["data"].values()), "none")))
         for name, got, old in facts:
             if got != old:
@@ -103,8 +154,21 @@ class StageRecord:
 
     def resumes(self) -> dict[str, Any]:
         """Plain values that a half-finished stage must share, beside its settings and the seed."""
-        data = {} if self.open_data is None else {"data": self.data.fingerprint}
+        data: dict[str, Any] = {"data": self.data.fingerprint} if self.role else {}
+        if self.role == "train":
+            data["data.validation"] = self.config.data.validation
         return {**self._of_stored(*self.counts), **data, **self.prints, **self.identity}
+
+    def begin(self) -> None:
+        """Make the folder a run, with the command's config and what the stage builds on.
+
+        Called before the first step, when nothing speaks against it; until then nothing is written.
+
+        Raises:
+            OutputError: the folder cannot be written.
+        """
+        store_config(self.config, self.run)
+        self.ready()
 
     def save(
         self,
@@ -124,7 +188,7 @@ class StageRecord:
             stage=self.name,
             modules=modules,
             config=self.stored,
-            data={} if self.open_data is None else {self.role: self.data.fingerprint},
+            data={self.role: self.data.fingerprint} if self.role else {},
             parents=self.prints,
             metrics=metrics,
             steps=steps,
@@ -182,22 +246,21 @@ def run_stage(record: StageRecord, prepare: Callable[[], Training]) -> StageChec
     training = prepare()
     modules: dict[str, nn.Module] = {}
     metrics: dict[str, float] = {}
-    results: list[FitResult] = []
+    steps, seconds = 0, 0.0
     for part in training.parts:
-        result = fit(
+        state, _ = fit(
             part,
             record.folder,
             seed=record.config.seed,
             device=training.device,
             logging=record.config.logging,
             identity={**record.resumes(), **training.identity},
-            ready=record.ready,
+            ready=record.begin,
         )
         prefix = f"{part.folder}_" if part.folder else ""
-        metrics |= {f"{prefix}{key}": value for key, value in result.metrics.items()}
+        metrics |= {f"{prefix}{key}": value for key, value in state.metrics.items()}
         modules |= part.stage.modules
-        results.append(result)
-    seconds = sum(result.seconds for result in results)
-    done = record.save(modules, metrics, results[0].step, seconds, training.extra)
+        steps, seconds = steps or state.step, seconds + state.seconds
+    done = record.save(modules, metrics, steps, seconds, training.extra)
     print(training.line(metrics), flush=True)
     return done

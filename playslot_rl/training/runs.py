@@ -22,24 +22,23 @@ from typing import TYPE_CHECKING
 import torch
 from torch import nn
 
-from playslot_rl.config import EnvConfig, ModelConfig, from_dict
+from playslot_rl.config import EnvConfig, ExperimentConfig, ModelConfig, from_dict, to_dict
+from playslot_rl.config.compose import SHIPPED
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_bytes, write_json
 from playslot_rl.storage.checkpoints import (
     StageCheckpoint,
     checkpoint_folder,
     load_weights,
-    read_json,
     read_stage,
     require_parents,
 )
 from playslot_rl.storage.folders import new_folder
+from playslot_rl.storage.resume import read_json
 
 if TYPE_CHECKING:
     from playslot_rl.modules.savi import SAVi
     from playslot_rl.world_model import Agent, WorldModel
-
-PRETRAINED = "pretrained"
 
 
 def pretrained_folder(env: str = "button_press") -> Path:
@@ -63,7 +62,7 @@ def pretrained_folder(env: str = "button_press") -> Path:
 def shipped_env(run: Path | str) -> str | None:
     """Environment of the shipped world model that `pretrained/ENV` or `pretrained` (ButtonPress) names, else None."""
     name, _, env = str(run).partition("/")
-    return (env or "button_press") if name == PRETRAINED else None
+    return (env or "button_press") if name == SHIPPED else None
 
 
 def run_folder(run: Path | str) -> Path:
@@ -77,8 +76,17 @@ def run_folder(run: Path | str) -> Path:
         return pretrained_folder(env)
     folder = Path(run)
     if not str(run) or not folder.is_dir():
-        raise CheckpointError(f"run={run}: no such folder, expected a run folder or `{PRETRAINED}`: check run=")
+        raise CheckpointError(f"run={run}: no such folder, expected a run folder or `{SHIPPED}`: check run=")
     return folder
+
+
+def store_config(config: ExperimentConfig, run: Path) -> None:
+    """Write the run's config. Called when everything fits, so that a refused command leaves the stored one as it was.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    write_json(run / "config.json", to_dict(config))
 
 
 def adopt_stage(checkpoint: StageCheckpoint, run: Path) -> None:
@@ -114,17 +122,6 @@ def require_adoptable(checkpoint: StageCheckpoint, run: Path) -> None:
         )
 
 
-def link_world_model(run: Path, source: Path | str) -> None:
-    """Say that the world model of `run` is the one of another run, or a shipped one (`pretrained/ENV`).
-
-    Raises:
-        OutputError: full disk.
-    """
-    env = shipped_env(source)
-    text = os.path.relpath(source, run) if env is None else f"{PRETRAINED}/{env}"
-    write_json(run / "world_model.json", {"source": text})
-
-
 def use_world_model(run: Path, parent: Path | str) -> None:
     """Have `run` build on the world model of `parent`: its own, another run's, or a shipped one (`pretrained/ENV`).
 
@@ -132,9 +129,9 @@ def use_world_model(run: Path, parent: Path | str) -> None:
         CheckpointError: no such parent.
         OutputError: full disk.
     """
-    home = world_model_folder(parent)
+    home, env = world_model_folder(parent), shipped_env(parent)
     if run.resolve() not in (home.resolve(), Path(parent).resolve()):
-        link_world_model(run, parent if shipped_env(parent) else home)
+        write_json(run / "world_model.json", {"source": f"{SHIPPED}/{env}" if env else os.path.relpath(home, run)})
 
 
 def world_model_folder(run: Path | str) -> Path:
@@ -149,7 +146,7 @@ def world_model_folder(run: Path | str) -> Path:
         return folder
     source = read_json(link).get("source")
     if not isinstance(source, str):
-        raise CheckpointError(f'{link}: got no "source", expected "{PRETRAINED}/ENV" or a path: train again')
+        raise CheckpointError(f'{link}: got no "source", expected "{SHIPPED}/ENV" or a path: train again')
     return run_folder(folder / source if shipped_env(source) is None else source)
 
 
@@ -194,13 +191,13 @@ def freeze_on(module: nn.Module, device: torch.device | str) -> None:
     module.to(device).eval().requires_grad_(False)
 
 
-def slots_fingerprint(run: Path | str) -> str:
-    """Fingerprint of a run's SAVi.
+def slots_checkpoint(run: Path | str) -> StageCheckpoint:
+    """The finished SAVi that a run builds on.
 
     Raises:
-        CheckpointError: it has none.
+        CheckpointError: there is none.
     """
-    return read_stage(checkpoint_folder(world_model_folder(run), "slots"), "slots").fingerprint
+    return read_stage(checkpoint_folder(world_model_folder(run), "slots"), "slots")
 
 
 def load_savi(run: Path | str, device: torch.device | str = "cpu") -> SAVi:
@@ -211,7 +208,7 @@ def load_savi(run: Path | str, device: torch.device | str = "cpu") -> SAVi:
     """
     from playslot_rl.modules.savi import SAVi
 
-    checkpoint = read_stage(checkpoint_folder(world_model_folder(run), "slots"), "slots")
+    checkpoint = slots_checkpoint(run)
     model, env = stage_model(checkpoint)
     with torch.random.fork_rng(devices=[]):
         savi = SAVi(model.savi, env.image_size)

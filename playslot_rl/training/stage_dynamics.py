@@ -12,12 +12,11 @@ from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.config import DynamicsStageConfig
-from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.losses.common import total_loss
 from playslot_rl.losses.dynamics import DynamicsLoss
 from playslot_rl.seeding import StepGenerators, step_generator
-from playslot_rl.world_model import WorldModel
+from playslot_rl.world_model import WorldModel, module_device
 
 
 class DynamicsStage:
@@ -25,30 +24,19 @@ class DynamicsStage:
 
     Args:
         model: world model; its SAVi is frozen, the rest is trained in place.
-        source: unlabelled videos.
-        slots: their cached slots (F, N, D).
+        clips: of unlabelled videos, as long as seed and predicted frames.
+        slots: cached slots (F, N, D) of the videos.
         config: rollout lengths, weights.
-        validation: fraction of episodes held out.
-        seed: of the split.
-        device: where `model` is.
     """
 
     def __init__(
-        self,
-        model: WorldModel,
-        source: EpisodeFrames,
-        slots: npt.NDArray[np.float32],
-        config: DynamicsStageConfig,
-        *,
-        validation: float,
-        seed: int,
-        device: torch.device | str = "cpu",
+        self, model: WorldModel, clips: Clips, slots: npt.NDArray[np.float32], config: DynamicsStageConfig
     ) -> None:
-        self.model, self.source, self.slots, self.config, self.device = model, source, slots, config, device
+        self.model, self.clips, self.slots, self.config = model, clips, slots, config
+        self.source, self.device = clips.source, module_device(model)
         self.criterion = DynamicsLoss(model.inverse_dynamics, model.predictor, model.savi, config)
         if self.criterion.needs_actions:
-            source.require_actions(model.env.action_dim)
-        self.clips = Clips(source, config.seed_frames + config.predicted_frames, validation, seed)
+            self.source.require_actions(model.env.action_dim)
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:

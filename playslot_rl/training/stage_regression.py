@@ -2,7 +2,8 @@
 
 The oracles, the action decoders and LAPO's latent policy are all trained by it.
 
-Shapes: M rows of training data, b rows of a batch; inputs and targets have any shape after their first dimension.
+Shapes: M rows of training data, b rows of a batch, H W image height and width; inputs and targets have any shape after
+their first dimension.
 """
 
 from __future__ import annotations
@@ -10,11 +11,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
 from playslot_rl.config import Precision
+from playslot_rl.data.demonstrations import real_actions, shift_frames, transitions
+from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.seeding import StepGenerators
 
@@ -58,6 +63,50 @@ class TensorInputs:
     def plain(self, rows: Tensor) -> Tensor:
         """Rows, without noise."""
         return self.values[rows]
+
+
+class FrameInputs:
+    """Frames by row: uint8 (b, 3, H, W), [0, 255].
+
+    Args:
+        source: the data set.
+        rows: its frames' row numbers, int64 (M,).
+        device: where the frames go.
+        shift: largest shift in training, pixels.
+    """
+
+    def __init__(
+        self, source: EpisodeFrames, rows: npt.NDArray[np.int64], device: torch.device | str, shift: int = 0
+    ) -> None:
+        self.source, self.rows, self.device, self.shift = source, rows, device, shift
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def draw(self, rows: Tensor, generators: StepGenerators) -> Tensor:
+        """Frames of rows, each shifted by its own random offset."""
+        if self.shift == 0:
+            return self.plain(rows)
+        offsets = torch.randint(2 * self.shift + 1, (len(rows), 2), generator=generators.torch("shift", "cpu"))
+        frames = self.source.frames[self.rows[rows.cpu().numpy()]]
+        moved = shift_frames(frames, offsets.numpy() - self.shift)
+        return torch.from_numpy(moved).movedim(-1, 1).to(self.device)
+
+    def plain(self, rows: Tensor) -> Tensor:
+        """Frames of rows, as they are."""
+        return self.source.pixels(self.rows[rows.cpu().numpy()]).to(self.device)
+
+
+def demonstrated_frames(
+    source: EpisodeFrames, action_dim: int, device: torch.device | str, shift: int = 0
+) -> tuple[FrameInputs, Tensor]:
+    """Frames of all transitions of demonstrations, with their real actions (M, A) in [-1, 1].
+
+    Raises:
+        DataError: no transition, no actions, or actions of another width.
+    """
+    rows = transitions(source).rows
+    return FrameInputs(source, rows, device, shift), real_actions(source, rows, action_dim).to(device)
 
 
 Examples = tuple[Inputs, Tensor]

@@ -11,11 +11,14 @@ from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.config import SlotsStageConfig
-from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips, IntArray
+from playslot_rl.errors import CheckpointError
 from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.seeding import StepGenerators, step_generator
+from playslot_rl.world_model import module_device
+
+INITIAL_SLOTS = "initializer.mean"
 
 
 class SlotsStage:
@@ -23,26 +26,13 @@ class SlotsStage:
 
     Args:
         savi: trained in place.
-        source: unlabelled videos.
-        config: clip length, batch, precision.
-        validation: fraction of episodes held out.
-        seed: of the split.
-        device: where `savi` is.
+        clips: of unlabelled videos.
+        config: batch, precision.
     """
 
-    def __init__(
-        self,
-        savi: SAVi,
-        source: EpisodeFrames,
-        config: SlotsStageConfig,
-        *,
-        validation: float,
-        seed: int,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        self.savi, self.source, self.config, self.device = savi, source, config, device
+    def __init__(self, savi: SAVi, clips: Clips, config: SlotsStageConfig) -> None:
+        self.savi, self.clips, self.config, self.device = savi, clips, config, module_device(savi)
         self.criterion = SlotsLoss(savi)
-        self.clips = Clips(source, config.clip_frames, validation, seed)
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -67,4 +57,40 @@ class SlotsStage:
         return {"mse": mse, "psnr": -10.0 * float(np.log10(max(mse, 1e-12)))}
 
     def _batch(self, rows: IntArray) -> TensorDict:
-        return TensorDict({keys.PIXELS: self.source.pixels(rows).to(self.device)}, [len(rows)])
+        return TensorDict({keys.PIXELS: self.clips.source.pixels(rows).to(self.device)}, [len(rows)])
+
+
+def warm_start(savi: SAVi, source: SAVi, where: str) -> None:
+    """Copy weights in place. With another number of learned initial slots the first ones are copied and the rest kept.
+
+    Note: the paper trains each SAVi from scratch. Slot Attention first fits what all frames share and only then takes
+    scenes apart; where objects are small and of any colour, that plateau outlasts what a CPU can pay for, and a SAVi
+    that has learned elsewhere to take scenes apart leaves it early.
+
+    Args:
+        savi: what will be trained.
+        source: what it starts from; all sizes but the number of slots must be equal.
+        where: its name, for the error.
+
+    Raises:
+        CheckpointError: sizes differ.
+    """
+    own, other = savi.state_dict(), source.state_dict()
+    shapes = [
+        (
+            name,
+            tuple(other[name].shape) if name in other else "nothing",
+            tuple(own[name].shape) if name in own else "nothing",
+        )
+        for name in sorted({*own, *other} - {INITIAL_SLOTS})
+    ]
+    for name, got, expected in shapes:
+        if got != expected:
+            raise CheckpointError(
+                f"slots.start_from={where}: got {name} of {got}, expected {expected}: give model.savi.* its sizes"
+            )
+    with torch.no_grad():
+        rows = min(len(own[INITIAL_SLOTS]), len(other[INITIAL_SLOTS]))
+        initial = own[INITIAL_SLOTS].clone()
+        initial[:rows] = other[INITIAL_SLOTS][:rows]
+    savi.load_state_dict({**other, INITIAL_SLOTS: initial})

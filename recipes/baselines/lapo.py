@@ -6,25 +6,15 @@ actions of `behaviour.labelled_demos` of them. `baselines.lapo.world=RUN` takes 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import (
-    demo_root,
-    held_out_text,
-    open_demonstrations,
-    open_device,
-    open_run,
-    open_videos,
-    store_config,
-)
+from playslot_rl.recipes.run import held_out_text, open_device, open_run, require_parent
 
 if TYPE_CHECKING:
-    from playslot_rl.data.demonstrations import DemonstrationSplit
     from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import StageRecord, Training
@@ -38,22 +28,19 @@ def main(config: ExperimentConfig) -> None:
         DataError: no videos, too few demonstrations, or none with actions.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.baselines.lapo.load import MODEL, NAME, given_model, sizes_of
+    from playslot_rl.baselines.lapo.load import MODEL, NAME, sizes_of
     from playslot_rl.data.demonstrations import require_labelled
+    from playslot_rl.storage.checkpoints import (
+        StageCheckpoint,
+        checkpoint_folder,
+        read_stage,
+        require_config,
+        require_whole,
+    )
     from playslot_rl.training.record import StageRecord, run_stage
-    from playslot_rl.training.runs import adopt_stage
+    from playslot_rl.training.runs import adopt_stage, run_folder
 
-    run, own = open_run(config), config.baselines.lapo
-    demos = cache(partial(open_demonstrations, config, "train-baseline"))
-    demos().trained.require_actions(config.env.action_dim)
-    require_labelled(config.behaviour.labelled_demos, demos().trained.episodes)  # before anything is computed
-    model = given_model(own, config.env.image_size, run) if own.world else train_model(config, run)
-
-    def ready() -> None:
-        store_config(config, run)  # first: it is what marks the folder as a run, should a kill come in between
-        if own.world:
-            adopt_stage(model, run)
-
+    run, own, parents = open_run(config), config.baselines.lapo, dict[str, StageCheckpoint]()
     stored = {
         "env": to_dict(config.env),
         "model": to_dict(config.model),
@@ -73,13 +60,21 @@ def main(config: ExperimentConfig) -> None:
             "loss": own.loss,
             "shift": own.shift,
         },
-        parents={MODEL: model},
-        open_data=lambda: demos().trained,
-        named=bool(demo_root(config)),
+        parents=parents,
         role="demos",
-        ready=ready,
+        ready=lambda: adopt_stage(parents[MODEL], run),
     )
-    run_stage(record, lambda: _training(config, record, demos))
+    record.data.require_actions(config.env.action_dim)
+    require_labelled(config.behaviour.labelled_demos, record.data.episodes)  # before anything is computed
+    if own.world:
+        model = read_stage(checkpoint_folder(run_folder(own.world), MODEL), MODEL)
+        require_whole(model)
+        require_parent(config, run, model, "image_size")
+        require_config(model, {NAME: sizes_of(own)})
+    else:
+        model = train_model(config, run)
+    parents[MODEL] = model
+    run_stage(record, lambda: _training(config, record))
 
 
 def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
@@ -89,7 +84,11 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
         CheckpointError, DataError, OutputError, TrainingError: see `playslot_rl.errors`.
     """
     from playslot_rl.baselines.lapo.load import MODEL, NAME, sizes_of
-    from playslot_rl.training.record import StageRecord, run_stage
+    from playslot_rl.baselines.lapo.model import ForwardModel, InverseModel
+    from playslot_rl.baselines.lapo.stage import LAPOModelStage
+    from playslot_rl.seeding import global_seed
+    from playslot_rl.training.fit import Part
+    from playslot_rl.training.record import StageRecord, Training, run_stage
 
     own = config.baselines.lapo
     record = StageRecord(
@@ -99,47 +98,34 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
         stored={"env": to_dict(config.env), "model": to_dict(config.model), NAME: to_dict(own)},
         counts=tuple(f"{NAME}.{key}" for key in sizes_of(own)),
         settings=(f"{NAME}.model",),
-        identity={"data.validation": config.data.validation},
-        open_data=partial(open_videos, config, config.data.root, "train-baseline"),
-        named=bool(config.data.root),
-        ready=partial(store_config, config, run),
-    )
-    return run_stage(record, partial(_model_training, config, record))
-
-
-def _model_training(config: ExperimentConfig, record: StageRecord) -> Training:
-    """Inverse and forward model, untrained."""
-    from playslot_rl.baselines.lapo.model import ForwardModel, InverseModel
-    from playslot_rl.baselines.lapo.stage import LAPOModelStage
-    from playslot_rl.seeding import global_seed
-    from playslot_rl.training.fit import Part
-    from playslot_rl.training.record import Training
-
-    own, device, source = config.baselines.lapo, open_device(config), record.data
-    with global_seed(config.seed, 0, record.name):
-        inverse, forward = InverseModel(own, config.env.image_size).to(device), ForwardModel(own).to(device)
-    stage = LAPOModelStage(
-        inverse, forward, source, own.model, validation=config.data.validation, seed=config.seed, device=device
-    )
-    return Training(
-        [Part("baselines.lapo.model", stage, own.model)],
-        device,
-        lambda metrics: (
-            f"{record.name}: {100 * metrics.get('unexplained', float('nan')):.0f} % of the change left on held-out "
-            f"pairs, {record.folder}"
-        ),
-        extra={"episodes": source.episodes},
     )
 
+    def prepare() -> Training:
+        device = open_device(config)
+        with global_seed(config.seed, 0, MODEL):
+            inverse, forward = InverseModel(own, config.env.image_size).to(device), ForwardModel(own).to(device)
+        stage = LAPOModelStage(inverse, forward, record.clips(2, shown=256), own.model)
+        return Training(
+            [Part("baselines.lapo.model", stage, own.model)],
+            device,
+            lambda metrics: (
+                f"{MODEL}: {100 * metrics.get('unexplained', float('nan')):.0f} % of the change left on held-out "
+                f"pairs, {record.folder}"
+            ),
+            extra={"episodes": record.data.episodes},
+        )
 
-def _training(config: ExperimentConfig, record: StageRecord, opened: Callable[[], DemonstrationSplit]) -> Training:
+    return run_stage(record, prepare)
+
+
+def _training(config: ExperimentConfig, record: StageRecord) -> Training:
     """Latent policy, then action decoder."""
     from playslot_rl.baselines.lapo.behaviour import LAPOBehaviour
     from playslot_rl.baselines.lapo.load import MODEL, NAME
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
 
-    own, device, split = config.baselines.lapo, open_device(config), opened()
+    own, device, split = config.baselines.lapo, open_device(config), record.demos
     behaviour = LAPOBehaviour(config, record.parents[MODEL], split, device)
     labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
 

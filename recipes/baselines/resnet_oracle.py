@@ -5,22 +5,12 @@ The head's sizes are `model.policy`, the schedule is `baselines.resnet_oracle`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache, partial
 from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import (
-    demo_root,
-    held_out_text,
-    open_demonstrations,
-    open_device,
-    open_run,
-    store_config,
-)
+from playslot_rl.recipes.run import held_out_text, open_device, open_run
 
 if TYPE_CHECKING:
-    from playslot_rl.data.demonstrations import DemonstrationSplit
     from playslot_rl.training.record import StageRecord, Training
 
 
@@ -35,11 +25,9 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.baselines.oracles.resnet import NAME
     from playslot_rl.training.record import StageRecord, run_stage
 
-    run = open_run(config)
-    demos = cache(partial(open_demonstrations, config, "train-baseline"))
     record = StageRecord(
         NAME,
-        run,
+        open_run(config),
         config,
         stored={
             "env": to_dict(config.env),
@@ -48,31 +36,24 @@ def main(config: ExperimentConfig) -> None:
             NAME: to_dict(config.baselines.resnet_oracle),
         },
         counts=("model.policy", "behaviour.loss"),
-        open_data=lambda: demos().trained,
-        named=bool(demo_root(config)),
         role="demos",
-        ready=partial(store_config, config, run),
     )
-    run_stage(record, lambda: _training(config, record, demos))
+    run_stage(record, lambda: _training(config, record))
 
 
-def _training(config: ExperimentConfig, record: StageRecord, opened: Callable[[], DemonstrationSplit]) -> Training:
+def _training(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl import keys
-    from playslot_rl.baselines.frame_inputs import demonstrated_frames
     from playslot_rl.baselines.oracles.resnet import NAME, ResNetPolicy, load_pretrained
     from playslot_rl.losses.behaviour import BehaviourLoss
     from playslot_rl.seeding import global_seed
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
-    from playslot_rl.training.stage_regression import RegressionStage
+    from playslot_rl.training.stage_regression import RegressionStage, demonstrated_frames
 
-    own, device, split = config.baselines.resnet_oracle, open_device(config), opened()
-    inputs, actions = demonstrated_frames(split.trained, config.env.action_dim, device, own.shift)
-    held_out = None
-    if split.held_out is not None:
-        held_out = demonstrated_frames(split.held_out, config.env.action_dim, device)
+    own, device, split, width = config.baselines.resnet_oracle, open_device(config), record.demos, config.env.action_dim
+    inputs, actions = demonstrated_frames(split.trained, width, device, own.shift)
     with global_seed(config.seed, 0, NAME):
-        policy = ResNetPolicy(config.model.policy, config.env.image_size, config.env.action_dim)
+        policy = ResNetPolicy(config.model.policy, config.env.image_size, width)
     pretraining = load_pretrained(policy, own.weights)
     policy.to(device)
     criterion = BehaviourLoss(policy, config.behaviour.loss)
@@ -83,7 +64,7 @@ def _training(config: ExperimentConfig, record: StageRecord, opened: Callable[[]
         inputs,
         actions,
         own.batch_size,
-        held_out=held_out,
+        held_out=None if split.held_out is None else demonstrated_frames(split.held_out, width, device),
         validated=256,
         precision=own.precision,
     )

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from clips import moving_square
 
-from playslot_rl.baselines.frame_inputs import FrameInputs
-from playslot_rl.data.shifted import shift_frames
+from playslot_rl.data.demonstrations import shift_frames
 from playslot_rl.seeding import StepGenerators
+from playslot_rl.training.stage_regression import FrameInputs
 
 
 def test_rows_are_those_of_the_data_set() -> None:

@@ -20,9 +20,9 @@ from playslot_rl.config import (
     to_dict,
 )
 from playslot_rl.config.compose import choices, compose
+from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import Checked, fixed_keys, keys_of, without
 from playslot_rl.errors import ConfigError
-from playslot_rl.storage.resume import flatten
 
 PRESETS = ["compact", "paper", "smoke"]
 ENVS = ["block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "grid_shapes", "sketchy"]

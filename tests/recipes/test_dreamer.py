@@ -13,14 +13,14 @@ from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.baselines.dreamer.actor import load_actor
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.recipes.baselines import dreamer
+from playslot_rl.recipes.baselines import online
 
 SMOKE = ("preset=smoke", "method=dreamer", "env=block_reach", "threads=1", "device=cpu", "env.max_steps=6")
 
 
 def train(out: Path, *overrides: str) -> None:
     """The recipe, as the command line calls it."""
-    dreamer.main(compose([*SMOKE, f"out={out}", *overrides]))
+    online.main(compose([*SMOKE, f"out={out}", *overrides]))
 
 
 def weights(out: Path) -> bytes:
@@ -42,6 +42,8 @@ def test_a_run_leaves_weights_a_curve_and_its_config(run: Path) -> None:
     assert meta["parameters"] > 0
     curve = json.loads((run / "dreamer" / "curve.json").read_text())
     assert [row["env_steps"] for row in curve["rows"]] == [12, 24, 36]
+    for theme in ("light", "dark"):
+        assert (run / "dreamer" / f"curve_{theme}.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((run / "config.json").read_text())["method"] == "dreamer"
     assert {path.name for path in run.iterdir()} == {"config.json", "dreamer"}
 
@@ -95,7 +97,7 @@ def test_what_cannot_be_learned_from_is_refused_before_anything_is_written(
 ) -> None:
     config = compose([*SMOKE, f"out={tmp_path / 'run'}", override])
     with pytest.raises(ConfigError, match=message):
-        dreamer.main(config)
+        online.main(config)
     assert not (tmp_path / "run").exists()
 
 

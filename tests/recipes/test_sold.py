@@ -14,14 +14,15 @@ from safetensors.torch import load_file
 
 from playslot_rl import keys
 from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
-from playslot_rl.baselines.sold.actor import load_actor, prior_steps, slots_checkpoint
+from playslot_rl.baselines.sold.actor import load_actor, prior_steps
 from playslot_rl.baselines.sold.learner import SOLDLearner
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError, TrainingError
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.recipes.baselines import sold
+from playslot_rl.recipes.baselines import online
 from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
+from playslot_rl.training.runs import slots_checkpoint
 
 FIXED = ("preset=smoke", "method=sold", "device=cpu", "threads=1", "logging.backend=none")
 
@@ -57,7 +58,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trained(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished smoke run of SOLD; look, do not touch."""
     run = tmp_path_factory.mktemp("sold") / "run"
-    sold.main(_config(world, run))
+    online.main(_config(world, run))
     return run
 
 
@@ -110,7 +111,7 @@ def test_it_is_evaluated_by_the_evaluator_of_all_methods(trained: Path) -> None:
 
 def test_a_finished_run_is_skipped(trained: Path, world: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = _weights(trained)
-    sold.main(_config(world, trained))
+    online.main(_config(world, trained))
     assert "sold: finished before" in capsys.readouterr().out
     assert _weights(trained) == before
 
@@ -128,9 +129,9 @@ def test_an_interrupted_run_ends_with_the_same_weights(
     with monkeypatch.context() as patch:
         patch.setattr(SOLDLearner, "update", stopped)
         with pytest.raises(KeyboardInterrupt, match="sold interrupted; the same command carries on from step 24"):
-            sold.main(config)
+            online.main(config)
     assert not (tmp_path / "run" / "sold" / "checkpoint").exists()
-    sold.main(config)
+    online.main(config)
     assert _weights(tmp_path / "run") == _weights(trained)
 
 
@@ -145,7 +146,7 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_checkpoint(
 
     monkeypatch.setattr(SOLDLearner, "update", broken)
     with pytest.raises(TrainingError, match=r"sold: slot_mse is nan .* the last good checkpoint is .*step_00000024"):
-        sold.main(_config(world, tmp_path / "run"))
+        online.main(_config(world, tmp_path / "run"))
 
 
 def test_another_savi_than_it_was_trained_on_is_refused(trained: Path, tmp_path: Path) -> None:
@@ -155,25 +156,25 @@ def test_another_savi_than_it_was_trained_on_is_refused(trained: Path, tmp_path:
     with pytest.raises(CheckpointError, match=r"was trained on slots .* got slots"):
         load_actor(run)
     with pytest.raises(CheckpointError, match=r"was trained on slots .* got slots"):
-        sold.main(_config(other, run))
+        online.main(_config(other, run))
 
 
 def test_a_world_without_slots_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(CheckpointError, match="no slots checkpoint"):
-        sold.main(_config(tmp_path / "empty", tmp_path / "run"))
+        online.main(_config(tmp_path / "empty", tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 
 
 def test_a_task_without_a_dense_reward_is_refused_before_anything_is_written(world: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"env\.blocks\.reward: got sparse with method=sold, expected dense"):
-        sold.main(_config(world, tmp_path / "run", "env=block_reach", "env.blocks.reward=sparse"))
+        online.main(_config(world, tmp_path / "run", "env=block_reach", "env.blocks.reward=sparse"))
     assert not (tmp_path / "run").exists()
 
 
 def test_another_frame_size_than_savis_is_refused(world: Path, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"env\.image_size: got 32, expected 64"):
-        sold.main(_config(world, tmp_path / "run", "env.image_size=32"))
+        online.main(_config(world, tmp_path / "run", "env.image_size=32"))
 
 
 def test_savis_data_are_counted_from_the_config_the_checkpoint_or_its_episodes(world: Path) -> None:
@@ -206,5 +207,5 @@ def test_settings_that_cannot_be_are_refused(override: str, message: str) -> Non
 def test_a_killed_run_ends_with_the_same_weights(trained: Path, world: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     killed_at_first_checkpoint(run / "sold", "train-baseline", *FIXED, f"run={world}", f"out={run}")
-    sold.main(_config(world, run))
+    online.main(_config(world, run))
     assert _weights(run) == _weights(trained)

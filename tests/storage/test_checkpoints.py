@@ -18,11 +18,11 @@ from playslot_rl.storage.resume import first_difference
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
 from playslot_rl.testing import tiny_config
 from playslot_rl.training.runs import (
-    link_world_model,
     load_agent,
     load_savi,
     load_world_model,
     run_folder,
+    use_world_model,
     world_model_folder,
 )
 from playslot_rl.world_model import Agent, WorldModel
@@ -202,7 +202,7 @@ def test_a_run_may_use_the_world_model_of_another(run: Path, tmp_path: Path) -> 
     shutil.copytree(run / "policy", child / "policy")
     with pytest.raises(CheckpointError, match="no slots checkpoint"):
         load_agent(child)
-    link_world_model(child, run)
+    use_world_model(child, run)
     assert json.loads((child / "world_model.json").read_text()) == {"source": "../run"}
     assert world_model_folder(child).resolve() == run.resolve()
     load_agent(child)

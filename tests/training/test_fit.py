@@ -55,9 +55,9 @@ def test_a_resumed_run_ends_with_the_same_weights_buffers_and_optimiser(
         stop_at(patch, step, KeyboardInterrupt())
         with pytest.raises(KeyboardInterrupt):
             train(tmp_path / "parts")
-    stage, result = train(tmp_path / "parts")
-    assert result.resumed_from == step - step % 3
-    assert stage.steps_seen == 12 - result.resumed_from
+    stage, _, start = train(tmp_path / "parts")
+    assert start == step - step % 3
+    assert stage.steps_seen == 12 - start
     assert_equal(tensors(tmp_path / "parts", 12), tensors(tmp_path / "whole", 12))
     rows = [History(tmp_path / name / "metrics.jsonl").read() for name in ("whole", "parts")]
     for row in rows[0] + rows[1]:
@@ -88,7 +88,7 @@ def test_a_run_killed_by_the_system_ends_with_the_same_weights(tmp_path: Path) -
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not (tmp_path / "killed" / "checkpoints" / "step_00000012").exists()
-    assert train(tmp_path / "killed")[1].resumed_from >= 3
+    assert train(tmp_path / "killed")[2] >= 3
     train(tmp_path / "whole")
     assert_equal(tensors(tmp_path / "killed", 12), tensors(tmp_path / "whole", 12))
 
@@ -98,17 +98,17 @@ def test_what_a_kill_left_half_written_is_removed(tmp_path: Path) -> None:
     leftover.mkdir(parents=True)
     (leftover / "modules.safetensors").write_bytes(b"half")
     (tmp_path / "metrics.jsonl").write_text('{"step": 50, "split": "train"}\n{"step": 5')
-    _, result = train(tmp_path)
-    assert result.resumed_from == 0
+    _, _, start = train(tmp_path)
+    assert start == 0
     assert not leftover.exists()
     assert all(row["step"] <= 12 for row in History(tmp_path / "metrics.jsonl").read())
 
 
 def test_a_finished_stage_is_not_trained_again(tmp_path: Path) -> None:
-    _, first = train(tmp_path)
-    stage, second = train(tmp_path)
+    _, first, _ = train(tmp_path)
+    stage, second, start = train(tmp_path)
     assert stage.steps_seen == 0
-    assert second.resumed_from == second.step == 12
+    assert start == second.step == 12
     assert second.metrics == first.metrics
     assert second.metrics["step"] == 12
 
@@ -126,8 +126,8 @@ def test_a_nan_loss_stops_and_keeps_the_last_good_checkpoint(tmp_path: Path) -> 
         fit(Part("toy", ToyStage(nan_at=7), toy_config()), tmp_path, seed=3, identity={"data": "abc"})
     assert "\n" not in str(caught.value)
     train(tmp_path / "whole")
-    _, result = train(tmp_path)
-    assert result.resumed_from == 6
+    _, _, start = train(tmp_path)
+    assert start == 6
     assert_equal(tensors(tmp_path, 12), tensors(tmp_path / "whole", 12))
 
 
@@ -171,7 +171,8 @@ def test_another_seed_or_data_set_is_refused(tmp_path: Path, seed: int, data: st
 def test_intervals_may_change_when_resuming(tmp_path: Path) -> None:
     train(tmp_path)
     config = toy_config(checkpoint_every=5, log_every=1)
-    assert fit(Part("toy", ToyStage(), config), tmp_path, seed=3, identity={"data": "abc"}).step == 12
+    state, _ = fit(Part("toy", ToyStage(), config), tmp_path, seed=3, identity={"data": "abc"})
+    assert state.step == 12
 
 
 @pytest.mark.parametrize("name", ["modules.safetensors", "optimizer.safetensors", "state.json"])
@@ -208,7 +209,7 @@ def test_a_full_disk_keeps_the_last_good_checkpoint(tmp_path: Path, monkeypatch:
         with pytest.raises(OutputError, match="the disk is full"):
             train(tmp_path)
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["step_00000003"]
-    assert train(tmp_path)[1].resumed_from == 3
+    assert train(tmp_path)[2] == 3
 
 
 def test_an_interrupt_says_where_it_carries_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

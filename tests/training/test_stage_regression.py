@@ -33,8 +33,8 @@ def test_a_linear_map_is_found(tmp_path: Path) -> None:
     y = x @ torch.randn(3, 2)
     network = nn.Linear(3, 2)
     config = StageConfig(steps=200, batch_size=16, optim=OptimConfig(lr=3e-2))
-    result = fit(Part("toy", _stage(network, x, y), config), tmp_path, seed=0)
-    assert result.metrics["unexplained"] < 0.01
+    state, _ = fit(Part("toy", _stage(network, x, y), config), tmp_path, seed=0)
+    assert state.metrics["unexplained"] < 0.01
 
 
 def test_batches_are_a_function_of_seed_and_step() -> None:

@@ -7,7 +7,7 @@ import torch
 
 from playslot_rl.errors import CheckpointError
 from playslot_rl.testing import tiny_savi
-from playslot_rl.training.warm_start import warm_start
+from playslot_rl.training.stage_slots import warm_start
 
 
 def test_a_warm_start_parses_and_renders_as_its_source() -> None:

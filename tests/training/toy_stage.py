@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from playslot_rl.config import OptimConfig, StageConfig
 from playslot_rl.modules.quantizer import ActionQuantizer
 from playslot_rl.seeding import StepGenerators, global_seed
-from playslot_rl.training.fit import FitResult, Part, fit
+from playslot_rl.training.fit import Part, TrainingState, fit
 
 
 class ToyStage:
@@ -56,9 +56,9 @@ def toy_config(steps: int = 12, **changes: float) -> StageConfig:
     return StageConfig(steps=steps, batch_size=16, optim=optim, **settings)  # type: ignore[arg-type]
 
 
-def train(folder: Path, steps: int = 12, delay: float = 0.0) -> tuple[ToyStage, FitResult]:
+def train(folder: Path, steps: int = 12, delay: float = 0.0) -> tuple[ToyStage, TrainingState, int]:
     stage = ToyStage(delay)
-    return stage, fit(Part("toy", stage, toy_config(steps)), folder, seed=3, identity={"data": "abc"})
+    return stage, *fit(Part("toy", stage, toy_config(steps)), folder, seed=3, identity={"data": "abc"})
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.baselines.frame_inputs import FrameInputs, demonstrated_frames
 from playslot_rl.baselines.lapo.load import NAME, LAPOPolicy
 from playslot_rl.baselines.lapo.model import InverseModel
 from playslot_rl.baselines.lapo.stage import infer_latents
@@ -29,7 +28,13 @@ from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeding import global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
 from playslot_rl.training.runs import freeze_on, stage_config, stage_model
-from playslot_rl.training.stage_regression import RegressionStage, TensorInputs, apply_rows
+from playslot_rl.training.stage_regression import (
+    FrameInputs,
+    RegressionStage,
+    TensorInputs,
+    apply_rows,
+    demonstrated_frames,
+)
 
 
 class _Seen(NamedTuple):

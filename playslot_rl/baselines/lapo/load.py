@@ -6,7 +6,7 @@ Shapes: B batch, H W image height and width, Z latent-action width, A action dim
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -20,9 +20,6 @@ from playslot_rl.config.plain import to_dict
 from playslot_rl.frames import normalise
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.world_model import action_decoder_module
-
-if TYPE_CHECKING:
-    from playslot_rl.storage.checkpoints import StageCheckpoint
 
 NAME: Final = "lapo"
 MODEL: Final = "lapo_model"
@@ -60,22 +57,6 @@ def sizes_of(config: LAPOConfig) -> dict[str, Any]:
     names = ("channels", "hidden", "groups", "code_dim", "codes", "decay", "dead_threshold", "commitment")
     values = to_dict(config)
     return {name: values[name] for name in names}
-
-
-def given_model(config: LAPOConfig, image_size: int, run: Path) -> StageCheckpoint:
-    """The inverse and forward model of the run `config.world`, after checking that `run` can build on it.
-
-    Raises:
-        CheckpointError: it is missing or damaged, of other sizes, or `run` has another one of its own.
-    """
-    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, require_whole
-    from playslot_rl.training.runs import require_adoptable, run_folder
-
-    model = read_stage(checkpoint_folder(run_folder(config.world), MODEL), MODEL)
-    require_whole(model)
-    require_adoptable(model, run)
-    require_config(model, {"env": {"image_size": image_size}, NAME: sizes_of(config)})
-    return model
 
 
 def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:

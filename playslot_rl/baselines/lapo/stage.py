@@ -25,8 +25,8 @@ from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.seeding import StepGenerators
+from playslot_rl.world_model import module_device
 
-VALIDATION_PAIRS = 256
 BATCH = 64
 
 
@@ -35,29 +35,12 @@ class LAPOModelStage:
 
     Args:
         inverse, forward: trained in place.
-        source: unlabelled videos.
+        clips: pairs of frames of unlabelled videos.
         config: batch, precision.
-        validation: fraction of episodes held out.
-        seed: of the split.
-        device: where the models are.
-
-    Raises:
-        DataError: no episode of two frames.
     """
 
-    def __init__(
-        self,
-        inverse: InverseModel,
-        forward: ForwardModel,
-        source: EpisodeFrames,
-        config: StageConfig,
-        *,
-        validation: float,
-        seed: int,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        self.inverse, self.forward, self.source, self.config, self.device = inverse, forward, source, config, device
-        self.clips = Clips(source, 2, validation, seed, VALIDATION_PAIRS)
+    def __init__(self, inverse: InverseModel, forward: ForwardModel, clips: Clips, config: StageConfig) -> None:
+        self.inverse, self.forward, self.clips, self.config = inverse, forward, clips, config
         first, second = self._frames(self.clips.spread(self.clips.train_episodes))
         self.still = max(1e-6, float((first - second).square().mean()))
 
@@ -95,7 +78,7 @@ class LAPOModelStage:
         return {"unexplained": sum(errors) / max(1e-6, sum(stills)), "perplexity": float(perplexity)}
 
     def _frames(self, rows: IntArray) -> tuple[Tensor, Tensor]:
-        pixels = normalise(self.source.pixels(rows).to(self.device))
+        pixels = normalise(self.clips.source.pixels(rows).to(module_device(self.inverse)))
         return pixels[:, 0], pixels[:, 1]
 
 

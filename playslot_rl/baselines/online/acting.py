@@ -120,15 +120,11 @@ def play(
         pool, actor, seeds, look_on, stop=False, see_last=True, draw=False, stride=stride, lockstep=len(seeds)
     )
     received = np.stack(rewards)
-    returns = tuple(received.sum(axis=0, dtype=np.float64).tolist())
-    return PlayedEpisodes(_with_rewards(torch.stack(kept, 1), received), returns, tuple(o.success for o in outcomes))
-
-
-def _with_rewards(frames: TensorDictBase, rewards: npt.NDArray[np.float32]) -> TensorDict:
-    """Frames [n, L] with the rewards (L, n) of arriving at them, and the episodes' first and last frames marked."""
+    frames: TensorDictBase = torch.stack(kept, 1)
     first = torch.zeros(*frames.batch_size, 1, dtype=torch.bool)
     last = first.clone()
     first[:, 0], last[:, -1] = True, True
-    received = torch.from_numpy(rewards).T.unsqueeze(-1).contiguous()
-    values = {**frames.to_dict(), keys.REWARD: received, keys.IS_FIRST: first, keys.IS_LAST: last}
-    return TensorDict(values, frames.batch_size)
+    arrived = torch.from_numpy(received).T.unsqueeze(-1).contiguous()
+    values = {**frames.to_dict(), keys.REWARD: arrived, keys.IS_FIRST: first, keys.IS_LAST: last}
+    returns = tuple(received.sum(axis=0, dtype=np.float64).tolist())
+    return PlayedEpisodes(TensorDict(values, frames.batch_size), returns, tuple(o.success for o in outcomes))

@@ -20,8 +20,7 @@ from torch import nn
 
 from playslot_rl.baselines.online.replay import Replay
 from playslot_rl.errors import CheckpointError
-from playslot_rl.storage.optimizers import optimizer_tensors, restore_optimizer
-from playslot_rl.storage.resume import KEPT, TrainingCheckpoints
+from playslot_rl.storage.resume import KEPT, TrainingCheckpoints, optimizer_tensors, restore_optimizer
 from playslot_rl.storage.tensors import load_modules, load_tensors, module_tensors, save_tensors
 
 

@@ -9,76 +9,57 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 
 from playslot_rl.acting.episodes import LOCKSTEP, TaskPool
-from playslot_rl.baselines.online.acting import PlayedEpisodes, play
+from playslot_rl.baselines.online.acting import play
 from playslot_rl.baselines.online.checkpoints import OnlineCheckpoints, OnlineState
-from playslot_rl.baselines.online.curve import curve_point, draw_curve, write_curve
 from playslot_rl.baselines.online.learner import Learner
 from playslot_rl.baselines.online.replay import Replay
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import to_dict
 from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.config.roles import fixed_keys
 from playslot_rl.episode_seeds import episode_seed
+from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.progress import StageProgress
 from playslot_rl.seeding import StepGenerators, global_seed, step_generator
-from playslot_rl.training.watch import Watch
+from playslot_rl.storage.atomic import write_json
+from playslot_rl.training.logging import Watch
+from playslot_rl.training.record import StageRecord
 
 if TYPE_CHECKING:
     from torchrl.trainers.algorithms import DreamerV3UpdateRatio
 
 
-@dataclass(frozen=True)
-class OnlineResult:
-    """What `train_online` did.
-
-    Attributes:
-        state: where it ended.
-        resumed_from: agent steps this process started at.
-        random: the random policy's point.
-    """
-
-    state: OnlineState
-    resumed_from: int
-    random: dict[str, Any]
-
-
 def train_online(
     learner: Learner,
     online: OnlineConfig,
-    config: ExperimentConfig,
-    folder: Path,
+    record: StageRecord,
     *,
-    name: str,
     title: str,
     device: torch.device,
-    identity: Mapping[str, Any] | None = None,
-    ready: Callable[[], None] | None = None,
     prior_steps: int = 0,
-) -> OnlineResult:
+) -> tuple[OnlineState, int]:
     """Train until `online.steps` agent steps (or `online.minutes`), carrying on from the newest checkpoint.
 
-    Writes `folder/checkpoints`, `folder/replay`, `folder/logs`, `folder/metrics.jsonl`, `folder/curve.json` and the
-    curve's pictures, nothing else.
+    Writes `checkpoints`, `replay`, `logs`, `metrics.jsonl` and `curve.json` in `RUN/METHOD`, nothing else.
 
     Args:
         learner: its modules already on `device`.
         online: the method's config.
-        config: task, renderer, seed, logging.
-        folder: `RUN/METHOD`.
-        name: the method, for messages and as the prefix of config keys.
-        title: as the picture names it.
+        record: the method, which is the prefix of its config keys, its run, task, renderer, seed, logging.
+        title: as the curve names it.
         device: the learner's.
-        identity: further plain values a resumed run must share.
-        ready: called once, before anything is played, when a run begun before was found to be the same.
         prior_steps: agent steps behind what the learner was given (a world model's data), added to the curve's.
+
+    Returns:
+        Where it ended, and the agent steps that this process started at.
 
     Raises:
         TrainingError: a loss or weight is not finite; the last good checkpoint stays.
@@ -86,19 +67,17 @@ def train_online(
         OutputError: full disk; the last good checkpoint stays.
         KeyboardInterrupt: Ctrl-C; its message says where the same command carries on.
     """
-    run = _Run(learner, online, config, folder, name, title, device, identity or {}, prior_steps)
-    if ready is not None:
-        ready()
-    start = run.state.step
+    run = _Run(learner, online, record, title, device, prior_steps)
+    record.begin()
+    start, logging = run.state.step, record.config.logging
     run.watch.history.rewind(start)
     if not run.finished:
-        progress = StageProgress(name, start, online.steps, config.logging.progress, online.evaluate_every)
-        with run.watch.running(config.logging, start), progress, run.pool:
+        progress = StageProgress(record.name, start, online.steps, logging.progress, online.evaluate_every)
+        with run.watch.running(logging, start), progress, run.pool:
             while not run.finished:
                 run.advance(progress)
     run.write_curve()
-    draw_curve(folder, name, run.state.curve, run.state.random)
-    return OnlineResult(run.state, start, run.state.random)
+    return run.state, start
 
 
 class _Run:
@@ -108,21 +87,19 @@ class _Run:
         self,
         learner: Learner,
         online: OnlineConfig,
-        config: ExperimentConfig,
-        folder: Path,
-        name: str,
+        record: StageRecord,
         title: str,
         device: torch.device,
-        identity: Mapping[str, Any],
         prior_steps: int,
     ) -> None:
         from torchrl.trainers.algorithms import DreamerV3UpdateRatio
 
+        config, folder, name = record.config, record.folder, record.name
         self.learner, self.online, self.config, self.folder = learner, online, config, folder
-        self.name, self.title, self.device, self.prior_steps = name, title, device, prior_steps
+        self.title, self.device, self.prior_steps = title, device, prior_steps
         self.replay = Replay(online, config.env.max_steps + 1)
         own = {name: fixed_keys(to_dict(online)), "seed": config.seed}
-        self.checkpoints = OnlineCheckpoints(folder, {**own, **identity})
+        self.checkpoints = OnlineCheckpoints(folder, {**own, **record.resumes()})
         cure = f"lower its learning rate (baselines.{name}.*)"
         self.watch = Watch(name, folder, self.checkpoints, cure)
         self.state = self.checkpoints.resume_online(learner.modules, learner.optimizers, self.replay)
@@ -200,7 +177,10 @@ class _Run:
         return [episode_seed("development", 0, i) for i in range(self.online.evaluation_episodes)]
 
     def _measure(self, random: bool = False) -> dict[str, Any]:
-        """Play the development episodes without exploring."""
+        """Play the development episodes without exploring.
+
+        Gives `return_mean` and its standard error, `success_rate` (0 to 1) and its Wilson interval `ci95`.
+        """
         seeds, played = self._development_seeds(), []
         self._mode(False)
         with global_seed(self.config.seed, self.state.rounds, "development"):
@@ -209,9 +189,14 @@ class _Run:
                 learner = None if random else self.learner
                 chunk = seeds[first : first + LOCKSTEP]
                 played.append(play(self.pool, chunk, learner, self.device, generator, random=random))
-        returns = tuple(value for part in played for value in part.returns)
-        successes = tuple(value for part in played for value in part.successes)
-        return curve_point(PlayedEpisodes(played[0].frames, returns, successes))
+        returns = np.array([value for part in played for value in part.returns])
+        solved = sum(sum(part.successes) for part in played)
+        return {
+            "return_mean": float(returns.mean()),
+            "return_error": float(returns.std(ddof=1) / np.sqrt(len(returns))) if len(returns) > 1 else 0.0,
+            "success_rate": solved / len(returns),
+            "ci95": list(wilson(solved, len(returns))),
+        }
 
     def _evaluate(self) -> None:
         state = self.state
@@ -230,7 +215,15 @@ class _Run:
     def write_curve(self) -> None:
         """Renew `curve.json`."""
         seeds = self._development_seeds()
-        write_curve(self.folder, self.title, self.config.env.name, seeds, self.state.curve, self.state.random)
+        values = {
+            "method": self.title,
+            "env": self.config.env.name,
+            "episodes": len(seeds),
+            "first_seed": seeds[0],
+            "random": self.state.random,
+            "rows": self.state.curve,
+        }
+        write_json(self.folder / "curve.json", values)
 
     def _save(self) -> None:
         self.watch.require_finite(self.learner.modules, self._when())

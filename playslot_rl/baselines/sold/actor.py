@@ -28,7 +28,7 @@ from playslot_rl.storage.checkpoints import (
     read_stage,
     require_parents,
 )
-from playslot_rl.training.runs import freeze_on, load_savi, run_folder, stage_config, stage_model, world_model_folder
+from playslot_rl.training.runs import freeze_on, load_savi, run_folder, slots_checkpoint, stage_config, stage_model
 from playslot_rl.world_model import frame_parser_module, module_device
 
 
@@ -111,15 +111,6 @@ def build_networks(config: SOLDConfig, slots: StageCheckpoint, action_dim: int, 
     """
     slot_dim = stage_model(slots)[0].savi.slot_dim
     return SOLDNetworks(config, slot_dim, action_dim, config.sequence or max_steps + 1)
-
-
-def slots_checkpoint(run: Path | str) -> StageCheckpoint:
-    """The finished SAVi that a run builds on.
-
-    Raises:
-        CheckpointError: there is none.
-    """
-    return read_stage(checkpoint_folder(world_model_folder(run), "slots"), "slots")
 
 
 def prior_steps(config: SOLDConfig, slots: StageCheckpoint) -> int:

@@ -15,6 +15,7 @@ from playslot_rl.baselines.lapo.stage import LAPOModelStage, infer_latents
 from playslot_rl.config import ActionDecoderConfig, OptimConfig, StageConfig
 from playslot_rl.config.baselines import LAPOConfig
 from playslot_rl.data.demonstrations import transitions
+from playslot_rl.data.windows import Clips
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeding import StepGenerators, global_seed
 
@@ -76,7 +77,7 @@ def test_training_predicts_the_change_and_the_codes_tell_directions_apart(
     inverse, forward = models
     source = moving_square(episodes=24)
     config = StageConfig(steps=120, batch_size=16, optim=OptimConfig(lr=3e-3))
-    stage = LAPOModelStage(inverse, forward, source, config, validation=0.2, seed=0)
+    stage = LAPOModelStage(inverse, forward, Clips(source, 2, validation=0.2, seed=0, shown=256), config)
     optimizer = torch.optim.Adam([*inverse.parameters(), *forward.parameters()], lr=3e-3)
     with torch.no_grad():
         start = stage.loss(0, StepGenerators(0, 0))["loss_image"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -13,10 +13,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.baselines.online.loop import OnlineResult, train_online
+from playslot_rl.baselines.online.checkpoints import OnlineState
+from playslot_rl.baselines.online.loop import train_online
 from playslot_rl.config import EnvConfig, ExperimentConfig, LoggingConfig, RenderConfig
 from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.training.record import StageRecord
 
 STEPS = 4
 
@@ -124,13 +126,19 @@ def toy_online(**changes: Any) -> OnlineConfig:
     return OnlineConfig(**(values | changes))
 
 
-def train(folder: Path, learner: ToyLearner | None = None, **changes: Any) -> tuple[ToyLearner, OnlineResult]:
-    """Train with the pool of `monkeypatch`ed toy tasks."""
+class Trained(NamedTuple):
+    """What `train_online` returns."""
+
+    state: OnlineState
+    resumed_from: int
+
+
+def train(run: Path, learner: ToyLearner | None = None, **changes: Any) -> tuple[ToyLearner, Trained]:
+    """Train with the pool of `monkeypatch`ed toy tasks, into `RUN/toy`."""
     learner = learner or ToyLearner()
     config = ExperimentConfig(
         env=EnvConfig(max_steps=STEPS), seed=3, logging=LoggingConfig(backend="none", progress=False)
     )
-    result = train_online(
-        learner, toy_online(**changes), config, folder, name="toy", title="Toy", device=torch.device("cpu")
-    )
-    return learner, result
+    record = StageRecord("toy", run, config, stored={}, role="")
+    done = train_online(learner, toy_online(**changes), record, title="Toy", device=torch.device("cpu"))
+    return learner, Trained(*done)
