@@ -90,7 +90,7 @@ def test_stages_one_by_one_equal_the_pipeline(shared_run: Path, videos: Path, de
     run = tmp_path / "run"
     smoke("train-slots", f"out={run}", f"data.root={videos}")
     smoke("train-dynamics", f"run={run}")
-    smoke("train-policy", f"run={run}", f"data.root={demos}")
+    smoke("train-policy", f"run={run}", f"data.root={demos}", "data.held_out=2")
     for stage in ("slots", "dynamics", "policy"):
         assert weights(run, stage) == weights(shared_run, stage)
 
@@ -117,7 +117,7 @@ def test_stages_with_nothing_but_out_equal_the_pipeline(
     run = tmp_path / "run"
     smoke("train-slots", f"out={run}", f"data.root={videos}")
     smoke("train-dynamics", f"out={run}", f"data.root={videos}")
-    smoke("train-policy", f"out={run}", f"data.root={demos}")
+    smoke("train-policy", f"out={run}", f"data.root={demos}", "data.held_out=2")
     assert all(weights(run, stage) == weights(shared_run, stage) for stage in ("slots", "dynamics", "policy"))
 
 
@@ -128,7 +128,8 @@ def test_a_stage_may_build_on_another_run(shared_run: Path, videos: Path, demos:
     assert weights(tmp_path / "b", "dynamics") != weights(shared_run, "dynamics")
     smoke("train-policy", f"run={shared_run}", f"out={tmp_path / 'c'}", f"data.demos={demos}")
     assert weights(tmp_path / "c", "policy") == weights(shared_run, "policy")
-    smoke("train-policy", f"out={tmp_path / 'c'}", f"data.demos={demos}")  # its world model is still found
+    held_out = "data.held_out=2"  # what `run=` had in its config
+    smoke("train-policy", f"out={tmp_path / 'c'}", f"data.demos={demos}", held_out)  # its world model is still found
     smoke("evaluate", f"run={tmp_path / 'c'}", "episodes=1", "evaluation.references=false")
     info = json.loads((tmp_path / "c" / "evaluation" / "simulation" / "eval_info.json").read_text())
     assert info["episodes"] == 1

@@ -153,7 +153,7 @@ def test_a_second_command_on_the_same_folder_is_refused(shared_run: Path, tmp_pa
     ("typed", "message", "code"),
     [
         ("methods=playslot,magic", "compare.methods: got 'magic', expected one of playslot", 2),
-        ("demos=2,7", "demos: got 7, expected at most the 6 demonstrations of data.demos=", 1),
+        ("demos=2,9", "demos: got 9, expected at most the 8 demonstrations of data.demos=", 1),
         ("env=grid_shapes", "env=grid_shapes: got an environment without a simulator", 1),
         ("hydra.launcher=ray", "expected an installed launcher", 1),
         ("run=nowhere", "run=nowhere: no such folder", 1),
