@@ -357,6 +357,7 @@ def test_kill_during_collection_loses_only_the_episode_in_hand(made: Path, tmp_p
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_kill_during_export_leaves_nothing_half_made(made: Path, tmp_path: Path) -> None:
     out = tmp_path / "data"
     restore(made, out)

@@ -60,7 +60,7 @@ def test_the_image_loss_reaches_the_dynamics_through_the_frozen_decoder(make_lea
     assert learner.update(batch, StepGenerators(0, 0))["dynamics_grad_norm"] > 0
 
 
-@pytest.mark.parametrize("gradient", ["dynamics", "reinforce"])
+@pytest.mark.parametrize("gradient", ["dynamics", pytest.param("reinforce", marks=pytest.mark.slow)])
 def test_the_actor_gets_a_gradient_by_both_estimators(make_learner: Make, batch: TensorDict, gradient: str) -> None:
     learner = make_learner(actor_gradient=gradient, entropy=0.0)
     assert learner.update(batch, StepGenerators(0, 0))["actor_grad_norm"] > 0
@@ -237,6 +237,7 @@ def test_windows_are_consecutive_frames_and_start_anywhere(make_learner: Make) -
     assert {c for _, c in drawn} == {1, 2}
 
 
+@pytest.mark.slow
 def test_the_critic_finds_the_value_of_a_constant_reward(make_learner: Make) -> None:
     """r = 1 for ever at gamma 1/2 is worth 2, of which a horizon of 2 sees 1.5: the rest is the critic's own."""
     learner = make_learner(
