@@ -338,6 +338,7 @@ def alive(pid: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_kill_during_collection_loses_only_the_episode_in_hand(made: Path, tmp_path: Path) -> None:
     out = tmp_path / "data"
     process = start(tmp_path, out, episodes=200, workers=1)

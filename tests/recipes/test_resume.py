@@ -70,7 +70,7 @@ def _wait_for_checkpoint(folder: Path, alive: Callable[[], bool]) -> None:
 
 
 @pytest.mark.parametrize(
-    "part", ["slots", "policy", *(pytest.param(part, marks=pytest.mark.slow) for part in ("dynamics", "decoder"))]
+    "part", ["policy", *(pytest.param(part, marks=pytest.mark.slow) for part in ("slots", "dynamics", "decoder"))]
 )
 def test_a_killed_stage_ends_with_the_weights_of_one_that_was_not(
     shared_run: Path, videos: Path, demos: Path, tmp_path: Path, part: str, start: Callable[..., object]

@@ -102,6 +102,7 @@ def test_the_dynamics_loss_is_the_stages(decoded_frames: int, sizes: Sizes) -> N
     torch.testing.assert_close(got, expected)
 
 
+@pytest.mark.slow
 def test_a_child_that_fails_ends_the_benchmark_with_one_line(sizes: Sizes) -> None:
     broken = replace(sizes, rollout_steps=0)
     with start("broken", Variant("rollout_cache"), broken, 1) as child:

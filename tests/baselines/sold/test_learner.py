@@ -60,7 +60,8 @@ def test_the_image_loss_reaches_the_dynamics_through_the_frozen_decoder(make_lea
     assert learner.update(batch, StepGenerators(0, 0))["dynamics_grad_norm"] > 0
 
 
-@pytest.mark.parametrize("gradient", ["dynamics", pytest.param("reinforce", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("gradient", ["dynamics", "reinforce"])
 def test_the_actor_gets_a_gradient_by_both_estimators(make_learner: Make, batch: TensorDict, gradient: str) -> None:
     learner = make_learner(actor_gradient=gradient, entropy=0.0)
     assert learner.update(batch, StepGenerators(0, 0))["actor_grad_norm"] > 0
