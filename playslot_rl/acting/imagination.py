@@ -266,14 +266,18 @@ class ImaginationSession:
         Raises:
             ValueError: before `reset`.
         """
+        return self._present().clone()
+
+    def _present(self) -> TensorDictBase:
+        """The state itself: a step replaces it and changes none of its tensors."""
         if self._state is None:
             raise ValueError("session: got no state, expected one: call reset(frames=...) or reset(slots=...) first")
-        return self._state.clone()
+        return self._state
 
     @property
     def slots(self) -> Tensor:
         """Present slots (B, N, D)."""
-        out: Tensor = self.state[keys.SLOTS]
+        out: Tensor = self._present()[keys.SLOTS].clone()
         return out
 
     def restore(self, state: TensorDictBase) -> None:
@@ -282,7 +286,7 @@ class ImaginationSession:
 
     def branch(self, candidates: int) -> None:
         """Repeat each of the B episodes, to go on in as many ways: B * `candidates` rows, an episode's together."""
-        self._state = self.state.repeat_interleave(candidates, dim=0)
+        self._state = self._present().repeat_interleave(candidates, dim=0)
 
     def step(self, latents: Tensor | None = None, *, prototypes: Sequence[int] | Tensor | None = None) -> Tensor:
         """One step of all episodes.
@@ -299,12 +303,11 @@ class ImaginationSession:
         """
         if (latents is None) == (prototypes is None):
             raise ValueError("step: got latents and prototypes, or neither, expected one of them")
-        state = self.state
+        state = self._present()
         z = latent_actions(self.world_model, torch.as_tensor(prototypes) if latents is None else latents)
         if z.shape[: -len(self.world_model.latent_shape)] != state.batch_size:
             raise ValueError(
                 f"step: got actions of shape {tuple(z.shape)}, expected one for each of {len(state)} episodes"
             )
-        state = state.set(keys.LATENT_ACTION, z)
-        self._state = self._env.step_mdp(self._env.step(state))
+        self._state = self._env.step_mdp(self._env.step(state.copy().set(keys.LATENT_ACTION, z)))
         return self.slots
