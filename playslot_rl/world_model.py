@@ -94,8 +94,15 @@ class Agent(nn.Module):
         self.oracle = oracle
 
     @classmethod
-    def untrained(cls, world_model: WorldModel, oracle: bool = True) -> Agent:
+    def untrained(
+        cls, world_model: WorldModel, oracle: bool = True, *, whiten: bool = False, decoder_state: bool = False
+    ) -> Agent:
         """Fresh networks of the sizes in `world_model.config`.
+
+        Args:
+            world_model: what they build on.
+            oracle: make a slot oracle, too.
+            whiten, decoder_state: see `BehaviourStageConfig`.
 
         Raises:
             ConfigError: the world model has one latent action per slot, the policy gives one per step.
@@ -110,8 +117,8 @@ class Agent(nn.Module):
         slot_dim, width = config.savi.slot_dim, world_model.inverse_dynamics.latent_dim
         return cls(
             world_model,
-            LatentPolicy(config.policy, slot_dim, width),
-            ActionDecoder(config.action_decoder, width, env.action_dim),
+            LatentPolicy(config.policy, slot_dim, width, whiten),
+            ActionDecoder(config.action_decoder, width, env.action_dim, slot_dim if decoder_state else 0, whiten),
             LatentPolicy(config.policy, slot_dim, env.action_dim) if oracle else None,
         )
 
@@ -208,9 +215,10 @@ def latent_policy_module(policy: nn.Module) -> TensorDictModule:
     return TensorDictModule(policy, in_keys=[keys.SLOTS], out_keys=[keys.LATENT_ACTION])
 
 
-def action_decoder_module(action_decoder: nn.Module) -> TensorDictModule:
-    """LATENT_ACTION (..., Z) to ACTION (..., A) in [-1, 1]."""
-    return TensorDictModule(action_decoder, in_keys=[keys.LATENT_ACTION], out_keys=[keys.ACTION])
+def action_decoder_module(action_decoder: ActionDecoder) -> TensorDictModule:
+    """LATENT_ACTION (..., Z), and SLOTS (..., N, D) where it reads them, to ACTION (..., A) in [-1, 1]."""
+    read = [keys.LATENT_ACTION, keys.SLOTS] if action_decoder.reads_slots else [keys.LATENT_ACTION]
+    return TensorDictModule(action_decoder, in_keys=read, out_keys=[keys.ACTION])
 
 
 def oracle_module(oracle: nn.Module, observation: str = keys.SLOTS) -> TensorDictModule:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import BehaviourStageConfig, ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
     demonstration_views,
     held_out_text,
@@ -21,7 +21,7 @@ from playslot_rl.recipes.run import (
 )
 
 if TYPE_CHECKING:
-    from playslot_rl.training.fit import Part
+    from playslot_rl.training.fit import Part, Stage
     from playslot_rl.training.record import StageRecord, Training
 
 
@@ -63,35 +63,39 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
     from playslot_rl.seeding import global_seed
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
-    from playslot_rl.training.runs import load_world_model
-    from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage
-    from playslot_rl.world_model import Agent
+    from playslot_rl.training.runs import load_world_model, trained_horizon, untrained_agent
+    from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage, cloning_settings
 
     device, split, behaviour = open_device(config), record.demos, config.behaviour
     require_labelled(behaviour.labelled_demos, split.trained.episodes)  # before anything is computed
     world = load_world_model(parent, device)
     world.config = replace(world.config, policy=config.model.policy, action_decoder=config.model.action_decoder)
     with global_seed(config.seed, 0, "policy"):
-        agent = Agent.untrained(world, oracle=behaviour.oracle).to(device)
+        agent = untrained_agent(world, behaviour, behaviour.oracle).to(device)
     views, others = demonstration_views(config, split, world.savi, record.prints["slots"])
-    demos = with_copies([label_demonstrations(world, frames, slots, device) for frames, slots in views])
+    whole = with_copies([label_demonstrations(world, frames, slots, device) for frames, slots in views])
+    demos = whole.trimmed(behaviour.trim, behaviour.trim_margin)
     held_out = next((label_demonstrations(world, frames, slots, device) for frames, slots in others), None)
+    if held_out is not None:
+        held_out = held_out.trimmed(behaviour.trim, behaviour.trim_margin)
+    horizon = trained_horizon(record.parents["dynamics"])
 
     def parts() -> Iterator[Part]:
-        yield Part(
-            "policy",
-            CloneStage(agent.policy, agent.oracle, demos, behaviour, held_out),
-            behaviour,
-            lr_key="behaviour.optim.lr",
-        )
+        cloning = cloning_settings(behaviour)
+        clone = CloneStage(agent.policy, agent.oracle, demos, cloning, held_out, horizon)
+        yield Part("policy", clone, cloning, lr_key="behaviour.optim.lr")
         agent.eval()
-        decoding = replace(
-            behaviour, steps=behaviour.decoder_steps, optim=replace(behaviour.optim, lr=behaviour.decoder_lr)
-        )
-        decoder = DecoderStage(agent.action_decoder, agent.policy, demos, behaviour, held_out)
-        yield Part("decoder", decoder, decoding, folder="decoder", lr_key="behaviour.decoder_lr")
+        decoder = DecoderStage(agent.action_decoder, agent.policy, demos, behaviour, held_out, horizon)
+        yield _part("decoder", decoder, behaviour, behaviour.decoder_steps, behaviour.decoder_lr)
+        if behaviour.finetune_steps:
+            both = FinetuneStage(clone.stages["policy"], agent.action_decoder, demos, behaviour, held_out, horizon)
+            yield _part("finetune", both, behaviour, behaviour.finetune_steps, behaviour.finetune_lr)
 
-    said = f"policy: {len(demos.lengths)} demos, {behaviour.labelled_demos} labelled, {held_out_text(split)}"
+    kept = len(demos.slots) / len(whole.slots)
+    said = (
+        f"policy: {len(demos.lengths)} demos, {100 * kept:.0f} % of their rows kept, {behaviour.labelled_demos} "
+        f"labelled, {held_out_text(split)}"
+    )
     return Training(
         parts(),
         device,
@@ -99,7 +103,15 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
         extra={
             "demos": len(demos.lengths),
             "labelled_demos": behaviour.labelled_demos,
+            "kept_rows": round(kept, 4),
             "held_out_demos": 0 if held_out is None else len(held_out.lengths),
             "data_root": record.roots,
         },
     )
+
+
+def _part(name: str, stage: Stage, behaviour: BehaviourStageConfig, steps: int, lr: float) -> Part:
+    from playslot_rl.training.fit import Part
+
+    own = replace(behaviour, steps=steps, optim=replace(behaviour.optim, lr=lr))
+    return Part(name, stage, own, folder=name, lr_key=f"behaviour.{name}_lr")

@@ -79,7 +79,7 @@ def imagine(agent: Agent, first: TensorDictBase, steps: int, generator: torch.Ge
     rollout = env.rollout(steps, policy, tensordict=start, auto_reset=False, break_when_any_done=False)
     slots = torch.cat([start[keys.SLOTS].unsqueeze(1), rollout["next", keys.SLOTS]], 1)
     latents = rollout[keys.LATENT_ACTION]
-    return Imagination(slots, latents, agent.action_decoder(latents))
+    return Imagination(slots, latents, agent.action_decoder(latents, slots[:, :-1]))
 
 
 class ImaginationActor(PlannedActor):

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Compose, EnvBase, StepCounter, Transform, TransformedEnv
 
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig, RenderConfig
+from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.world_model import WorldModel, frame_parser_module, module_device
 
@@ -78,22 +79,35 @@ class SlotTransform(Transform):
 
 
 class ActionDecoderTransform(Transform):
-    """Turns the policy's LATENT_ACTION into the ACTION the task wants, on the way in.
+    """Turns the policy's LATENT_ACTION, with the SLOTS it was chosen at, into the ACTION the task wants, on the way in.
 
     Args:
         action_decoder: latent action to real action, in evaluation mode.
         latent_shape: ([N,] Z).
+        slot_shape: (N, D).
     """
 
-    def __init__(self, action_decoder: nn.Module, latent_shape: tuple[int, ...]) -> None:
+    def __init__(
+        self, action_decoder: ActionDecoder, latent_shape: tuple[int, ...], slot_shape: tuple[int, int]
+    ) -> None:
         super().__init__(in_keys=[], out_keys=[], in_keys_inv=[keys.ACTION], out_keys_inv=[keys.LATENT_ACTION])
         self.action_decoder = action_decoder
-        self.latent_shape = latent_shape
+        self.latent_shape, self.slot_shape = latent_shape, slot_shape
 
     @torch.no_grad()
-    def _inv_apply_transform(self, state: Tensor) -> Tensor:
-        action: Tensor = self.action_decoder(state.to(module_device(self.action_decoder)))
-        return action.to(state.device)
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        latent, slots = tensordict.get(keys.LATENT_ACTION, None), tensordict.get(keys.SLOTS, None)
+        if latent is None:
+            return tensordict
+        device = module_device(self.action_decoder)
+        action: Tensor = self.action_decoder(latent.to(device), None if slots is None else slots.to(device))
+        return tensordict.set(keys.ACTION, action.to(latent.device))
+
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
+        """SLOTS are an input of the next step where the decoder reads them."""
+        if self.action_decoder.reads_slots:
+            state_spec[keys.SLOTS] = Unbounded((*state_spec.shape, *self.slot_shape), device=state_spec.device)
+        return state_spec
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
         """LATENT_ACTION in place of ACTION."""
@@ -104,7 +118,7 @@ class ActionDecoderTransform(Transform):
 def latent_env(
     base: EnvBase,
     world_model: WorldModel,
-    action_decoder: nn.Module,
+    action_decoder: ActionDecoder,
     max_steps: int,
     generator: torch.Generator | None = None,
 ) -> TransformedEnv:
@@ -127,7 +141,7 @@ def latent_env(
         base,
         Compose(
             SlotTransform(world_model.savi, world_model.slot_shape, generator),
-            ActionDecoderTransform(action_decoder, world_model.latent_shape),
+            ActionDecoderTransform(action_decoder, world_model.latent_shape, world_model.slot_shape),
             StepCounter(max_steps=max_steps, step_count_key=keys.STEP_COUNT),
         ),
         auto_unwrap=True,
@@ -138,7 +152,7 @@ def make_simulation_env(
     env_config: EnvConfig,
     render_config: RenderConfig,
     world_model: WorldModel,
-    action_decoder: nn.Module,
+    action_decoder: ActionDecoder,
     generator: torch.Generator | None = None,
     device: torch.device | str = "cpu",
 ) -> TransformedEnv:

@@ -151,9 +151,18 @@ class PolicyConfig:
 
 @dataclass(frozen=True)
 class ActionDecoderConfig:
-    """Sizes of the action decoder: a three-layer MLP (paper, appendix A.4)."""
+    """Sizes of the action decoder: a three-layer MLP (paper, appendix A.4).
+
+    Attributes:
+        hidden_dim: hidden width.
+        state_dim, state_layers, state_heads: width, layers and heads of the slot encoder beside it, for
+            `behaviour.decoder_state`.
+    """
 
     hidden_dim: int = 128
+    state_dim: int = 64
+    state_layers: int = 2
+    state_heads: int = 4
 
 
 @dataclass(frozen=True)

@@ -102,9 +102,19 @@ class BehaviourStageConfig(StageConfig):
         shift: policy, oracle and decoder also learn from copies of the demonstrations moved by so many pixels, with the
             same actions (0 in the paper, none): from ten demonstrations a policy learns where it has been.
         shifted_copies: how many, of the eight directions (`playslot_rl.data.demonstrations.DIRECTIONS`).
+        trim: slot motion, the RMS change of the slots to the next frame, up to which a transition counts as still and
+            is left out by all that clone; read off the videos alone. 0 keeps every row (paper).
+        trim_margin: still transitions that are kept after each stretch of motion, so that stopping is learned.
+        whiten: clone the latents in whitened coordinates (`playslot_rl.modules.whitening`), where each of the handful
+            of directions that they vary in weighs the same; false clones them as they are (paper).
         decoder_inputs: `inverse_dynamics` (InvDyn's latents; paper), `policy` (the policy's outputs) or `both`.
+        decoder_state: the decoder also reads the slots, a_t = D_a(z_t, S_t): the same change of the image asks for
+            different actions in different places. False reads z_t alone (paper).
         decoder_steps: optimiser steps of the action decoder.
         decoder_lr: its base learning rate; the rest of `optim` is shared.
+        finetune_steps: optimiser steps after that, of policy and decoder together, on the labelled rows' actions; the
+            policy goes on cloning all rows meanwhile. 0 has none (paper).
+        finetune_lr: their base learning rate.
         oracle: also train the slot oracle (same network on the real actions of all demos).
     """
 
@@ -115,7 +125,13 @@ class BehaviourStageConfig(StageConfig):
     slot_noise: float = 0.0
     shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
     shifted_copies: int = field(default=8, metadata=between(1, 8, "1 to 8"))
+    trim: float = field(default=0.0, metadata=at_least(0, "0 (keep all) or more"))
+    trim_margin: int = field(default=2, metadata=at_least(0, "0 or more"))
+    whiten: bool = False
     decoder_inputs: Literal["inverse_dynamics", "policy", "both"] = "inverse_dynamics"
+    decoder_state: bool = False
     decoder_steps: int = 2000
     decoder_lr: float = 2e-4
+    finetune_steps: int = field(default=0, metadata=at_least(0, "0 (none) or more"))
+    finetune_lr: float = 2e-4
     oracle: bool = True

@@ -40,7 +40,9 @@ class Demonstrations:
         latents: inferred latent actions (M, Z).
         actions: real actions (M, A) in [-1, 1], or None.
         episode: number of the demonstration of each transition, int64 (M,); a shifted copy's is its original's.
-        lengths: transitions of each demonstration, int64 (E,).
+        step: number of the transition in its demonstration, int64 (M,).
+        motion: RMS change of the slots over the transition (M,), see `slot_motion`.
+        lengths: transitions of each demonstration as it was recorded, int64 (E,).
     """
 
     slots: Tensor
@@ -48,7 +50,30 @@ class Demonstrations:
     latents: Tensor
     actions: Tensor | None
     episode: Tensor
+    step: Tensor
+    motion: Tensor
     lengths: Tensor
+
+    def take(self, rows: Tensor) -> Demonstrations:
+        """Some transitions: an index int64 (M',) or a mask bool (M,); `lengths` stays."""
+        return replace(
+            self,
+            slots=self.slots[rows],
+            imagined=self.imagined[rows],
+            latents=self.latents[rows],
+            actions=None if self.actions is None else self.actions[rows],
+            episode=self.episode[rows],
+            step=self.step[rows],
+            motion=self.motion[rows],
+        )
+
+    def trimmed(self, threshold: float, margin: int) -> Demonstrations:
+        """Without the stretches in which nothing moves (`moving_rows`); all of it where `threshold` is 0.
+
+        Raises:
+            DataError: nothing is left.
+        """
+        return self.take(moving_rows(self.motion, self.step, threshold, margin)) if threshold else self
 
     def labelled(self, demos: int) -> Tensor:
         """Rows (int64) of the first `demos` demonstrations and their copies, the only ones whose actions the action
@@ -59,6 +84,39 @@ class Demonstrations:
         """
         require_labelled(demos, len(self.lengths))
         return torch.nonzero(self.episode < demos)[:, 0]
+
+
+def slot_motion(slots: Tensor) -> Tensor:
+    """RMS change of the slots from one frame to the next: (..., T + 1, N, D) to (..., T), in units of the slots."""
+    return (slots[..., 1:, :, :] - slots[..., :-1, :, :]).square().mean(dim=(-2, -1)).sqrt()
+
+
+def moving_rows(motion: Tensor, step: Tensor, threshold: float, margin: int, key: str = "behaviour.trim") -> Tensor:
+    """Transitions in which something moves, and `margin` still ones after each stretch of them: mask bool (M,).
+
+    An expert that holds still once the task is solved says nothing of how to solve it, but fills half of the rows.
+    Nothing but the videos is looked at.
+
+    Args:
+        motion: of each transition (M,), the episodes one after the other.
+        step: number of each in its episode, int64 (M,).
+        threshold: motion up to this is none.
+        margin: 0 or more.
+        key: of the threshold, for the error.
+
+    Raises:
+        DataError: nothing moves.
+    """
+    moving = motion > threshold
+    if not bool(moving.any()):
+        raise DataError(
+            f"{key}: got {threshold:g}, which leaves no transition, expected less than the largest motion, "
+            f"{float(motion.max()):.3g}: lower it"
+        )
+    kept = moving.clone()
+    for after in range(1, min(margin, len(moving) - 1) + 1):
+        kept[after:] |= moving[:-after] & (step[after:] >= after)
+    return kept
 
 
 def require_labelled(labelled: int, demos: int) -> None:
@@ -155,11 +213,13 @@ class Transitions:
     Attributes:
         rows: frame a transition starts from, int64 (M,); row + 1 is the frame after it.
         episode: number of its episode among those with a transition, int64 (M,).
+        step: its number in that episode, int64 (M,).
         lengths: transitions of each of those episodes, int64 (E,).
     """
 
     rows: npt.NDArray[np.int64]
     episode: npt.NDArray[np.int64]
+    step: npt.NDArray[np.int64]
     lengths: npt.NDArray[np.int64]
 
 
@@ -173,8 +233,9 @@ def transitions(source: EpisodeFrames) -> Transitions:
     if not len(kept):
         raise DataError("demonstrations: got no episode of two frames or more, expected videos: collect again")
     steps = source.lengths[kept] - 1
-    rows = np.concatenate([source.starts[e] + np.arange(n) for e, n in zip(kept, steps, strict=True)])
-    return Transitions(rows, np.repeat(np.arange(len(kept)), steps), steps)
+    step = np.concatenate([np.arange(n) for n in steps])
+    rows = np.repeat(source.starts[kept], steps) + step
+    return Transitions(rows, np.repeat(np.arange(len(kept)), steps), step, steps)
 
 
 def real_actions(source: EpisodeFrames, rows: npt.NDArray[np.int64], width: int) -> Tensor:
@@ -204,7 +265,7 @@ def label_demonstrations(
     moves = transitions(source)
     kept = np.nonzero(source.lengths >= 2)[0]
     labels = None if source.actions is None else real_actions(source, moves.rows, model.env.action_dim).to(device)
-    parts: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+    parts: dict[int, tuple[Tensor, ...]] = {}
     for length in np.unique(source.lengths[kept]):
         same = kept[source.lengths[kept] == length]
         for chosen in np.array_split(same, -(-len(same) // BATCH)):
@@ -215,16 +276,18 @@ def label_demonstrations(
                 actions = torch.from_numpy(source.require_actions()[rows[:, :-1]]).to(device)
             latent = model.inverse_dynamics(parsed, actions)
             rolled = model.predictor.rollout(parsed[:, :1], latent.prototype, latent.variability)
-            imagined = torch.cat((parsed[:, :1], rolled[:, :-1]), dim=1)
+            imagined, motion = torch.cat((parsed[:, :1], rolled[:, :-1]), dim=1), slot_motion(parsed)
             for i, episode in enumerate(chosen):
-                parts[int(episode)] = (parsed[i, :-1], imagined[i], latent.mean[i])
-    order = [int(e) for e in kept]
+                parts[int(episode)] = (parsed[i, :-1], imagined[i], latent.mean[i], motion[i])
+    slots, imagined, latents, motion = (torch.cat(part) for part in zip(*(parts[int(e)] for e in kept), strict=True))
     return Demonstrations(
-        slots=torch.cat([parts[e][0] for e in order]),
-        imagined=torch.cat([parts[e][1] for e in order]),
-        latents=torch.cat([parts[e][2] for e in order]),
+        slots=slots,
+        imagined=imagined,
+        latents=latents,
         actions=labels,
         episode=torch.from_numpy(moves.episode).to(device),
+        step=torch.from_numpy(moves.step).to(device),
+        motion=motion,
         lengths=torch.from_numpy(moves.lengths),
     )
 
@@ -236,13 +299,14 @@ def with_copies(demos: Sequence[Demonstrations]) -> Demonstrations:
         demos: the originals first; each with the same transitions.
     """
     first = demos[0]
-    actions = None if first.actions is None else first.actions.repeat(len(demos), 1)
     return Demonstrations(
         slots=torch.cat([copy.slots for copy in demos]),
         imagined=torch.cat([copy.imagined for copy in demos]),
         latents=torch.cat([copy.latents for copy in demos]),
-        actions=actions,
+        actions=None if first.actions is None else first.actions.repeat(len(demos), 1),
         episode=first.episode.repeat(len(demos)),
+        step=first.step.repeat(len(demos)),
+        motion=torch.cat([copy.motion for copy in demos]),
         lengths=first.lengths,
     )
 

@@ -2,7 +2,8 @@
 
     L_pi = mean (f_pi(S_t) - z_t)^2,   L_a = mean (D_a(z_t) - a_t)^2
 
-or, with `loss_function="l1"`, the means of the absolute differences.
+or, with `loss_function="l1"`, the means of the absolute differences. A policy with a `whitening` W is compared in its
+coordinates, W (f_pi(S_t) - z_t); a decoder that reads slots gets S_t beside z_t.
 
 Shapes: N slots, D slot width, Z latent-action width, A action width; "..." is any batch.
 """
@@ -58,9 +59,14 @@ class _CloningLoss(LossModule):
         self.loss_function = loss_function
 
     @property
+    def observed(self) -> list[NestedKey]:
+        """What the network reads, in its order."""
+        return [self.tensor_keys.observation]
+
+    @property
     def in_keys(self) -> list[NestedKey]:
         """Keys that are read."""
-        return [self.tensor_keys.observation, self.tensor_keys.action]
+        return [*self.observed, self.tensor_keys.action]
 
     @property
     def out_keys(self) -> list[NestedKey]:
@@ -77,7 +83,7 @@ class _CloningLoss(LossModule):
         Raises:
             ValueError: output and target differ in shape, which broadcasting would hide.
         """
-        predicted: Tensor = self.network(tensordict.get(self.tensor_keys.observation))
+        predicted: Tensor = self.network(*(tensordict.get(key) for key in self.observed))
         target = tensordict.get(self.tensor_keys.action)
         if predicted.shape != target.shape:
             got, expected = tuple(target.shape), tuple(predicted.shape)
@@ -91,6 +97,9 @@ class _CloningLoss(LossModule):
         return TensorDict({self.out_name: error.sum() / mask.sum().clamp(min=1)}, [])
 
     def _distance(self, difference: Tensor) -> Tensor:
+        whitening = getattr(self.network, "whitening", None)
+        if whitening is not None and self.tensor_keys.action == keys.LATENT_ACTION:
+            difference = whitening.turn(difference)
         return difference.abs() if self.loss_function == "l1" else difference.square()
 
 
@@ -122,7 +131,8 @@ class BehaviourLoss(_CloningLoss):
 class ActionDecoderLoss(_CloningLoss):
     """Regression of real actions on latent ones, on the labelled demonstrations.
 
-    Reads LATENT_ACTION (..., Z) and ACTION (..., A) in [-1, 1]; writes `loss_action`.
+    Reads LATENT_ACTION (..., Z), SLOTS (..., N, D) where the decoder does, and ACTION (..., A) in [-1, 1]; writes
+    `loss_action`.
 
     Args:
         network: the action decoder that is trained, (..., Z) to (..., A).
@@ -143,6 +153,13 @@ class ActionDecoderLoss(_CloningLoss):
 
         observation: NestedKey = keys.LATENT_ACTION
         action: NestedKey = keys.ACTION
+        state: NestedKey = keys.SLOTS
 
     default_keys = _AcceptedKeys
     out_name = "loss_action"
+
+    @property
+    def observed(self) -> list[NestedKey]:
+        """The latent action, and the slots where the decoder reads them."""
+        reads_slots = getattr(self.network, "reads_slots", False)
+        return [self.tensor_keys.observation, *([self.tensor_keys.state] if reads_slots else [])]

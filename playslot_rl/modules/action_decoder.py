@@ -1,9 +1,14 @@
-"""The action decoder: a_t = D_a(z_t), a three-layer MLP (paper, appendix A.4).
+"""The action decoder: a_t = D_a(z_t), a three-layer MLP (paper, appendix A.4), or a_t = D_a(z_t, S_t).
 
-Shapes: latent actions (..., Z) -> real actions (..., A) in [-1, 1].
+Shapes: latent actions (..., Z), slots (..., N, D) -> real actions (..., A) in [-1, 1].
 
 Note: a final tanh keeps the output inside the action space; the paper does not name one. Inputs are standardised by the
-mean and scale of the training latents: their scale is free (about 0.07 here), and a decoder on raw ones underfits.
+mean and scale of the training latents: their scale is free (about 0.07 here), and a decoder on raw ones underfits. With
+`whiten` they are whitened instead.
+
+Note: the paper's decoder reads z_t alone. A latent action is a change of the image: the depth of a motion hardly shows
+in it, and the same change asks for different actions in different places. With slots, their summary by the [ACT]
+transformer of the policy, made small, is put beside z_t; it does not depend on the order of the slots.
 """
 
 from __future__ import annotations
@@ -12,6 +17,8 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.config import ActionDecoderConfig
+from playslot_rl.modules.transformer import SlotTokenEncoder
+from playslot_rl.modules.whitening import Whitening
 
 
 class ActionDecoder(nn.Module):
@@ -21,26 +28,63 @@ class ActionDecoder(nn.Module):
         config: sizes.
         latent_dim: Z.
         action_dim: A.
+        slot_dim: D of the slots that it reads beside z; 0 reads none.
+        whiten: have a `whitening` in place of `mean` and `scale`.
+
+    Raises:
+        ValueError: `config.state_dim` is no multiple of `config.state_heads`.
     """
 
     mean: Tensor
     scale: Tensor
 
-    def __init__(self, config: ActionDecoderConfig, latent_dim: int, action_dim: int) -> None:
+    def __init__(
+        self,
+        config: ActionDecoderConfig,
+        latent_dim: int,
+        action_dim: int,
+        slot_dim: int = 0,
+        whiten: bool = False,
+    ) -> None:
         super().__init__()
-        h = config.hidden_dim
-        self.register_buffer("mean", torch.zeros(latent_dim))
-        self.register_buffer("scale", torch.ones(latent_dim))
+        h, width, heads = config.hidden_dim, config.state_dim, config.state_heads
+        if slot_dim and width % heads:
+            raise ValueError(f"model.action_decoder.state_dim: got {width}, expected a multiple of {heads} heads")
+        self.whitening = Whitening(latent_dim) if whiten else None
+        if not whiten:
+            self.register_buffer("mean", torch.zeros(latent_dim))
+            self.register_buffer("scale", torch.ones(latent_dim))
+        self.encoder: SlotTokenEncoder | None = None
+        if slot_dim:
+            self.encoder = SlotTokenEncoder(slot_dim, width, config.state_layers, heads, width // heads, 2 * width)
+            latent_dim += width
         self.layers = nn.Sequential(
             nn.Linear(latent_dim, h), nn.ReLU(), nn.Linear(h, h), nn.ReLU(), nn.Linear(h, action_dim)
         )
 
+    @property
+    def reads_slots(self) -> bool:
+        """Whether `forward` wants slots."""
+        return self.encoder is not None
+
     @torch.no_grad()
     def standardise(self, z: Tensor) -> None:
-        """Take mean and scale from latent actions (M, Z)."""
+        """Take mean and scale, or the whitening, from latent actions (M, Z)."""
+        if self.whitening is not None:
+            self.whitening.fit(z)
+            return
         self.mean.copy_(z.mean(dim=0))
         self.scale.copy_(z.std(dim=0).clamp(min=1e-6))
 
-    def forward(self, z: Tensor) -> Tensor:
-        """Latent actions (..., Z) to real actions (..., A)."""
-        return torch.tanh(self.layers((z - self.mean) / self.scale))
+    def forward(self, z: Tensor, slots: Tensor | None = None) -> Tensor:
+        """Latent actions (..., Z), and slots (..., N, D) where it reads them, to real actions (..., A).
+
+        Raises:
+            ValueError: no slots, and it reads them.
+        """
+        inputs = (z - self.mean) / self.scale if self.whitening is None else self.whitening(z)
+        if self.encoder is not None:
+            if slots is None:
+                raise ValueError("action decoder: got no slots, expected (..., N, D): it was trained to read them")
+            inputs = torch.cat((inputs, self.encoder(slots)), dim=-1)
+        return torch.tanh(self.layers(inputs))

@@ -9,24 +9,30 @@ from torch import Tensor, nn
 
 from playslot_rl.config import PolicyConfig
 from playslot_rl.modules.transformer import SlotTokenEncoder
+from playslot_rl.modules.whitening import Whitening
 
 
 class LatentPolicy(nn.Module):
     """Latent action from the slots of one frame.
 
+    Note: with `whiten` the head gives whitened coordinates of the latent action, which is what is cloned
+    (`behaviour.whiten`); the paper clones latents as they are.
+
     Args:
         config: sizes.
         slot_dim: D.
         out_dim: Z, or A for the oracle.
+        whiten: have a `whitening`, to be fitted before training.
     """
 
-    def __init__(self, config: PolicyConfig, slot_dim: int, out_dim: int) -> None:
+    def __init__(self, config: PolicyConfig, slot_dim: int, out_dim: int, whiten: bool = False) -> None:
         super().__init__()
         c = config
         self.encoder = SlotTokenEncoder(slot_dim, c.dim, c.layers, c.heads, c.head_dim, c.mlp_dim)
         self.head = nn.Linear(c.dim, out_dim)
+        self.whitening = Whitening(out_dim) if whiten else None
 
     def forward(self, slots: Tensor) -> Tensor:
         """Slots (..., N, D) to latent actions (..., Z)."""
         out: Tensor = self.head(self.encoder(slots))
-        return out
+        return out if self.whitening is None else self.whitening.inverse(out)

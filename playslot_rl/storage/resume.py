@@ -46,7 +46,20 @@ class TrainingState:
     metrics: dict[str, float] = field(default_factory=dict)
 
 
-ADDED: Final[Mapping[str, Any]] = {"reward_scale": 1.0, "actor_average": 0.0, "kind": "cocvp"}
+ADDED: Final[Mapping[str, Any]] = {
+    "reward_scale": 1.0,
+    "actor_average": 0.0,
+    "kind": "cocvp",
+    "trim": 0.0,
+    "trim_margin": 2,
+    "whiten": False,
+    "decoder_state": False,
+    "finetune_steps": 0,
+    "finetune_lr": 2e-4,
+    "state_dim": 64,
+    "state_layers": 2,
+    "state_heads": 4,
+}
 """Settings that came after the first checkpoints, and what those were trained with."""
 
 

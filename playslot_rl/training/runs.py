@@ -22,7 +22,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch import nn
 
-from playslot_rl.config import EnvConfig, ExperimentConfig, ModelConfig, from_dict, to_dict
+from playslot_rl.config import (
+    BehaviourStageConfig,
+    DynamicsStageConfig,
+    EnvConfig,
+    ExperimentConfig,
+    ModelConfig,
+    from_dict,
+    to_dict,
+)
 from playslot_rl.config.compose import SHIPPED
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_bytes, write_json
@@ -227,6 +235,16 @@ def world_model_config(stages: Mapping[str, StageCheckpoint]) -> tuple[ModelConf
     return replace(model, savi=stage_model(stages["slots"])[0].savi), env
 
 
+def trained_horizon(dynamics: StageCheckpoint) -> int:
+    """Steps after the first frame that a predictor was trained to roll out.
+
+    Raises:
+        CheckpointError: its config.json is not one of this version.
+    """
+    own = stage_config(dynamics, DynamicsStageConfig, "dynamics")
+    return own.seed_frames - 1 + own.predicted_frames
+
+
 def load_world_model(run: Path | str, device: torch.device | str = "cpu") -> WorldModel:
     """World model of a run or the shipped one (`pretrained`), in eval mode, without gradients for its weights.
 
@@ -244,14 +262,23 @@ def load_world_model(run: Path | str, device: torch.device | str = "cpu") -> Wor
     return world
 
 
+def untrained_agent(world: WorldModel, behaviour: BehaviourStageConfig, oracle: bool) -> Agent:
+    """The agent that the stage trains on a world model: fresh networks, of the kinds that its settings name."""
+    from playslot_rl.world_model import Agent
+
+    return Agent.untrained(world, oracle, whiten=behaviour.whiten, decoder_state=behaviour.decoder_state)
+
+
+def _has_oracle(policy: StageCheckpoint) -> bool:
+    return "oracle" in policy.meta.get("modules", [])
+
+
 def load_agent(run: Path | str, device: torch.device | str = "cpu") -> Agent:
     """World model, policy, action decoder and, if trained, slot oracle of a run; eval mode, no gradients.
 
     Raises:
         CheckpointError: a stage is missing or damaged, or was trained on other parents.
     """
-    from playslot_rl.world_model import Agent
-
     folder = run_folder(run)
     policy = read_stage(checkpoint_folder(folder, "policy"), "policy")
     require_parents(policy, world_model_checkpoints(run))
@@ -259,7 +286,7 @@ def load_agent(run: Path | str, device: torch.device | str = "cpu") -> Agent:
     model, _ = stage_model(policy)
     world.config = replace(world.config, policy=model.policy, action_decoder=model.action_decoder)
     with torch.random.fork_rng(devices=[]):
-        agent = Agent.untrained(world, oracle="oracle" in policy.meta.get("modules", []))
+        agent = untrained_agent(world, stage_config(policy, BehaviourStageConfig, "policy"), _has_oracle(policy))
     modules = {"policy": agent.policy, "action_decoder": agent.action_decoder, "oracle": agent.oracle}
     load_weights(policy, {name: module for name, module in modules.items() if module is not None})
     freeze_on(agent, device)

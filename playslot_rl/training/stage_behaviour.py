@@ -6,6 +6,7 @@ Two `Stage`s for `fit`. The world model is frozen and has labelled the demonstra
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -18,19 +19,60 @@ from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeding import StepGenerators
-from playslot_rl.training.stage_regression import HELD_OUT, Examples, RegressionStage, TensorInputs, apply_rows
+from playslot_rl.training.stage_regression import (
+    HELD_OUT,
+    Examples,
+    PairedInputs,
+    RegressionStage,
+    TensorInputs,
+    apply_rows,
+)
 
 
-def _inputs(demos: Demonstrations, config: BehaviourStageConfig) -> list[Tensor]:
-    """What the policy clones from, each (M, N, D): parsed slots, and imagined ones."""
-    return [demos.slots, demos.imagined] if config.imagined else [demos.slots]
+def cloning_settings(config: BehaviourStageConfig) -> BehaviourStageConfig:
+    """The settings that decide the policy itself; labels and decoder, which come after it, are at their defaults.
+
+    The same policy serves any number of labels, so that a half-finished or copied training is told by these alone.
+    """
+    plain = BehaviourStageConfig()
+    later = ("labelled_demos", "decoder_inputs", "decoder_state", "decoder_steps", "decoder_lr")
+    return replace(config, **{name: getattr(plain, name) for name in (*later, "finetune_steps", "finetune_lr")})
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What policy and decoder see of demonstrations: parsed slots, and imagined ones with `config.imagined`.
+
+    Attributes:
+        slots: (I, N, D), the parsed ones first.
+        rows: the transition of each, int64 (I,).
+    """
+
+    slots: Tensor
+    rows: Tensor
+
+    @classmethod
+    def of(cls, demos: Demonstrations, imagined: bool, horizon: int | None) -> Seen:
+        """Look at demonstrations.
+
+        Args:
+            demos: labelled by the world model.
+            imagined: look at what the predictor imagines, too.
+            horizon: only up to so many steps after the first frame; None for as long as there are.
+        """
+        rows = torch.arange(len(demos.slots), device=demos.slots.device)
+        if not imagined:
+            return cls(demos.slots, rows)
+        far = rows if horizon is None else rows[demos.step <= horizon]
+        return cls(torch.cat((demos.slots, demos.imagined[far])), torch.cat((rows, far)))
 
 
 class CloneStage:
     """Clone latents from parsed slots, and from imagined ones with `config.imagined`; the oracle clones real actions.
 
     Note: the paper clones from parsed slots only. Imagination then feeds the policy slots it never saw; with the
-    predicted slots of the same demonstrations among its inputs (still without any action label) it has. Noise on the
+    predicted slots of the same demonstrations among its inputs (still without any action label) it has, up to the
+    horizon the predictor was trained on: beyond it they say little of what happened. Noise on the
     slots (`config.slot_noise`) makes both networks smooth over errors of about that size: 150 demonstrations are few.
     With `config.loss=l1` they learn medians: the scripted experts switch between full speed back and ahead, and a mean
     of both stands still.
@@ -41,6 +83,7 @@ class CloneStage:
         demos: labelled by the world model.
         config: batch and options.
         held_out: demonstrations that are not trained on, labelled likewise; None for none.
+        horizon: steps that the predictor was trained to roll out; None for any number.
 
     Raises:
         DataError: an oracle, but no actions.
@@ -53,14 +96,17 @@ class CloneStage:
         demos: Demonstrations,
         config: BehaviourStageConfig,
         held_out: Demonstrations | None = None,
+        horizon: int | None = None,
     ) -> None:
-        inputs = _inputs(demos, config)
+        if policy.whitening is not None:
+            policy.whitening.fit(demos.latents)
+        seen = Seen.of(demos, config.imagined, horizon)
         self.stages = {
             "policy": RegressionStage(
                 "policy",
                 BehaviourLoss(policy, config.loss),
-                TensorInputs(torch.cat(inputs), config.slot_noise, "policy_noise"),
-                demos.latents.repeat(len(inputs), 1),
+                TensorInputs(seen.slots, config.slot_noise, "policy_noise"),
+                demos.latents[seen.rows],
                 config.batch_size,
                 checks=_checks(demos) | ({} if held_out is None else _checks(held_out, HELD_OUT)),
                 precision=config.precision,
@@ -106,7 +152,7 @@ def _acted(demos: Demonstrations | None) -> tuple[Tensor, Tensor] | None:
 
 
 class DecoderStage(RegressionStage):
-    """Regress real actions of the labelled demonstrations.
+    """Regress real actions of the labelled demonstrations from latents, and from slots where the decoder reads them.
 
     Note: with `config.decoder_inputs=policy` the inputs are the trained policy's outputs, on parsed slots and (with
     `config.imagined`) on imagined ones, which is what the decoder gets at test time; the paper feeds InvDyn's latents.
@@ -118,6 +164,7 @@ class DecoderStage(RegressionStage):
         demos: with actions.
         config: options.
         held_out: demonstrations that are not trained on; None for none. Their actions only measure.
+        horizon: see `CloneStage`.
 
     Raises:
         DataError: no actions, or fewer demonstrations than `config.labelled_demos`.
@@ -130,17 +177,27 @@ class DecoderStage(RegressionStage):
         demos: Demonstrations,
         config: BehaviourStageConfig,
         held_out: Demonstrations | None = None,
+        horizon: int | None = None,
     ) -> None:
-        def examples(demos: Demonstrations, rows: Tensor) -> Examples:
+        def examples(demos: Demonstrations, noise: float) -> tuple[Tensor, Examples]:
             if demos.actions is None:
                 raise DataError("action decoder: got demonstrations without actions, expected the feature `action`")
-            inputs = [] if config.decoder_inputs == "policy" else [demos.latents[rows]]
+            latents, slots, rows = [], [], []
+            if config.decoder_inputs != "policy":
+                every = torch.arange(len(demos.slots), device=demos.slots.device)
+                latents, slots, rows = [demos.latents], [demos.slots], [every]
             if config.decoder_inputs != "inverse_dynamics":
-                inputs += [apply_rows(policy, TensorInputs(slots), rows) for slots in _inputs(demos, config)]
-            return TensorInputs(torch.cat(inputs)), demos.actions[rows].repeat(len(inputs), 1)
+                seen = Seen.of(demos, config.imagined, horizon)
+                said = apply_rows(
+                    policy, TensorInputs(seen.slots), torch.arange(len(seen.rows), device=seen.rows.device)
+                )
+                latents, slots, rows = [*latents, said], [*slots, seen.slots], [*rows, seen.rows]
+            z = torch.cat(latents)
+            state = [TensorInputs(torch.cat(slots), noise, "decoder_noise")] if decoder.reads_slots else []
+            return z, (PairedInputs(TensorInputs(z), *state), demos.actions[torch.cat(rows)])
 
-        inputs, actions = examples(demos, demos.labelled(config.labelled_demos))
-        decoder.standardise(inputs.plain(torch.arange(len(inputs))))
+        z, (inputs, actions) = examples(demos.take(demos.labelled(config.labelled_demos)), config.slot_noise)
+        decoder.standardise(z)
         acted = None if held_out is None or held_out.actions is None else held_out
         super().__init__(
             "action_decoder",
@@ -148,10 +205,83 @@ class DecoderStage(RegressionStage):
             inputs,
             actions,
             config.batch_size,
-            held_out=None if acted is None else examples(acted, acted.labelled(len(acted.lengths))),
+            held_out=None if acted is None else examples(acted, 0.0)[1],
             stream="decoder",
             precision=config.precision,
         )
+
+
+class FinetuneStage:
+    """Policy and decoder together on real actions, L_a(D_a(f_pi(S_t), S_t)), while the policy goes on cloning: + L_pi.
+
+    Note: not in the paper, whose decoder is trained beside a finished policy. The cloning term keeps the policy's
+    latents what the predictor understands.
+
+    Args:
+        clone: the policy's training, whose rows and loss go on.
+        decoder: trained.
+        demos: with actions.
+        config: options.
+        held_out: demonstrations that only measure; None for none.
+        horizon: see `CloneStage`.
+
+    Raises:
+        DataError: no actions, or fewer demonstrations than `config.labelled_demos`.
+    """
+
+    def __init__(
+        self,
+        clone: RegressionStage,
+        decoder: ActionDecoder,
+        demos: Demonstrations,
+        config: BehaviourStageConfig,
+        held_out: Demonstrations | None = None,
+        horizon: int | None = None,
+    ) -> None:
+        policy = clone.criterion.network
+        self.clone, self.both = clone, _Both(policy, decoder)
+
+        def examples(demos: Demonstrations, noise: float) -> Examples:
+            if demos.actions is None:
+                raise DataError("action decoder: got demonstrations without actions, expected the feature `action`")
+            seen = Seen.of(demos, config.imagined, horizon)
+            return TensorInputs(seen.slots, noise, "finetune_noise"), demos.actions[seen.rows]
+
+        criterion = BehaviourLoss(self.both, config.loss)
+        criterion.set_keys(action=keys.ACTION)
+        acted = None if held_out is None or held_out.actions is None else held_out
+        self.acting = RegressionStage(
+            "finetune",
+            criterion,
+            *examples(demos.take(demos.labelled(config.labelled_demos)), config.slot_noise),
+            config.batch_size,
+            held_out=None if acted is None else examples(acted, 0.0),
+            precision=config.precision,
+        )
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        """Policy and action decoder."""
+        return {"policy": self.both.policy, "action_decoder": self.both.decoder}
+
+    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+        """Errors of actions and of latents."""
+        action, latent = (part.loss(step, generators)["loss"] for part in (self.acting, self.clone))
+        return {"loss": action + latent, "action": action, "latent": latent}
+
+    def validate(self, step: int) -> Mapping[str, float]:
+        """Unexplained fraction of the actions' variance."""
+        return self.acting.validate(step)
+
+
+class _Both(nn.Module):
+    def __init__(self, policy: nn.Module, decoder: ActionDecoder) -> None:
+        super().__init__()
+        self.policy, self.decoder = policy, decoder
+
+    def forward(self, slots: Tensor) -> Tensor:
+        out: Tensor = self.decoder(self.policy(slots), slots)
+        return out
 
 
 def oracle_stage(

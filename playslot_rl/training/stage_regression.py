@@ -23,6 +23,9 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.seeding import StepGenerators
 
+Observed = Tensor | tuple[Tensor, ...]
+"""What a network is called with: one tensor (b, ...), or several."""
+
 
 class Inputs(Protocol):
     """What a network regresses from, by row."""
@@ -30,10 +33,10 @@ class Inputs(Protocol):
     def __len__(self) -> int:
         """M."""
 
-    def draw(self, rows: Tensor, generators: StepGenerators) -> Tensor:
+    def draw(self, rows: Tensor, generators: StepGenerators) -> Observed:
         """Inputs (b, ...) of rows int64 (b,) for training, with noise or augmentation drawn from `generators`."""
 
-    def plain(self, rows: Tensor) -> Tensor:
+    def plain(self, rows: Tensor) -> Observed:
         """Inputs (b, ...) of rows, as they are."""
 
 
@@ -63,6 +66,28 @@ class TensorInputs:
     def plain(self, rows: Tensor) -> Tensor:
         """Rows, without noise."""
         return self.values[rows]
+
+
+class PairedInputs:
+    """Several inputs by row, for a network that reads more than one.
+
+    Args:
+        parts: equally long, in the order in which the network takes them.
+    """
+
+    def __init__(self, *parts: TensorInputs) -> None:
+        self.parts = parts
+
+    def __len__(self) -> int:
+        return len(self.parts[0])
+
+    def draw(self, rows: Tensor, generators: StepGenerators) -> tuple[Tensor, ...]:
+        """Rows of each, each with its own noise."""
+        return tuple(part.draw(rows, generators) for part in self.parts)
+
+    def plain(self, rows: Tensor) -> tuple[Tensor, ...]:
+        """Rows of each, without noise."""
+        return tuple(part.plain(rows) for part in self.parts)
 
 
 class FrameInputs:
@@ -166,8 +191,9 @@ class RegressionStage:
         """Error of one batch."""
         device = self.targets.device
         drawn = torch.randint(len(self.targets), (self.batch_size,), generator=generators.torch(self.stream, "cpu"))
-        rows, names = drawn.to(device), self.criterion.tensor_keys
-        batch = {names.observation: self.inputs.draw(rows, generators), names.action: self.targets[rows]}
+        rows = drawn.to(device)
+        observed = dict(zip(self.criterion.observed, _several(self.inputs.draw(rows, generators)), strict=True))
+        batch = {**observed, self.criterion.tensor_keys.action: self.targets[rows]}
         with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):
             losses = self.criterion(TensorDict(batch, [len(rows)]))
         return {"loss": losses[self.criterion.out_name]}
@@ -185,7 +211,11 @@ class RegressionStage:
 @torch.no_grad()
 def apply_rows(network: nn.Module, inputs: Inputs, rows: Tensor, batch: int = 1024) -> Tensor:
     """A network's outputs (b, ...) on rows of its inputs, in the mode it is in."""
-    return torch.cat([network(inputs.plain(part)) for part in rows.split(batch)])
+    return torch.cat([network(*_several(inputs.plain(part))) for part in rows.split(batch)])
+
+
+def _several(observed: Observed) -> tuple[Tensor, ...]:
+    return observed if isinstance(observed, tuple) else (observed,)
 
 
 def unexplained(predicted: Tensor, target: Tensor) -> float:
