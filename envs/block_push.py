@@ -181,6 +181,7 @@ class BlockEnv(PixelTask):
         "action": "grip displacement x, y, z in units of 0.05 m and gripper effort (used by Pick only)",
     }
     """`control_hz` counts environment steps: an agent step of `frame_skip` of them takes `frame_skip / 25` seconds."""
+    still = ("robot0:base_link", "robot0:torso_lift_link", "robot0:torso_fixed_link")
 
     layout: Layout
 
@@ -212,6 +213,12 @@ class BlockEnv(PixelTask):
     def _begin(self, rng: np.random.Generator) -> None:
         self.layout = draw_layout(rng, self.variant, self.config.blocks, self._simulation.start_grip)
         self._simulation.place(self.layout)
+
+    def objects(self) -> tuple[tuple[str, ...], ...]:
+        """The arm, the goal, and each object there may be."""
+        kind = "sphere" if self.variant == "reach" else "object"
+        things = (f"{kind}{i}" for i in range(self._simulation.count))
+        return ("robot0:base_link",), ("target0",), *((name,) for name in things)
 
     def _advance(self, action: Action) -> tuple[float, bool]:
         self._simulation.advance(action)

@@ -16,6 +16,7 @@ from playslot_rl.envs.pixel_task import ACTION_DIM, STATE_DIM, Action, PixelTask
 from playslot_rl.envs.rendering import Camera, FrameRenderer, import_mujoco
 
 CAMERA = Camera(distance=1.25, azimuth=145.0, elevation=-40.0, lookat=(-0.05, 0.75, 0.0))
+PEDESTAL = ("base", "controller_box", "pedestal_feet", "pedestal", "torso", "right_arm_base_link")
 HAND_STATE = slice(0, STATE_DIM)
 """Part of Meta-World's observation that is proprioception: hand xyz (metres) and gripper opening [0, 1]."""
 
@@ -41,6 +42,7 @@ class ButtonPressEnv(PixelTask):
         RenderError: there is no working GL backend.
     """
 
+    still = PEDESTAL
     metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it so)
         "render_modes": ["rgb_array"],
         "render_fps": 16,
@@ -82,6 +84,10 @@ class ButtonPressEnv(PixelTask):
         mujoco.mj_resetData(env.model, env.data)
         self._full = env.reset_model()
         env._prev_obs = self._full[:18].copy()
+
+    def objects(self) -> tuple[tuple[str, ...], ...]:
+        """The arm, and the box with its button."""
+        return ("base", "hand"), ("box",)
 
     def _advance(self, action: Action) -> tuple[float, bool]:
         self._full, reward, _, _, info = self._simulation.step(action)

@@ -6,14 +6,15 @@ Shapes: A = 4, S = 4, H = W = `EnvConfig.image_size`.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, Final, cast
+from collections.abc import Sequence
+from typing import Any, ClassVar, Final, cast
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig
-from playslot_rl.envs.rendering import FrameRenderer
+from playslot_rl.envs.rendering import FrameRenderer, import_mujoco
 from playslot_rl.errors import ConfigError
 
 ACTION_DIM: Final = 4
@@ -45,6 +46,8 @@ class PixelTask(gym.Env[Observation, Action]):
 
     _simulation: Any  # MuJoCo's `model` and `data`, and `close`; made by the subclass, as is the next one
     _renderer: FrameRenderer
+    still: ClassVar[tuple[str, ...]] = ()
+    """Bodies of an object that stay where they are and look like ground."""
 
     def __init__(self, config: EnvConfig, render_mode: str | None) -> None:
         if config.action_dim != ACTION_DIM:
@@ -95,6 +98,28 @@ class PixelTask(gym.Env[Observation, Action]):
     def draw(self) -> Frame:
         """Draw the present state anew: uint8 (H, W, 3). `render` returns the frame that was last observed."""
         return self._renderer(self._simulation.data)
+
+    @abstractmethod
+    def objects(self) -> Sequence[Sequence[str]]:
+        """What a viewer calls one thing: for each, the names of its root bodies, or of sites of the world."""
+
+    def segment(self) -> npt.NDArray[np.int64]:
+        """Which object each pixel shows: int64 (H, W), o + 1 for `objects()[o]`, 0 for the ground."""
+        model, found = self._simulation.model, self._renderer.parts(self._simulation.data)
+        number = {name: label for label, names in enumerate(self.objects(), 1) for name in names}
+        kinds = import_mujoco().mjtObj
+        labels = np.zeros(found.shape[:2], np.int64)
+        bodies = {int(kinds.mjOBJ_GEOM): model.geom_bodyid, int(kinds.mjOBJ_SITE): model.site_bodyid}
+        for part, kind in np.unique(found.reshape(-1, 2), axis=0).tolist():
+            if kind not in bodies:
+                continue
+            body = bodies[kind][part]
+            name = model.body(model.body_rootid[body]).name
+            if body == 0 and kind == kinds.mjOBJ_SITE:
+                name = model.site(part).name
+            if model.body(body).name not in self.still:
+                labels[(found == (part, kind)).all(-1)] = number.get(name, 0)
+        return labels
 
     def close(self) -> None:
         """Free the GL context."""

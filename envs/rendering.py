@@ -177,6 +177,20 @@ class FrameRenderer:
             return frame.copy()
         return box_mean(frame, self._factor)
 
+    def parts(self, data: mujoco.MjData) -> npt.NDArray[np.int32]:
+        """Which part of the model each pixel shows: int32 (H, W, 2), its number and its `mjtObj` type; -1 where none.
+
+        Of the pixels that `__call__` averages, the one at the centre.
+        """
+        self._renderer.enable_segmentation_rendering()
+        try:
+            self._renderer.update_scene(data, self._camera)
+            found: npt.NDArray[np.int32] = self._renderer.render()
+        finally:
+            self._renderer.disable_segmentation_rendering()
+        middle = self._factor // 2
+        return found[middle :: self._factor, middle :: self._factor].copy()
+
     def close(self) -> None:
         """Free the GL context; safe to call twice."""
         self._finalizer()

@@ -279,10 +279,10 @@ def label_demonstrations(
             imagined, motion = torch.cat((parsed[:, :1], rolled[:, :-1]), dim=1), slot_motion(parsed)
             for i, episode in enumerate(chosen):
                 parts[int(episode)] = (parsed[i, :-1], imagined[i], latent.mean[i], motion[i])
-    slots, imagined, latents, motion = (torch.cat(part) for part in zip(*(parts[int(e)] for e in kept), strict=True))
+    seen, dreamt, latents, motion = (torch.cat(part) for part in zip(*(parts[int(e)] for e in kept), strict=True))
     return Demonstrations(
-        slots=slots,
-        imagined=imagined,
+        slots=seen,
+        imagined=dreamt,
         latents=latents,
         actions=labels,
         episode=torch.from_numpy(moves.episode).to(device),

@@ -40,12 +40,14 @@ class _CloningLoss(LossModule):
         Attributes:
             observation: what the network reads.
             action: the target.
+            state: what a decoder with `reads_slots` reads beside it.
             mask: optional bool (...); False leaves an element's target out. Not read where missing.
         """
 
         observation: NestedKey = keys.SLOTS
         action: NestedKey = keys.LATENT_ACTION
         mask: NestedKey = "mask"
+        state: NestedKey = keys.SLOTS
 
     tensor_keys: _AcceptedKeys
     default_keys: ClassVar[type[Any]] = _AcceptedKeys
@@ -153,7 +155,6 @@ class ActionDecoderLoss(_CloningLoss):
 
         observation: NestedKey = keys.LATENT_ACTION
         action: NestedKey = keys.ACTION
-        state: NestedKey = keys.SLOTS
 
     default_keys = _AcceptedKeys
     out_name = "loss_action"

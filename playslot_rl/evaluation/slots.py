@@ -1,0 +1,118 @@
+"""Slots scored against the simulator's own segmentation, on episodes of the scripted expert that no training has seen.
+
+    ARI = adjusted Rand index of (slot with the largest mask, object) over the pixels of a clip,   FG-ARI: of objects' alone
+
+Shapes: E episodes, T agent steps (T + 1 frames), N slots, H W image size. Label images count from 0, the ground.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.envs import make_env
+from playslot_rl.evaluation.objects import adjusted_rand_index
+from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
+from playslot_rl.evaluation.success import hardware
+from playslot_rl.frames import to_float
+from playslot_rl.modules.savi import SAVi
+from playslot_rl.storage.atomic import write_json
+from playslot_rl.training.runs import load_savi, slots_checkpoint
+from playslot_rl.world_model import module_device
+
+DEFAULT_EPISODES: Final = 20
+RESULT: Final = Path("evaluation") / "slots" / "eval_info.json"
+"""The result, relative to the folder that is written."""
+
+
+def segmented_episode(env: Any, seed: int, steps: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int64]]:
+    """Frames uint8 (T + 1, H, W, 3) of the scripted expert's episode, and which object each pixel shows (T + 1, H, W).
+
+    Args:
+        env: a `PixelTask`.
+        seed: of the episode.
+        steps: T.
+    """
+    frames, labels = [env.reset(seed=seed)[0]["pixels"]], [env.segment()]
+    for _ in range(steps):
+        frames.append(env.step(env.expert_action())[0]["pixels"])
+        labels.append(env.segment())
+    return np.stack(frames), np.stack(labels)
+
+
+@torch.no_grad()
+def score_slots(savi: SAVi, config: ExperimentConfig, seeds: Sequence[int]) -> dict[str, Any]:
+    """Parse the expert's episodes and compare slots with objects.
+
+    Args:
+        savi: in evaluation mode.
+        config: its `env` and `render` say what is seen; `env.max_steps` is T.
+        seeds: of the episodes.
+
+    Returns:
+        Means over episodes: `ari`, `foreground_ari`, `psnr` of the reconstructions (dB), and `slots_per_object`, of
+        each object that is seen the number of slots that hold at least a tenth of its pixels, averaged.
+    """
+    env, device = make_env(config.env, config.render).unwrapped, module_device(savi)
+    scores = []
+    try:
+        for seed in seeds:
+            frames, truth = segmented_episode(env, seed, config.env.max_steps)
+            real = to_float(frames[None], device)
+            decoded = savi.decode(savi(real, generator=torch.Generator(device).manual_seed(seed))[0])
+            found = decoded.masks[0, :, :, 0].argmax(1).cpu().numpy()
+            error = float((decoded.frames - real).square().mean())
+            scores.append(
+                (
+                    adjusted_rand_index(truth, found),
+                    adjusted_rand_index(truth, found, foreground=True),
+                    -10.0 * float(np.log10(max(error, 1e-12))),
+                    slots_per_object(truth, found, savi.config.n_slots),
+                )
+            )
+    finally:
+        env.close()
+    names = ("ari", "foreground_ari", "psnr", "slots_per_object")
+    return dict(zip(names, np.mean(scores, 0).tolist(), strict=True))
+
+
+def slots_per_object(truth: npt.NDArray[np.int64], found: npt.NDArray[np.int64], slots: int) -> float:
+    """Slots that hold at least a tenth of an object's pixels, averaged over the objects of a clip."""
+    counts = []
+    for label in np.unique(truth[truth > 0]):
+        share = np.bincount(found[truth == label], minlength=slots) / (truth == label).sum()
+        counts.append(int((share >= 0.1).sum()))
+    return float(np.mean(counts)) if counts else 0.0
+
+
+def evaluate_slots(run: str | Path, out: Path, config: ExperimentConfig, device: torch.device | str) -> dict[str, Any]:
+    """Score a run's slots on `config.episodes` episodes (20) and write `OUT/evaluation/slots/eval_info.json`.
+
+    Raises:
+        CheckpointError: the run has no finished slots.
+        ConfigError: a training data set holds one of the seeds.
+        OutputError: the file cannot be written.
+    """
+    began, start = time.perf_counter(), first_seed(config, config.seed)
+    seeds = list(range(start, start + (config.episodes or DEFAULT_EPISODES)))
+    check_disjoint(seeds, training_seeds(config, Path(run)))
+    result = {
+        "protocol": "slots",
+        "episodes": len(seeds),
+        "seed": config.seed,
+        "seeds": seeds,
+        **score_slots(load_savi(run, device), config, seeds),
+        "fingerprints": {"slots": slots_checkpoint(run).fingerprint},
+        "wall_seconds": round(time.perf_counter() - began, 2),
+        "hardware": hardware(),
+    }
+    (out / RESULT).parent.mkdir(parents=True, exist_ok=True)
+    write_json(out / RESULT, result)
+    return result
