@@ -79,7 +79,11 @@ def _run_due(config: ExperimentConfig, report: Comparison) -> None:
     print(f"compare: {len(due)} of {len(report.jobs)} jobs to run", flush=True)
     try:
         if due and config.compare.launcher:
-            run_sweep(list(due), config.compare.launcher, config.compare.hydra)
+            # Those whose policy others take over come first; these would train it again, side by side.
+            for first in (True, False):
+                wave = [file for file, job in due.items() if (job.policy_of is None) is first]
+                if wave:
+                    run_sweep(wave, config.compare.launcher, config.compare.hydra)
         else:
             for file, job in due.items():
                 run_process(file)

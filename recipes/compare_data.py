@@ -142,5 +142,5 @@ class Parents:
         if job.method == "lapo":
             prints |= self._lapo
         if job.demos is not None and self._demos is not None:
-            prints["demos"] = first_demonstrations(self._demos, job.demos).fingerprint
+            prints["demos"] = first_demonstrations(self._demos, job.demos).fingerprint  # the draw is in its config
         return prints

@@ -55,7 +55,7 @@ def _run(job: dict[str, Any]) -> None:
     facts = {
         "episodes": config.episodes or DEFAULT_EPISODES,
         "seed": seed,
-        "fingerprints": run_facts(run, job["stage"]).fingerprints,
+        "fingerprints": run_facts(run, job["method"]).fingerprints,
         **task_facts(config, seed),
     }
     for protocol in job["protocols"]:

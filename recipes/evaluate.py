@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 
 from playslot_rl.config import EnvConfig, ExperimentConfig
 from playslot_rl.config.compose import shipped
-from playslot_rl.config.methods import METHODS
+from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes import objects
@@ -76,7 +76,8 @@ def evaluate_baseline(config: ExperimentConfig, run: Path) -> None:
 
     check_baseline_protocol(config)
     run_facts(run, config.method)  # a run without a policy is refused before anything is loaded
-    env = stage_config(read_stage(checkpoint_folder(run, config.method), config.method), EnvConfig, "env")
+    stage = method_stage(config.method)
+    env = stage_config(read_stage(checkpoint_folder(run, stage), stage), EnvConfig, "env")
     check_environment(config, env.image_size, env.action_dim)
     device = open_device(config)
     module, _, function = METHODS[config.method].actor.partition(":")

@@ -11,6 +11,8 @@ from playslot_rl.config.compose import SHIPPED, shipped
 from playslot_rl.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
     import numpy.typing as npt
     import torch
@@ -96,9 +98,12 @@ def demonstration_views(
     def parse(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
         return slot_cache(frames, savi, slots_print, config.data.cache, module_device(savi), config.logging.progress)
 
-    copies = shifted_copies(demos.trained, config.behaviour.shift, config.behaviour.shifted_copies)
+    def copies(of: EpisodeFrames) -> Sequence[EpisodeFrames]:
+        return shifted_copies(of, config.behaviour.shift, config.behaviour.shifted_copies)
+
+    shifted_views = [(copy, parse(of)) for copy, of in zip(copies(demos.trained), copies(demos.parsed), strict=True)]
     held_out = [] if demos.held_out is None else [(demos.held_out, parse(demos.held_out))]
-    return [(demos.trained, parse(demos.parsed)), *((copy, parse(copy)) for copy in copies)], held_out
+    return [(demos.trained, parse(demos.parsed)), *shifted_views], held_out
 
 
 def held_out_text(demos: DemonstrationSplit) -> str:

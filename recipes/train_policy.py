@@ -34,7 +34,7 @@ def main(config: ExperimentConfig) -> None:
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
     from playslot_rl.training.record import StageRecord, run_stage
-    from playslot_rl.training.runs import use_world_model, world_model_checkpoints, world_model_config
+    from playslot_rl.training.runs import adopt_training, use_world_model, world_model_checkpoints, world_model_config
 
     run = open_run(config)
     parent = parent_run(config, run)
@@ -47,14 +47,22 @@ def main(config: ExperimentConfig) -> None:
         "policy",
         run,
         config,
-        stored={"env": to_dict(env), "model": sizes, "policy": to_dict(config.behaviour)},
+        stored={"env": to_dict(env), "model": sizes, "policy": to_dict(replace(config.behaviour, policy_from=""))},
         counts=("model.policy", "model.action_decoder"),
         identity={"model": sizes},
         parents=parents,
         role="demos",
         ready=partial(use_world_model, run, parent),
     )
-    run_stage(record, lambda: _training(config, record, parent))
+
+    def prepare() -> Training:
+        training = _training(config, record, parent)
+        if config.behaviour.policy_from:
+            record.begin()
+            adopt_training(config.behaviour.policy_from, run, record.name, config.behaviour.steps)
+        return training
+
+    run_stage(record, prepare)
 
 
 def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Training:

@@ -34,10 +34,10 @@ def comparison_page(result: Result) -> str:
         "interval over the episodes, which all seeds share, and after it the lowest and the highest seed."
     )
     parts = [
-        f"# {result['env']}: success against demonstrations",
+        f"# {result['env']}: success against {'labels' if result['labels'] else 'demonstrations'}",
         lead,
         "![Success rate](comparison.png)",
-        *_offline(result["summary"], len(result["seeds"])),
+        *(_by_labels if result["labels"] else _offline)(result["summary"], len(result["seeds"])),
         *_online(result["summary"], len(result["seeds"])),
         "## Footnotes",
         "\n".join(f"- {note}" for note in _footnotes(result)),
@@ -56,6 +56,25 @@ def _offline(summary: Sequence[Result], seeds: int) -> list[str]:
     cells = {(row["title"], row["protocol"], row["demos"]): cell(row, seeds) for row in rows}
     body = [[f"{t}, {p}", *(cells.get((t, p, n), "–") for n in numbers)] for t, p in series]
     return ["## By demonstrations", table(["", *(f"{n} demonstrations" for n in numbers)], body)]
+
+
+def _by_labels(summary: Sequence[Result], seeds: int) -> list[str]:
+    """A table for each number of videos: methods by labelled demonstrations, and the oracles, which see all actions."""
+    rows = [row for row in summary if row["demos"] is not None]
+    parts = []
+    for videos in sorted({row["demos"] for row in rows if not METHODS[row["method"]].labelled_only}) or [None]:
+        own = [row for row in rows if METHODS[row["method"]].labelled_only or row["demos"] == videos]
+        labels = sorted({row["labels"] for row in own if row["labels"] is not None})
+        series = list(dict.fromkeys((row["title"], row["protocol"]) for row in own if row["labels"] is not None))
+        cells = {(row["title"], row["protocol"], row["labels"]): cell(row, seeds) for row in own}
+        body = [[f"{t}, {p}", *(cells.get((t, p, n), "–") for n in labels)] for t, p in series]
+        parts.append(
+            f"## By labelled demonstrations, of {videos} videos" if videos else "## By labelled demonstrations"
+        )
+        parts.append(table(["", *(f"{n} labelled" for n in labels)], body))
+        ceiling = [f"{row['title']} {cell(row, seeds)}" for row in own if row["labels"] is None]
+        parts += [f"With the actions of all {videos}: {'; '.join(ceiling)}."] if ceiling else []
+    return parts
 
 
 def _online(summary: Sequence[Result], seeds: int) -> list[str]:
@@ -147,7 +166,11 @@ def _open_jobs(rows: Sequence[Result], jobs: int) -> list[str]:
 
 def _ratios(summary: Sequence[Result]) -> list[str]:
     """PlaySlot's success in simulation as a share of the Slot Oracle's, which sees all real actions."""
-    rates = {(row["method"], row["demos"]): row["success_rate"] for row in summary if row["protocol"] == "simulation"}
+    rates = {
+        (row["method"], row["demos"]): row["success_rate"]
+        for row in summary
+        if row["protocol"] == "simulation" and row["labels"] is None
+    }
     shares = [
         f"{100 * rate / rates['slot_oracle', demos]:.0f} % at {demos}"
         for (method, demos), rate in rates.items()
@@ -240,11 +263,13 @@ def comparison_figure(result: Result, theme: Theme) -> Figure:
     curves = [row for row in result["rows"] if row["curve"]]
     final = [row for row in result["summary"] if row["demos"] is None]
     online = bool(curves or final)
-    figure = new_figure(9.6 if offline and online else 6.4, 3.9)
-    panels = int(bool(offline)) + int(online) or 1
-    if offline or not online:
-        axes = figure.add_subplot(1, panels, 1)
-        _demonstrations(axes, offline, result["rows"], theme)
+    groups = _panels(result, offline) or ([] if online else [("", [])])
+    panels = len(groups) + int(online)
+    figure = new_figure(9.6 if panels > 1 else 6.4, 3.9)
+    for number, (title, rows) in enumerate(groups, 1):
+        axes = figure.add_subplot(1, panels, number)
+        axes.set_title(title, color=theme.text, fontsize=10)
+        _against(axes, rows, result["rows"], theme, "labels" if result["labels"] else "demos")
         _finish(axes, result, theme)
     if online:
         axes = figure.add_subplot(1, panels, panels)
@@ -254,15 +279,34 @@ def comparison_figure(result: Result, theme: Theme) -> Figure:
     return figure
 
 
-def _demonstrations(axes: Axes, summary: Sequence[Result], rows: Sequence[Result], theme: Theme) -> None:
+def _panels(result: Result, offline: Sequence[Result]) -> list[tuple[str, Sequence[Result]]]:
+    """Title and rows of each panel of the methods that learn from demonstrations: by labels, one a number of videos."""
+    if not result["labels"]:
+        return [("", offline)] if offline else []
+    videos = sorted({row["demos"] for row in offline if not METHODS[row["method"]].labelled_only})
+    if not videos:
+        return [("", offline)] if offline else []
+    return [
+        (f"{n} videos", [row for row in offline if METHODS[row["method"]].labelled_only or row["demos"] == n])
+        for n in videos
+    ]
+
+
+def _against(axes: Axes, summary: Sequence[Result], rows: Sequence[Result], theme: Theme, key: str) -> None:
+    """Success over `demos` or `labels`; what has no such number, oracles among labels, is a line across."""
+    for row in (row for row in summary if row[key] is None):
+        colour = theme.series[METHOD_STYLES[row["method"]].colour]
+        axes.axhline(100 * row["success_rate"], color=colour, linestyle="-.", linewidth=1.2, label=row["title"])
+    summary = [row for row in summary if row[key] is not None]
+    shown = {(row["method"], row["protocol"], row["demos"]) for row in summary}
     series = list(dict.fromkeys((row["method"], row["protocol"], row["title"]) for row in summary))
-    numbers = sorted({row["demos"] for row in summary})
+    numbers = sorted({row[key] for row in summary})
     for index, (method, protocol, title) in enumerate(series):
         style, own = METHOD_STYLES[method], [r for r in summary if (r["method"], r["protocol"]) == (method, protocol)]
-        own.sort(key=lambda row: row["demos"])
+        own.sort(key=lambda row: row[key])
         # Side by side, so that equal rates do not hide each other; by a factor, since the axis is logarithmic.
         aside = 1.035 ** (index - (len(series) - 1) / 2)
-        x, y = [row["demos"] * aside for row in own], [100 * row["success_rate"] for row in own]
+        x, y = [row[key] * aside for row in own], [100 * row["success_rate"] for row in own]
         below = [max(0.0, 100 * (row["success_rate"] - row["ci95"][0])) for row in own]
         above = [max(0.0, 100 * (row["ci95"][1] - row["success_rate"])) for row in own]
         dream = protocol == "imagination"
@@ -273,15 +317,19 @@ def _demonstrations(axes: Axes, summary: Sequence[Result], rows: Sequence[Result
             elinewidth=1.2, label=f"{title}, imagination" if dream else title,
         )  # fmt: skip
         single = [
-            r for r in rows if (r["method"], r["protocol"]) == (method, protocol) and r["success_rate"] is not None
+            r
+            for r in rows
+            if (r["method"], r["protocol"]) == (method, protocol)
+            and (method, protocol, r["demos"]) in shown
+            and r["success_rate"] is not None
         ]
         if len({row["seed"] for row in single}) > 1:
-            dots = [row["demos"] * aside for row in single]
+            dots = [row[key] * aside for row in single]
             axes.plot(dots, [100 * row["success_rate"] for row in single], ".", color=colour, markersize=4, alpha=0.5)
     axes.set_xscale("log")
     axes.set_xticks(numbers, [str(n) for n in numbers])
     axes.minorticks_off()
-    axes.set_xlabel("demonstrations")
+    axes.set_xlabel("labelled demonstrations" if key == "labels" else "demonstrations")
 
 
 def _steps(axes: Axes, curves: Sequence[Result], final: Sequence[Result], theme: Theme) -> None:

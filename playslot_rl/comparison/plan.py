@@ -1,4 +1,4 @@
-"""Which jobs a comparison has: one for each method, number of demonstrations and training seed.
+"""Which jobs a comparison has: one for each method, number of demonstrations, of labels, and training seed.
 
 A job is a file, `OUT/jobs/NAME.json`, that says everything; `python -m playslot_rl.recipes.compare_job FILE` runs it,
 on any machine that sees the folder, and running it again carries on or does nothing.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from playslot_rl.baselines.online.requirements import require_online
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import shipped
-from playslot_rl.config.methods import METHODS, MethodName
+from playslot_rl.config.methods import METHODS, MethodName, method_stage
 from playslot_rl.config.roles import without
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
@@ -33,18 +33,25 @@ class Job:
         demos: demonstrations it learns from; None for a method that acts.
         seed: of the training.
         out: folder of the comparison.
+        labels: those of them whose real actions it sees; None for a method that sees all or none, or where the
+            comparison has one number for all (`behaviour.labelled_demos`).
+        policy_of: labels of the job, with the same demonstrations and seed, whose policy is this one's too; None for
+            one that trains its own.
     """
 
     method: MethodName
     demos: int | None
     seed: int
     out: Path
+    labels: int | None = None
+    policy_of: int | None = None
 
     @property
     def name(self) -> str:
-        """Such as `lapo-d50-s0`, or `dreamer-s0`."""
+        """Such as `lapo-d50-s0`, `lapo-d50-l10-s0` or `dreamer-s0`."""
         demos = "" if self.demos is None else f"-d{self.demos}"
-        return f"{self.method}{demos}-s{self.seed}"
+        labels = "" if self.labels is None else f"-l{self.labels}"
+        return f"{self.method}{demos}{labels}-s{self.seed}"
 
     @property
     def file(self) -> Path:
@@ -59,7 +66,7 @@ class Job:
     @property
     def stage(self) -> str:
         """Stage of the run whose checkpoint is the method's."""
-        return "policy" if self.method == "playslot" else self.method
+        return method_stage(self.method)
 
     @property
     def protocols(self) -> tuple[str, ...]:
@@ -72,10 +79,20 @@ def jobs(config: ExperimentConfig, out: Path) -> list[Job]:
     wanted = config.compare
     offline = [m for m in wanted.methods if not METHODS[m].online]
     online = [m for m in wanted.methods if METHODS[m].online]
-    return [
-        *(Job(m, n, s, out) for s in wanted.seeds for n in sorted(wanted.demos) for m in offline),
-        *(Job(m, None, s, out) for s in wanted.online_seeds or wanted.seeds for m in online),
-    ]
+    found: list[Job] = []
+    for seed in wanted.seeds:
+        found += [Job(m, n, seed, out, n) for n in sorted(wanted.labels) for m in offline if METHODS[m].labelled_only]
+        for demos in sorted(wanted.demos):
+            for method in (m for m in offline if not METHODS[m].labelled_only):
+                found += _of_demonstrations(method, demos, seed, out, sorted(wanted.labels))
+    return [*found, *(Job(m, None, s, out) for s in wanted.online_seeds or wanted.seeds for m in online)]
+
+
+def _of_demonstrations(method: MethodName, demos: int, seed: int, out: Path, labels: Sequence[int]) -> list[Job]:
+    """One job, or one for each number of labels where the method's policy needs none and serves them all."""
+    if not labels or method not in ("playslot", "lapo"):
+        return [Job(method, demos, seed, out)]
+    return [Job(method, demos, seed, out, n, None if n == labels[0] else labels[0]) for n in labels]
 
 
 def uses_demos(config: ExperimentConfig) -> bool:
@@ -102,7 +119,7 @@ def check_comparison(config: ExperimentConfig) -> None:
         require_online(config, getattr(config.baselines, method), method)
     weights = config.baselines.resnet_oracle.weights
     named = weights in ("auto", "download", "scratch")
-    if "resnet_oracle" in wanted.methods and not named and not Path(weights).is_file():
+    if {"resnet_oracle", "resnet_bc"} & {*wanted.methods} and not named and not Path(weights).is_file():
         raise ConfigError(
             f"baselines.resnet_oracle.weights: got {weights}, expected a file, auto, download or scratch: check it"
         )
@@ -148,8 +165,8 @@ def check_demos(config: ExperimentConfig, episodes: int, where: str) -> None:
 def job_config(config: ExperimentConfig, job: Job, world: str, lapo_world: str) -> ExperimentConfig:
     """What a job trains with.
 
-    Labels are `behaviour.labelled_demos` or, with fewer demonstrations than that, all of them. PlaySlot's own oracle
-    and the references of each evaluation are left out: the slot oracle is a method, and the references run once.
+    Labels are the job's, else `behaviour.labelled_demos` or, with fewer demonstrations, all of them. PlaySlot's own
+    oracle and the references of each evaluation are left out: the slot oracle is a method, and the references run once.
     Paths are absolute, so that a job runs from any folder.
 
     Args:
@@ -158,13 +175,15 @@ def job_config(config: ExperimentConfig, job: Job, world: str, lapo_world: str) 
         world: run folder of the world model, or `pretrained`.
         lapo_world: run folder of LAPO's inverse and forward model.
     """
-    labelled = min(config.behaviour.labelled_demos, job.demos or config.behaviour.labelled_demos)
+    labelled = job.labels or min(config.behaviour.labelled_demos, job.demos or config.behaviour.labelled_demos)
+    policy = "" if job.policy_of is None else absolute(str(replace(job, labels=job.policy_of).run))
     lapo = replace(config.baselines.lapo, world=absolute(lapo_world))
     data = replace(
         config.data,
         root=",".join(absolute(part.strip()) for part in config.data.root.split(",")),
         demos=absolute(config.data.demos),
         cache=absolute(config.data.cache),
+        draw=None if METHODS[job.method].online else job.seed,
     )
     return replace(
         config,
@@ -175,7 +194,7 @@ def job_config(config: ExperimentConfig, job: Job, world: str, lapo_world: str) 
         out=absolute(str(job.run)),
         run=absolute(world) if METHODS[job.method].slots else "",
         protocol="simulation",
-        behaviour=replace(config.behaviour, labelled_demos=labelled, oracle=False),
+        behaviour=replace(config.behaviour, labelled_demos=labelled, oracle=False, policy_from=policy),
         baselines=replace(config.baselines, lapo=lapo),
         evaluation=replace(config.evaluation, references=False),
         logging=replace(config.logging, progress=False),
@@ -197,7 +216,7 @@ def job_record(job: Job, config: ExperimentConfig, parents: Mapping[str, str]) -
     """
     values = to_dict(config)
     result = without(config, "machine")  # of data and parents the content counts
-    result["baselines"] = result["baselines"].get(job.method, {})  # another method's settings are none of this job's
+    result["baselines"] = result["baselines"].get(job.stage, {})  # another method's settings are none of this job's
     if result["model"]["predictor"]["kind"] == "cocvp":
         del result["model"]["predictor"]["kind"]  # jobs from before there was a choice are the same jobs
     identity = json.dumps([result, config.compare.evaluation_seed, dict(parents)], sort_keys=True)
@@ -205,6 +224,7 @@ def job_record(job: Job, config: ExperimentConfig, parents: Mapping[str, str]) -
         "name": job.name,
         "method": job.method,
         "demos": job.demos,
+        "labels": job.labels,
         "seed": job.seed,
         "evaluation_seed": config.compare.evaluation_seed,
         "protocols": list(job.protocols),

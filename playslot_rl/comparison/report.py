@@ -30,7 +30,8 @@ from playslot_rl.visualization.charts import LIGHT, figure_bytes
 def job_rows(job: Job, frame_skip: int, fingerprint: str | None = None) -> list[dict[str, Any]]:
     """One row for each protocol of a job, finished or not.
 
-    Keys: `name`, `method`, `title`, `protocol`, `demos`, `seed`, `status`, `error`, `labelled_demos`, `agent_steps`
+    Keys: `name`, `method`, `title`, `protocol`, `demos`, `labels` (see `Job`), `seed`,
+    `status`, `error`, `labelled_demos`, `agent_steps`
     and `env_steps` (an agent step is `frame_skip` of them), `samples` (optimiser steps times batch),
     `success_rate`, `successes`, `episodes`, `ci95` (Wilson), `mean_steps_to_success`, `train_seconds`,
     `evaluation_seconds`, `parameters`, `pretraining` (null where there is nothing to say), `curve` (rows of an online
@@ -56,6 +57,7 @@ def job_rows(job: Job, frame_skip: int, fingerprint: str | None = None) -> list[
                 "title": METHODS[job.method].title,
                 "protocol": protocol,
                 "demos": job.demos,
+                "labels": job.labels,
                 "seed": job.seed,
                 "status": status.status,
                 "error": status.error or None,
@@ -122,7 +124,8 @@ def read_json(path: Path) -> dict[str, Any]:
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Rows of finished jobs, pooled over training seeds.
 
-    Keys: `method`, `title`, `protocol`, `demos`, `agent_steps` and `env_steps` (means), `seeds`, `success_rate` (mean
+    Keys: `method`, `title`, `protocol`, `demos`, `labels`,
+    `agent_steps` and `env_steps` (means), `seeds`, `success_rate` (mean
     over the seeds), `ci95`, `lowest` and `highest` (of a seed), `episodes`, `labelled_demos`.
 
     `ci95` is Wilson's interval of that mean over the episodes of one seed: all seeds play the same ones, so that
@@ -131,9 +134,9 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in rows:
         if row["success_rate"] is not None:
-            groups.setdefault((row["method"], row["protocol"], row["demos"]), []).append(row)
+            groups.setdefault((row["method"], row["protocol"], row["demos"], row["labels"]), []).append(row)
     summary = []
-    for (method, protocol, demos), group in groups.items():
+    for (method, protocol, demos, labels), group in groups.items():
         rates = [r["success_rate"] for r in group]
         summary.append(
             {
@@ -141,6 +144,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "title": METHODS[method].title,
                 "protocol": protocol,
                 "demos": demos,
+                "labels": labels,
                 **{key: _mean(r[key] for r in group) for key in ("agent_steps", "env_steps")},
                 "seeds": sorted(r["seed"] for r in group),
                 "success_rate": sum(rates) / len(rates),
@@ -231,6 +235,7 @@ class Comparison:
             "preset": config.preset,
             "methods": list(config.compare.methods),
             "demos": list(config.compare.demos),
+            "labels": list(config.compare.labels),
             "seeds": list(config.compare.seeds),
             "episodes": config.episodes,
             "evaluation_seed": config.compare.evaluation_seed,

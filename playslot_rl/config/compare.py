@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from playslot_rl.config.methods import MethodName
+from playslot_rl.config.methods import METHODS, MethodName
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import SEED, Checked, at_least
 
@@ -20,13 +20,16 @@ LAUNCHERS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class CompareConfig(Checked):
-    """What is compared. On the command line of `playslot compare` the keys are `methods=`, `demos=`, `seeds=` and
-    `hydra.launcher=`, without the group's name.
+    """What is compared. On the command line of `playslot compare` the keys are `methods=`, `demos=`, `labels=`,
+    `seeds=` and `hydra.launcher=`, without the group's name.
 
     Attributes:
         methods: names of `playslot_rl.config.methods`.
         demos: numbers of demonstrations, for the methods that learn from them.
-        seeds: training seeds.
+        labels: numbers of labelled demonstrations. PlaySlot and LAPO learn from the videos of all `demos` and the real
+            actions of so many of them, `slot_bc` and `resnet_bc` from these alone, the oracles from the actions of all.
+            Empty: PlaySlot and LAPO see the actions of `behaviour.labelled_demos`.
+        seeds: training seeds; each has its own draw of demonstrations.
         online_seeds: training seeds of the methods that act, which take the longest; empty means `seeds`.
         evaluation_seed: seed of the evaluation's episodes, the same for every method and training seed.
         launcher: Hydra launcher that runs the jobs; empty runs them one after the other.
@@ -36,6 +39,7 @@ class CompareConfig(Checked):
     group = "compare."
     methods: tuple[MethodName, ...] = ("playslot", "lapo", "slot_oracle", "resnet_oracle", "dreamer", "sold")
     demos: tuple[int, ...] = field(default=(10, 50, 100, 150), metadata=at_least(1, "numbers of at least 1"))
+    labels: tuple[int, ...] = field(default=(), metadata=at_least(1, "numbers of at least 1"))
     seeds: tuple[int, ...] = field(default=(0, 1, 2), metadata=SEED)
     online_seeds: tuple[int, ...] = ()
     evaluation_seed: int = field(default=100, metadata=SEED)
@@ -48,6 +52,11 @@ class CompareConfig(Checked):
             values = getattr(self, name)
             check(len(values) > 0, name, values, "at least one")
             check(len(set(values)) == len(values), name, values, "each one once")
+        check(len(set(self.labels)) == len(self.labels), "labels", self.labels, "each one once")
+        most = max(self.labels, default=0)
+        check(most <= min(self.demos), "labels", most, f"at most the {min(self.demos)} demonstrations of demos=")
+        alone = [name for name in self.methods if METHODS[name].labelled_only]
+        check(bool(self.labels) or not alone, "labels", self.labels, f"some numbers with methods={','.join(alone)}")
         online = self.online_seeds
         check(set(online) <= set(self.seeds), "compare.online_seeds", online, f"some of seeds={self.seeds}")
         check(len(set(online)) == len(online), "compare.online_seeds", online, "each one once")

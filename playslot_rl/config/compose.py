@@ -114,7 +114,7 @@ def _compare_keys(overrides: Sequence[str]) -> list[str]:
     for argument in overrides:
         key, equals, value = argument.partition("=")
         name = key.strip().lstrip("+")
-        if equals and name in ("methods", "demos", "seeds"):
+        if equals and name in ("methods", "demos", "labels", "seeds"):
             inside = _unquote(value.strip()).removeprefix("[").removesuffix("]")
             kept.append(f"compare.{name}=[{inside}]")
         elif equals and name == "hydra.launcher":

@@ -23,6 +23,8 @@ class DataConfig(Checked):
         root: LeRobot v3.0 data set(s) of unlabelled videos; several are separated by commas.
         demos: data set of demonstrations; empty means `root`.
         held_out: how many of its last episodes are neither trained on nor shown to the world model: they measure.
+        draw: seed of the draw that decides which demonstrations are the first ones, of those that are not held out;
+            None takes them in the order in which they were recorded.
         camera: image feature(s) to read, separated by commas; empty means the only one.
         resize: resize frames of another size than `env.image_size` (area averaging) instead of refusing them.
         cache: folder of the frame and slot caches; empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
@@ -33,6 +35,7 @@ class DataConfig(Checked):
     root: str = field(default="", metadata=role("machine", "folder"))
     demos: str = field(default="", metadata=role("machine", "folder"))
     held_out: int = field(default=0, metadata=role("machine") | at_least(0, "0 or more"))
+    draw: int | None = field(default=None, metadata=SEED)
     camera: str = ""
     resize: bool = False
     cache: str = field(default="", metadata=role("machine", "folder"))

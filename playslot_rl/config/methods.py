@@ -9,7 +9,7 @@ from typing import Final, Literal, get_args
 
 from playslot_rl.errors import ConfigError
 
-MethodName = Literal["playslot", "slot_oracle", "resnet_oracle", "lapo", "dreamer", "sold"]
+MethodName = Literal["playslot", "slot_oracle", "resnet_oracle", "slot_bc", "resnet_bc", "lapo", "dreamer", "sold"]
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,8 @@ class Method:
         actor: `module:function` of `load_actor(run, device) -> Actor`.
         online: it learns by acting (environment steps on the axis, needs a reward) instead of from demonstrations.
         slots: it builds on a world model's slots.
+        stage: stage of its run whose checkpoint is the method's; empty means its name.
+        labelled_only: it learns from labelled demonstrations alone; what they leave out, it never sees.
         aliases: what people call it besides its name and its title.
     """
 
@@ -30,11 +32,13 @@ class Method:
     actor: str
     online: bool = False
     slots: bool = False
+    stage: str = ""
+    labelled_only: bool = False
     aliases: tuple[str, ...] = ()
 
 
 METHODS: Final[dict[str, Method]] = {
-    "playslot": Method("PlaySlot", "train_policy", "playslot_rl.acting.agent:load_actor", slots=True),
+    "playslot": Method("PlaySlot", "train_policy", "playslot_rl.acting.agent:load_actor", slots=True, stage="policy"),
     "slot_oracle": Method(
         "Slot Oracle", "baselines.slot_oracle", "playslot_rl.baselines.oracles.slot:load_actor", slots=True
     ),
@@ -44,10 +48,30 @@ METHODS: Final[dict[str, Method]] = {
         "playslot_rl.baselines.oracles.resnet:load_actor",
         aliases=("ResNet",),
     ),
+    "slot_bc": Method(
+        "Slot BC",
+        "baselines.slot_oracle",
+        "playslot_rl.baselines.oracles.slot:load_actor",
+        slots=True,
+        stage="slot_oracle",
+        labelled_only=True,
+    ),
+    "resnet_bc": Method(
+        "ResNet BC",
+        "baselines.resnet_oracle",
+        "playslot_rl.baselines.oracles.resnet:load_actor",
+        stage="resnet_oracle",
+        labelled_only=True,
+    ),
     "lapo": Method("LAPO", "baselines.lapo", "playslot_rl.baselines.lapo.load:load_actor"),
     "dreamer": Method("DreamerV3", "baselines.online", "playslot_rl.baselines.dreamer.actor:load_actor", online=True),
     "sold": Method("SOLD", "baselines.online", "playslot_rl.baselines.sold.actor:load_actor", online=True, slots=True),
 }
+
+
+def method_stage(method: str) -> str:
+    """Stage of a method's run whose checkpoint is the method's."""
+    return METHODS[method].stage or method
 
 
 def canonical_method(text: str) -> MethodName:

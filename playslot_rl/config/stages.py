@@ -115,6 +115,8 @@ class BehaviourStageConfig(StageConfig):
         finetune_steps: optimiser steps after that, of policy and decoder together, on the labelled rows' actions; the
             policy goes on cloning all rows meanwhile. 0 has none (paper).
         finetune_lr: their base learning rate.
+        policy_from: run whose finished policy training is taken over where it is the same one but for labels and
+            decoder; another, or none, is trained here.
         oracle: also train the slot oracle (same network on the real actions of all demos).
     """
 
@@ -134,4 +136,5 @@ class BehaviourStageConfig(StageConfig):
     decoder_lr: float = 2e-4
     finetune_steps: int = field(default=0, metadata=at_least(0, "0 (none) or more"))
     finetune_lr: float = 2e-4
+    policy_from: str = field(default="", metadata=role("machine", "folder"))
     oracle: bool = True

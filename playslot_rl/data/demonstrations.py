@@ -25,6 +25,8 @@ from playslot_rl.errors import DataError
 from playslot_rl.world_model import WorldModel
 
 BATCH = 64
+DRAW_STREAM = 14
+"""Keeps the draws of demonstrations apart from what else a seed draws."""
 DIRECTIONS = ((1, 1), (-1, -1), (1, -1), (-1, 1), (1, 0), (-1, 0), (0, 1), (0, -1))
 """Of the copies, (down, right): corners first, so that the first four surround the original."""
 
@@ -156,6 +158,18 @@ def first_demonstrations(source: EpisodeFrames, demos: int | None) -> EpisodeFra
     )
 
 
+def drawn_demonstrations(source: EpisodeFrames, seed: int) -> EpisodeFrames:
+    """The same episodes in an order drawn by a seed; row numbers stay."""
+    order = np.random.default_rng([seed, DRAW_STREAM]).permutation(source.episodes)
+    return replace(
+        source,
+        starts=source.starts[order],
+        lengths=source.lengths[order],
+        seeds=None if source.seeds is None else source.seeds[order],
+        fingerprint=hashlib.sha256(f"{source.fingerprint}/drawn {seed}".encode()).hexdigest()[:16],
+    )
+
+
 def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames:
     """Episodes `first` to `last` (exclusive) as a data set of their own, rows counted anew."""
     begin, end = int(source.starts[first]), int(source.starts[last - 1] + source.lengths[last - 1])
@@ -186,7 +200,9 @@ class DemonstrationSplit:
     held_out: EpisodeFrames | None
 
 
-def split_demonstrations(source: EpisodeFrames, demos: int | None, kept: int, measured: int) -> DemonstrationSplit:
+def split_demonstrations(
+    source: EpisodeFrames, demos: int | None, kept: int, measured: int, draw: int | None = None
+) -> DemonstrationSplit:
     """Train on the first demonstrations, and measure on the last ones.
 
     Args:
@@ -194,6 +210,7 @@ def split_demonstrations(source: EpisodeFrames, demos: int | None, kept: int, me
         demos: how many are trained on; None for all that are not kept.
         kept: the last ones, which were recorded to measure (`data.held_out`).
         measured: at most so many of the last ones beyond those that are trained on measure, if more than `kept`.
+        draw: seed that decides which of those that do not measure are the first ones; None keeps their order.
 
     Raises:
         DataError: there are fewer episodes than `demos`.
@@ -202,6 +219,8 @@ def split_demonstrations(source: EpisodeFrames, demos: int | None, kept: int, me
     trained = first_demonstrations(source, free if demos is None else demos)
     parsed = first_demonstrations(source, max(free, trained.episodes))
     rest = source.episodes - min(max(kept, measured), source.episodes - trained.episodes)
+    if draw is not None:
+        trained = first_demonstrations(drawn_demonstrations(first_demonstrations(source, rest), draw), trained.episodes)
     usable = bool((source.lengths[rest:] >= 2).any())
     return DemonstrationSplit(trained, parsed, episode_range(source, rest, source.episodes) if usable else None)
 

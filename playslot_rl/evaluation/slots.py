@@ -1,6 +1,6 @@
 """Slots scored against the simulator's own segmentation, on episodes of the scripted expert that no training has seen.
 
-    ARI = adjusted Rand index of (slot with the largest mask, object) over the pixels of a clip,   FG-ARI: of objects' alone
+    ARI = adjusted Rand index of (slot with the largest mask, object) over a clip's pixels; FG-ARI: over objects' alone
 
 Shapes: E episodes, T agent steps (T + 1 frames), N slots, H W image size. Label images count from 0, the ground.
 """

@@ -24,6 +24,7 @@ from playslot_rl.acting.actor import Actor, ExpertActor, RandomActor
 from playslot_rl.acting.agent import ImaginationActor, oracle_actor, playslot_actor
 from playslot_rl.acting.episodes import Outcome, TaskPool, run_episodes
 from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config.methods import method_stage
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
@@ -56,15 +57,16 @@ class RunFacts:
     extra: dict[str, Any] = field(default_factory=dict)
 
 
-def run_facts(run: Path, stage: str = "policy") -> RunFacts:
-    """Read `RUN/STAGE/checkpoint/meta.json`; a baseline's stage has its method's name.
+def run_facts(run: Path, method: str = "playslot") -> RunFacts:
+    """Read `RUN/STAGE/checkpoint/meta.json` of a method's stage.
 
     Raises:
         CheckpointError: the run has no trained policy, or its meta file cannot be read.
     """
+    stage = method_stage(method)
     path = run / stage / "checkpoint" / "meta.json"
     if not path.is_file():
-        command = f"train-policy run={run}" if stage == "policy" else f"train-baseline method={stage} out={run}"
+        command = f"train-policy run={run}" if method == "playslot" else f"train-baseline method={method} out={run}"
         raise CheckpointError(f"{run}: got no {stage}/checkpoint, expected a trained policy; run `playslot {command}`")
     try:
         meta: dict[str, Any] = json.loads(path.read_text())
@@ -77,7 +79,7 @@ def run_facts(run: Path, stage: str = "policy") -> RunFacts:
         labelled_demos=meta.get("labelled_demos"),
         fingerprints=prints,
         commit=str(meta.get("commit", "")),
-        method="playslot" if stage == "policy" else stage,
+        method=method,
         extra={name: meta[name] for name in ("pretraining", "env_steps") if name in meta},
     )
 

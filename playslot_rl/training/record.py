@@ -110,7 +110,8 @@ class StageRecord:
             DataError: none are named, they cannot be read, or there are fewer than `demos`.
         """
         config = self.config
-        return split_demonstrations(self.videos, config.demos, config.data.held_out, config.collect.validation_episodes)
+        data, most = config.data, config.collect.validation_episodes
+        return split_demonstrations(self.videos, config.demos, data.held_out, most, data.draw)
 
     def clips(self, frames: int, shown: int = 32) -> Clips:
         """Clips of the videos, some of their episodes (`data.validation`) held out; `shown` of these at most validate.

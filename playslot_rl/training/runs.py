@@ -113,6 +113,30 @@ def adopt_stage(checkpoint: StageCheckpoint, run: Path) -> None:
             write_bytes(temporary / file.name, file.read_bytes())
 
 
+def adopt_training(source: str, run: Path, stage: str, steps: int) -> None:
+    """Copy the last checkpoint of another run's training of a stage into a run that has none of its own.
+
+    The training that carries on from it refuses it unless it is the same one. Nothing is copied from a training that
+    has not reached `steps`: this run then trains for itself, to the same weights.
+
+    Args:
+        source: the other run; empty for none.
+        run: the run that takes it over.
+        stage: of both.
+        steps: of a finished training.
+
+    Raises:
+        OutputError: full disk.
+    """
+    name = f"step_{steps:08d}"
+    there, target = Path(source) / stage / "checkpoints" / name, run / stage / "checkpoints" / name
+    if not source or target.parent.exists() or not (there / "state.json").is_file():
+        return
+    with new_folder(target) as temporary:
+        for file in sorted(there.iterdir()):
+            write_bytes(temporary / file.name, file.read_bytes())
+
+
 def require_adoptable(checkpoint: StageCheckpoint, run: Path) -> None:
     """Check that a run has no checkpoint of that stage, or this one.
 

@@ -36,7 +36,8 @@ def cloning_settings(config: BehaviourStageConfig) -> BehaviourStageConfig:
     """
     plain = BehaviourStageConfig()
     later = ("labelled_demos", "decoder_inputs", "decoder_state", "decoder_steps", "decoder_lr")
-    return replace(config, **{name: getattr(plain, name) for name in (*later, "finetune_steps", "finetune_lr")})
+    later += ("finetune_steps", "finetune_lr", "policy_from")
+    return replace(config, **{name: getattr(plain, name) for name in later})
 
 
 @dataclass(frozen=True)

@@ -57,6 +57,8 @@ METHOD_STYLES: Final = {
     "lapo": MethodStyle(5, "s"),
     "slot_oracle": MethodStyle(2, "^"),
     "resnet_oracle": MethodStyle(1, "v"),
+    "slot_bc": MethodStyle(2, "<"),
+    "resnet_bc": MethodStyle(1, ">"),
     "dreamer": MethodStyle(3, "D"),
     "sold": MethodStyle(4, "P"),
 }

@@ -38,13 +38,13 @@ def main(config: ExperimentConfig) -> None:
         require_whole,
     )
     from playslot_rl.training.record import StageRecord, run_stage
-    from playslot_rl.training.runs import adopt_stage, run_folder
+    from playslot_rl.training.runs import adopt_stage, adopt_training, run_folder
 
     run, own, parents = open_run(config), config.baselines.lapo, dict[str, StageCheckpoint]()
     stored = {
         "env": to_dict(config.env),
         "model": to_dict(config.model),
-        "behaviour": to_dict(config.behaviour),
+        "behaviour": to_dict(replace(config.behaviour, policy_from="")),
         NAME: to_dict(own),
     }
     its_own = (f"{NAME}.{key}" for key in stored[NAME] if key not in ("model", "world"))
@@ -74,7 +74,15 @@ def main(config: ExperimentConfig) -> None:
     else:
         model = train_model(config, run)
     parents[MODEL] = model
-    run_stage(record, lambda: _training(config, record))
+
+    def prepare() -> Training:
+        training = _training(config, record)
+        if config.behaviour.policy_from:
+            record.begin()
+            adopt_training(config.behaviour.policy_from, run, record.name, own.policy.steps)
+        return training
+
+    run_stage(record, prepare)
 
 
 def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
