@@ -103,7 +103,8 @@ class BehaviourStageConfig(StageConfig):
             same actions (0 in the paper, none): from ten demonstrations a policy learns where it has been.
         shifted_copies: how many, of the eight directions (`playslot_rl.data.demonstrations.DIRECTIONS`).
         trim: slot motion, the RMS change of the slots to the next frame, up to which a transition counts as still and
-            is left out by all that clone; read off the videos alone. 0 keeps every row (paper).
+            is left out by all that clone from slots; read off the videos alone. 0 keeps every row (paper).
+        trim_pixels: the same for those that clone from frames: the RMS change of the pixels, in [0, 1].
         trim_margin: still transitions that are kept after each stretch of motion, so that stopping is learned.
         whiten: clone the latents in whitened coordinates (`playslot_rl.modules.whitening`), where each of the handful
             of directions that they vary in weighs the same; false clones them as they are (paper).
@@ -128,6 +129,7 @@ class BehaviourStageConfig(StageConfig):
     shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
     shifted_copies: int = field(default=8, metadata=between(1, 8, "1 to 8"))
     trim: float = field(default=0.0, metadata=at_least(0, "0 (keep all) or more"))
+    trim_pixels: float = field(default=0.0, metadata=between(0, 1, "0 (keep all) to 1"))
     trim_margin: int = field(default=2, metadata=at_least(0, "0 or more"))
     whiten: bool = False
     decoder_inputs: Literal["inverse_dynamics", "policy", "both"] = "inverse_dynamics"

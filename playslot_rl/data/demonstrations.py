@@ -21,10 +21,13 @@ import torch
 from torch import Tensor
 
 from playslot_rl.data.source import EpisodeFrames, FrameRows, Frames
+from playslot_rl.data.trimming import moving_rows, slot_motion
 from playslot_rl.errors import DataError
+from playslot_rl.frames import to_float
 from playslot_rl.world_model import WorldModel
 
 BATCH = 64
+FRAMES_AT_ONCE = 1024
 DRAW_STREAM = 14
 """Keeps the draws of demonstrations apart from what else a seed draws."""
 DIRECTIONS = ((1, 1), (-1, -1), (1, -1), (-1, 1), (1, 0), (-1, 0), (0, 1), (0, -1))
@@ -86,39 +89,6 @@ class Demonstrations:
         """
         require_labelled(demos, len(self.lengths))
         return torch.nonzero(self.episode < demos)[:, 0]
-
-
-def slot_motion(slots: Tensor) -> Tensor:
-    """RMS change of the slots from one frame to the next: (..., T + 1, N, D) to (..., T), in units of the slots."""
-    return (slots[..., 1:, :, :] - slots[..., :-1, :, :]).square().mean(dim=(-2, -1)).sqrt()
-
-
-def moving_rows(motion: Tensor, step: Tensor, threshold: float, margin: int, key: str = "behaviour.trim") -> Tensor:
-    """Transitions in which something moves, and `margin` still ones after each stretch of them: mask bool (M,).
-
-    An expert that holds still once the task is solved says nothing of how to solve it, but fills half of the rows.
-    Nothing but the videos is looked at.
-
-    Args:
-        motion: of each transition (M,), the episodes one after the other.
-        step: number of each in its episode, int64 (M,).
-        threshold: motion up to this is none.
-        margin: 0 or more.
-        key: of the threshold, for the error.
-
-    Raises:
-        DataError: nothing moves.
-    """
-    moving = motion > threshold
-    if not bool(moving.any()):
-        raise DataError(
-            f"{key}: got {threshold:g}, which leaves no transition, expected less than the largest motion, "
-            f"{float(motion.max()):.3g}: lower it"
-        )
-    kept = moving.clone()
-    for after in range(1, min(margin, len(moving) - 1) + 1):
-        kept[after:] |= moving[:-after] & (step[after:] >= after)
-    return kept
 
 
 def require_labelled(labelled: int, demos: int) -> None:
@@ -233,13 +203,47 @@ class Transitions:
         rows: frame a transition starts from, int64 (M,); row + 1 is the frame after it.
         episode: number of its episode among those with a transition, int64 (M,).
         step: its number in that episode, int64 (M,).
-        lengths: transitions of each of those episodes, int64 (E,).
+        lengths: transitions of each of those episodes as they were recorded, int64 (E,).
     """
 
     rows: npt.NDArray[np.int64]
     episode: npt.NDArray[np.int64]
     step: npt.NDArray[np.int64]
     lengths: npt.NDArray[np.int64]
+
+    def trimmed(self, motion: Tensor, threshold: float, margin: int, key: str) -> Transitions:
+        """Without the stretches in which nothing moves (`moving_rows`); all of them where `threshold` is 0."""
+        if not threshold:
+            return self
+        kept = moving_rows(motion, torch.from_numpy(self.step), threshold, margin, key).numpy()
+        return replace(self, rows=self.rows[kept], episode=self.episode[kept], step=self.step[kept])
+
+
+def moving_frames(source: EpisodeFrames, threshold: float, margin: int) -> Transitions:
+    """Transitions of a data set in which its frames move: RMS change of the pixels, in [0, 1], above `threshold`.
+
+    Raises:
+        DataError: nothing is left, or no episode has two frames.
+    """
+    moves = transitions(source)
+    if not threshold:
+        return moves
+    motion = []
+    for rows in np.array_split(moves.rows, -(-len(moves.rows) // FRAMES_AT_ONCE)):
+        here, after = (to_float(np.asarray(source.frames[at]), "cpu") for at in (rows, rows + 1))
+        motion.append((after - here).square().mean(dim=(-3, -2, -1)).sqrt())
+    return moves.trimmed(torch.cat(motion), threshold, margin, "behaviour.trim_pixels")
+
+
+def moving_slots(source: EpisodeFrames, slots: npt.NDArray[np.float32], threshold: float, margin: int) -> Transitions:
+    """Transitions of a data set in which its slots (F, N, D) move: `slot_motion` above `threshold`.
+
+    Raises:
+        DataError: nothing is left, or no episode has two frames.
+    """
+    moves = transitions(source)
+    pairs = torch.from_numpy(slots[np.stack((moves.rows, moves.rows + 1), axis=1)])
+    return moves.trimmed(slot_motion(pairs)[:, 0], threshold, margin, "behaviour.trim")
 
 
 def transitions(source: EpisodeFrames) -> Transitions:

@@ -51,6 +51,7 @@ ADDED: Final[Mapping[str, Any]] = {
     "actor_average": 0.0,
     "kind": "cocvp",
     "trim": 0.0,
+    "trim_pixels": 0.0,
     "trim_margin": 2,
     "whiten": False,
     "decoder_state": False,

@@ -35,8 +35,8 @@ def cloning_settings(config: BehaviourStageConfig) -> BehaviourStageConfig:
     The same policy serves any number of labels, so that a half-finished or copied training is told by these alone.
     """
     plain = BehaviourStageConfig()
-    later = ("labelled_demos", "decoder_inputs", "decoder_state", "decoder_steps", "decoder_lr")
-    later += ("finetune_steps", "finetune_lr", "policy_from")
+    decoding = ("labelled_demos", "decoder_inputs", "decoder_state", "decoder_steps", "decoder_lr")
+    later = (*decoding, "finetune_steps", "finetune_lr", "policy_from")
     return replace(config, **{name: getattr(plain, name) for name in later})
 
 

@@ -18,7 +18,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from playslot_rl.config import Precision
-from playslot_rl.data.demonstrations import real_actions, shift_frames, transitions
+from playslot_rl.data.demonstrations import Transitions, real_actions, shift_frames
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.seeding import StepGenerators
@@ -123,15 +123,14 @@ class FrameInputs:
 
 
 def demonstrated_frames(
-    source: EpisodeFrames, action_dim: int, device: torch.device | str, shift: int = 0
+    source: EpisodeFrames, moves: Transitions, action_dim: int, device: torch.device | str, shift: int = 0
 ) -> tuple[FrameInputs, Tensor]:
-    """Frames of all transitions of demonstrations, with their real actions (M, A) in [-1, 1].
+    """Frames of transitions of demonstrations, with their real actions (M, A) in [-1, 1].
 
     Raises:
-        DataError: no transition, no actions, or actions of another width.
+        DataError: no actions, or actions of another width.
     """
-    rows = transitions(source).rows
-    return FrameInputs(source, rows, device, shift), real_actions(source, rows, action_dim).to(device)
+    return FrameInputs(source, moves.rows, device, shift), real_actions(source, moves.rows, action_dim).to(device)
 
 
 Examples = tuple[Inputs, Tensor]

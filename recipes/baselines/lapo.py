@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from playslot_rl.training.record import StageRecord, Training
 
 
+BEHAVIOUR = ("labelled_demos", "decoder_inputs", "trim_pixels", "trim_margin")
+"""Settings of the behaviour stage that count for LAPO, too."""
+
+
 def main(config: ExperimentConfig) -> None:
     """Train LAPO into `OUT/lapo_model` and `OUT/lapo`; killed, the same command carries on; finished, it says so.
 
@@ -53,12 +57,13 @@ def main(config: ExperimentConfig) -> None:
         run,
         config,
         stored=stored,
-        settings=("model.action_decoder", "behaviour.labelled_demos", "behaviour.decoder_inputs", *its_own),
+        settings=("model.action_decoder", *(f"behaviour.{key}" for key in BEHAVIOUR), *its_own),
         identity={
             "action_decoder": to_dict(config.model.action_decoder),
             NAME: sizes_of(own),
             "loss": own.loss,
             "shift": own.shift,
+            "trim": [config.behaviour.trim_pixels, config.behaviour.trim_margin],
         },
         parents=parents,
         role="demos",
@@ -149,6 +154,7 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
             identity=labelled,
         )
 
-    demos = split.trained.episodes
+    demos, whole = split.trained.episodes, int((split.trained.lengths - 1).sum())
+    kept = {"kept_rows": round(len(behaviour.trained.actions) / whole, 4)}
     said = f"{NAME}: {demos} demos, {labelled['labelled_demos']} labelled, {held_out_text(split)}"
-    return Training(parts(), device, lambda _: f"{said}, {record.folder}", extra={"demos": demos, **labelled})
+    return Training(parts(), device, lambda _: f"{said}, {record.folder}", extra={"demos": demos, **labelled, **kept})

@@ -11,6 +11,8 @@ from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import held_out_text, open_device, open_run
 
 if TYPE_CHECKING:
+    from playslot_rl.data.demonstrations import Transitions
+    from playslot_rl.data.source import EpisodeFrames
     from playslot_rl.training.record import StageRecord, Training
 
 
@@ -35,7 +37,7 @@ def main(config: ExperimentConfig) -> None:
             "behaviour": to_dict(config.behaviour),
             NAME: to_dict(config.baselines.resnet_oracle),
         },
-        counts=("model.policy", "behaviour.loss"),
+        counts=("model.policy", "behaviour.loss", "behaviour.trim_pixels", "behaviour.trim_margin"),
         role="demos",
     )
     run_stage(record, lambda: _training(config, record))
@@ -44,6 +46,7 @@ def main(config: ExperimentConfig) -> None:
 def _training(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl import keys
     from playslot_rl.baselines.oracles.resnet import NAME, ResNetPolicy, load_pretrained
+    from playslot_rl.data.demonstrations import moving_frames
     from playslot_rl.losses.behaviour import BehaviourLoss
     from playslot_rl.seeding import global_seed
     from playslot_rl.training.fit import Part
@@ -51,7 +54,14 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.training.stage_regression import RegressionStage, demonstrated_frames
 
     own, device, split, width = config.baselines.resnet_oracle, open_device(config), record.demos, config.env.action_dim
-    inputs, actions = demonstrated_frames(split.trained, width, device, own.shift)
+    behaviour = config.behaviour
+
+    def moving(source: EpisodeFrames) -> Transitions:
+        return moving_frames(source, behaviour.trim_pixels, behaviour.trim_margin)
+
+    moves, whole = moving(split.trained), int((split.trained.lengths - 1).sum())
+    inputs, actions = demonstrated_frames(split.trained, moves, width, device, own.shift)
+    held_out = split.held_out
     with global_seed(config.seed, 0, NAME):
         policy = ResNetPolicy(config.model.policy, config.env.image_size, width)
     pretraining = load_pretrained(policy, own.weights)
@@ -64,16 +74,16 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
         inputs,
         actions,
         own.batch_size,
-        held_out=None if split.held_out is None else demonstrated_frames(split.held_out, width, device),
+        held_out=None if held_out is None else demonstrated_frames(held_out, moving(held_out), width, device),
         validated=256,
         precision=own.precision,
     )
-    demos = int((split.trained.lengths >= 2).sum())
+    demos, kept = int((split.trained.lengths >= 2).sum()), round(len(moves.rows) / whole, 4)
     said = f"{NAME}: {demos} demos, all labelled, {held_out_text(split)}, ResNet-18 from {pretraining}"
     return Training(
         [Part(f"baselines.{NAME}", stage, own)],
         device,
         lambda _: f"{said}, {record.folder}",
-        extra={"demos": demos, "labelled_demos": demos, "pretraining": pretraining},
+        extra={"demos": demos, "labelled_demos": demos, "kept_rows": kept, "pretraining": pretraining},
         identity={"pretraining": pretraining},
     )

@@ -59,7 +59,7 @@ def main(config: ExperimentConfig) -> None:
 def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Training:
     import torch
 
-    from playslot_rl.data.demonstrations import real_actions, transitions
+    from playslot_rl.data.demonstrations import moving_slots, real_actions
     from playslot_rl.modules.policy import LatentPolicy
     from playslot_rl.seeding import global_seed
     from playslot_rl.training.fit import Part
@@ -73,19 +73,24 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
     with global_seed(config.seed, 0, record.name):
         oracle = LatentPolicy(config.model.policy, savi.config.slot_dim, width).to(device)
 
+    behaviour = config.behaviour
+
     def examples(views: list[ParsedVideos]) -> tuple[Tensor, Tensor]:
-        rows = [transitions(frames).rows for frames, _ in views]
+        moving = [moving_slots(*view, behaviour.trim, behaviour.trim_margin) for view in views]
+        rows = [moves.rows for moves in moving]
         slots = [torch.from_numpy(cached[at]) for (_, cached), at in zip(views, rows, strict=True)]
         actions = [real_actions(frames, at, width) for (frames, _), at in zip(views, rows, strict=True)]
         return torch.cat(slots).to(device), torch.cat(actions).to(device)
 
     views, others = demonstration_views(config, split, savi, record.prints["slots"])
-    stage = oracle_stage(oracle, *examples(views), config.behaviour, examples(others) if others else None)
+    slots, actions = examples(views)
+    whole = len(views) * int((split.trained.lengths - 1).sum())
+    stage = oracle_stage(oracle, slots, actions, behaviour, examples(others) if others else None)
     demos = int((split.trained.lengths >= 2).sum())
     said = f"{record.name}: {demos} demos, all labelled, {held_out_text(split)}"
     return Training(
         [Part(record.name, stage, config.behaviour, lr_key="behaviour.optim.lr")],
         device,
         lambda _: f"{said}, {record.folder}",
-        extra={"demos": demos, "labelled_demos": demos},
+        extra={"demos": demos, "labelled_demos": demos, "kept_rows": round(len(slots) / whole, 4)},
     )

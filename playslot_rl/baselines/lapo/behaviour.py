@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -21,7 +22,7 @@ from playslot_rl.baselines.lapo.load import NAME, LAPOPolicy
 from playslot_rl.baselines.lapo.model import InverseModel
 from playslot_rl.baselines.lapo.stage import infer_latents
 from playslot_rl.config import ExperimentConfig, LAPOConfig
-from playslot_rl.data.demonstrations import DemonstrationSplit, transitions
+from playslot_rl.data.demonstrations import DemonstrationSplit, moving_frames
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
@@ -38,11 +39,12 @@ from playslot_rl.training.stage_regression import (
 
 
 class _Seen(NamedTuple):
-    """Transitions of demonstrations: frames, latents (M, Z) and real actions (M, A)."""
+    """Transitions of demonstrations: frames, latents (M, Z), real actions (M, A) and whose they are (M,)."""
 
     frames: FrameInputs
     latents: Tensor
     actions: Tensor
+    episode: npt.NDArray[np.int64]
 
 
 class LAPOBehaviour:
@@ -66,12 +68,12 @@ class LAPOBehaviour:
         inverse = load_inverse(model, device)
 
         def seen(source: EpisodeFrames, shift: int = 0) -> _Seen:
-            inputs, actions = demonstrated_frames(source, config.env.action_dim, device, shift)
-            return _Seen(inputs, infer_latents(inverse, source, transitions(source), device), actions)
+            moves = moving_frames(source, config.behaviour.trim_pixels, config.behaviour.trim_margin)
+            inputs, actions = demonstrated_frames(source, moves, config.env.action_dim, device, shift)
+            return _Seen(inputs, infer_latents(inverse, source, moves, device), actions, moves.episode)
 
         self.trained = seen(demos.trained, self.own.shift)
         self.held_out = None if demos.held_out is None else seen(demos.held_out)
-        self.episode = transitions(demos.trained).episode
         with global_seed(config.seed, 0, "lapo"):
             self.policy = LAPOPolicy(self.own, config.env.image_size).to(device)
             width = self.own.latent_dim
@@ -94,7 +96,7 @@ class LAPOBehaviour:
 
     def decoder_stage(self) -> RegressionStage:
         """Real actions of the labelled demonstrations, from inferred latents, the policy's, or both."""
-        labelled = np.flatnonzero(self.episode < self.config.behaviour.labelled_demos)
+        labelled = np.flatnonzero(self.trained.episode < self.config.behaviour.labelled_demos)
         inputs, actions = self._decoded(self.trained, torch.from_numpy(labelled).to(self.device))
         held_out = None
         if self.held_out is not None:
