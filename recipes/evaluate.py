@@ -17,6 +17,7 @@ from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes import objects
+from playslot_rl.recipes.run import open_run, parent_run
 
 PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")
 
@@ -24,7 +25,8 @@ PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulatio
 def main(config: ExperimentConfig, report: bool = True) -> None:
     """Evaluate the policy of `config.run` under `config.protocol` and print the result.
 
-    A baseline's run (`method` in its config) is evaluated in simulation only. Where there is no
+    A shipped policy (`run=pretrained/ENV`) is copied into `out`, which becomes a run like any other. A baseline's run
+    (`method` in its config) is evaluated in simulation only. Where there is no
     simulator (GridShapes) its slots and latent actions are scored instead: see `recipes.objects`.
 
     Args:
@@ -37,6 +39,9 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
         OutputError: the result cannot be written.
     """
     run = check_run(config)
+    if shipped(config.run):
+        run = take_shipped(config, run)
+        config = replace(config, run=str(run), out="")
     if config.method != "playslot":
         evaluate_baseline(config, run)
         return
@@ -123,16 +128,20 @@ def measured(run: Path, protocol: str, facts: dict[str, Any]) -> bool:
 
 
 def check_run(config: ExperimentConfig) -> Path:
-    """The run folder.
+    """The run folder; of a shipped policy the folder to write.
 
     Raises:
-        ConfigError: none was named, or `out` names another folder.
-        CheckpointError: there is no such folder, or it is the shipped world model, which has no policy.
+        ConfigError: none was named, or `out` names another folder; a shipped policy without `out`.
+        CheckpointError: there is no such folder.
     """
     if not config.run:
         raise ConfigError("run: got nothing, expected the folder of a run with a trained policy, such as run=runs/demo")
     if shipped(config.run):
-        raise CheckpointError(f"run={config.run} is a world model without a policy; run `playslot train-policy`")
+        if not config.out:
+            raise ConfigError(
+                f"out: got nothing with run={config.run}, expected a folder to write, such as out=runs/check"
+            )
+        return open_run(config)
     run = Path(config.run)
     if not run.is_dir():
         raise CheckpointError(f"run={config.run}: no such folder, expected a run; make one by `playslot demo`")
@@ -140,6 +149,28 @@ def check_run(config: ExperimentConfig) -> Path:
         raise ConfigError(
             f"out: got {config.out}, expected nothing: evaluate writes into run={config.run}; leave it out"
         )
+    return run
+
+
+def take_shipped(config: ExperimentConfig, run: Path) -> Path:
+    """Make `run` a run of the shipped policy: its checkpoint, the name of its world model, and this config.
+
+    Raises:
+        CheckpointError: no model of that name ships, it has no policy, or `run` has another one.
+        OutputError: the folder cannot be written.
+    """
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+    from playslot_rl.training.runs import adopt_stage, require_adoptable, run_folder, store_config, use_world_model
+
+    parent = parent_run(config, run)
+    folder = checkpoint_folder(run_folder(parent), "policy")
+    if not (folder / "meta.json").is_file():
+        raise CheckpointError(f"run={config.run} is a world model without a policy; run `playslot train-policy`")
+    policy = read_stage(folder, "policy")
+    require_adoptable(policy, run)
+    store_config(replace(config, run="", out=""), run)
+    use_world_model(run, parent)
+    adopt_stage(policy, run)
     return run
 
 

@@ -62,6 +62,9 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
     try:
         run = _expand_home(_unquote(pairs.get("run", "")))
         continues = command in CONTINUES and run != "" and not shipped(run)
+        if shipped(run) and run != SHIPPED:
+            pairs.setdefault("env", run.partition("/")[2])  # the task that the model is named after
+            _check_choice("env", pairs["env"])
         if continues:
             config = _from_run(Path(run), pairs)
         else:
