@@ -186,11 +186,12 @@ def _titles(rows: Sequence[Result]) -> list[str]:
 
 
 def _labels(rows: Sequence[Result], title: str) -> str:
-    pairs = {row["demos"]: row["labelled_demos"] for row in rows if row["title"] == title}
-    pairs = {demos: labels for demos, labels in pairs.items() if labels is not None}
-    return _list(f"{labels} of {demos}" for demos, labels in sorted(pairs.items())) + (
-        " demonstrations" if pairs else ""
-    )
+    found: dict[int, set[int]] = {}
+    for row in rows:
+        if row["title"] == title and row["demos"] is not None and row["labelled_demos"] is not None:
+            found.setdefault(row["demos"], set()).add(row["labelled_demos"])
+    said = _list(f"{_list(sorted(labels))} of {demos}" for demos, labels in sorted(found.items()))
+    return f"{said} demonstrations" if said else ""
 
 
 def _one_each(rows: Sequence[Result], key: str, text: str) -> list[str]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from playslot_rl.data.demonstrations import (
+    drawn_demonstrations,
     first_demonstrations,
     real_actions,
     require_labelled,
@@ -93,3 +94,26 @@ def test_the_last_demonstrations_beyond_those_trained_on_measure(
         if source.actions is not None and split.held_out.actions is not None:
             assert np.array_equal(split.held_out.actions[rows], source.actions[there])
     assert len({split.held_out.fingerprint, split.trained.fingerprint, source.fingerprint}) == 3
+
+
+def test_a_draw_changes_who_comes_first_and_nothing_else(source: EpisodeFrames) -> None:
+    orders = {tuple(drawn_demonstrations(source, seed).starts.tolist()) for seed in range(20)}
+    assert len(orders) > 1
+    drawn = drawn_demonstrations(source, 3)
+    assert sorted(zip(drawn.starts, drawn.lengths, strict=True)) == [(0, 3), (3, 1), (4, 2)]
+    assert drawn.seeds is not None
+    assert {int(s): int(n) for s, n in zip(drawn.starts, drawn.seeds, strict=True)} == {0: 7, 3: 8, 4: 9}
+    assert drawn.frames is source.frames
+    assert (
+        drawn_demonstrations(source, 3).fingerprint == drawn.fingerprint != drawn_demonstrations(source, 4).fingerprint
+    )
+
+
+@pytest.mark.parametrize("draw", range(6))
+def test_what_measures_is_never_drawn(source: EpisodeFrames, draw: int) -> None:
+    split = split_demonstrations(source, 1, 1, 0, draw)
+    assert split.trained.episodes == 1
+    assert int(split.trained.starts[0]) in (0, 3), "the last one measures"
+    whole = split_demonstrations(source, None, 0, 10, draw)
+    assert sorted(whole.trained.starts.tolist()) == [0, 3, 4]
+    assert whole.parsed is source, "the slot cache is in the order of the data set"

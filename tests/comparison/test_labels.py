@@ -1,0 +1,114 @@
+"""Comparisons by labels: which jobs there are, what they learn from, and how table and plot show them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from jobs_on_disk import comparison, finish
+
+from playslot_rl.comparison.page import comparison_figure, comparison_page
+from playslot_rl.comparison.plan import Job, job_config, jobs
+from playslot_rl.comparison.report import job_rows, summarise
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.compose import compose
+from playslot_rl.errors import ConfigError
+from playslot_rl.visualization.charts import LIGHT
+
+OUT = Path("out")
+
+
+def compared(*typed: str) -> ExperimentConfig:
+    return compose(["preset=compact", *typed], "compare")
+
+
+def test_bc_has_a_job_for_each_number_of_labels_and_the_oracles_one_for_all() -> None:
+    typed = ("methods=playslot,lapo,slot_bc,resnet_bc,slot_oracle", "demos=100", "labels=25,5", "seeds=3")
+    assert [job.name for job in jobs(compared(*typed), OUT)] == [
+        "slot_bc-d5-l5-s3", "resnet_bc-d5-l5-s3", "slot_bc-d25-l25-s3", "resnet_bc-d25-l25-s3",
+        "playslot-d100-l5-s3", "playslot-d100-l25-s3", "lapo-d100-l5-s3", "lapo-d100-l25-s3", "slot_oracle-d100-s3",
+    ]  # fmt: skip
+
+
+def test_the_policy_is_trained_once_for_all_numbers_of_labels() -> None:
+    first, second = jobs(compared("methods=playslot", "demos=100", "labels=5,25", "seeds=0"), OUT)
+    assert (first.policy_of, second.policy_of) == (None, 5)
+    config = compared("methods=playslot", "demos=100", "labels=5,25")
+    assert job_config(config, first, "pretrained", "").behaviour.policy_from == ""
+    assert job_config(config, second, "pretrained", "").behaviour.policy_from == str(first.run.resolve())
+
+
+@pytest.mark.parametrize(
+    ("method", "demos", "labels", "expected"),
+    [("playslot", 100, 5, (100, 5)), ("lapo", 100, 25, (100, 25)), ("slot_bc", 5, 5, (5, 5)),
+     ("resnet_bc", 25, 25, (25, 25)), ("slot_oracle", 100, None, (100, 50))],
+)  # fmt: skip
+def test_every_method_learns_from_the_draw_of_its_seed(
+    method: Any, demos: int, labels: int | None, expected: tuple[int, int]
+) -> None:
+    own = job_config(compared(), Job(method, demos, 7, OUT, labels), "pretrained", "")
+    assert (own.demos, own.behaviour.labelled_demos) == expected
+    assert own.data.draw == 7, "the same draw for all methods: BC's labelled demonstrations are PlaySlot's"
+
+
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        (["labels=0"], "labels: got .*0.*, expected numbers of at least 1"),
+        (["labels=5,5"], "labels: got .*, expected each one once"),
+        (["labels=200", "demos=100,300"], "labels: got 200, expected at most the 100 demonstrations"),
+        (["methods=slot_bc,lapo"], "labels: got .*, expected some numbers with methods=slot_bc"),
+        (["labels=few"], "compare.labels: got 'few'"),
+    ],
+)
+def test_bad_labels_are_one_line(typed: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as error:
+        compared(*typed)
+    assert "\n" not in str(error.value)
+
+
+@pytest.fixture
+def by_labels(tmp_path: Path) -> dict[str, Any]:
+    """PlaySlot with two numbers of videos, BC, and an oracle."""
+    ended = [
+        finish(Job("slot_bc", 5, 0, tmp_path, 5), {"simulation": 4}, labelled_demos=5),
+        finish(Job("slot_bc", 25, 0, tmp_path, 25), {"simulation": 5}, labelled_demos=25),
+        *(
+            finish(
+                Job("playslot", videos, 0, tmp_path, labels),
+                {"simulation": won, "imagination": won - 1},
+                labelled_demos=labels,
+            )
+            for videos, labels, won in ((100, 5, 6), (100, 25, 7), (300, 5, 8), (300, 25, 9))
+        ),
+        finish(Job("slot_oracle", 300, 0, tmp_path), {"simulation": 10}),
+    ]
+    rows = [row for job in ended for row in job_rows(job, frame_skip=5)]
+    return comparison(tmp_path, rows, summarise(rows))
+
+
+def test_the_page_has_a_table_for_each_number_of_videos_with_bc_in_each(by_labels: dict[str, Any]) -> None:
+    page = comparison_page(by_labels)
+    assert page.startswith("# button_press: success against labels")
+    few, many = page.partition("## By labelled demonstrations, of 300 videos")[::2]
+    assert "of 100 videos" in few
+    for part, playslot in ((few, ("60 %", "70 %")), (many, ("80 %", "90 %"))):
+        table = part.partition("|  | 5 labelled | 25 labelled |")[2]
+        lines = {line.split("|")[1].strip(): line for line in table.splitlines() if line.startswith("| ")}
+        assert all(rate in lines["PlaySlot, simulation"] for rate in playslot)
+        assert "40 %" in lines["Slot BC, simulation"]
+    assert "With the actions of all 300: Slot Oracle 100 %" in many
+    assert "With the actions of all" not in few
+    assert "PlaySlot saw the real actions of 5, 25 of 100, 5, 25 of 300 demonstrations" in page
+
+
+def test_the_plot_has_a_panel_for_each_number_of_videos(by_labels: dict[str, Any]) -> None:
+    panels = comparison_figure(by_labels, LIGHT).axes
+    assert [axes.get_title() for axes in panels] == ["100 videos", "300 videos"]
+    assert all(axes.get_xlabel() == "labelled demonstrations" for axes in panels)
+    drawn = [{str(line.get_label()) for line in axes.lines} for axes in panels]
+    assert "Slot Oracle" in drawn[1]
+    assert "Slot Oracle" not in drawn[0]
+    series = [{container.get_label() for container in axes.containers} for axes in panels]
+    assert series == [{"PlaySlot", "PlaySlot, imagination", "Slot BC"}] * 2

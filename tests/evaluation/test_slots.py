@@ -1,0 +1,66 @@
+"""Every simulated task says which object each pixel shows, and slots are scored against that."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from playslot_rl.config.compose import compose
+from playslot_rl.envs import make_env
+from playslot_rl.evaluation.slots import RESULT, evaluate_slots, segmented_episode, slots_per_object
+from playslot_rl.training.runs import load_savi
+
+OBJECTS = {
+    "button_press": {1: "arm", 2: "box"},
+    "block_push": {1: "arm", 2: "goal", 3: "cube", 4: "cube", 5: "cube", 6: "cube"},
+    "block_push_easy": {1: "arm", 2: "goal", 3: "cube"},
+    "block_reach": {1: "arm", 3: "sphere", 4: "sphere", 5: "sphere", 6: "sphere"},
+    "block_pick": {1: "arm", 2: "goal", 3: "cube"},
+}
+
+
+@pytest.mark.parametrize("name", sorted(OBJECTS))
+def test_pixels_are_told_apart_in_every_task(name: str) -> None:
+    config = compose([f"env={name}", "preset=compact"])
+    env = make_env(config.env, config.render).unwrapped
+    try:
+        frames, labels = segmented_episode(env, 3, 2)
+        plain = [env.reset(seed=3)[0]["pixels"]]
+        plain += [env.step(env.expert_action())[0]["pixels"] for _ in range(2)]
+    finally:
+        env.close()
+    assert labels.shape == frames.shape[:3] == (3, 64, 64)
+    assert set(np.unique(labels)) - {0} >= set(OBJECTS[name])
+    assert (labels == 0).mean() > 0.5, "the ground is most of the picture"
+    assert np.array_equal(frames, np.stack(plain)), "segmenting changes no frame"
+
+
+def test_the_arm_is_where_the_picture_changes() -> None:
+    config = compose(["env=button_press", "preset=compact"])
+    env = make_env(config.env, config.render).unwrapped
+    try:
+        frames, labels = segmented_episode(env, 0, 6)
+    finally:
+        env.close()
+    change = np.abs(frames[1:].astype(int) - frames[:-1]).sum(-1)
+    arm = (labels[1:] == 1) | (labels[:-1] == 1)
+    assert change[arm].mean() > 10 * change[~arm].mean()
+
+
+def test_slots_per_object_counts_those_with_a_share() -> None:
+    truth = np.array([[1] * 20 + [2] * 10 + [0] * 5])
+    found = np.array([[0] * 10 + [1] * 9 + [2] + [3] * 10 + [0] * 5])
+    assert slots_per_object(truth, found, 4) == 1.5
+
+
+def test_a_shipped_models_slots_are_scored_and_written(tmp_path: Path) -> None:
+    config = compose(["env=block_push_easy", "preset=compact", "episodes=1"])
+    assert load_savi("pretrained/block_push_easy").config.n_slots == 5
+    result = evaluate_slots("pretrained/block_push_easy", tmp_path, config, torch.device("cpu"))
+    assert json.loads((tmp_path / RESULT).read_text()) == result
+    assert result["foreground_ari"] > 0.4
+    assert result["psnr"] > 22

@@ -1,0 +1,94 @@
+"""Whitening is invertible and gives latents unit scale; decoders that read slots do not depend on their order."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from playslot_rl.config import ActionDecoderConfig, PolicyConfig
+from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.modules.whitening import FADE, Whitening
+
+SMALL = PolicyConfig(dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16)
+
+
+def latents(rows: int = 500) -> torch.Tensor:
+    """Correlated latents of very different scales, (M, 5)."""
+    generator = torch.Generator().manual_seed(0)
+    mix = torch.randn(5, 5, generator=generator)
+    return torch.randn(rows, 5, generator=generator) * torch.tensor([3.0, 1.0, 0.5, 1e-3, 1e-5]) @ mix + 4.0
+
+
+def test_it_is_the_identity_until_it_is_fitted_and_invertible_after() -> None:
+    z, whitening = latents(), Whitening(5)
+    assert torch.equal(whitening(z), z)
+    whitening.fit(z)
+    assert torch.allclose(whitening.inverse(whitening(z)), z, atol=1e-4)
+    assert torch.allclose(whitening.turn(z[:3] - z[3:6]), whitening(z[:3]) - whitening(z[3:6]), atol=1e-4)
+
+
+def test_coordinates_are_uncorrelated_and_directions_without_variance_fade() -> None:
+    z, whitening = latents(), Whitening(5)
+    whitening.fit(z)
+    covariance = torch.cov(whitening(z).T)
+    assert torch.allclose(covariance, covariance.diagonal().diag(), atol=1e-3)
+    spread = covariance.diagonal()
+    assert float(spread[0]) == pytest.approx(1 / (1 + FADE), rel=1e-3)
+    assert float(spread[-1]) < 1e-3
+    assert bool((spread.diff() <= 1e-4).all())
+
+
+def test_constant_latents_do_no_harm() -> None:
+    whitening = Whitening(3)
+    whitening.fit(torch.ones(10, 3))
+    assert bool(torch.isfinite(whitening(torch.randn(4, 3))).all())
+
+
+def test_a_whitened_policy_is_compared_in_coordinates() -> None:
+    torch.manual_seed(0)
+    policy, z = LatentPolicy(SMALL, 6, 5, whiten=True), latents(8)
+    assert policy.whitening is not None
+    policy.whitening.fit(latents())
+    slots = torch.randn(8, 3, 6)
+    loss = BehaviourLoss(policy, "l1")(TensorDict({"slots": slots, "latent_action": z}, [8]))["loss_policy"]
+    expected = (policy.whitening(policy(slots)) - policy.whitening(z)).abs().mean()
+    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-4)
+
+
+@pytest.mark.parametrize("whiten", [False, True])
+def test_a_decoder_that_reads_slots_does_not_depend_on_their_order(whiten: bool) -> None:
+    torch.manual_seed(0)
+    decoder = ActionDecoder(ActionDecoderConfig(hidden_dim=16, state_dim=8, state_heads=2), 5, 4, 6, whiten)
+    decoder.standardise(latents())
+    z, slots = latents(7), torch.randn(7, 3, 6)
+    action = decoder(z, slots)
+    assert action.shape == (7, 4)
+    assert torch.allclose(decoder(z, slots[:, [2, 0, 1]]), action, atol=1e-5)
+    assert not torch.allclose(decoder(z, slots + 1.0 * torch.randn_like(slots)), action, atol=1e-3)
+    with pytest.raises(ValueError, match="got no slots, expected"):
+        decoder(z)
+
+
+def test_a_decoder_without_slots_takes_or_leaves_them() -> None:
+    decoder = ActionDecoder(ActionDecoderConfig(hidden_dim=16), 5, 4)
+    z = latents(3)
+    assert not decoder.reads_slots
+    assert torch.equal(decoder(z), decoder(z, torch.randn(3, 2, 6)))
+
+
+def test_its_loss_reads_what_it_reads() -> None:
+    plain = ActionDecoderLoss(ActionDecoder(ActionDecoderConfig(hidden_dim=16), 5, 4))
+    state = ActionDecoderLoss(ActionDecoder(ActionDecoderConfig(hidden_dim=16, state_dim=8, state_heads=2), 5, 4, 6))
+    assert plain.in_keys == ["latent_action", "action"]
+    assert state.in_keys == ["latent_action", "slots", "action"]
+    rows = TensorDict({"latent_action": latents(3), "slots": torch.randn(3, 2, 6), "action": torch.rand(3, 4)}, [3])
+    state(rows)["loss_action"].backward()
+    assert state.network.encoder.to_token.weight.grad is not None
+
+
+def test_widths_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"model\.action_decoder\.state_dim: got 10, expected a multiple of 4 heads"):
+        ActionDecoder(ActionDecoderConfig(state_dim=10), 5, 4, 6)
