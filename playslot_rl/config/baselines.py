@@ -59,6 +59,7 @@ class LAPOConfig(Checked):
         dead_threshold: EMA cluster size under which a code is revived.
         commitment: weight beta of the commitment term.
         loss: of the latent policy and the action decoder: `l2` or `l1`.
+        targets: latents that the policy clones and the decoder reads, `quantised` or `continuous` (before they are).
         shift: shift of frames in the latent policy's training, pixels.
         model: training of inverse and forward model.
         policy: training of the latent policy.
@@ -77,6 +78,7 @@ class LAPOConfig(Checked):
     dead_threshold: float = 1.0
     commitment: float = 0.05
     loss: Literal["l2", "l1"] = "l2"
+    targets: Literal["quantised", "continuous"] = "quantised"
     shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
     model: StageConfig = field(default_factory=lambda: _stage(200_000, 3e-4, "cosine"))
     policy: StageConfig = field(default_factory=lambda: _stage(20_000, 2e-4, "constant"))

@@ -50,6 +50,7 @@ ADDED: Final[Mapping[str, Any]] = {
     "reward_scale": 1.0,
     "actor_average": 0.0,
     "kind": "cocvp",
+    "targets": "quantised",
     "trim": 0.0,
     "trim_pixels": 0.0,
     "trim_margin": 2,

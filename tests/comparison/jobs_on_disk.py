@@ -35,7 +35,8 @@ def comparison(out: Path, rows: list[dict[str, Any]], summary: list[dict[str, An
     reference = {"success_rate": 1.0, "ci95": [0.7, 1.0]}
     return {
         "env": "button_press", "preset": "compact",
-        "labels": sorted({row["labels"] for row in rows if row["labels"]}), "seeds": [0, 1], "episodes": 10, "evaluation_seed": 100,
+        "labels": sorted({row["labels"] for row in rows if row["labels"]}), "seeds": [0, 1],
+        "episodes": 10, "evaluation_seed": 100,
         "max_steps": 20, "frame_skip": 5, "learn_from_demos": True, "lapo_model": None,
         "jobs": 7, "rows": rows, "summary": summary, "seconds": 99.0, "command": "playslot compare",
         "commit": "c", "hardware": {"machine": "x86_64", "cores": 2, "gpu": None},

@@ -195,7 +195,7 @@ def test_roles_say_what_each_key_counts_for() -> None:
     call = {"out", "run", "episodes", "policy", "protocol", "workers", "collector", "device", "export"}
     assert keys_of(ExperimentConfig, "call") == call
     machine = {"device", "threads", "workers", "logging", "collector", "compare", "preset", "out", "run"}
-    named = {"data.root", "data.demos", "data.cache", "baselines.lapo.world"}
+    named = {"data.root", "data.demos", "data.cache", "baselines.lapo.world", "behaviour.policy_from"}
     measures = {"data.held_out", "collect.validation_episodes"}
     assert keys_of(ExperimentConfig, "machine") == machine | named | measures
     assert keys_of(ExperimentConfig, "folder") == {"out", "run", "slots.start_from"} | named

@@ -70,7 +70,12 @@ class LAPOBehaviour:
         def seen(source: EpisodeFrames, shift: int = 0) -> _Seen:
             moves = moving_frames(source, config.behaviour.trim_pixels, config.behaviour.trim_margin)
             inputs, actions = demonstrated_frames(source, moves, config.env.action_dim, device, shift)
-            return _Seen(inputs, infer_latents(inverse, source, moves, device), actions, moves.episode)
+            return _Seen(
+                inputs,
+                infer_latents(inverse, source, moves, device, self.own.targets == "quantised"),
+                actions,
+                moves.episode,
+            )
 
         self.trained = seen(demos.trained, self.own.shift)
         self.held_out = None if demos.held_out is None else seen(demos.held_out)

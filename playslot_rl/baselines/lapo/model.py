@@ -98,11 +98,13 @@ class Inferred(NamedTuple):
 
     Attributes:
         z: quantised, straight-through (B, Z).
+        before: what was quantised (B, Z).
         code: int64 (B, G).
         vq_loss: commitment term, weight included (scalar).
     """
 
     z: Tensor
+    before: Tensor
     code: Tensor
     vq_loss: Tensor
 
@@ -129,7 +131,7 @@ class InverseModel(nn.Module):
         z = self.network(torch.cat((normalise(first), normalise(second)), dim=1)).float()
         grouped = self.standardise(z).view(-1, self.config.groups, self.config.code_dim)
         p, code, loss = self.quantizer(grouped)
-        return Inferred(p.flatten(1), code, loss)
+        return Inferred(p.flatten(1), grouped.flatten(1), code, loss)
 
 
 class ForwardModel(nn.Module):

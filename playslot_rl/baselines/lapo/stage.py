@@ -84,11 +84,16 @@ class LAPOModelStage:
 
 @torch.no_grad()
 def infer_latents(
-    inverse: InverseModel, source: EpisodeFrames, moves: Transitions, device: torch.device | str = "cpu"
+    inverse: InverseModel,
+    source: EpisodeFrames,
+    moves: Transitions,
+    device: torch.device | str = "cpu",
+    quantised: bool = True,
 ) -> Tensor:
-    """Quantised latent actions (M, Z) of transitions; the model in evaluation mode."""
+    """Latent actions (M, Z) of transitions, quantised or as they were before; the model in evaluation mode."""
     parts = []
     for rows in np.array_split(moves.rows, -(-len(moves.rows) // BATCH)):
         pixels = source.pixels(np.stack((rows, rows + 1), axis=1)).to(device)
-        parts.append(inverse(pixels[:, 0], pixels[:, 1]).z)
+        inferred = inverse(pixels[:, 0], pixels[:, 1])
+        parts.append(inferred.z if quantised else inferred.before)
     return torch.cat(parts)

@@ -38,8 +38,7 @@ class SOLDActor(Actor):
     Reads PIXELS (n, 3, H, W) uint8, SLOT_STATE, SLOT_AGE, SLOT_HISTORY (n, W, N, D), right-aligned, and
     HISTORY_LENGTH (n, 1); writes these anew but for the frame, SLOTS (n, N, D) and ACTION (n, A) in [-1, 1].
 
-    Note: W is C. In imagination the first decision follows 1 to C parsed frames and later ones follow predicted frames
-    too; longer windows of parsed frames only are what the actor never saw.
+    Note: W is C, in imagination as here: each decision follows the last 1 to C frames, there predicted ones too.
 
     Args:
         savi: frozen.

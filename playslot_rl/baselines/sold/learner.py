@@ -139,7 +139,9 @@ class SOLDLearner:
         context, actions = self._starts(batch, generators)
         frames = context.shape[1]
         noise = generators.torch("imagination")
-        imagined = losses.imagine(networks.dynamics, networks.actor, context, actions, config.horizon, noise)
+        imagined = losses.imagine(
+            networks.dynamics, networks.actor, context, actions, config.horizon, config.context, noise
+        )
         logits = networks.critic(imagined.slots)[:, frames - 1 :]
         values = networks.critic.decode(logits)
         rewards = networks.reward.decode(networks.reward(imagined.slots)[:, frames:])

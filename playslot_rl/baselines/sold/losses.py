@@ -44,11 +44,13 @@ def imagine(
     context: Tensor,
     actions: Tensor,
     horizon: int,
+    window: int,
     generator: torch.Generator | None = None,
 ) -> Imagined:
     """Unfold H steps from the context's last frame.
 
     The actor reads slots without their gradient (as in Dreamer): an action is judged by what the dynamics make of it.
+    It sees as many frames as it does when it acts, the last `window`, not all that were imagined so far.
 
     Args:
         dynamics: predicts the next frame's slots.
@@ -56,16 +58,17 @@ def imagine(
         context: parsed slots (B, C, N, D).
         actions: (B, C - 1, A) taken between them.
         horizon: H.
+        window: frames the actor sees, at most.
         generator: of the sampled actions.
     """
     memory = None
     if context.shape[1] > 1:
         with torch.no_grad():  # no action that is judged leads there
             _, memory = dynamics.step(context[:, :-1], actions)
-    location, std, past = actor(context.detach())
     frames, chosen, log_probs, entropies, locations = [context], [], [], [], []
     current = context[:, -1:]
-    for step in range(horizon):
+    for _ in range(horizon):
+        location, std, _past = actor(torch.cat(frames, dim=1)[:, -window:].detach())
         distribution = TruncatedNormal(location[:, -1:], std[:, -1:])
         action = sample_action(distribution, generator)
         current, memory = dynamics.step(current, action, past=memory)
@@ -74,8 +77,6 @@ def imagine(
         log_probs.append(distribution.log_prob(action.detach()))
         entropies.append(distribution.base_dist.entropy().sum(dim=-1))
         locations.append(location[:, -1:].detach())
-        if step + 1 < horizon:
-            location, std, past = actor(current.detach(), past)
     return Imagined(*(torch.cat(parts, dim=1) for parts in (frames, chosen, log_probs, entropies, locations)))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
+from torch import Tensor
 from torchrl.modules import TruncatedNormal
 
 from playslot_rl import keys
@@ -148,7 +149,7 @@ def test_rollouts_start_within_one_episode_with_the_actions_taken_there(make_lea
 def test_imagined_steps_follow_from_the_dynamics_and_the_actors_history(make_learner: Make, batch: TensorDict) -> None:
     networks = make_learner().networks
     context, taken = batch[keys.SLOTS][:, :3], batch[keys.ACTION][:, 1:3]
-    out = imagine(networks.dynamics, networks.actor, context, taken, 3, torch.Generator().manual_seed(0))
+    out = imagine(networks.dynamics, networks.actor, context, taken, 3, 6, torch.Generator().manual_seed(0))
     torch.testing.assert_close(out.slots[:, :3], context)
     whole = networks.dynamics(out.slots[:, :-1], torch.cat((taken, out.actions), dim=1))
     torch.testing.assert_close(out.slots[:, 3:], whole[:, 2:])
@@ -161,7 +162,7 @@ def test_an_action_is_judged_by_what_follows_and_not_by_what_it_saw(make_learner
     """sg(S) in a ~ pi(. | sg(S)): no gradient runs from the actions back into slots."""
     networks = make_learner().networks
     context = batch[keys.SLOTS][:, :2].clone().requires_grad_()
-    out = imagine(networks.dynamics, networks.actor, context, batch[keys.ACTION][:, 1:2], 3)
+    out = imagine(networks.dynamics, networks.actor, context, batch[keys.ACTION][:, 1:2], 3, 3)
     assert torch.autograd.grad(out.actions.sum(), context, allow_unused=True, retain_graph=True) == (None,)
     assert torch.autograd.grad(out.slots.sum(), context)[0].abs().max() > 0
 
@@ -182,6 +183,23 @@ class _Counting(torch.nn.Module):
 
     def cross_entropy(self, logits: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         return logits.squeeze(-1) * 0 + values.detach() * 0
+
+
+def test_the_actor_sees_as_many_frames_when_it_imagines_as_when_it_acts(
+    make_learner: Make, batch: TensorDict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learner = make_learner()
+    networks, lengths = learner.networks, list[int]()
+    whole = networks.actor.forward
+
+    def watched(slots: Tensor, *rest: Any) -> Any:
+        lengths.append(slots.shape[1])
+        return whole(slots, *rest)
+
+    monkeypatch.setattr(networks.actor, "forward", watched)
+    imagine(networks.dynamics, networks.actor, batch[keys.SLOTS][:, :2], batch[keys.ACTION][:, 1:2], 4, 3)
+    assert lengths == [2, 3, 3, 3]
+    assert learner.acting.window == learner.config.context
 
 
 def test_rewards_are_of_the_frames_reached_and_values_of_the_frames_left(
