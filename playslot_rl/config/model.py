@@ -157,12 +157,14 @@ class ActionDecoderConfig:
         hidden_dim: hidden width.
         state_dim, state_layers, state_heads: width, layers and heads of the slot encoder beside it, for
             `behaviour.decoder_state`.
+        state_dropout: fraction of the training rows that do without the slots, so that the decoder can, too.
     """
 
     hidden_dim: int = 128
     state_dim: int = 64
     state_layers: int = 2
     state_heads: int = 4
+    state_dropout: float = 0.5
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ mean and scale of the training latents: their scale is free (about 0.07 here), a
 
 Note: the paper's decoder reads z_t alone. A latent action is a change of the image: the depth of a motion hardly shows
 in it, and the same change asks for different actions in different places. With slots, their summary by the [ACT]
-transformer of the policy, made small, is put beside z_t; it does not depend on the order of the slots.
+transformer of the policy, made small, is put beside z_t; it does not depend on the order of the slots. In training the
+summary of some rows is replaced by zeros: so the decoder also works where there are no slots, or none to be trusted.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ class ActionDecoder(nn.Module):
             self.register_buffer("mean", torch.zeros(latent_dim))
             self.register_buffer("scale", torch.ones(latent_dim))
         self.encoder: SlotTokenEncoder | None = None
+        self.width, self.dropout = width, config.state_dropout
         if slot_dim:
             self.encoder = SlotTokenEncoder(slot_dim, width, config.state_layers, heads, width // heads, 2 * width)
             latent_dim += width
@@ -77,14 +79,11 @@ class ActionDecoder(nn.Module):
         self.scale.copy_(z.std(dim=0).clamp(min=1e-6))
 
     def forward(self, z: Tensor, slots: Tensor | None = None) -> Tensor:
-        """Latent actions (..., Z), and slots (..., N, D) where it reads them, to real actions (..., A).
-
-        Raises:
-            ValueError: no slots, and it reads them.
-        """
+        """Latent actions (..., Z), and slots (..., N, D) where it reads them and they are given, to actions (..., A)."""
         inputs = (z - self.mean) / self.scale if self.whitening is None else self.whitening(z)
         if self.encoder is not None:
-            if slots is None:
-                raise ValueError("action decoder: got no slots, expected (..., N, D): it was trained to read them")
-            inputs = torch.cat((inputs, self.encoder(slots)), dim=-1)
+            state = z.new_zeros(*z.shape[:-1], self.width) if slots is None else self.encoder(slots)
+            if self.training and self.dropout:
+                state = state * (torch.rand(*state.shape[:-1], 1, device=state.device) >= self.dropout)
+            inputs = torch.cat((inputs, state), dim=-1)
         return torch.tanh(self.layers(inputs))

@@ -61,6 +61,7 @@ ADDED: Final[Mapping[str, Any]] = {
     "state_dim": 64,
     "state_layers": 2,
     "state_heads": 4,
+    "state_dropout": 0.5,
 }
 """Settings that came after the first checkpoints, and what those were trained with."""
 

@@ -63,13 +63,26 @@ def test_a_decoder_that_reads_slots_does_not_depend_on_their_order(whiten: bool)
     torch.manual_seed(0)
     decoder = ActionDecoder(ActionDecoderConfig(hidden_dim=16, state_dim=8, state_heads=2), 5, 4, 6, whiten)
     decoder.standardise(latents())
+    decoder.eval()
     z, slots = latents(7), torch.randn(7, 3, 6)
     action = decoder(z, slots)
     assert action.shape == (7, 4)
     assert torch.allclose(decoder(z, slots[:, [2, 0, 1]]), action, atol=1e-5)
     assert not torch.allclose(decoder(z, slots + 1.0 * torch.randn_like(slots)), action, atol=1e-3)
-    with pytest.raises(ValueError, match="got no slots, expected"):
-        decoder(z)
+    assert decoder(z).shape == (7, 4), "it can do without"
+
+
+def test_slots_are_dropped_in_training_only_and_by_rows() -> None:
+    config = ActionDecoderConfig(hidden_dim=16, state_dim=8, state_heads=2, state_dropout=0.5)
+    torch.manual_seed(0)
+    decoder, z, slots = ActionDecoder(config, 5, 4, 6), latents(200), torch.randn(200, 3, 6)
+    decoder.eval()
+    seen, blind = decoder(z, slots), decoder(z)
+    decoder.train()
+    drawn = decoder(z, slots)
+    dropped = (drawn == blind).all(-1)
+    assert 60 < int(dropped.sum()) < 140
+    assert torch.equal(drawn[~dropped], seen[~dropped])
 
 
 def test_a_decoder_without_slots_takes_or_leaves_them() -> None:
