@@ -1,4 +1,4 @@
-"""`playslot evaluate run=DIR protocol=simulation|imagination episodes=N seed=S`: success of a trained policy.
+"""`playslot evaluate run=DIR protocol=simulation|imagination|slots episodes=N seed=S`: success of a trained policy.
 
 Writes `DIR/evaluation/PROTOCOL/eval_info.json` and renews `DIR/report.md` and `DIR/report.html`.
 """
@@ -16,7 +16,7 @@ from playslot_rl.config.compose import shipped
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.recipes import objects
+from playslot_rl.recipes import objects, slots
 from playslot_rl.recipes.run import open_run, parent_run
 
 PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")
@@ -47,6 +47,9 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
         return
     if config.env.name in PROCEDURAL:
         objects.main(config, run)
+        return
+    if config.protocol == "slots":
+        slots.main(config, run)
         return
     from playslot_rl.acting.episodes import TaskPool
     from playslot_rl.evaluation.success import check_protocol, evaluate_run, run_facts

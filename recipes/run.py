@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from playslot_rl.data.source import EpisodeFrames
     from playslot_rl.modules.savi import SAVi
     from playslot_rl.storage.checkpoints import StageCheckpoint
+    from playslot_rl.training.record import StageRecord
 
     ParsedVideos = tuple[EpisodeFrames, npt.NDArray[np.float32]]
 
@@ -104,6 +105,15 @@ def demonstration_views(
     shifted_views = [(copy, parse(of)) for copy, of in zip(copies(demos.trained), copies(demos.parsed), strict=True)]
     held_out = [] if demos.held_out is None else [(demos.held_out, parse(demos.held_out))]
     return [(demos.trained, parse(demos.parsed)), *shifted_views], held_out
+
+
+def adopt_policy(config: ExperimentConfig, record: StageRecord, steps: int) -> None:
+    """Take over the finished policy training of the run `behaviour.policy_from` names, if it is the same one."""
+    from playslot_rl.training.runs import adopt_training
+
+    if config.behaviour.policy_from:
+        record.begin()
+        adopt_training(config.behaviour.policy_from, record.run, record.name, steps)
 
 
 def held_out_text(demos: DemonstrationSplit) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from playslot_rl.config import BehaviourStageConfig, ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
+    adopt_policy,
     demonstration_views,
     held_out_text,
     open_device,
@@ -34,7 +35,7 @@ def main(config: ExperimentConfig) -> None:
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
     from playslot_rl.training.record import StageRecord, run_stage
-    from playslot_rl.training.runs import adopt_training, use_world_model, world_model_checkpoints, world_model_config
+    from playslot_rl.training.runs import use_world_model, world_model_checkpoints, world_model_config
 
     run = open_run(config)
     parent = parent_run(config, run)
@@ -57,9 +58,7 @@ def main(config: ExperimentConfig) -> None:
 
     def prepare() -> Training:
         training = _training(config, record, parent)
-        if config.behaviour.policy_from:
-            record.begin()
-            adopt_training(config.behaviour.policy_from, run, record.name, config.behaviour.steps)
+        adopt_policy(config, record, config.behaviour.steps)
         return training
 
     run_stage(record, prepare)

@@ -79,7 +79,7 @@ class ActionDecoder(nn.Module):
         self.scale.copy_(z.std(dim=0).clamp(min=1e-6))
 
     def forward(self, z: Tensor, slots: Tensor | None = None) -> Tensor:
-        """Latent actions (..., Z), and slots (..., N, D) where it reads them and they are given, to actions (..., A)."""
+        """Latent actions (..., Z), and slots (..., N, D) if it reads them and there are some, to actions (..., A)."""
         inputs = (z - self.mean) / self.scale if self.whitening is None else self.whitening(z)
         if self.encoder is not None:
             state = z.new_zeros(*z.shape[:-1], self.width) if slots is None else self.encoder(slots)

@@ -206,6 +206,11 @@ def notes(given: ReportInput) -> list[str]:
             f"demonstrations{unlabelled}. The slot oracle is the policy's network trained "
             "on the real actions of all demonstrations: it shows what the slots allow."
         )
+    if meta.get("kept_rows", 1.0) < 1.0:
+        found.append(
+            f"Still stretches left out: {percent(meta['kept_rows'])} of the demonstrations' rows were learned from, "
+            "those in which the slots move and a few after them (`behaviour.trim`); no action was looked at."
+        )
     results = read_evaluations(given.run)
     found.append(
         "No evaluation seed is in a data set whose seeds are on record. An episode that starts solved is replaced by "

@@ -11,6 +11,7 @@ from typing import Any
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.seeds import first_seed
+from playslot_rl.evaluation.slots import RESULT as SLOTS_RESULT
 from playslot_rl.evaluation.success import PROTOCOLS
 from playslot_rl.visualization.charts import DARK, LIGHT, Theme, loss_chart, loss_names, success_chart
 from playslot_rl.visualization.document import Block, Missing, Picture, Section, Table, Text
@@ -195,7 +196,17 @@ def slots_section(given: ReportInput, clip: Callable[[], Any], what: str = EXPER
         f"{what} Segmentation: each pixel in the colour of the slot with the "
         "largest mask. Slot rows: the slot's colours weighted by its mask, on white."
     )
-    return Section(title, [Picture("slots", png(draw_slots(given.world_model, clip())), alt, caption)])
+    picture = Picture("slots", png(draw_slots(given.world_model, clip())), alt, caption)
+    path = given.run / SLOTS_RESULT
+    return Section(title, [picture, *([Text(_slots_scored(json.loads(path.read_text())))] if path.is_file() else [])])
+
+
+def _slots_scored(result: dict[str, Any]) -> str:
+    return (
+        f"On {result['episodes']} held-out episodes of the expert: FG-ARI {result['foreground_ari']:.2f} and ARI "
+        f"{result['ari']:.2f} against the simulator's segmentation (1 is perfect, 0 chance), "
+        f"{result['slots_per_object']:.1f} slots an object, reconstruction {result['psnr']:.1f} dB."
+    )
 
 
 def prototype_section(given: ReportInput, clip: Callable[[], Any]) -> Section:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import held_out_text, open_device, open_run, require_parent
+from playslot_rl.recipes.run import adopt_policy, held_out_text, open_device, open_run, require_parent
 
 if TYPE_CHECKING:
     from playslot_rl.storage.checkpoints import StageCheckpoint
@@ -42,7 +42,7 @@ def main(config: ExperimentConfig) -> None:
         require_whole,
     )
     from playslot_rl.training.record import StageRecord, run_stage
-    from playslot_rl.training.runs import adopt_stage, adopt_training, run_folder
+    from playslot_rl.training.runs import adopt_stage, run_folder
 
     run, own, parents = open_run(config), config.baselines.lapo, dict[str, StageCheckpoint]()
     stored = {
@@ -61,11 +61,8 @@ def main(config: ExperimentConfig) -> None:
         identity={
             "action_decoder": to_dict(config.model.action_decoder),
             NAME: sizes_of(own),
-            "loss": own.loss,
-            "targets": own.targets,
-            "shift": own.shift,
-            "trim_pixels": config.behaviour.trim_pixels,
-            "trim_margin": config.behaviour.trim_margin,
+            **{key: getattr(own, key) for key in ("loss", "targets", "shift")},
+            **{key: getattr(config.behaviour, key) for key in ("trim_pixels", "trim_margin")},
         },
         parents=parents,
         role="demos",
@@ -84,9 +81,7 @@ def main(config: ExperimentConfig) -> None:
 
     def prepare() -> Training:
         training = _training(config, record)
-        if config.behaviour.policy_from:
-            record.begin()
-            adopt_training(config.behaviour.policy_from, run, record.name, own.policy.steps)
+        adopt_policy(config, record, own.policy.steps)
         return training
 
     run_stage(record, prepare)

@@ -1,0 +1,50 @@
+"""`playslot evaluate run=DIR protocol=slots`: slots against the simulator's own segmentation.
+
+Writes `DIR/evaluation/slots/eval_info.json` and renews the report.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from playslot_rl.config import ExperimentConfig
+
+
+def main(config: ExperimentConfig, run: Path) -> None:
+    """Score the slots of `run` on the scripted expert's episodes and print the result.
+
+    Raises:
+        CheckpointError: the run has no finished slots.
+        ConfigError: a training data set holds one of the seeds.
+        OutputError: the result cannot be written.
+    """
+    from playslot_rl.evaluation.slots import RESULT, evaluate_slots
+    from playslot_rl.recipes.run import open_device
+
+    print(describe(evaluate_slots(run, run, config, open_device(config)), run / RESULT), flush=True)
+
+
+def main_if_needed(config: ExperimentConfig, run: Path) -> None:
+    """As `main` with the default number of episodes, unless these slots were scored with this seed before."""
+    from playslot_rl.evaluation.slots import RESULT
+    from playslot_rl.training.runs import slots_checkpoint
+
+    facts = {"seed": config.seed, "fingerprints": {"slots": slots_checkpoint(run).fingerprint}}
+    path = run / RESULT
+    stored = json.loads(path.read_text()) if path.is_file() else {}
+    if {key: stored.get(key) for key in facts} == facts:
+        print(f"slots: scored before, FG-ARI {stored['foreground_ari']:.2f}, skipped", flush=True)
+        return
+    main(replace(config, episodes=None), run)
+
+
+def describe(result: dict[str, Any], path: Path) -> str:
+    """The result in two lines."""
+    return (
+        f"{'slots':>22}: FG-ARI {result['foreground_ari']:.2f}, ARI {result['ari']:.2f}, "
+        f"{result['slots_per_object']:.1f} slots an object, reconstruction {result['psnr']:.1f} dB\n"
+        f"{result['episodes']} episodes of the expert, {result['wall_seconds']:.0f} s; written to {path}"
+    )
