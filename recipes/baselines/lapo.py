@@ -75,9 +75,7 @@ def main(config: ExperimentConfig) -> None:
         require_whole(model)
         require_parent(config, run, model, "image_size")
         require_config(model, {NAME: sizes_of(own)})
-    else:
-        model = train_model(config, run)
-    parents[MODEL] = model
+    parents[MODEL] = model if own.world else train_model(config, run)
 
     def prepare() -> Training:
         training = _training(config, record)
