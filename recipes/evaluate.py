@@ -40,7 +40,7 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
     """
     run = check_run(config)
     if shipped(config.run):
-        run = take_shipped(config, run)
+        run = take_shipped(config)
         config = replace(config, run=str(run), out="")
     if config.method != "playslot":
         evaluate_baseline(config, run)
@@ -131,20 +131,22 @@ def measured(run: Path, protocol: str, facts: dict[str, Any]) -> bool:
 
 
 def check_run(config: ExperimentConfig) -> Path:
-    """The run folder; of a shipped policy the folder to write.
+    """The run folder.
 
     Raises:
-        ConfigError: none was named, or `out` names another folder; a shipped policy without `out`.
-        CheckpointError: there is no such folder.
+        ConfigError: none was named, or `out` names another folder.
+        CheckpointError: there is no such folder, or it is a shipped world model without a policy.
     """
     if not config.run:
         raise ConfigError("run: got nothing, expected the folder of a run with a trained policy, such as run=runs/demo")
     if shipped(config.run):
-        if not config.out:
-            raise ConfigError(
-                f"out: got nothing with run={config.run}, expected a folder to write, such as out=runs/check"
-            )
-        return open_run(config)
+        from playslot_rl.storage.checkpoints import checkpoint_folder
+        from playslot_rl.training.runs import run_folder
+
+        folder = run_folder(parent_run(config, Path()))
+        if config.protocol != "slots" and not (checkpoint_folder(folder, "policy") / "meta.json").is_file():
+            raise CheckpointError(f"run={config.run} is a world model without a policy; run `playslot train-policy`")
+        return folder
     run = Path(config.run)
     if not run.is_dir():
         raise CheckpointError(f"run={config.run}: no such folder, expected a run; make one by `playslot demo`")
@@ -155,25 +157,29 @@ def check_run(config: ExperimentConfig) -> Path:
     return run
 
 
-def take_shipped(config: ExperimentConfig, run: Path) -> Path:
-    """Make `run` a run of the shipped policy: its checkpoint, the name of its world model, and this config.
+def take_shipped(config: ExperimentConfig) -> Path:
+    """Make `out` a run of the shipped model: the name of its world model, its policy if it has one, and this config.
 
     Raises:
-        CheckpointError: no model of that name ships, it has no policy, or `run` has another one.
+        ConfigError: no `out`.
+        CheckpointError: `out` has another policy.
         OutputError: the folder cannot be written.
     """
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
     from playslot_rl.training.runs import adopt_stage, require_adoptable, run_folder, store_config, use_world_model
 
+    if not config.out:
+        raise ConfigError(f"out: got nothing with run={config.run}, expected a folder to write, such as out=runs/check")
+    run = open_run(config)
     parent = parent_run(config, run)
     folder = checkpoint_folder(run_folder(parent), "policy")
-    if not (folder / "meta.json").is_file():
-        raise CheckpointError(f"run={config.run} is a world model without a policy; run `playslot train-policy`")
-    policy = read_stage(folder, "policy")
-    require_adoptable(policy, run)
+    policy = read_stage(folder, "policy") if (folder / "meta.json").is_file() else None
+    if policy is not None:
+        require_adoptable(policy, run)
     store_config(replace(config, run="", out=""), run)
     use_world_model(run, parent)
-    adopt_stage(policy, run)
+    if policy is not None:
+        adopt_stage(policy, run)
     return run
 
 
