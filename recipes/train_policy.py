@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -92,6 +93,12 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
         clone = CloneStage(agent.policy, agent.oracle, demos, cloning, held_out, horizon)
         yield Part("policy", clone, cloning, lr_key="behaviour.optim.lr")
         agent.eval()
+        if agent.action_decoder.reads_slots:
+            agent.action_decoder.trusts_slots.fill_(False)  # one demonstration cannot tell
+        if agent.action_decoder.reads_slots and behaviour.labelled_demos > 1:
+            trial = DecoderStage.trial(deepcopy(agent.action_decoder), agent.policy, demos, behaviour, horizon)
+            yield _part("decoder_trial", trial, behaviour, behaviour.decoder_steps, behaviour.decoder_lr)
+            agent.action_decoder.trusts_slots.fill_(trial.slots_pay())
         decoder = DecoderStage(agent.action_decoder, agent.policy, demos, behaviour, held_out, horizon)
         yield _part("decoder", decoder, behaviour, behaviour.decoder_steps, behaviour.decoder_lr)
         if behaviour.finetune_steps:
@@ -121,4 +128,4 @@ def _part(name: str, stage: Stage, behaviour: BehaviourStageConfig, steps: int, 
     from playslot_rl.training.fit import Part
 
     own = replace(behaviour, steps=steps, optim=replace(behaviour.optim, lr=lr))
-    return Part(name, stage, own, folder=name, lr_key=f"behaviour.{name}_lr")
+    return Part(name, stage, own, folder=name, lr_key=f"behaviour.{name.partition('_')[0]}_lr")

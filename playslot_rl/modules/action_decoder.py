@@ -9,7 +9,8 @@ mean and scale of the training latents: their scale is free (about 0.07 here), a
 Note: the paper's decoder reads z_t alone. A latent action is a change of the image: the depth of a motion hardly shows
 in it, and the same change asks for different actions in different places. With slots, their summary by the [ACT]
 transformer of the policy, made small, is put beside z_t; it does not depend on the order of the slots. In training the
-summary of some rows is replaced by zeros: so the decoder also works where there are no slots, or none to be trusted.
+summary of some rows is replaced by zeros: so the decoder also works where there are no slots, or where it learned them
+from too few labels to be trusted (`trusts_slots`).
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ class ActionDecoder(nn.Module):
 
     mean: Tensor
     scale: Tensor
+    trusts_slots: Tensor
 
     def __init__(
         self,
@@ -57,6 +59,8 @@ class ActionDecoder(nn.Module):
             self.register_buffer("scale", torch.ones(latent_dim))
         self.encoder: SlotTokenEncoder | None = None
         self.width, self.dropout = width, config.state_dropout
+        if slot_dim:
+            self.register_buffer("trusts_slots", torch.tensor(True))
         if slot_dim:
             self.encoder = SlotTokenEncoder(slot_dim, width, config.state_layers, heads, width // heads, 2 * width)
             latent_dim += width
@@ -82,7 +86,8 @@ class ActionDecoder(nn.Module):
         """Latent actions (..., Z), and slots (..., N, D) if it reads them and there are some, to actions (..., A)."""
         inputs = (z - self.mean) / self.scale if self.whitening is None else self.whitening(z)
         if self.encoder is not None:
-            state = z.new_zeros(*z.shape[:-1], self.width) if slots is None else self.encoder(slots)
+            seen = slots if self.training or bool(self.trusts_slots) else None
+            state = z.new_zeros(*z.shape[:-1], self.width) if seen is None else self.encoder(seen)
             if self.training and self.dropout:
                 state = state * (torch.rand(*state.shape[:-1], 1, device=state.device) >= self.dropout)
             inputs = torch.cat((inputs, state), dim=-1)

@@ -171,6 +171,30 @@ class DecoderStage(RegressionStage):
         DataError: no actions, or fewer demonstrations than `config.labelled_demos`.
     """
 
+    @classmethod
+    def trial(
+        cls,
+        decoder: ActionDecoder,
+        policy: LatentPolicy,
+        demos: Demonstrations,
+        config: BehaviourStageConfig,
+        horizon: int | None = None,
+    ) -> DecoderStage:
+        """On the first half of the labelled demonstrations, measured on the second: see `slots_pay`."""
+        labelled = demos.take(demos.labelled(config.labelled_demos))
+        half = (config.labelled_demos + 1) // 2
+        second = labelled.take(labelled.episode >= half)
+        return cls(decoder, policy, labelled, replace(config, labelled_demos=half), second, horizon)
+
+    def slots_pay(self) -> bool:
+        """Whether the decoder does better on `held_out` with slots than without; mean absolute error of the actions."""
+        inputs, actions = self.checks[f"unexplained{HELD_OUT}"]
+        z, slots = inputs.plain(torch.arange(len(inputs), device=actions.device))
+        decoder = self.criterion.network.eval()
+        with torch.no_grad():
+            seeing, blind = ((decoder(z, seen) - actions).abs().mean() for seen in (slots, None))
+        return bool(seeing < blind)
+
     def __init__(
         self,
         decoder: ActionDecoder,

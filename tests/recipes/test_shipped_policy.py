@@ -26,7 +26,7 @@ def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for stage in ("slots", "dynamics"):
         shutil.copytree(runs.pretrained_folder("button_press") / stage, home / stage)
     shutil.copytree(ASSET, home / "policy")
-    monkeypatch.setattr(runs, "pretrained_folder", lambda env="button_press": home)  # noqa: ARG005
+    monkeypatch.setattr(runs, "pretrained_folder", lambda env="button_press": home)
     return home
 
 
