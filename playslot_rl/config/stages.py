@@ -110,8 +110,8 @@ class BehaviourStageConfig(StageConfig):
             of directions that they vary in weighs the same; false clones them as they are (paper).
         decoder_inputs: `inverse_dynamics` (InvDyn's latents; paper), `policy` (the policy's outputs) or `both`.
         decoder_state: the decoder also reads the slots, a_t = D_a(z_t, S_t): the same change of the image asks for
-            different actions in different places. From very few labels that is not learned, so a decoder of the first half
-            of them is first tried on the second, with the slots and without. False reads z_t alone (paper).
+            different actions in different places. From very few labels that is not learned, so a decoder of the first
+            half of them is first tried on the second, with the slots and without. False reads z_t alone (paper).
         decoder_steps: optimiser steps of the action decoder.
         decoder_lr: its base learning rate; the rest of `optim` is shared.
         finetune_steps: optimiser steps after that, of policy and decoder together, on the labelled rows' actions; the
