@@ -67,6 +67,9 @@ class Imagination(NamedTuple):
 def imagine(agent: Agent, first: TensorDictBase, steps: int, generator: torch.Generator | None = None) -> Imagination:
     """Unfold the policy in latent space, by a rollout of the imagination environment: nothing is observed afterwards.
 
+    The latents are decoded alone: a decoder that reads slots learned from those that it sees when it acts, and imagined
+    ones mislead it (docs/results.md).
+
     Args:
         agent: in evaluation mode.
         first: batch size [E], on the agent's device: SLOTS (E, N, D), or PIXELS (E, 3, H, W) to parse.
@@ -79,7 +82,7 @@ def imagine(agent: Agent, first: TensorDictBase, steps: int, generator: torch.Ge
     rollout = env.rollout(steps, policy, tensordict=start, auto_reset=False, break_when_any_done=False)
     slots = torch.cat([start[keys.SLOTS].unsqueeze(1), rollout["next", keys.SLOTS]], 1)
     latents = rollout[keys.LATENT_ACTION]
-    return Imagination(slots, latents, agent.action_decoder(latents, slots[:, :-1]))
+    return Imagination(slots, latents, agent.action_decoder(latents))
 
 
 class ImaginationActor(PlannedActor):
