@@ -94,15 +94,8 @@ class Agent(nn.Module):
         self.oracle = oracle
 
     @classmethod
-    def untrained(
-        cls, world_model: WorldModel, oracle: bool = True, *, whiten: bool = False, decoder_state: bool = False
-    ) -> Agent:
+    def untrained(cls, world_model: WorldModel, oracle: bool = True) -> Agent:
         """Fresh networks of the sizes in `world_model.config`.
-
-        Args:
-            world_model: what they build on.
-            oracle: make a slot oracle, too.
-            whiten, decoder_state: see `BehaviourStageConfig`.
 
         Raises:
             ConfigError: the world model has one latent action per slot, the policy gives one per step.
@@ -117,8 +110,8 @@ class Agent(nn.Module):
         slot_dim, width = config.savi.slot_dim, world_model.inverse_dynamics.latent_dim
         return cls(
             world_model,
-            LatentPolicy(config.policy, slot_dim, width, whiten),
-            ActionDecoder(config.action_decoder, width, env.action_dim, slot_dim if decoder_state else 0, whiten),
+            LatentPolicy(config.policy, slot_dim, width, config.policy.whiten),
+            ActionDecoder(config.action_decoder, width, env.action_dim, slot_dim),
             LatentPolicy(config.policy, slot_dim, env.action_dim) if oracle else None,
         )
 

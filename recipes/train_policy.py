@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import BehaviourStageConfig, ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
@@ -44,7 +44,7 @@ def main(config: ExperimentConfig) -> None:
     for checkpoint in parents.values():
         require_parent(config, run, checkpoint, "image_size", "action_dim")
     model, env = world_model_config(parents)
-    sizes = to_dict(replace(model, policy=config.model.policy, action_decoder=config.model.action_decoder))
+    sizes = to_dict(replace(model, **behaviour_networks(config)))
     record = StageRecord(
         "policy",
         run,
@@ -65,21 +65,31 @@ def main(config: ExperimentConfig) -> None:
     run_stage(record, prepare)
 
 
+def behaviour_networks(config: ExperimentConfig) -> dict[str, Any]:
+    """Configs of the two networks, `policy` and `action_decoder`, of the kinds that `behaviour` names."""
+    own, model = config.behaviour, config.model
+    return {
+        "policy": replace(model.policy, whiten=own.whiten),
+        "action_decoder": replace(model.action_decoder, whiten=own.whiten, reads_slots=own.decoder_state),
+    }
+
+
 def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Training:
     """The frozen world model's view of the demonstrations; fresh policy, oracle and decoder on top of it."""
     from playslot_rl.data.demonstrations import label_demonstrations, require_labelled, with_copies
     from playslot_rl.seeding import global_seed
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
-    from playslot_rl.training.runs import load_world_model, trained_horizon, untrained_agent
+    from playslot_rl.training.runs import load_world_model, trained_horizon
     from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage, cloning_settings
+    from playslot_rl.world_model import Agent
 
     device, split, behaviour = open_device(config), record.demos, config.behaviour
     require_labelled(behaviour.labelled_demos, split.trained.episodes)  # before anything is computed
     world = load_world_model(parent, device)
-    world.config = replace(world.config, policy=config.model.policy, action_decoder=config.model.action_decoder)
+    world.config = replace(world.config, **behaviour_networks(config))
     with global_seed(config.seed, 0, "policy"):
-        agent = untrained_agent(world, behaviour, behaviour.oracle).to(device)
+        agent = Agent.untrained(world, oracle=behaviour.oracle).to(device)
     views, others = demonstration_views(config, split, world.savi, record.prints["slots"])
     whole = with_copies([label_demonstrations(world, frames, slots, device) for frames, slots in views])
     demos = whole.trimmed(behaviour.trim, behaviour.trim_margin)

@@ -140,13 +140,19 @@ class PredictorConfig(Checked):
 
 @dataclass(frozen=True)
 class PolicyConfig:
-    """Sizes of the latent policy: InvDyn_S's architecture with one head (paper, appendix A.4)."""
+    """Sizes of the latent policy: InvDyn_S's architecture with one head (paper, appendix A.4).
+
+    Attributes:
+        dim, layers, heads, head_dim, mlp_dim: the transformer.
+        whiten: it gives whitened coordinates; `behaviour.whiten` sets it where a policy is trained.
+    """
 
     dim: int = 256
     layers: int = 4
     heads: int = 4
     head_dim: int = 64
     mlp_dim: int = 1024
+    whiten: bool = False
 
 
 @dataclass(frozen=True)
@@ -157,6 +163,8 @@ class ActionDecoderConfig:
         hidden_dim: hidden width.
         state_dim, state_layers, state_heads: width, layers and heads of the slot encoder beside it, for
             `behaviour.decoder_state`.
+        whiten: its inputs are whitened; `behaviour.whiten` sets it where a decoder is trained.
+        reads_slots: there is a slot encoder; `behaviour.decoder_state` sets it likewise.
         state_dropout: fraction of the training rows that do without the slots, so that the decoder can, too.
     """
 
@@ -165,6 +173,8 @@ class ActionDecoderConfig:
     state_layers: int = 2
     state_heads: int = 4
     state_dropout: float = 0.5
+    whiten: bool = False
+    reads_slots: bool = False
 
 
 @dataclass(frozen=True)

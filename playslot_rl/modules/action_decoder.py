@@ -30,8 +30,7 @@ class ActionDecoder(nn.Module):
         config: sizes.
         latent_dim: Z.
         action_dim: A.
-        slot_dim: D of the slots that it reads beside z; 0 reads none.
-        whiten: have a `whitening` in place of `mean` and `scale`.
+        slot_dim: D of the slots that it reads beside z where `config.reads_slots`.
 
     Raises:
         ValueError: `config.state_dim` is no multiple of `config.state_heads`.
@@ -47,21 +46,20 @@ class ActionDecoder(nn.Module):
         latent_dim: int,
         action_dim: int,
         slot_dim: int = 0,
-        whiten: bool = False,
     ) -> None:
         super().__init__()
         h, width, heads = config.hidden_dim, config.state_dim, config.state_heads
-        if slot_dim and width % heads:
+        if config.reads_slots and width % heads:
             raise ValueError(f"model.action_decoder.state_dim: got {width}, expected a multiple of {heads} heads")
-        self.whitening = Whitening(latent_dim) if whiten else None
-        if not whiten:
+        self.whitening = Whitening(latent_dim) if config.whiten else None
+        if not config.whiten:
             self.register_buffer("mean", torch.zeros(latent_dim))
             self.register_buffer("scale", torch.ones(latent_dim))
         self.encoder: SlotTokenEncoder | None = None
         self.width, self.dropout = width, config.state_dropout
-        if slot_dim:
+        if config.reads_slots:
             self.register_buffer("trusts_slots", torch.tensor(True))
-        if slot_dim:
+        if config.reads_slots:
             self.encoder = SlotTokenEncoder(slot_dim, width, config.state_layers, heads, width // heads, 2 * width)
             latent_dim += width
         self.layers = nn.Sequential(

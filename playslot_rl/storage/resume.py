@@ -62,6 +62,7 @@ ADDED: Final[Mapping[str, Any]] = {
     "state_layers": 2,
     "state_heads": 4,
     "state_dropout": 0.5,
+    "reads_slots": False,
 }
 """Settings that came after the first checkpoints, and what those were trained with."""
 

@@ -23,7 +23,6 @@ import torch
 from torch import nn
 
 from playslot_rl.config import (
-    BehaviourStageConfig,
     DynamicsStageConfig,
     EnvConfig,
     ExperimentConfig,
@@ -286,23 +285,14 @@ def load_world_model(run: Path | str, device: torch.device | str = "cpu") -> Wor
     return world
 
 
-def untrained_agent(world: WorldModel, behaviour: BehaviourStageConfig, oracle: bool) -> Agent:
-    """The agent that the stage trains on a world model: fresh networks, of the kinds that its settings name."""
-    from playslot_rl.world_model import Agent
-
-    return Agent.untrained(world, oracle, whiten=behaviour.whiten, decoder_state=behaviour.decoder_state)
-
-
-def _has_oracle(policy: StageCheckpoint) -> bool:
-    return "oracle" in policy.meta.get("modules", [])
-
-
 def load_agent(run: Path | str, device: torch.device | str = "cpu") -> Agent:
     """World model, policy, action decoder and, if trained, slot oracle of a run; eval mode, no gradients.
 
     Raises:
         CheckpointError: a stage is missing or damaged, or was trained on other parents.
     """
+    from playslot_rl.world_model import Agent
+
     folder = run_folder(run)
     policy = read_stage(checkpoint_folder(folder, "policy"), "policy")
     require_parents(policy, world_model_checkpoints(run))
@@ -310,7 +300,7 @@ def load_agent(run: Path | str, device: torch.device | str = "cpu") -> Agent:
     model, _ = stage_model(policy)
     world.config = replace(world.config, policy=model.policy, action_decoder=model.action_decoder)
     with torch.random.fork_rng(devices=[]):
-        agent = untrained_agent(world, stage_config(policy, BehaviourStageConfig, "policy"), _has_oracle(policy))
+        agent = Agent.untrained(world, oracle="oracle" in policy.meta.get("modules", []))
     modules = {"policy": agent.policy, "action_decoder": agent.action_decoder, "oracle": agent.oracle}
     load_weights(policy, {name: module for name, module in modules.items() if module is not None})
     freeze_on(agent, device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -52,9 +53,12 @@ class SquareEnv(EnvBase):
         pass
 
 
-@pytest.fixture(scope="module")
-def agent() -> Agent:
-    return tiny_agent(tiny_config(max_steps=STEPS))
+@pytest.fixture(scope="module", params=[False, True], ids=["latent", "latent and slots"])
+def agent(request: pytest.FixtureRequest) -> Agent:
+    """Untrained; its decoder reads the latent action alone, or the slots too."""
+    config = tiny_config(max_steps=STEPS)
+    decoder = replace(config.model.action_decoder, reads_slots=request.param, state_dim=8, state_heads=2)
+    return tiny_agent(replace(config, model=replace(config.model, action_decoder=decoder)))
 
 
 def square_env(agent: Agent, max_steps: int = STEPS, length: int = 100, start: int = 0) -> TransformedEnv:

@@ -12,6 +12,7 @@ from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.modules.whitening import FADE, Whitening
 
+READS = ActionDecoderConfig(16, state_dim=8, state_heads=2, state_dropout=0.5, reads_slots=True)
 SMALL = PolicyConfig(dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16)
 
 
@@ -61,7 +62,9 @@ def test_a_whitened_policy_is_compared_in_coordinates() -> None:
 @pytest.mark.parametrize("whiten", [False, True])
 def test_a_decoder_that_reads_slots_does_not_depend_on_their_order(whiten: bool) -> None:
     torch.manual_seed(0)
-    decoder = ActionDecoder(ActionDecoderConfig(hidden_dim=16, state_dim=8, state_heads=2), 5, 4, 6, whiten)
+    decoder = ActionDecoder(
+        ActionDecoderConfig(16, state_dim=8, state_heads=2, whiten=whiten, reads_slots=True), 5, 4, 6
+    )
     decoder.standardise(latents())
     decoder.eval()
     z, slots = latents(7), torch.randn(7, 3, 6)
@@ -73,9 +76,8 @@ def test_a_decoder_that_reads_slots_does_not_depend_on_their_order(whiten: bool)
 
 
 def test_slots_are_dropped_in_training_only_and_by_rows() -> None:
-    config = ActionDecoderConfig(hidden_dim=16, state_dim=8, state_heads=2, state_dropout=0.5)
     torch.manual_seed(0)
-    decoder, z, slots = ActionDecoder(config, 5, 4, 6), latents(200), torch.randn(200, 3, 6)
+    decoder, z, slots = ActionDecoder(READS, 5, 4, 6), latents(200), torch.randn(200, 3, 6)
     decoder.eval()
     seen, blind = decoder(z, slots), decoder(z)
     decoder.train()
@@ -94,7 +96,9 @@ def test_a_decoder_without_slots_takes_or_leaves_them() -> None:
 
 def test_its_loss_reads_what_it_reads() -> None:
     plain = ActionDecoderLoss(ActionDecoder(ActionDecoderConfig(hidden_dim=16), 5, 4))
-    state = ActionDecoderLoss(ActionDecoder(ActionDecoderConfig(hidden_dim=16, state_dim=8, state_heads=2), 5, 4, 6))
+    state = ActionDecoderLoss(
+        ActionDecoder(ActionDecoderConfig(16, state_dim=8, state_heads=2, reads_slots=True), 5, 4, 6)
+    )
     assert plain.in_keys == ["latent_action", "action"]
     assert state.in_keys == ["latent_action", "slots", "action"]
     rows = TensorDict({"latent_action": latents(3), "slots": torch.randn(3, 2, 6), "action": torch.rand(3, 4)}, [3])
@@ -104,4 +108,4 @@ def test_its_loss_reads_what_it_reads() -> None:
 
 def test_widths_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match=r"model\.action_decoder\.state_dim: got 10, expected a multiple of 4 heads"):
-        ActionDecoder(ActionDecoderConfig(state_dim=10), 5, 4, 6)
+        ActionDecoder(ActionDecoderConfig(state_dim=10, reads_slots=True), 5, 4, 6)

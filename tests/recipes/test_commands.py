@@ -35,6 +35,7 @@ def test_the_recorded_demonstrations_beyond_those_trained_on_measure(shared_run:
     meta = json.loads((shared_run / "policy" / "checkpoint" / "meta.json").read_text())
     assert (meta["demos"], meta["held_out_demos"]) == (6, 2)
     names = ("unexplained_parsed", "unexplained_imagined", "oracle_unexplained", "decoder_unexplained")
+    names += ("decoder_trial_unexplained", "finetune_unexplained")
     assert meta["metrics"].keys() == {*names, *(f"{name}_held_out" for name in names)}
     assert all(meta["metrics"][name] != meta["metrics"][f"{name}_held_out"] for name in names)
     assert "held-out demonstrations" in (shared_run / "report.md").read_text()

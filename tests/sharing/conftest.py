@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 
 from playslot_rl.sharing.folder import SharedPolicyConfig, save_pretrained
 from playslot_rl.storage.atomic import write_json
-from playslot_rl.testing import tiny_agent
+from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.world_model import Agent
 
 ASSET = Path(__file__).parents[1] / "assets" / "button_press_policy"
@@ -20,8 +21,11 @@ ASSET = Path(__file__).parents[1] / "assets" / "button_press_policy"
 
 @pytest.fixture(scope="session")
 def agent() -> Agent:
-    """Untrained, with a slot oracle."""
-    return tiny_agent()
+    """Untrained, with a slot oracle, whitened latents and a decoder that reads slots."""
+    plain = tiny_config()
+    policy = replace(plain.model.policy, whiten=True)
+    decoder = replace(plain.model.action_decoder, whiten=True, reads_slots=True, state_dim=8, state_heads=2)
+    return tiny_agent(replace(plain, model=replace(plain.model, policy=policy, action_decoder=decoder)))
 
 
 @pytest.fixture(scope="session")

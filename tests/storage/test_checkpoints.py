@@ -36,7 +36,7 @@ def write_run(run: Path, seed: int = 0, oracle: bool = True) -> Agent:
     world = agent.world_model
     values = to_dict(config)
     common: dict[str, Any] = {"metrics": {"loss": 0.5}, "steps": 3, "seconds": 1.0, "data": {"train": "d" * 16}}
-    stored = {"env": values["env"], "model": values["model"], "policy": values["behaviour"]}
+    stored = {"env": values["env"], "model": values["model"]}
     parents: dict[str, str] = {}
     stages = {
         "slots": {"savi": world.savi},

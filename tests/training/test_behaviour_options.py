@@ -43,9 +43,9 @@ def demonstrations(actions: str = "slots", seed: int = 0) -> Demonstrations:
 
 def networks() -> tuple[LatentPolicy, ActionDecoder]:
     torch.manual_seed(0)
-    sizes = ActionDecoderConfig(hidden_dim=32, state_dim=16, state_layers=1, state_heads=2)
+    sizes = ActionDecoderConfig(32, state_dim=16, state_layers=1, state_heads=2, whiten=True, reads_slots=True)
     policy = LatentPolicy(PolicyConfig(dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16), D, Z, whiten=True)
-    return policy, ActionDecoder(sizes, Z, A, D, whiten=True)
+    return policy, ActionDecoder(sizes, Z, A, D)
 
 
 def train(stage: DecoderStage | FinetuneStage, steps: int, lr: float = 3e-3) -> None:
