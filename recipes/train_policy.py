@@ -107,7 +107,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
             agent.action_decoder.trusts_slots.fill_(False)  # one demonstration cannot tell
         if agent.action_decoder.reads_slots and behaviour.labelled_demos > 1:
             trial = DecoderStage.trial(deepcopy(agent.action_decoder), agent.policy, demos, behaviour, horizon)
-            yield _part("decoder_trial", trial, behaviour, behaviour.decoder_steps, behaviour.decoder_lr)
+            yield _part("decoder_trial", trial, behaviour, -(-behaviour.decoder_steps // 2), behaviour.decoder_lr)
             agent.action_decoder.trusts_slots.fill_(trial.slots_pay())
         decoder = DecoderStage(agent.action_decoder, agent.policy, demos, behaviour, held_out, horizon)
         yield _part("decoder", decoder, behaviour, behaviour.decoder_steps, behaviour.decoder_lr)
