@@ -77,8 +77,10 @@ def test_copies_carry_the_labels_of_their_originals(source: EpisodeFrames) -> No
 
     def labelled(value: float) -> Demonstrations:
         slots = torch.full((count, 1, 1), value)
-        return Demonstrations(slots, slots, slots[:, 0], actions, torch.from_numpy(moves.episode),
-                              torch.from_numpy(moves.lengths))  # fmt: skip
+        return Demonstrations(
+            slots=slots, imagined=slots, latents=slots[:, 0], actions=actions, episode=torch.from_numpy(moves.episode),
+            step=torch.from_numpy(moves.step), motion=slots[:, 0, 0], lengths=torch.from_numpy(moves.lengths),
+        )  # fmt: skip
 
     demos = with_copies([labelled(0.0), labelled(1.0), labelled(2.0)])
     assert demos.actions is not None
