@@ -107,9 +107,7 @@ def adopt_stage(checkpoint: StageCheckpoint, run: Path) -> None:
     require_adoptable(checkpoint, run)
     if target.exists():
         return
-    with new_folder(target, replace=True) as temporary:
-        for file in sorted(checkpoint.path.iterdir()):
-            write_bytes(temporary / file.name, file.read_bytes())
+    _copy_files(checkpoint.path, target)
 
 
 def adopt_training(source: str, run: Path, stage: str, steps: int) -> None:
@@ -131,8 +129,12 @@ def adopt_training(source: str, run: Path, stage: str, steps: int) -> None:
     there, target = Path(source) / stage / "checkpoints" / name, run / stage / "checkpoints" / name
     if not source or target.parent.exists() or not (there / "state.json").is_file():
         return
-    with new_folder(target) as temporary:
-        for file in sorted(there.iterdir()):
+    _copy_files(there, target)
+
+
+def _copy_files(source: Path, target: Path) -> None:
+    with new_folder(target, replace=True) as temporary:
+        for file in sorted(source.iterdir()):
             write_bytes(temporary / file.name, file.read_bytes())
 
 

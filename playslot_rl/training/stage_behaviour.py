@@ -119,7 +119,9 @@ class CloneStage:
                     "behaviour.oracle: got demonstrations without actions, expected some for the slot oracle: "
                     "set behaviour.oracle=false"
                 )
-            self.stages["oracle"] = oracle_stage(oracle, demos.slots, demos.actions, config, _acted(held_out))
+            acted = _acted(held_out)
+            measured = None if acted is None else (acted.slots, _require_actions(acted))
+            self.stages["oracle"] = oracle_stage(oracle, demos.slots, demos.actions, config, measured)
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -148,8 +150,15 @@ def _checks(demos: Demonstrations, ending: str = "") -> dict[str, Examples]:
     }
 
 
-def _acted(demos: Demonstrations | None) -> tuple[Tensor, Tensor] | None:
-    return None if demos is None or demos.actions is None else (demos.slots, demos.actions)
+def _acted(demos: Demonstrations | None) -> Demonstrations | None:
+    """Held-out demonstrations whose actions can measure, if there are any."""
+    return None if demos is None or demos.actions is None else demos
+
+
+def _require_actions(demos: Demonstrations) -> Tensor:
+    if demos.actions is None:
+        raise DataError("action decoder: got demonstrations without actions, expected the feature `action`")
+    return demos.actions
 
 
 class DecoderStage(RegressionStage):
@@ -205,8 +214,7 @@ class DecoderStage(RegressionStage):
         horizon: int | None = None,
     ) -> None:
         def examples(demos: Demonstrations, noise: float) -> tuple[Tensor, Examples]:
-            if demos.actions is None:
-                raise DataError("action decoder: got demonstrations without actions, expected the feature `action`")
+            actions = _require_actions(demos)
             latents, slots, rows = [], [], []
             if config.decoder_inputs != "policy":
                 every = torch.arange(len(demos.slots), device=demos.slots.device)
@@ -219,11 +227,11 @@ class DecoderStage(RegressionStage):
                 latents, slots, rows = [*latents, said], [*slots, seen.slots], [*rows, seen.rows]
             z = torch.cat(latents)
             state = [TensorInputs(torch.cat(slots), noise, "decoder_noise")] if decoder.reads_slots else []
-            return z, (PairedInputs(TensorInputs(z), *state), demos.actions[torch.cat(rows)])
+            return z, (PairedInputs(TensorInputs(z), *state), actions[torch.cat(rows)])
 
         z, (inputs, actions) = examples(demos.take(demos.labelled(config.labelled_demos)), config.slot_noise)
         decoder.standardise(z)
-        acted = None if held_out is None or held_out.actions is None else held_out
+        acted = _acted(held_out)
         super().__init__(
             "action_decoder",
             ActionDecoderLoss(decoder, config.loss),
@@ -267,14 +275,13 @@ class FinetuneStage:
         self.clone, self.both = clone, _Both(policy, decoder)
 
         def examples(demos: Demonstrations, noise: float) -> Examples:
-            if demos.actions is None:
-                raise DataError("action decoder: got demonstrations without actions, expected the feature `action`")
+            actions = _require_actions(demos)
             seen = Seen.of(demos, config.imagined, horizon)
-            return TensorInputs(seen.slots, noise, "finetune_noise"), demos.actions[seen.rows]
+            return TensorInputs(seen.slots, noise, "finetune_noise"), actions[seen.rows]
 
         criterion = BehaviourLoss(self.both, config.loss)
         criterion.set_keys(action=keys.ACTION)
-        acted = None if held_out is None or held_out.actions is None else held_out
+        acted = _acted(held_out)
         self.acting = RegressionStage(
             "finetune",
             criterion,
