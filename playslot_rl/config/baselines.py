@@ -26,6 +26,8 @@ class ResNetOracleConfig(StageConfig):
             `scratch`, `download` (ImageNet's, fetched if they are not in the cache), or the path of a file of them
             (`.pth` as torchvision publishes it, or `.safetensors` with the same names).
         shift: frames are shifted by up to so many pixels either way in training, edges repeated; 0 does not.
+        patience: end before `steps` once the error on held-out demonstrations has not fallen for so many validations,
+            with the weights that had the lowest; 0, or none held out: train all steps.
     """
 
     group = "baselines.resnet_oracle."
@@ -36,6 +38,7 @@ class ResNetOracleConfig(StageConfig):
     )
     weights: str = "auto"
     shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
+    patience: int = field(default=0, metadata=at_least(0))
 
 
 def _stage(steps: int, lr: float, schedule: Literal["cosine", "constant"]) -> StageConfig:

@@ -39,11 +39,15 @@ class TrainingState:
         step: finished optimiser steps.
         seconds: wall-clock seconds spent on them, over all processes.
         metrics: the last validation's numbers.
+        best: those of the best validation, where a training stops early; else empty.
+        stale: validations since then.
     """
 
     step: int = 0
     seconds: float = 0.0
     metrics: dict[str, float] = field(default_factory=dict)
+    best: dict[str, float] = field(default_factory=dict)
+    stale: int = 0
 
 
 ADDED: Final[Mapping[str, Any]] = {
@@ -63,6 +67,7 @@ ADDED: Final[Mapping[str, Any]] = {
     "state_heads": 4,
     "state_dropout": 0.5,
     "reads_slots": False,
+    "patience": 0,
 }
 """Settings that came after the first checkpoints, and what those were trained with."""
 
@@ -129,7 +134,8 @@ class TrainingCheckpoints:
         last, stored = newest
         load_modules(modules, load_tensors(last / "modules.safetensors"), str(last))
         restore_optimizer(optimizer, load_tensors(last / "optimizer.safetensors"), str(last), list(parameters))
-        return TrainingState(stored["step"], stored["seconds"], stored["metrics"])
+        best, stale = stored.get("best", {}), stored.get("stale", 0)
+        return TrainingState(stored["step"], stored["seconds"], stored["metrics"], best, stale)
 
     def _write(self, step: int, files: Mapping[str, Mapping[str, Tensor]], state: Mapping[str, Any]) -> Path:
         """Write `step_STEP` of tensors `NAME.safetensors` and a `state.json`; keep the newest two.

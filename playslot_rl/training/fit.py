@@ -22,6 +22,7 @@ from playslot_rl.progress import StageProgress
 from playslot_rl.seeding import StepGenerators, global_seed
 from playslot_rl.storage.resume import TrainingCheckpoints, TrainingState
 from playslot_rl.training.logging import Watch, finite
+from playslot_rl.training.patience import Patience
 
 
 class Stage(Protocol):
@@ -49,6 +50,7 @@ class Part:
         folder: below the stage's own; empty is that one.
         lr_key: config key of the learning rate, for messages; empty means `NAME.optim.lr`.
         identity: further plain values that a resumed one must share.
+        patience: ends the training before `config.steps`, with the weights of the best validation; None does not.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Part:
     folder: str = ""
     lr_key: str = ""
     identity: Mapping[str, Any] = field(default_factory=dict)
+    patience: Patience | None = None
 
 
 def fit(
@@ -69,7 +72,7 @@ def fit(
     identity: Mapping[str, Any] | None = None,
     ready: Callable[[], None] | None = None,
 ) -> tuple[TrainingState, int]:
-    """Train to `part.config.steps`, carrying on from the newest checkpoint if there is one.
+    """Train to `part.config.steps` or the end of patience, carrying on from the newest checkpoint if there is one.
 
     Writes `checkpoints/step_*`, `logs/` and `metrics.jsonl` in the part's folder, nothing else.
 
@@ -97,11 +100,11 @@ def fit(
         ready()
     start = run.state.step
     run.watch.history.rewind(start)
-    if start < config.steps:
+    if not run.ended:
         progress = StageProgress(part.name, start, config.steps, logging.progress, config.log_every * 10)
         with run.watch.running(logging, start), progress:
-            for step in range(start, config.steps):
-                run.advance(step, progress)
+            while not run.ended:
+                run.advance(run.state.step, progress)
     return run.state, start
 
 
@@ -112,9 +115,12 @@ class _Run:
         self, part: Part, folder: Path, seed: int, device: torch.device | str, identity: Mapping[str, Any]
     ) -> None:
         self.stage, self.config, self.seed, self.device = part.stage, part.config, seed, device
+        self.folder, self.patience = folder, part.patience
         self.parameters = trainable_parameters(part.stage.modules)
         self.optimizer = build_adam(self.parameters, part.config.optim)
         own = {part.name: fixed_keys(to_dict(part.config)), "seed": seed}
+        if part.patience is not None:  # when it looks decides where it ends
+            own["validate_every"] = part.config.validate_every
         self.checkpoints = TrainingCheckpoints(folder / "checkpoints", {**own, **identity, **part.identity})
         cure = f"lower {part.lr_key or f'{part.name}.optim.lr'} or check the data"
         self.watch = Watch(part.name, folder, self.checkpoints, cure)
@@ -122,12 +128,18 @@ class _Run:
         self._began = time.monotonic() - self.state.seconds
         self._train_mode(True)
 
+    @property
+    def ended(self) -> bool:
+        """Whether there is nothing left to do."""
+        patient = self.patience is None or not self.patience.ended(self.state)
+        return self.state.step >= self.config.steps or not patient
+
     def advance(self, step: int, progress: StageProgress) -> None:
         """One step, and whatever is due after it."""
         config, done = self.config, step + 1
         values = self._step(step)
         last = done == config.steps
-        self.state = TrainingState(done, time.monotonic() - self._began, self.state.metrics)
+        self.state = replace(self.state, step=done, seconds=time.monotonic() - self._began)
         if done == 1 or done % config.log_every == 0 or last:
             numbers = {key: float(value) for key, value in values.items()}
             self._log("train", done, numbers)
@@ -137,7 +149,8 @@ class _Run:
         if done % config.validate_every == 0 or last:
             self.state = replace(self.state, metrics=self._validate(done))
             self._log("validation", done, self.state.metrics)
-        if done % config.checkpoint_every == 0 or last:
+            self._judge()
+        if done % config.checkpoint_every == 0 or self.ended:
             self.watch.require_finite(self.stage.modules, f"step {done}")
             self.checkpoints.save(self.state, self.stage.modules, self.optimizer, self.parameters)
 
@@ -168,6 +181,15 @@ class _Run:
         if values and not kept:
             raise self.watch.not_finite("validation", next(iter(values)) + " not finite", f"step {done}")
         return kept
+
+    def _judge(self) -> None:
+        if self.patience is None:
+            return
+        modules = self.stage.modules
+        self.watch.require_finite(modules, f"step {self.state.step}")
+        self.state = self.patience.judge(self.state, modules, self.folder)
+        if self.ended:
+            self.state = self.patience.restore(self.state, modules, self.folder)
 
     def _train_mode(self, on: bool) -> None:
         for module in self.stage.modules.values():

@@ -50,8 +50,9 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.losses.behaviour import BehaviourLoss
     from playslot_rl.seeding import global_seed
     from playslot_rl.training.fit import Part
+    from playslot_rl.training.patience import Patience
     from playslot_rl.training.record import Training
-    from playslot_rl.training.stage_regression import RegressionStage, demonstrated_frames
+    from playslot_rl.training.stage_regression import HELD_OUT, RegressionStage, demonstrated_frames
 
     own, device, split, width = config.baselines.resnet_oracle, open_device(config), record.demos, config.env.action_dim
     behaviour = config.behaviour
@@ -75,13 +76,14 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
         actions,
         own.batch_size,
         held_out=None if held_out is None else demonstrated_frames(held_out, moving(held_out), width, device),
-        validated=256,
+        validated=512,
         precision=own.precision,
     )
+    patience = Patience(own.patience, f"unexplained{HELD_OUT}") if own.patience and held_out is not None else None
     demos, kept = int((split.trained.lengths >= 2).sum()), round(len(moves.rows) / whole, 4)
     said = f"{NAME}: {demos} demos, all labelled, {held_out_text(split)}, ResNet-18 from {pretraining}"
     return Training(
-        [Part(f"baselines.{NAME}", stage, own)],
+        [Part(f"baselines.{NAME}", stage, own, patience=patience)],
         device,
         lambda _: f"{said}, {record.folder}",
         extra={"demos": demos, "labelled_demos": demos, "kept_rows": kept, "pretraining": pretraining},
