@@ -6,7 +6,6 @@ Writes `DIR/evaluation/PROTOCOL/eval_info.json` and renews `DIR/report.md` and `
 from __future__ import annotations
 
 import importlib
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -17,7 +16,7 @@ from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes import objects, slots
-from playslot_rl.recipes.run import open_run, parent_run
+from playslot_rl.recipes.run import open_run, parent_run, stored_result
 
 PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")
 
@@ -122,9 +121,8 @@ def main_if_needed(config: ExperimentConfig) -> None:
 
 def measured(run: Path, protocol: str, facts: dict[str, Any]) -> bool:
     """Whether the run was measured under a protocol with the same `facts` (parts of its result); if so, say it."""
-    path = run / "evaluation" / protocol / "eval_info.json"
-    stored = json.loads(path.read_text()) if path.is_file() else {}
-    if {key: stored.get(key) for key in facts} != facts:
+    stored = stored_result(run / "evaluation" / protocol / "eval_info.json", facts)
+    if stored is None:
         return False
     print(f"{protocol}: measured before, {100 * stored['success_rate']:.0f} % success, skipped", flush=True)
     return True

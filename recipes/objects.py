@@ -5,11 +5,11 @@ Writes `RUN/evaluation/objects/eval_info.json` and renews `RUN/report.md` and `R
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.recipes.run import open_device, stored_result
 
 
 def main(config: ExperimentConfig, run: Path) -> None:
@@ -21,7 +21,6 @@ def main(config: ExperimentConfig, run: Path) -> None:
     """
     from playslot_rl.evaluation.objects import evaluate_run_objects
     from playslot_rl.recipes.evaluate import check_environment
-    from playslot_rl.recipes.run import open_device
     from playslot_rl.training.runs import load_world_model
     from playslot_rl.visualization.report import write_report
 
@@ -43,9 +42,8 @@ def main_if_needed(config: ExperimentConfig, run: Path) -> None:
         "seed": config.seed,
         "fingerprints": run_fingerprints(run),
     }
-    path = run / RESULT
-    stored = json.loads(path.read_text()) if path.is_file() else {}
-    if {key: stored.get(key) for key in facts} == facts and (run / "report.html").is_file():
+    stored = stored_result(run / RESULT, facts)
+    if stored is not None and (run / "report.html").is_file():
         print(f"objects: scored before, ARI {stored['ari']:.2f}, skipped", flush=True)
         return
     main(config, run)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import SHIPPED, shipped
@@ -26,6 +27,12 @@ if TYPE_CHECKING:
     ParsedVideos = tuple[EpisodeFrames, npt.NDArray[np.float32]]
 
 OURS = ("slots", "dynamics", "policy", "world_model.json")  # known names of a run folder without config.json
+
+
+def stored_result(path: Path, facts: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What an evaluation wrote before, if `facts` (parts of its result) are the same; None otherwise."""
+    stored: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+    return stored if stored and {key: stored.get(key) for key in facts} == facts else None
 
 
 def open_run(config: ExperimentConfig) -> Path:

@@ -5,12 +5,12 @@ Writes `DIR/evaluation/slots/eval_info.json` and renews the report.
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.recipes.run import open_device, stored_result
 
 
 def main(config: ExperimentConfig, run: Path) -> None:
@@ -22,7 +22,6 @@ def main(config: ExperimentConfig, run: Path) -> None:
         OutputError: the result cannot be written.
     """
     from playslot_rl.evaluation.slots import RESULT, evaluate_slots
-    from playslot_rl.recipes.run import open_device
 
     print(describe(evaluate_slots(run, run, config, open_device(config)), run / RESULT), flush=True)
 
@@ -33,9 +32,8 @@ def main_if_needed(config: ExperimentConfig, run: Path) -> None:
     from playslot_rl.training.runs import slots_checkpoint
 
     facts = {"seed": config.seed, "fingerprints": {"slots": slots_checkpoint(run).fingerprint}}
-    path = run / RESULT
-    stored = json.loads(path.read_text()) if path.is_file() else {}
-    if {key: stored.get(key) for key in facts} == facts:
+    stored = stored_result(run / RESULT, facts)
+    if stored is not None:
         print(f"slots: scored before, FG-ARI {stored['foreground_ari']:.2f}, skipped", flush=True)
         return
     main(replace(config, episodes=None), run)
