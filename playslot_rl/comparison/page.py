@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config.methods import METHODS
+from playslot_rl.progress import format_seconds
 from playslot_rl.visualization.charts import METHOD_STYLES, Theme, legend, new_figure, step_axis, style_axes
 from playslot_rl.visualization.document import table
 
@@ -38,7 +39,7 @@ def comparison_page(result: Result) -> str:
         lead,
         "![Success rate](comparison.png)",
         *(_by_labels if result["labels"] else _offline)(result["summary"], len(result["seeds"])),
-        *_online(result["summary"], len(result["seeds"])),
+        *_online(result),
         "## Footnotes",
         "\n".join(f"- {note}" for note in _footnotes(result)),
         "## Every job",
@@ -77,12 +78,23 @@ def _by_labels(summary: Sequence[Result], seeds: int) -> list[str]:
     return parts
 
 
-def _online(summary: Sequence[Result], seeds: int) -> list[str]:
-    rows = [row for row in summary if row["demos"] is None]
+def _online(result: Result) -> list[str]:
+    rows = [row for row in result["summary"] if row["demos"] is None]
     if not rows:
         return []
-    body = [[row["title"], _number(row["env_steps"]), cell(row, seeds)] for row in rows]
+    seeds = len(result["seeds"])
+    body = [[budgeted(row, result), _number(row["env_steps"]), cell(row, seeds)] for row in rows]
     return ["## By acting", table(["", "environment steps", "success"], body)]
+
+
+def budgeted(row: Result, result: Result) -> str:
+    """A method that acts is only as good as its time: `DreamerV3, 1 h 00 min on 2 cores`."""
+    spent = row["train_seconds"]
+    return (
+        row["title"]
+        if spent is None
+        else f"{row['title']}, {format_seconds(spent)} on {result['hardware']['cores']} cores"
+    )
 
 
 def cell(row: Result, seeds: int) -> str:
@@ -274,7 +286,7 @@ def comparison_figure(result: Result, theme: Theme) -> Figure:
         _finish(axes, result, theme)
     if online:
         axes = figure.add_subplot(1, panels, panels)
-        _steps(axes, curves, final, theme)
+        _steps(axes, curves, [{**row, "title": budgeted(row, result)} for row in final], theme)
         _finish(axes, result, theme)
     legend(figure, theme, loc="outside lower center", ncols=3, fontsize=9)
     return figure

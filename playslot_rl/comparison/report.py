@@ -125,7 +125,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Rows of finished jobs, pooled over training seeds.
 
     Keys: `method`, `title`, `protocol`, `demos`, `labels`,
-    `agent_steps` and `env_steps` (means), `seeds`, `success_rate` (mean
+    `agent_steps`, `env_steps` and `train_seconds` (means), `seeds`, `success_rate` (mean
     over the seeds), `ci95`, `lowest` and `highest` (of a seed), `episodes`, `labelled_demos`.
 
     `ci95` is Wilson's interval of that mean over the episodes of one seed: all seeds play the same ones, so that
@@ -145,7 +145,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "protocol": protocol,
                 "demos": demos,
                 "labels": labels,
-                **{key: _mean(r[key] for r in group) for key in ("agent_steps", "env_steps")},
+                **{key: _mean(r[key] for r in group) for key in ("agent_steps", "env_steps", "train_seconds")},
                 "seeds": sorted(r["seed"] for r in group),
                 "success_rate": sum(rates) / len(rates),
                 "ci95": list(wilson(sum(r["successes"] for r in group) / len(group), group[0]["episodes"])),

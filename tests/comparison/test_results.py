@@ -60,7 +60,7 @@ def test_the_page_has_the_table_the_footnotes_and_the_failure(ended: dict[str, A
     page = comparison_page(ended)
     assert "| PlaySlot, simulation | 70 % (40 to 89; seeds 60 to 80) | – |" in page
     assert "| Slot Oracle, simulation | 100 % (72 to 100; 1 of 2 seeds) | 100 % (72 to 100; 1 of 2 seeds) |" in page
-    assert "| DreamerV3 | 10,000 | 70 % (40 to 89; 1 of 2 seeds) |" in page
+    assert "| DreamerV3, 30 s on 2 cores | 10,000 | 70 % (40 to 89; 1 of 2 seeds) |" in page
     assert "PlaySlot saw the real actions of 5 of 10 demonstrations" in page
     assert "Slot Oracle saw the real actions of 10 of 10, 50 of 50 demonstrations" in page
     assert "ResNet Oracle starts from scratch weights" in page
@@ -122,7 +122,7 @@ def test_the_plot_shows_every_series_in_its_methods_colour(ended: dict[str, Any]
             shown[label] = (handle[0] if isinstance(handle, tuple) else handle).get_color()
     for method, label in (
         ("playslot", "PlaySlot"), ("playslot", "PlaySlot, imagination"), ("slot_oracle", "Slot Oracle"),
-        ("resnet_oracle", "ResNet Oracle"), ("dreamer", "DreamerV3"),
+        ("resnet_oracle", "ResNet Oracle"), ("dreamer", "DreamerV3, 30 s on 2 cores"),
     ):  # fmt: skip
         assert shown[label] == LIGHT.series[METHOD_STYLES[method].colour]
     curve = max(right.get_lines(), key=lambda line: len(line.get_xdata()))
