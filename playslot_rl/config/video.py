@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import Checked, at_least, role, within
+from playslot_rl.config.roles import at_least, role, within
 from playslot_rl.config.stages import OptimConfig, StageConfig
 
 NOT_NEGATIVE = at_least(0, "0 or more")
