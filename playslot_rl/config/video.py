@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from playslot_rl.config.model import PredictorConfig
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import at_least, role, within
-from playslot_rl.config.stages import OptimConfig, StageConfig
+from playslot_rl.config.stages import DynamicsStageConfig, OptimConfig, StageConfig
 
 NOT_NEGATIVE = at_least(0, "0 or more")
 FRACTION = within(lambda value: 0 < value < 1, "a number in (0, 1)")
@@ -121,25 +122,48 @@ class CADDYConfig(VideoStageConfig):
 
 
 @dataclass(frozen=True)
-class SlotVideoConfig(VideoStageConfig):
-    """Training of a slot predictor without actions, on a frozen SAVi's slots: SlotFormer or OCVP-Seq.
+class SlotFormerSizes(PredictorConfig):
+    """SlotFormer at the paper's size: queries, keys and values without bias, heads without an output projection."""
+
+    group = "baselines.slotformer.predictor."
+    kind: Literal["cocvp", "ocvp_seq", "slotformer"] = "slotformer"
+    head_dim: int = 32
+    residual: bool = True
+    context: int = field(default=6, metadata=at_least(2, "at least 2 frames"))
+    project_out: bool = False
+
+
+@dataclass(frozen=True)
+class OCVPSeqSizes(PredictorConfig):
+    """OCVP-Seq at the paper's size, likewise: two blocks a layer, each with an MLP of 512."""
+
+    group = "baselines.ocvp_seq.predictor."
+    kind: Literal["cocvp", "ocvp_seq", "slotformer"] = "ocvp_seq"
+    head_dim: int = 32
+    mlp_dim: int = 512
+    residual: bool = True
+    project_out: bool = False
+
+
+@dataclass(frozen=True)
+class SlotFormerConfig(DynamicsStageConfig):
+    """SlotFormer on a frozen SAVi's slots: stage 2 with nothing inferred.
 
     Attributes:
-        dim, layers, heads, head_dim, mlp_dim: the transformer.
-        projection: the heads have an output projection; without one the parameters are as many as the paper says.
-        context: frames it attends to.
-        residual: predict the change of the slots instead of the slots.
-        image_weight, slot_weight: loss weights.
+        predictor: sizes.
     """
 
-    steps: int = field(default=200_000, metadata=at_least(1))
-    dim: int = 256
-    layers: int = 4
-    heads: int = 8
-    head_dim: int = 32
-    mlp_dim: int = 1024
-    projection: bool = False
-    context: int = field(default=6, metadata=at_least(1))
-    residual: bool = True
-    image_weight: float = field(default=1.0, metadata=NOT_NEGATIVE)
-    slot_weight: float = field(default=1.0, metadata=NOT_NEGATIVE)
+    group = "baselines.slotformer."
+    predictor: SlotFormerSizes = field(default_factory=SlotFormerSizes)
+
+
+@dataclass(frozen=True)
+class OCVPSeqConfig(DynamicsStageConfig):
+    """OCVP-Seq on a frozen SAVi's slots: stage 2 with nothing inferred.
+
+    Attributes:
+        predictor: sizes.
+    """
+
+    group = "baselines.ocvp_seq."
+    predictor: OCVPSeqSizes = field(default_factory=OCVPSeqSizes)
