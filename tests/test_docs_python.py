@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-ASSET = ROOT / "tests" / "assets" / "button_press_policy"
+SHIPPED = ROOT / "playslot_rl" / "pretrained" / "button_press"
 
 
 def blocks(page: Path) -> list[str]:
@@ -35,7 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     root = tmp_path_factory.mktemp("docs")
     run = root / "runs" / "demo"
-    shutil.copytree(ASSET / "policy" / "checkpoint", run / "policy" / "checkpoint")
+    shutil.copytree(SHIPPED / "policy" / "checkpoint", run / "policy" / "checkpoint")
     write_json(run / "world_model.json", {"source": "pretrained/button_press"})
     config = compose(["preset=compact", "logging.progress=false"])
     write_json(run / "config.json", to_dict(config))

@@ -177,7 +177,7 @@ class ActionDecoderConfig:
             `behaviour.decoder_state`.
         whiten: its inputs are whitened; `behaviour.whiten` sets it where a decoder is trained.
         reads_slots: there is a slot encoder; `behaviour.decoder_state` sets it likewise.
-        state_dropout: fraction of the training rows that do without the slots, so that the decoder can, too.
+        state_dropout: fraction of the training rows in which the network that reads slots goes without them.
     """
 
     hidden_dim: int = 128

@@ -10,6 +10,7 @@ Shapes: N slots, D slot width, Z latent-action width, A action width; "..." is a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -85,18 +86,21 @@ class _CloningLoss(LossModule):
         Raises:
             ValueError: output and target differ in shape, which broadcasting would hide.
         """
-        predicted: Tensor = self.network(*(tensordict.get(key) for key in self.observed))
+        return TensorDict({self.out_name: self._error(tensordict, self.observed)}, [])
+
+    def _error(self, tensordict: TensorDictBase, observed: Sequence[NestedKey]) -> Tensor:
+        predicted: Tensor = self.network(*(tensordict.get(key) for key in observed))
         target = tensordict.get(self.tensor_keys.action)
         if predicted.shape != target.shape:
             got, expected = tuple(target.shape), tuple(predicted.shape)
             raise ValueError(f"{self.tensor_keys.action}: got shape {got}, expected {expected} (the network's output)")
         mask: Tensor | None = tensordict.get(self.tensor_keys.mask, None)
         if mask is None:
-            return TensorDict({self.out_name: self._distance(predicted - target).mean()}, [])
+            return self._distance(predicted - target).mean()
         mask = mask.reshape(target.shape[:-1])
         # The target is replaced, not the error multiplied: it may be NaN, and 0 * NaN is NaN in the gradient.
         error = self._distance(predicted - torch.where(mask[..., None], target, predicted.detach())).mean(-1)
-        return TensorDict({self.out_name: error.sum() / mask.sum().clamp(min=1)}, [])
+        return error.sum() / mask.sum().clamp(min=1)
 
     def _distance(self, difference: Tensor) -> Tensor:
         whitening = getattr(self.network, "whitening", None)
@@ -164,3 +168,8 @@ class ActionDecoderLoss(_CloningLoss):
         """The latent action, and the slots where the decoder reads them."""
         reads_slots = getattr(self.network, "reads_slots", False)
         return [self.tensor_keys.observation, *([self.tensor_keys.state] if reads_slots else [])]
+
+    def _error(self, tensordict: TensorDictBase, observed: Sequence[NestedKey]) -> Tensor:
+        """Of a decoder that reads slots, both ways: with them and from the latent action alone."""
+        error = super()._error(tensordict, observed)
+        return error if len(observed) == 1 else error + super()._error(tensordict, observed[:1])

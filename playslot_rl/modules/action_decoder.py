@@ -8,9 +8,10 @@ mean and scale of the training latents: their scale is free (about 0.07 here), a
 
 Note: the paper's decoder reads z_t alone. A latent action is a change of the image: the depth of a motion hardly shows
 in it, and the same change asks for different actions in different places. With slots, their summary by the [ACT]
-transformer of the policy, made small, is put beside z_t; it does not depend on the order of the slots. In training the
-summary of some rows is replaced by zeros: so the decoder also works where there are no slots, or where it learned them
-from too few labels to be trusted (`trusts_slots`).
+transformer of the policy, made small, is put beside z_t; it does not depend on the order of the slots. That is a second
+MLP: the one on z_t alone stays, for where there are no slots (those predicted in imagination are a little off), and for
+where it learned to read them from too few labels to be trusted (`trusts_slots`). Both are trained on every row; in some
+the summary is replaced by zeros, so that no action hangs on the slots alone.
 """
 
 from __future__ import annotations
@@ -55,16 +56,13 @@ class ActionDecoder(nn.Module):
         if not config.whiten:
             self.register_buffer("mean", torch.zeros(latent_dim))
             self.register_buffer("scale", torch.ones(latent_dim))
+        self.layers = _mlp(latent_dim, h, action_dim)
         self.encoder: SlotTokenEncoder | None = None
-        self.width, self.dropout = width, config.state_dropout
         if config.reads_slots:
             self.register_buffer("trusts_slots", torch.tensor(True))
-        if config.reads_slots:
+            self.dropout = config.state_dropout
             self.encoder = SlotTokenEncoder(slot_dim, width, config.state_layers, heads, width // heads, 2 * width)
-            latent_dim += width
-        self.layers = nn.Sequential(
-            nn.Linear(latent_dim, h), nn.ReLU(), nn.Linear(h, h), nn.ReLU(), nn.Linear(h, action_dim)
-        )
+            self.seeing = _mlp(latent_dim + width, h, action_dim)
 
     @property
     def reads_slots(self) -> bool:
@@ -83,10 +81,15 @@ class ActionDecoder(nn.Module):
     def forward(self, z: Tensor, slots: Tensor | None = None) -> Tensor:
         """Latent actions (..., Z), and slots (..., N, D) if it reads them and there are some, to actions (..., A)."""
         inputs = (z - self.mean) / self.scale if self.whitening is None else self.whitening(z)
-        if self.encoder is not None:
-            seen = slots if self.training or bool(self.trusts_slots) else None
-            state = z.new_zeros(*z.shape[:-1], self.width) if seen is None else self.encoder(seen)
-            if self.training and self.dropout:
-                state = state * (torch.rand(*state.shape[:-1], 1, device=state.device) >= self.dropout)
-            inputs = torch.cat((inputs, state), dim=-1)
-        return torch.tanh(self.layers(inputs))
+        if self.encoder is None or slots is None or not (self.training or bool(self.trusts_slots)):
+            return torch.tanh(self.layers(inputs))
+        state = self.encoder(slots)
+        if self.training and self.dropout:
+            state = state * (torch.rand(*state.shape[:-1], 1, device=state.device) >= self.dropout)
+        return torch.tanh(self.seeing(torch.cat((inputs, state), dim=-1)))
+
+
+def _mlp(width: int, hidden: int, out: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, out)
+    )

@@ -273,23 +273,28 @@ class FinetuneStage:
     ) -> None:
         policy = clone.criterion.network
         self.clone, self.both = clone, _Both(policy, decoder)
+        networks = [self.both, *([_Both(policy, decoder, blind=True)] if decoder.reads_slots else [])]
 
         def examples(demos: Demonstrations, noise: float) -> Examples:
             actions = _require_actions(demos)
             seen = Seen.of(demos, config.imagined, horizon)
             return TensorInputs(seen.slots, noise, "finetune_noise"), actions[seen.rows]
 
-        criterion = BehaviourLoss(self.both, config.loss)
-        criterion.set_keys(action=keys.ACTION)
-        acted = _acted(held_out)
-        self.acting = RegressionStage(
-            "finetune",
-            criterion,
-            *examples(demos.take(demos.labelled(config.labelled_demos)), config.slot_noise),
-            config.batch_size,
-            held_out=None if acted is None else examples(acted, 0.0),
-            precision=config.precision,
-        )
+        labelled, acted = demos.take(demos.labelled(config.labelled_demos)), _acted(held_out)
+
+        def acting(network: _Both) -> RegressionStage:
+            criterion = BehaviourLoss(network, config.loss)
+            criterion.set_keys(action=keys.ACTION)
+            return RegressionStage(
+                "finetune",
+                criterion,
+                *examples(labelled, config.slot_noise),
+                config.batch_size,
+                held_out=None if acted is None else examples(acted, 0.0),
+                precision=config.precision,
+            )
+
+        self.acting = [acting(network) for network in networks]
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -298,21 +303,22 @@ class FinetuneStage:
 
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         """Errors of actions and of latents."""
-        action, latent = (part.loss(step, generators)["loss"] for part in (self.acting, self.clone))
+        action = torch.stack([part.loss(step, generators)["loss"] for part in self.acting]).sum()
+        latent = self.clone.loss(step, generators)["loss"]
         return {"loss": action + latent, "action": action, "latent": latent}
 
     def validate(self, step: int) -> Mapping[str, float]:
         """Unexplained fraction of the actions' variance."""
-        return self.acting.validate(step)
+        return self.acting[0].validate(step)
 
 
 class _Both(nn.Module):
-    def __init__(self, policy: nn.Module, decoder: ActionDecoder) -> None:
+    def __init__(self, policy: nn.Module, decoder: ActionDecoder, blind: bool = False) -> None:
         super().__init__()
-        self.policy, self.decoder = policy, decoder
+        self.policy, self.decoder, self.blind = policy, decoder, blind
 
     def forward(self, slots: Tensor) -> Tensor:
-        out: Tensor = self.decoder(self.policy(slots), slots)
+        out: Tensor = self.decoder(self.policy(slots), None if self.blind else slots)
         return out
 
 

@@ -20,14 +20,14 @@ from playslot_rl.training.runs import load_agent
 
 pytestmark = pytest.mark.slow  # a process that imports all of LeRobot
 
-ASSET = Path(__file__).parents[1] / "assets" / "button_press_policy"
+SHIPPED = Path(__file__).parents[2] / "playslot_rl" / "pretrained" / "button_press"
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with the stored policy."""
     root = tmp_path_factory.mktemp("run")
-    shutil.copytree(ASSET / "policy" / "checkpoint", root / "policy" / "checkpoint")
+    shutil.copytree(SHIPPED / "policy" / "checkpoint", root / "policy" / "checkpoint")
     write_json(root / "world_model.json", {"source": "pretrained"})
     return root
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -12,7 +14,7 @@ from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.modules.whitening import FADE, Whitening
 
-READS = ActionDecoderConfig(16, state_dim=8, state_heads=2, state_dropout=0.5, reads_slots=True)
+READS = ActionDecoderConfig(16, state_dim=8, state_heads=2, state_dropout=0.0, reads_slots=True)
 SMALL = PolicyConfig(dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16)
 
 
@@ -75,16 +77,43 @@ def test_a_decoder_that_reads_slots_does_not_depend_on_their_order(whiten: bool)
     assert decoder(z).shape == (7, 4), "it can do without"
 
 
+def test_with_and_without_slots_are_two_networks_and_each_learns_from_every_row() -> None:
+    torch.manual_seed(0)
+    decoder, z, slots, action = ActionDecoder(READS, 5, 4, 6), latents(9), torch.randn(9, 3, 6), torch.rand(9, 4)
+    loss = ActionDecoderLoss(decoder, "l1")
+    got = loss(TensorDict({"latent_action": z, "slots": slots, "action": action}, [9]))["loss_action"]
+    parts = [(decoder(z, seen) - action).abs().mean() for seen in (slots, None)]
+    assert float(got.detach()) == pytest.approx(float(sum(part.detach() for part in parts)), rel=1e-5)
+
+    def moved(part: torch.Tensor) -> set[str]:
+        decoder.zero_grad()
+        part.backward()
+        return {name.partition(".")[0] for name, p in decoder.named_parameters() if p.grad is not None and p.grad.any()}
+
+    assert [moved(part) for part in parts] == [{"encoder", "seeing"}, {"layers"}]
+
+
 def test_slots_are_dropped_in_training_only_and_by_rows() -> None:
     torch.manual_seed(0)
-    decoder, z, slots = ActionDecoder(READS, 5, 4, 6), latents(200), torch.randn(200, 3, 6)
+    decoder, z, slots = ActionDecoder(replace(READS, state_dropout=0.5), 5, 4, 6), latents(200), torch.randn(200, 3, 6)
     decoder.eval()
-    seen, blind = decoder(z, slots), decoder(z)
+    seen = decoder(z, slots)
     decoder.train()
     drawn = decoder(z, slots)
-    dropped = (drawn == blind).all(-1)
-    assert 60 < int(dropped.sum()) < 140
-    assert torch.equal(drawn[~dropped], seen[~dropped])
+    kept = (drawn == seen).all(-1)
+    assert 60 < int(kept.sum()) < 140
+    with torch.no_grad():
+        alone = torch.tanh(decoder.seeing(torch.cat(((z - decoder.mean) / decoder.scale, torch.zeros(200, 8)), dim=-1)))
+    assert torch.equal(drawn[~kept], alone[~kept])
+
+
+def test_without_slots_it_is_the_papers_decoder() -> None:
+    torch.manual_seed(0)
+    plain, decoder = ActionDecoder(ActionDecoderConfig(16), 5, 4), ActionDecoder(READS, 5, 4, 6)
+    missing = decoder.load_state_dict(plain.state_dict(), strict=False)
+    assert all(name.startswith(("encoder", "seeing", "trusts_slots")) for name in missing.missing_keys)
+    z = latents(7)
+    assert torch.equal(plain(z), decoder(z))
 
 
 def test_a_decoder_without_slots_takes_or_leaves_them() -> None:

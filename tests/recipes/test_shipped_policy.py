@@ -16,16 +16,12 @@ from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes import evaluate
 from playslot_rl.training import runs
 
-ASSET = Path(__file__).parents[1] / "assets" / "button_press_policy" / "policy"
-
 
 @pytest.fixture
 def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The shipped world model with the stored policy beside it, in place of the package's folder."""
+    """A copy of the shipped model in place of the package's folder."""
     home = tmp_path / "shipped"
-    for stage in ("slots", "dynamics"):
-        shutil.copytree(runs.pretrained_folder("button_press") / stage, home / stage)
-    shutil.copytree(ASSET, home / "policy")
+    shutil.copytree(runs.pretrained_folder("button_press"), home)
     monkeypatch.setattr(runs, "pretrained_folder", lambda env="button_press": home)
     return home
 

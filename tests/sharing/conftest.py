@@ -16,7 +16,7 @@ from playslot_rl.storage.atomic import write_json
 from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.world_model import Agent
 
-ASSET = Path(__file__).parents[1] / "assets" / "button_press_policy"
+SHIPPED = Path(__file__).parents[2] / "playslot_rl" / "pretrained" / "button_press"
 
 
 @pytest.fixture(scope="session")
@@ -48,7 +48,7 @@ def run(tmp_path: Path) -> Path:
     from playslot_rl.config.compose import compose
 
     root = tmp_path / "run"
-    shutil.copytree(ASSET / "policy" / "checkpoint", root / "policy" / "checkpoint")
+    shutil.copytree(SHIPPED / "policy" / "checkpoint", root / "policy" / "checkpoint")
     write_json(root / "world_model.json", {"source": "pretrained"})
     write_json(root / "config.json", to_dict(compose(["preset=compact", "data.demos=/home/someone/data"])))
     return root
