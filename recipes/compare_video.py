@@ -12,6 +12,9 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.recipes.run import parent_run
 
+TEST_SEED = 1_000_003
+"""Of a recorded test set: no collection of a preset has it, so that no shipped model has seen its episodes."""
+
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
@@ -33,7 +36,7 @@ def main(config: ExperimentConfig) -> None:
     began, own = time.monotonic(), config.compare_video
     out = Path(config.out or f"runs/video_{config.env.name}_{config.preset}")
     run = parent_run(config, out) if config.run else ""
-    data = replace(config.data, tested=own.tested)
+    data = replace(config.data, tested=own.tested if config.data.root and not own.test else 0.0)
     config = replace(config, out=str(out), run=run, data=data, demos=None)
     lpips = open_lpips(config.metrics.lpips_weights)  # a wrong file is refused before anything is computed
     if config.data.root:
@@ -82,15 +85,23 @@ def _prepare(config: ExperimentConfig, out: Path) -> ExperimentConfig:
     Raises:
         DataError, CheckpointError, OutputError, TrainingError: see `playslot_rl.errors`.
     """
+    from playslot_rl.collectors import collect
     from playslot_rl.comparison.video_plan import uses_slots
+    from playslot_rl.envs import PROCEDURAL
     from playslot_rl.recipes import train_slots
     from playslot_rl.recipes.pipeline import collect_demos, collect_videos
     from playslot_rl.training.runs import slots_checkpoint
 
+    own = config.compare_video
     if not config.data.root:
         data = collect_demos(config, out) if config.collect.learn_from_demos else config.data
         config = replace(config, data=collect_videos(replace(config, data=data), out))
         config = replace(config, data=replace(config.data, demos="", held_out=0))
+        if not own.test:
+            test, want = out / "data" / "test", config.collect
+            policy = "random" if config.env.name in PROCEDURAL else "expert"
+            collect(config, policy, own.episodes, want.expert_steps, test, TEST_SEED, config.workers)
+            config = replace(config, compare_video=replace(own, test=str(test)))
     if uses_slots(config):
         if config.run:
             slots_checkpoint(config.run)
@@ -102,11 +113,15 @@ def _prepare(config: ExperimentConfig, out: Path) -> ExperimentConfig:
 
 
 def _parents(config: ExperimentConfig) -> dict[str, str]:
+    from playslot_rl.comparison.video_clips import open_clips
     from playslot_rl.comparison.video_plan import uses_slots
     from playslot_rl.training.record import open_videos
     from playslot_rl.training.runs import slots_checkpoint
 
-    parents = {"videos": open_videos(config, config.data.root, "compare-video").fingerprint}
+    parents = {
+        "videos": open_videos(config, config.data.root, "compare-video").fingerprint,
+        "test": open_clips(config, 2, 2)[0].fingerprint,
+    }
     if uses_slots(config):
         parents["slots"] = slots_checkpoint(config.run).fingerprint
     return parents

@@ -10,10 +10,10 @@ from playslot_rl.errors import DataError
 
 
 def open_clips(config: ExperimentConfig, frames: int, count: int) -> tuple[EpisodeFrames, IntArray]:
-    """The test episodes of `data.root`, and clips of them.
+    """The test episodes, of `compare_video.test` or else those kept of `data.root`, and clips of them.
 
     Args:
-        config: `data`, `env`.
+        config: `data`, `env`, `compare_video`.
         frames: T, of a clip.
         count: clips, at most; they do not overlap, and are spread evenly over the episodes.
 
@@ -23,14 +23,14 @@ def open_clips(config: ExperimentConfig, frames: int, count: int) -> tuple[Episo
     Raises:
         DataError: too few episodes, none so long, fewer than two clips, or a data set that cannot be read.
     """
-    data = config.data
+    data, root = config.data, config.compare_video.test or config.data.root
     size, resize = config.env.image_size, data.resize
-    source = open_sources(data.root, data.camera, data.cache, image_size=size, resize=resize)
-    _, tested = split_tested(source, data.tested)
+    source = open_sources(root, data.camera, data.cache, image_size=size, resize=resize)
+    tested = source if config.compare_video.test else split_tested(source, data.tested)[1]
     rows = spread_windows(tested.starts, tested.lengths, frames, count, range(tested.episodes))
     if len(rows) < 2:
         raise DataError(
-            f"data.root={data.root}: got {len(rows)} held-out clip of {frames} frames, expected at least 2: collect "
-            "more episodes, or raise compare_video.tested"
+            f"data.root={root}: got {len(rows)} held-out clip of {frames} frames, expected at least 2: collect more "
+            "episodes, or raise compare_video.tested"
         )
     return tested, rows

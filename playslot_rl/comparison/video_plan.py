@@ -123,11 +123,12 @@ def video_job_config(config: ExperimentConfig, job: VideoJob, world: str) -> Exp
         root=",".join(absolute(part.strip()) for part in config.data.root.split(",")),
         demos="",
         held_out=0,
-        tested=own.tested,
+        tested=0.0 if own.test else own.tested,
         cache=absolute(config.data.cache),
     )
     return replace(
         config,
+        compare_video=replace(own, test=absolute(own.test)),
         method=job.trained_as,
         seed=job.seed,
         data=data,
@@ -150,7 +151,8 @@ def video_job_record(job: VideoJob, config: ExperimentConfig, parents: Mapping[s
     result = without(config, "machine")
     result.pop("compare_video", None)
     result["baselines"] = result["baselines"].get(job.method, {})  # another method's settings are none of this job's
-    identity = json.dumps([result, asked, dict(parents)], sort_keys=True)
+    content = {key: value for key, value in asked.items() if key != "test"}  # of a data set the content counts
+    identity = json.dumps([result, content, dict(parents)], sort_keys=True)
     return {
         "kind": "video",
         "name": job.name,

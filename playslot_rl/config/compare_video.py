@@ -7,7 +7,7 @@ from typing import Final, Literal, get_args
 
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import SEED, Checked, at_least, within
+from playslot_rl.config.roles import SEED, Checked, at_least, role, within
 
 VideoMethod = Literal["svg", "caddy", "slotformer", "ocvp_seq", "playslot", "playslot_m"]
 VIDEO_METHODS: Final[tuple[VideoMethod, ...]] = get_args(VideoMethod)
@@ -35,8 +35,11 @@ class CompareVideoConfig(Checked):
         trained_seed, trained_frames: seed frames and predicted frames of a training clip, the same for all methods.
         shown: numbers of seed frames that are tested, each with `predicted` frames after them.
         predicted: frames that a test predicts.
-        tested: fraction of the episodes that are kept for the test; validation clips, which choose the learning rate,
-            are of others.
+        test: data set the test clips are of; empty records one with `data.root` empty, and else keeps some of its
+            episodes.
+        tested: fraction of the episodes that are kept for the test where there is no such data set; validation clips,
+            which choose the learning rate, are of others.
+        episodes: expert episodes that a recorded test set has.
         clips: clips of these that are scored, at most.
         pictures: of so many of them the predictions are drawn.
         minutes: wall-clock budget of each training, from its measured steps a second; 0 trains the preset's steps.
@@ -53,6 +56,8 @@ class CompareVideoConfig(Checked):
     trained_frames: int = field(default=8, metadata=at_least(1))
     shown: tuple[int, ...] = field(default=(6, 1), metadata=at_least(1, "numbers of at least 1"))
     predicted: int = field(default=15, metadata=at_least(1))
+    test: str = field(default="", metadata=role("folder"))
+    episodes: int = field(default=40, metadata=at_least(2))
     tested: float = field(default=0.1, metadata=within(lambda share: 0 < share < 1, "a fraction in (0, 1)"))
     clips: int = field(default=64, metadata=at_least(2))
     pictures: int = field(default=3, metadata=at_least(1))

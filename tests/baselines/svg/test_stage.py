@@ -13,6 +13,7 @@ from playslot_rl.baselines.svg.model import SVG
 from playslot_rl.baselines.svg.stage import SVGStage
 from playslot_rl.config.video import SVGConfig
 from playslot_rl.data.windows import Clips
+from playslot_rl.frames import normalise
 from playslot_rl.seeding import StepGenerators
 from playslot_rl.storage.tensors import load_tensors
 from playslot_rl.training.fit import Part, fit
@@ -112,21 +113,23 @@ def test_training_predicts_better_with_running_statistics_too(config: SVGConfig)
     assert validate() < 0.25 * before
 
 
-def test_validation_scores_frames_and_then_averages(config: SVGConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_validation_clamps_scores_frames_and_then_averages(config: SVGConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     stage = make_stage(config)
     stage.model.eval()
 
     def predict(frames: torch.Tensor, seed: int) -> torch.Tensor:
-        wrong = frames[:, seed:] + torch.tensor([0.1, 0.2, 0.0])[:, None, None, None]
-        wrong[:, :, :, 0, 0] += torch.where(wrong[:, :, :, 0, 0] > 0.99, 5.0, 0.0)
-        return wrong
+        predicted = frames[:, seed:].clone()
+        predicted[:, 0] += 0.1
+        predicted[:, 1] = 3.0
+        return predicted
 
     monkeypatch.setattr(stage.model, "predict", predict)
     with torch.no_grad():
         metrics = stage.validate(0)
     assert metrics.keys() == {"psnr", "mse", "psnr_prior", "kl"}
-    assert metrics["mse"] == pytest.approx((0.01 + 0.04 + 0) / 3, rel=0.2)
-    assert metrics["psnr"] == pytest.approx((20 + 13.98 + 80) / 3, abs=0.5)
+    white = (1 - normalise(stage.clips.source.pixels(stage.clips.held_out))[:, 4]).square().mean(dim=(1, 2, 3))
+    assert metrics["mse"] == pytest.approx((0.01 + float(white.mean()) + 0) / 3, rel=1e-4)
+    assert metrics["psnr"] == pytest.approx((20 + float((-10 * white.log10()).mean()) + 80) / 3, rel=1e-4)
     assert metrics["kl"] > 0
 
 
