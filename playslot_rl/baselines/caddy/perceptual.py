@@ -12,14 +12,12 @@ Shapes: B batch, H W image height and width.
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.errors import CheckpointError
-from playslot_rl.storage.tensors import load_tensors
+from playslot_rl.storage.published import pick_published, read_published
 
 KEY = "baselines.caddy.perceptual"
 
@@ -90,17 +88,13 @@ def load_perceptual(weights: str) -> VGGFeatures | None:
     path = cached_weights() if weights == "auto" else Path(weights)
     if not weights or (weights == "auto" and not path.is_file()):
         return None
-    state = _read(path)
     with torch.random.fork_rng(devices=[]):
         network = VGGFeatures()
-    own = network.state_dict()
-    wrong = sorted(name for name in own if name not in state or state[name].shape != own[name].shape)
-    if wrong:
-        raise CheckpointError(
-            f"{KEY}={path}: got no tensor {wrong[0]} of its shape, expected the weights of torchvision's VGG19: "
-            "give another file, or leave it empty"
-        )
-    network.load_state_dict({name: state[name] for name in own})
+    own, cure = network.state_dict(), "leave it empty"
+    state = read_published(path, KEY, "VGG19", cure)
+    names = {name: name for name in own}
+    where = f"{KEY}={path}"
+    network.load_state_dict(pick_published(state, names, own, where, f"give torchvision's VGG19, or {cure}"))
     return network
 
 
@@ -109,17 +103,3 @@ def cached_weights() -> Path:
     from torchvision.models import VGG19_Weights
 
     return Path(torch.hub.get_dir()) / "checkpoints" / Path(VGG19_Weights.IMAGENET1K_V1.url).name
-
-
-def _read(path: Path) -> dict[str, Tensor]:
-    if path.suffix == ".safetensors":
-        return load_tensors(path)
-    try:
-        # Published as a pickle; read as tensors only.
-        state: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
-        raise CheckpointError(
-            f"{KEY}={path}: got {str(error).splitlines()[0]}, expected a file of VGG19's weights: "
-            "check the path, or leave it empty"
-        ) from error
-    return state
