@@ -35,7 +35,7 @@ class SVGConfig(VideoStageConfig):
     """SVG-LP (Denton and Fergus, 2018).
 
     Attributes:
-        channels: of the groups of 3x3 convolutions; each but the last is followed by a halving of the resolution.
+        channels: of the groups of 3x3 convolutions, each followed by a halving of the resolution, to 4x4 in the end.
         convs: convolutions in each group.
         features: width of a frame's code h.
         latent_dim: Z.

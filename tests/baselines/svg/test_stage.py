@@ -149,5 +149,5 @@ def test_half_precision_trains_on_about_the_same_loss(config: SVGConfig) -> None
         loss = stage.loss(0, StepGenerators(0, 0))["loss"]
         loss.backward()
         assert loss.dtype == torch.float32
-        losses.append(float(loss))
+        losses.append(loss.item())
     assert losses[0] == pytest.approx(losses[1], rel=0.02)
