@@ -18,7 +18,6 @@ from playslot_rl.training.runs import load_agent, load_world_model, pretrained_f
 
 ENVS = ("button_press", "block_push_easy", "block_push")
 STAGES = ("slots", "dynamics", "policy")
-ACTING = ("button_press", "block_push_easy")
 LEAST = {"button_press": 0.8, "block_push_easy": 0.6, "block_push": 0.15}
 """Success rate in simulation below which a shipped policy is broken; on 20 episodes, so well below its own."""
 LIMIT = 14 * 1000**2
@@ -34,15 +33,12 @@ def test_the_shipped_model_is_small_and_holds_nothing_else(shipped: Path) -> Non
     files = [path for path in shipped.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) < LIMIT
     names = {"weights.safetensors", "config.json", "meta.json"}
-    stages = STAGES if shipped.name in ACTING else STAGES[:2]
-    kept = {f"{stage}/checkpoint/{name}" for stage in stages for name in names}
+    kept = {f"{stage}/checkpoint/{name}" for stage in STAGES for name in names}
     assert {str(path.relative_to(shipped)) for path in files if path.suffix != ".md"} == kept
 
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_its_meta_says_how_it_was_made(shipped: Path, stage: str) -> None:
-    if stage == "policy" and shipped.name not in ACTING:
-        return
     meta: dict[str, Any] = read_stage(shipped / stage / "checkpoint", stage).meta
     assert len(meta["commit"]) == 40, "expected a commit without local changes"
     assert ("pipeline" in meta["command"]) or stage == "policy"
@@ -73,14 +69,14 @@ def test_it_loads_and_has_the_sizes_of_the_compact_preset(env: str) -> None:
     assert world.env == config.env
 
 
-@pytest.mark.parametrize("env", ACTING)
+@pytest.mark.parametrize("env", ENVS)
 def test_its_policy_was_trained_on_it(env: str) -> None:
     agent = load_agent(f"pretrained/{env}")
     assert agent.action_decoder.reads_slots
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("env", ACTING)
+@pytest.mark.parametrize("env", ENVS)
 def test_its_policy_solves_the_task_in_simulation(env: str) -> None:
     from playslot_rl.evaluation.success import evaluate
 

@@ -163,7 +163,7 @@ def test_an_unknown_protocol_and_a_run_without_policy_are_refused(
     ("changes", "error", "message"),
     [
         ({}, ConfigError, "expected the folder of a run"),
-        ({"run": "pretrained"}, CheckpointError, "without a policy"),
+        ({"run": "pretrained"}, ConfigError, "out: got nothing with run=pretrained"),
         ({"run": "nowhere"}, CheckpointError, "no such folder"),
         ({"run": ".", "out": "elsewhere"}, ConfigError, "leave it out"),
         ({"run": "."}, CheckpointError, "no policy/checkpoint"),

@@ -47,9 +47,14 @@ def test_a_run_becomes_a_folder_and_stays_as_it_was(run: Path, tmp_path: Path) -
     config = read_config(tmp_path / "policies" / "press")
     stored = json.loads((run / "policy" / "checkpoint" / "meta.json").read_text())
     assert config.source["fingerprints"] == {**stored["parents"], "policy": stored["fingerprint"]}
-    assert (config.source["demos"], config.source["labelled_demos"]) == (150, 50)
+    assert (config.source["demos"], config.source["labelled_demos"]) == (150, 5)
     assert config.source["shipped_world_model"]
     assert config.camera == "observation.images.front"
+
+
+def test_a_shipped_policy_becomes_a_folder_too(tmp_path: Path) -> None:
+    assert playslot("export", "run=pretrained/button_press", f"out={tmp_path / 'press'}").code == 0
+    assert read_config(tmp_path / "press").source["labelled_demos"] == 5
 
 
 def test_the_card_tells_task_data_results_limits_and_versions(run: Path, tmp_path: Path) -> None:
@@ -62,8 +67,9 @@ def test_the_card_tells_task_data_results_limits_and_versions(run: Path, tmp_pat
     assert "| task | Press the red button. |" in card
     assert "4 numbers in [-1, 1]: hand displacement x, y, z and gripper effort" in card
     assert "`observation.images.front`, 64 x 64 RGB" in card
-    assert "real actions of 50 demonstrations" in card
-    assert "7b45eb63425fa8bc" in card, "fingerprint of the demonstrations"
+    assert "real actions of 5 demonstrations" in card
+    meta = json.loads((run / "policy" / "checkpoint" / "meta.json").read_text())
+    assert meta["data"]["demos"] in card, "fingerprint of the demonstrations"
     assert "| this policy, in simulation (closed loop) | 98 % | 90 to 100 % | 14.5 | 50 | 0 |" in card
     assert "| random actions | 0 % | 0 to 7 % |" in card
     assert "slot oracle" not in card, "it was not measured"
@@ -107,7 +113,7 @@ def test_the_commands_of_the_card_are_accepted_and_bring_back_the_config(run: Pa
     assert [line[0] for line in lines] == ["collect", "train-policy", "evaluate"]
     recorded, trained = (compose(line[1:], "collect") for line in lines[:2])
     assert (recorded.episodes, recorded.collect.noise, recorded.policy) == (150, 0.25, "expert")
-    assert (trained.behaviour.steps, trained.seed, trained.run) == (77, 7, "pretrained")
+    assert (trained.behaviour.steps, trained.seed, trained.run) == (77, 0, "pretrained")
     assert (trained.preset, trained.env.name) == ("compact", "button_press")
 
 
@@ -144,7 +150,6 @@ def test_the_card_says_how_many_demonstrations_and_which_seeds(
         (["run={run}", "out={run}"], "out: got nothing or the run itself", 1),
         (["run={run}", "out={there}"], "there already", 1),
         (["run={run}", "out={there}", "export.repo=me/press"], "there already", 1),
-        (["run=pretrained", "out={new}"], "world model without a policy", 1),
         (["out={new}"], "run: got nothing", 1),
         (["run={none}", "out={new}"], "expected the folder of a run", 2),
         (["run={run}", "out={new}", "method=lapo"], "got a run of method=lapo", 1),
@@ -164,7 +169,8 @@ def test_what_cannot_be_exported_is_refused_in_one_line(
 
 def test_a_run_without_a_policy_or_with_damaged_weights_is_refused(run: Path, tmp_path: Path) -> None:
     weights = run / "policy" / "checkpoint" / "weights.safetensors"
-    weights.write_bytes(weights.read_bytes()[:-1] + b"\x00")
+    content = weights.read_bytes()
+    weights.write_bytes(content[:-1] + bytes([content[-1] ^ 0xFF]))
     refused("export", f"run={run}", f"out={tmp_path / 'new'}", message="got fingerprint")
     shutil.rmtree(run / "policy")
     refused("export", f"run={run}", f"out={tmp_path / 'new'}", message="expected a trained policy")
