@@ -280,18 +280,15 @@ class FinetuneStage:
             seen = Seen.of(demos, config.imagined, horizon)
             return TensorInputs(seen.slots, noise, "finetune_noise"), actions[seen.rows]
 
-        labelled, acted = demos.take(demos.labelled(config.labelled_demos)), _acted(held_out)
+        acted = _acted(held_out)
+        labelled = examples(demos.take(demos.labelled(config.labelled_demos)), config.slot_noise)
+        measured = None if acted is None else examples(acted, 0.0)
 
         def acting(network: _Both) -> RegressionStage:
             criterion = BehaviourLoss(network, config.loss)
             criterion.set_keys(action=keys.ACTION)
             return RegressionStage(
-                "finetune",
-                criterion,
-                *examples(labelled, config.slot_noise),
-                config.batch_size,
-                held_out=None if acted is None else examples(acted, 0.0),
-                precision=config.precision,
+                "finetune", criterion, *labelled, config.batch_size, held_out=measured, precision=config.precision
             )
 
         self.acting = [acting(network) for network in networks]
