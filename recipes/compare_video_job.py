@@ -45,7 +45,7 @@ def _chosen(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> 
     from playslot_rl.comparison.video_plan import asked_of, training_of, with_training
     from playslot_rl.storage.atomic import write_json
 
-    asked, own, path = asked_of(record), training_of(config, job.method), job.run / "choice.json"
+    asked, own, path = asked_of(record), training_of(config, job.method), job.choice
     stored = json.loads(path.read_text()) if path.is_file() else {}
     if stored.get("fingerprint") != record["fingerprint"]:
         tried = []
@@ -55,7 +55,7 @@ def _chosen(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> 
         seconds = min((float(trial["seconds_a_step"]) for trial in tried), default=0.0)
         steps = max(1, round(60 * asked.minutes / seconds)) if asked.minutes and seconds else own.steps
         stored = {"fingerprint": record["fingerprint"], "rate": best["rate"], "steps": steps, "tried": tried}
-        job.run.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, stored)
     optim = replace(own.optim, lr=own.optim.lr * float(stored["rate"]))
     return with_training(config, job.method, steps=int(stored["steps"]), optim=optim)
@@ -119,7 +119,7 @@ def _score(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> N
             "steps": done.meta["steps"],
             "train_seconds": done.meta["seconds"],
             "score_seconds": round(time.monotonic() - began, 1),
-            "choice": json.loads((job.run / "choice.json").read_text()),
+            "choice": json.loads(job.choice.read_text()),
         },
     )
 

@@ -71,6 +71,11 @@ class VideoJob:
         return self.out / "trials" / self.name
 
     @property
+    def choice(self) -> Path:
+        """The learning rate and the number of steps that they led to."""
+        return self.trials / "choice.json"
+
+    @property
     def scores(self) -> Path:
         """What it scored."""
         return self.run / "video.json"

@@ -12,7 +12,6 @@ from playslot_rl.baselines.svg.model import SVG
 from playslot_rl.baselines.video.predictor import VideoPredictor
 from playslot_rl.baselines.video.slots import SlotVideo
 from playslot_rl.config import (
-    BaselinesConfig,
     CADDYConfig,
     EnvConfig,
     ModelConfig,
@@ -20,6 +19,7 @@ from playslot_rl.config import (
     SlotFormerConfig,
     SVGConfig,
 )
+from playslot_rl.config.baselines import BaselinesConfig
 from playslot_rl.storage.checkpoints import (
     StageCheckpoint,
     checkpoint_folder,
