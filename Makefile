@@ -63,7 +63,8 @@ $(UV): $(if $(VENV_OK),,FORCE)
 	@$(BIN)/python -m pip install --quiet "uv==$(UV_VERSION)"
 
 $(STAMP): $(UV) $(LOCK) pyproject.toml $(PLUGIN)/pyproject.toml
-	@$(UV) pip install --require-hashes -r $(LOCK)
+	@# With bytecode: where PYTHONDONTWRITEBYTECODE is set, every command would compile torch and its like anew (20 s).
+	@$(UV) pip install --compile-bytecode --require-hashes -r $(LOCK)
 	@$(UV) pip install --no-deps --editable . --editable ./$(PLUGIN)
 	@touch $@
 
