@@ -15,25 +15,10 @@ from typing import Any
 import pytest
 from commands import ONE_CORE, Done, assert_one_line, contents, playslot
 
-from playslot_rl.comparison import launch
-from playslot_rl.comparison.launch import Status, comparison_lock
+from playslot_rl.comparison.launch import comparison_lock
 from playslot_rl.config.compare import LAUNCHERS
-from playslot_rl.recipes import compare_job
 
 Compare = Callable[..., Done]
-
-
-@pytest.fixture
-def started(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Jobs run in this process; their names in the order in which they started."""
-    names: list[str] = []
-
-    def here(file: Path) -> Status:
-        names.append(file.stem)
-        return compare_job.main(file)
-
-    monkeypatch.setattr(launch, "run_process", here)
-    return names
 
 
 def _arguments(shared_run: Path, out: Path, *more: object) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import playslot, refused, smoke
+from commands import playslot, refused, run_jobs_here, smoke
 
 from playslot_rl.config.compare_video import TITLES, VIDEO_METHODS
 
@@ -19,7 +19,9 @@ METHODS = ",".join(VIDEO_METHODS)
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A comparison of all methods on ButtonPress, from nothing."""
     out = tmp_path_factory.mktemp("video") / "out"
-    smoke("compare-video", "env=button_press", f"methods={METHODS}", f"out={out}")
+    with pytest.MonkeyPatch.context() as patch:
+        run_jobs_here(patch)
+        smoke("compare-video", "env=button_press", f"methods={METHODS}", f"out={out}")
     return out
 
 
@@ -86,6 +88,7 @@ def test_the_same_command_trains_nothing_again_and_gives_the_same_numbers(finish
     assert result(finished)["summary"] == before["summary"]
 
 
+@pytest.mark.usefixtures("started")
 def test_a_method_that_fails_leaves_a_row_that_says_so(finished: Path, tmp_path: Path) -> None:
     """A learning rate that blows up ends one training, not the others."""
     data = f"{finished}/data/random"
