@@ -43,7 +43,7 @@ class VideoJob:
     @property
     def trained_as(self) -> MethodName:
         """Its name among `playslot_rl.config.methods`."""
-        return "playslot" if self.method in ("playslot", "playslot_m") else self.method
+        return "playslot" if self.method == "playslot_m" else self.method
 
     @property
     def stage(self) -> str:
