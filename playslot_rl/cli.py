@@ -127,6 +127,21 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot compare run=pretrained hydra.launcher=joblib hydra.launcher.n_jobs=2 out=runs/comparison",
         ),
     ),
+    "compare-video": Command(
+        "video predictors side by side: PSNR, SSIM and LPIPS on held-out clips, table, curves and pictures",
+        "Trains every model with every seed on the same clips, and predicts the same held-out ones, of any LeRobot "
+        "data set with a camera (data.root=) or of videos recorded once into OUT/data. Writes OUT/video.json, .md, "
+        ".png, .svg and sheets of frames. What is done is reused, so the same command carries on after a stop. Here "
+        "seeds= and methods= are lists; compare_video.minutes= gives every training the same time. SAVi is run=, or "
+        "trained once into OUT/world_model. Jobs run one after the other, or by a Hydra launcher, as those of compare.",
+        (
+            (
+                "playslot compare-video env=block_push preset=compact methods=svg,caddy,slotformer,ocvp_seq,playslot "
+                "seeds=0 run=pretrained out=runs/video"
+            ),
+            "playslot compare-video data.root=data/mine env=sketchy seeds=0 compare_video.minutes=15 out=runs/video",
+        ),
+    ),
     "demo": Command(
         "the main job with the shipped world model, in minutes",
         "Collects fresh expert demos, trains the policy on their videos and the action decoder on the labels of a "

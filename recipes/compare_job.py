@@ -46,6 +46,11 @@ def main(file: Path) -> Status:
 
 
 def _run(job: dict[str, Any]) -> None:
+    if job.get("kind") == "video":
+        from playslot_rl.recipes import compare_video_job
+
+        compare_video_job.run(job)
+        return
     from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts, task_facts
     from playslot_rl.recipes import evaluate, train_baseline
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal, Protocol
 
 from playslot_rl.config.plain import from_dict
-from playslot_rl.errors import PlaySlotError
+from playslot_rl.errors import OutputError, PlaySlotError
 from playslot_rl.storage.atomic import explain_write_errors, write_json
 from playslot_rl.storage.locks import locked
 
@@ -71,7 +71,7 @@ def comparison_lock(out: Path) -> AbstractContextManager[None]:
     with explain_write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     busy = (
-        f"out={out}: got a folder that another `playslot compare` works on, expected one of its own: wait for it, or "
+        f"out={out}: got a folder that another comparison works on, expected one of its own: wait for it, or "
         "use another out="
     )
     return locked(out / LOCK, busy)
@@ -80,6 +80,84 @@ def comparison_lock(out: Path) -> AbstractContextManager[None]:
 def job_lock(job_file: Path) -> AbstractContextManager[None]:
     """Wait until no other process works on the job."""
     return locked(job_file.with_suffix(".lock"))
+
+
+def open_comparison(out: Path) -> None:
+    """Refuse a folder that holds something else than a comparison.
+
+    Raises:
+        OutputError: it does.
+    """
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"out={out}: got a file, expected a folder: choose another out=")
+    names = {path.name for path in out.iterdir()} if out.is_dir() else set()
+    if names and (not names & {LOCK, "jobs"} or names & {"meta", "config.json"}):
+        raise OutputError(f"out={out}: got a folder that holds something else, expected none: choose another out=")
+
+
+class AnyJob(Protocol):
+    """What is asked of a job: its name, its file, and which of several waves of a launcher it belongs to, from 0 on."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def file(self) -> Path: ...
+    @property
+    def wave(self) -> int: ...
+
+
+class Report[J: AnyJob](Protocol):
+    """What gathers the jobs' results."""
+
+    out: Path
+
+    @property
+    def jobs(self) -> Mapping[J, Mapping[str, Any]]:
+        """All of them, with what their files say."""
+
+    def ended(self, job: J) -> None:
+        """Say how a job ended, and write what there is so far."""
+
+    def write(self) -> Sequence[Mapping[str, Any]]:
+        """Write everything."""
+
+
+def run_due[J: AnyJob](command: str, report: Report[J], launcher: str, hydra: Sequence[str]) -> None:
+    """Write every job's file, and run those that are not done as they stand there.
+
+    Args:
+        command: for the messages.
+        report: the jobs, and who is told.
+        launcher: Hydra's name of one; empty runs one after the other.
+        hydra: further overrides for Hydra.
+
+    Raises:
+        PlaySlotError: the launcher itself failed.
+        KeyboardInterrupt: Ctrl-C. In both cases what there is has been written.
+    """
+    due: dict[Path, J] = {}
+    for job, record in report.jobs.items():
+        write_json(job.file, record)
+        status = read_status(job.file)
+        if status.status == "done" and status.fingerprint == record["fingerprint"]:
+            print(f"{job.name}: done before, skipped", flush=True)
+        else:
+            due[job.file] = job
+    print(f"{command}: {len(due)} of {len(report.jobs)} jobs to run", flush=True)
+    try:
+        if due and launcher:
+            for wave in sorted({job.wave for job in due.values()}):
+                run_sweep([file for file, job in due.items() if job.wave == wave], launcher, hydra)
+        else:
+            for file, job in due.items():
+                run_process(file)
+                report.ended(job)
+    except KeyboardInterrupt:
+        report.write()
+        raise KeyboardInterrupt(f"{command} interrupted; the same command carries on in {report.out}") from None
+    except PlaySlotError:
+        report.write()
+        raise
 
 
 JOB_MODULE = "playslot_rl.recipes.compare_job"

@@ -69,6 +69,11 @@ class Job:
         return method_stage(self.method)
 
     @property
+    def wave(self) -> int:
+        """Those whose policy others take over come first; these would train it again, side by side."""
+        return int(self.policy_of is not None)
+
+    @property
     def protocols(self) -> tuple[str, ...]:
         """How it is evaluated."""
         return ("simulation", "imagination") if self.method == "playslot" else ("simulation",)

@@ -36,3 +36,8 @@ from playslot_rl.config.stages import OptimConfig as OptimConfig
 from playslot_rl.config.stages import Precision as Precision
 from playslot_rl.config.stages import SlotsStageConfig as SlotsStageConfig
 from playslot_rl.config.stages import StageConfig as StageConfig
+from playslot_rl.config.video import CADDYConfig as CADDYConfig
+from playslot_rl.config.video import OCVPSeqConfig as OCVPSeqConfig
+from playslot_rl.config.video import SlotFormerConfig as SlotFormerConfig
+from playslot_rl.config.video import SVGConfig as SVGConfig
+from playslot_rl.config.video import VideoStageConfig as VideoStageConfig

@@ -11,6 +11,7 @@ from typing import Literal
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import Checked, at_least, between, role, within
 from playslot_rl.config.stages import OptimConfig, StageConfig
+from playslot_rl.config.video import CADDYConfig, OCVPSeqConfig, SlotFormerConfig, SVGConfig
 
 SHARE = between(0, 1, "a number in [0, 1]")
 ABOVE_ZERO = within(lambda value: value > 0, "above 0")
@@ -286,3 +287,7 @@ class BaselinesConfig:
     lapo: LAPOConfig = field(default_factory=LAPOConfig)
     dreamer: DreamerConfig = field(default_factory=DreamerConfig)
     sold: SOLDConfig = field(default_factory=SOLDConfig)
+    svg: SVGConfig = field(default_factory=SVGConfig)
+    caddy: CADDYConfig = field(default_factory=CADDYConfig)
+    slotformer: SlotFormerConfig = field(default_factory=SlotFormerConfig)
+    ocvp_seq: OCVPSeqConfig = field(default_factory=OCVPSeqConfig)

@@ -52,6 +52,8 @@ class CompareConfig(Checked):
             values = getattr(self, name)
             check(len(values) > 0, name, values, "at least one")
             check(len(set(values)) == len(values), name, values, "each one once")
+        still = [name for name in self.methods if not METHODS[name].actor]
+        check(not still, "methods", ",".join(still), "methods that act; `playslot compare-video` compares predictions")
         check(len(set(self.labels)) == len(self.labels), "labels", self.labels, "each one once")
         most = max(self.labels, default=0)
         check(most <= min(self.demos), "labels", most, f"at most the {min(self.demos)} demonstrations of demos=")

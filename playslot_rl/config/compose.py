@@ -26,6 +26,8 @@ CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
 CONTINUES: Final = frozenset({"evaluate", "export", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
+COMPARISONS: Final = {"compare": ("methods", "demos", "labels", "seeds"), "compare-video": ("methods", "seeds")}
+"""Commands with a group of their own in the config, and its keys that go without its name."""
 SHIPPED: Final = "pretrained"
 """`run=pretrained` names the task's shipped world model, `run=pretrained/ENV` one of them: no run folders."""
 
@@ -55,7 +57,7 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         ConfigError: an argument that is not `key=value`, an unknown environment, preset or key, a value outside its
             range, or a run folder without a usable `config.json`.
     """
-    pairs = _parse(_compare_keys(overrides) if command == "compare" else overrides)
+    pairs = _parse(_compare_keys(overrides, command) if command in COMPARISONS else overrides)
     for group in GROUPS:
         if group in pairs:
             _check_choice(group, pairs[group])
@@ -107,27 +109,28 @@ def _method_names(key: str, value: str) -> str:
     return f"[{names}]" if text.startswith("[") else names
 
 
-def _compare_keys(overrides: Sequence[str]) -> list[str]:
-    """The short keys of `playslot compare` as those of the config's group `compare`.
+def _compare_keys(overrides: Sequence[str], command: str) -> list[str]:
+    """The short keys of a comparison as those of its group in the config, such as `compare`.
 
     `demos=10,50` (or `demos=[10,50]`) becomes `compare.demos=[10,50]`, `hydra.launcher=joblib` becomes
     `compare.launcher=joblib`, and other `hydra.` keys are gathered, as they are, in `compare.hydra`.
     """
     kept, hydra = [], []
+    group, lists = command.replace("-", "_"), COMPARISONS[command]
     for argument in overrides:
         key, equals, value = argument.partition("=")
         name = key.strip().lstrip("+")
-        if equals and name in ("methods", "demos", "labels", "seeds"):
+        if equals and name in lists:
             inside = _unquote(value.strip()).removeprefix("[").removesuffix("]")
-            kept.append(f"compare.{name}=[{inside}]")
+            kept.append(f"{group}.{name}=[{inside}]")
         elif equals and name == "hydra.launcher":
-            kept.append(f"compare.launcher={value}")
+            kept.append(f"{group}.launcher={value}")
         elif equals and name.startswith("hydra."):
             hydra.append(argument.strip())
         else:
             kept.append(argument)
     quoted = ",".join(_quote(argument) for argument in hydra)
-    return [*kept, f"compare.hydra=[{quoted}]"] if hydra else kept
+    return [*kept, f"{group}.hydra=[{quoted}]"] if hydra else kept
 
 
 def _quote(text: str) -> str:

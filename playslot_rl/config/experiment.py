@@ -7,6 +7,7 @@ from typing import Literal
 
 from playslot_rl.config.baselines import BaselinesConfig
 from playslot_rl.config.compare import CompareConfig
+from playslot_rl.config.compare_video import CompareVideoConfig
 from playslot_rl.config.env import EnvConfig, RenderConfig
 from playslot_rl.config.methods import MethodName
 from playslot_rl.config.model import ModelConfig
@@ -29,6 +30,7 @@ class DataConfig(Checked):
         resize: resize frames of another size than `env.image_size` (area averaging) instead of refusing them.
         cache: folder of the frame and slot caches; empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
         validation: fraction of episodes held out from training.
+        tested: fraction of episodes that no training and no validation sees, for `compare-video`; 0 keeps none.
     """
 
     group = "data."
@@ -40,6 +42,7 @@ class DataConfig(Checked):
     resize: bool = False
     cache: str = field(default="", metadata=role("machine", "folder"))
     validation: float = field(default=0.05, metadata=within(lambda value: 0 <= value < 1, "a fraction in [0, 1)"))
+    tested: float = field(default=0.0, metadata=within(lambda value: 0 <= value < 1, "a fraction in [0, 1)"))
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,17 @@ class ExportConfig:
 
 
 @dataclass(frozen=True)
+class MetricsConfig:
+    """Metrics that need something from elsewhere.
+
+    Attributes:
+        lpips_weights: file of torchvision's AlexNet for LPIPS; empty takes torch's cache where it has them.
+    """
+
+    lpips_weights: str = field(default="", metadata=role("folder"))
+
+
+@dataclass(frozen=True)
 class LoggingConfig:
     """Logging: `tensorboard` (default), `wandb`, `trackio` or `none`, and a progress bar."""
 
@@ -174,6 +188,8 @@ class ExperimentConfig(Checked):
     behaviour: BehaviourStageConfig = field(default_factory=BehaviourStageConfig)
     baselines: BaselinesConfig = field(default_factory=BaselinesConfig)
     compare: CompareConfig = field(default_factory=CompareConfig, metadata=role("machine"))
+    compare_video: CompareVideoConfig = field(default_factory=CompareVideoConfig, metadata=role("machine"))
+    metrics: MetricsConfig = field(default_factory=MetricsConfig, metadata=role("machine"))
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     logging: LoggingConfig = field(default_factory=LoggingConfig, metadata=role("machine"))
     export: ExportConfig = field(default_factory=ExportConfig, metadata=role("call"))

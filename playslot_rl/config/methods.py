@@ -9,7 +9,10 @@ from typing import Final, Literal, get_args
 
 from playslot_rl.errors import ConfigError
 
-MethodName = Literal["playslot", "slot_oracle", "resnet_oracle", "slot_bc", "resnet_bc", "lapo", "dreamer", "sold"]
+MethodName = Literal[
+    "playslot", "slot_oracle", "resnet_oracle", "slot_bc", "resnet_bc", "lapo", "dreamer", "sold",
+    "svg", "caddy", "slotformer", "ocvp_seq",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -19,7 +22,8 @@ class Method:
     Attributes:
         title: as tables and plots name it.
         recipe: module of `playslot_rl.recipes` whose `main(config)` trains it.
-        actor: `module:function` of `load_actor(run, device) -> Actor`.
+        actor: `module:function` of `load_actor(run, device) -> Actor`; empty for one that predicts frames and does not
+            act (`playslot_rl.baselines.video`).
         online: it learns by acting (environment steps on the axis, needs a reward) instead of from demonstrations.
         slots: it builds on a world model's slots.
         stage: stage of its run whose checkpoint is the method's; empty means its name.
@@ -29,7 +33,7 @@ class Method:
 
     title: str
     recipe: str
-    actor: str
+    actor: str = ""
     online: bool = False
     slots: bool = False
     stage: str = ""
@@ -66,6 +70,10 @@ METHODS: Final[dict[str, Method]] = {
     "lapo": Method("LAPO", "baselines.lapo", "playslot_rl.baselines.lapo.load:load_actor"),
     "dreamer": Method("DreamerV3", "baselines.online", "playslot_rl.baselines.dreamer.actor:load_actor", online=True),
     "sold": Method("SOLD", "baselines.online", "playslot_rl.baselines.sold.actor:load_actor", online=True, slots=True),
+    "svg": Method("SVG-LP", "baselines.video", aliases=("SVG",)),
+    "caddy": Method("CADDY", "baselines.video"),
+    "slotformer": Method("SlotFormer", "baselines.video", slots=True),
+    "ocvp_seq": Method("OCVP-Seq", "baselines.video", slots=True, aliases=("OCVP",)),
 }
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import Checked, at_least, within
 
-LatentMode = Literal["hybrid", "discrete", "continuous", "ground_truth"]
+LatentMode = Literal["hybrid", "discrete", "continuous", "ground_truth", "none"]
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class InverseDynamicsConfig(Checked):
 
     Attributes:
         variant: `single` (InvDyn_S, one z per step) or `multi` (InvDyn_M, one z per slot and step).
-        mode: latent-action mode.
+        mode: latent-action mode; `none` infers nothing, for predictors without control.
         latent_dim: Z.
         n_prototypes: K.
         dim, layers, heads, head_dim, mlp_dim: transformer of InvDyn_S; `dim` is the hidden width of InvDyn_M.
@@ -121,14 +121,16 @@ class PredictorConfig(Checked):
     """Kind and sizes of the predictor (paper, appendix A.3).
 
     Attributes:
-        kind: `cocvp` (paper) or `ocvp_seq` (OCVP-Seq with an action token, as in SOLD).
+        kind: `cocvp` (paper), `ocvp_seq` (OCVP-Seq, with an action token as in SOLD where there are latent actions) or
+            `slotformer` (SlotFormer, which takes none).
         dim, layers, heads, head_dim, mlp_dim: the transformer.
+        project_out: attention has an output projection; without one `heads * head_dim` is `dim`.
         residual: predict the change of the slots instead of the slots.
         context: frames it attends to; past them the window slides and is recomputed.
     """
 
     group = "model.predictor."
-    kind: Literal["cocvp", "ocvp_seq"] = "cocvp"
+    kind: Literal["cocvp", "ocvp_seq", "slotformer"] = "cocvp"
     dim: int = 256
     layers: int = 4
     heads: int = 8
@@ -136,6 +138,16 @@ class PredictorConfig(Checked):
     mlp_dim: int = 1024
     residual: bool = False
     context: int = field(default=24, metadata=at_least(2, "at least 2 frames"))
+    project_out: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(
+            self.project_out or self.heads * self.head_dim == self.dim,
+            "model.predictor.head_dim",
+            self.head_dim,
+            f"dim / heads with project_out=false, dim {self.dim} and {self.heads} heads",
+        )
 
 
 @dataclass(frozen=True)

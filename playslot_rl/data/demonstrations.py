@@ -30,6 +30,8 @@ BATCH = 64
 FRAMES_AT_ONCE = 1024
 DRAW_STREAM = 14
 """Keeps the draws of demonstrations apart from what else a seed draws."""
+TEST_STREAM = 0x7E57
+"""Seed of the split in training and test episodes."""
 DIRECTIONS = ((1, 1), (-1, -1), (1, -1), (-1, 1), (1, 0), (-1, 0), (0, 1), (0, -1))
 """Of the copies, (down, right): corners first, so that the first four surround the original."""
 
@@ -138,6 +140,37 @@ def drawn_demonstrations(source: EpisodeFrames, seed: int) -> EpisodeFrames:
         seeds=None if source.seeds is None else source.seeds[order],
         fingerprint=hashlib.sha256(f"{source.fingerprint}/drawn {seed}".encode()).hexdigest()[:16],
     )
+
+
+def split_tested(source: EpisodeFrames, fraction: float) -> tuple[EpisodeFrames, EpisodeFrames]:
+    """The episodes that are trained on, and those that are kept for a test, the same ones for every seed; rows stay.
+
+    Args:
+        source: the data set.
+        fraction: of its episodes that are kept, at least two.
+
+    Raises:
+        DataError: fewer than two would be left for either.
+    """
+    kept = max(2, round(fraction * source.episodes))
+    if source.episodes - kept < 2:
+        raise DataError(
+            f"data.tested={fraction}: got {source.episodes} episodes, expected at least 4, two of them to train on: "
+            "collect more"
+        )
+    order = np.random.default_rng(TEST_STREAM).permutation(source.episodes)
+    parts = {"trained": np.sort(order[kept:]), "tested": np.sort(order[:kept])}
+    trained, tested = (
+        replace(
+            source,
+            starts=source.starts[episodes],
+            lengths=source.lengths[episodes],
+            seeds=None if source.seeds is None else source.seeds[episodes],
+            fingerprint=hashlib.sha256(f"{source.fingerprint}/{name} {kept}".encode()).hexdigest()[:16],
+        )
+        for name, episodes in parts.items()
+    )
+    return trained, tested
 
 
 def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames:

@@ -52,7 +52,7 @@ class InverseDynamics(nn.Module):
     """InvDyn_S or InvDyn_M, by `config.variant`.
 
     Args:
-        config: sizes and mode.
+        config: sizes and mode; in mode `none` latents have width 0, and say only how many frames there are.
         slot_dim: D.
         action_dim: A, the width of z in mode `ground_truth`.
 
@@ -68,11 +68,13 @@ class InverseDynamics(nn.Module):
         super().__init__()
         self.config = config
         self.per_slot = config.variant == "multi"
-        self.latent_dim = action_dim if config.mode == "ground_truth" else config.latent_dim
-        if config.mode == "ground_truth" and self.per_slot:
-            raise ValueError("mode ground_truth with variant multi: real actions are not per slot; use variant=single")
+        self.latent_dim = {"ground_truth": action_dim, "none": 0}.get(config.mode, config.latent_dim)
+        if config.mode in ("ground_truth", "none") and self.per_slot:
+            raise ValueError(
+                f"mode {config.mode} with variant multi: real actions are not per slot; use variant=single"
+            )
         c = config
-        if config.mode != "ground_truth":
+        if config.mode not in ("ground_truth", "none"):
             self.encoder: nn.Module = (
                 SlotMLP(slot_dim, c.dim)
                 if self.per_slot
@@ -121,6 +123,9 @@ class InverseDynamics(nn.Module):
             if actions is None:
                 raise ValueError("mode ground_truth: got no actions, expected (B, T-1, A); use a data set with actions")
             return self._compose(actions, actions)
+        if self.config.mode == "none":
+            nothing = slots.new_zeros(len(slots), slots.shape[1] - 1, 0)
+            return self._compose(nothing, nothing)
         mu, var = self.scene_dynamics(slots)
         mean, variance = mu[:, 1:] - mu[:, :-1], var[:, 1:] + var[:, :-1]
         z = mean
@@ -136,7 +141,7 @@ class InverseDynamics(nn.Module):
 
     def _compose(self, z: Tensor, mean: Tensor) -> LatentActions:
         mode = self.config.mode
-        if mode in ("continuous", "ground_truth"):
+        if mode in ("continuous", "ground_truth", "none"):
             # Without a codebook z enters through the variability's projection alone.
             code = torch.zeros(z.shape[:-1], dtype=torch.long, device=z.device)
             return LatentActions(z, mean, torch.zeros_like(z), z, code, z.new_zeros(()))

@@ -70,7 +70,7 @@ class TransformerBlock(nn.Module):
         k, v = self._heads(self.to_k(normed)), self._heads(self.to_v(normed))
         if past is not None:
             k, v = torch.cat((past[0], k), dim=2), torch.cat((past[1], v), dim=2)
-        if mask is not None and wanted != slice(None):
+        if mask is not None and wanted != slice(None) and mask.shape[-2] > 1:
             mask = mask[..., wanted, :]
         y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
         x = x[:, wanted] + self.to_out(y.transpose(1, 2).flatten(2))

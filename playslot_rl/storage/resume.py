@@ -68,6 +68,7 @@ ADDED: Final[Mapping[str, Any]] = {
     "state_dropout": 0.5,
     "reads_slots": False,
     "patience": 0,
+    "project_out": True,
 }
 """Settings that came after the first checkpoints, and what those were trained with."""
 

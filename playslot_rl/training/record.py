@@ -13,7 +13,7 @@ from torch import nn
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.roles import fixed_keys
-from playslot_rl.data.demonstrations import DemonstrationSplit, episode_range, split_demonstrations
+from playslot_rl.data.demonstrations import DemonstrationSplit, episode_range, split_demonstrations, split_tested
 from playslot_rl.data.source import EpisodeFrames, concatenate, open_sources
 from playslot_rl.data.windows import Clips
 from playslot_rl.errors import CheckpointError, DataError
@@ -31,7 +31,8 @@ from playslot_rl.training.runs import store_config
 
 
 def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrames:
-    """Open the data sets of a stage; of `data.demos` among several, not the demonstrations that are held out.
+    """Open the data sets of a stage, without the episodes that are kept for a test (`data.tested`); of `data.demos`
+    among several, without the demonstrations that are held out.
 
     Raises:
         DataError: none is named, or one cannot be read.
@@ -44,6 +45,8 @@ def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrame
     if not roots:
         raise DataError(f"{what}: got no data set, expected data.root=DIR; record one by `playslot collect`")
     names = [name.strip() for name in roots.split(",")]
+    if config.data.tested:
+        return split_tested(opened(roots), config.data.tested)[0]
     if not config.data.held_out or config.data.demos not in names or len(names) == 1:
         return opened(roots)
     parts = {name: opened(name) for name in names}

@@ -62,6 +62,14 @@ METHOD_STYLES: Final = {
     "dreamer": MethodStyle(3, "D"),
     "sold": MethodStyle(4, "P"),
 }
+VIDEO_STYLES: Final = {
+    "playslot": MethodStyle(0, "o"),
+    "playslot_m": MethodStyle(4, "P"),
+    "svg": MethodStyle(1, "v"),
+    "caddy": MethodStyle(5, "s"),
+    "slotformer": MethodStyle(2, "^"),
+    "ocvp_seq": MethodStyle(3, "D"),
+}
 
 
 def new_figure(width: float, height: float) -> Figure:

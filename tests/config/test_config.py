@@ -198,7 +198,8 @@ def test_roles_say_what_each_key_counts_for() -> None:
     named = {"data.root", "data.demos", "data.cache", "baselines.lapo.world", "behaviour.policy_from"}
     measures = {"data.held_out", "collect.validation_episodes"}
     assert keys_of(ExperimentConfig, "machine") == machine | named | measures
-    assert keys_of(ExperimentConfig, "folder") == {"out", "run", "slots.start_from"} | named
+    weights = {"slots.start_from", "baselines.caddy.perceptual"}
+    assert keys_of(ExperimentConfig, "folder") == {"out", "run"} | weights | named
 
 
 def test_a_config_without_a_role_keeps_all_other_keys() -> None:

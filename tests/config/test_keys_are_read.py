@@ -20,7 +20,13 @@ from playslot_rl.config import ExperimentConfig
 
 ROOT = Path(playslot_rl.__file__).parents[1]
 FOLDERS = ("playslot_rl", "recipes", "collectors", "envs")
-LOOPS = ("playslot_rl/training/", "playslot_rl/baselines/online/", "recipes/baselines/online.py")
+LOOPS = (
+    "playslot_rl/training/",
+    "playslot_rl/losses/dynamics.py",
+    "playslot_rl/modules/predictors/",
+    "playslot_rl/baselines/online/",
+    "recipes/baselines/online.py",
+)
 """Where a config known only by its base class is any stage's; elsewhere it is a stage of exactly that class."""
 
 CHECKED = {

@@ -12,7 +12,12 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
 from playslot_rl import cli
+from playslot_rl.comparison import launch
+from playslot_rl.comparison.launch import Status
+from playslot_rl.recipes import compare_job
 
 ONE_CORE = ("threads=1", "workers=1", "device=cpu")
 
@@ -39,6 +44,18 @@ def smoke(command: str, *arguments: object) -> Done:
     done = playslot(command, *_defaults(arguments), *map(str, arguments), *ONE_CORE)
     assert (done.code, done.err) == (0, ""), done.err
     return done
+
+
+def run_jobs_here(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Let comparisons run their jobs in this process; returns the jobs' names, in the order in which they start."""
+    names: list[str] = []
+
+    def here(file: Path) -> Status:
+        names.append(file.stem)
+        return compare_job.main(file)
+
+    monkeypatch.setattr(launch, "run_process", here)
+    return names
 
 
 def refused(command: str, *arguments: object, message: str, code: int = 1) -> Done:

@@ -14,7 +14,7 @@ from filelock import FileLock
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
 
-from commands import ONE_CORE, Done, playslot
+from commands import ONE_CORE, Done, playslot, run_jobs_here
 
 
 @pytest.fixture(scope="session")
@@ -69,6 +69,12 @@ def slots_only(world: Path) -> Path:
     """A copy with finished slots and nothing after them."""
     shutil.rmtree(world / "dynamics")
     return world
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Jobs of comparisons run in this process; their names in the order in which they started."""
+    return run_jobs_here(monkeypatch)
 
 
 @pytest.fixture(scope="session")

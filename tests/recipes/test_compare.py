@@ -15,25 +15,10 @@ from typing import Any
 import pytest
 from commands import ONE_CORE, Done, assert_one_line, contents, playslot
 
-from playslot_rl.comparison import launch
-from playslot_rl.comparison.launch import Status, comparison_lock
+from playslot_rl.comparison.launch import comparison_lock
 from playslot_rl.config.compare import LAUNCHERS
-from playslot_rl.recipes import compare_job
 
 Compare = Callable[..., Done]
-
-
-@pytest.fixture
-def started(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Jobs run in this process; their names in the order in which they started."""
-    names: list[str] = []
-
-    def here(file: Path) -> Status:
-        names.append(file.stem)
-        return compare_job.main(file)
-
-    monkeypatch.setattr(launch, "run_process", here)
-    return names
 
 
 def _arguments(shared_run: Path, out: Path, *more: object) -> list[str]:
@@ -146,7 +131,7 @@ def test_a_second_command_on_the_same_folder_is_refused(shared_run: Path, tmp_pa
         done = playslot(*_arguments(shared_run, tmp_path / "out", "methods=slot_oracle", "demos=2"))
     assert done.code == 1
     assert_one_line(done.err, "compare")
-    assert "that another `playslot compare` works on" in done.err
+    assert "that another comparison works on" in done.err
 
 
 @pytest.mark.parametrize(

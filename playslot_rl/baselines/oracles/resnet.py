@@ -13,7 +13,6 @@ Shapes: B batch, H W image height and width, h w those of the feature map (H / 3
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from typing import Literal
 
@@ -27,7 +26,7 @@ from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import normalise
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
-from playslot_rl.storage.tensors import load_tensors
+from playslot_rl.storage.published import pick_published, read_published
 from playslot_rl.training.runs import freeze_on, stage_model
 from playslot_rl.world_model import oracle_module
 
@@ -94,15 +93,11 @@ def load_pretrained(policy: ResNetPolicy, weights: str) -> Pretraining:
         return "scratch"
     if weights == "download" and not path.is_file():
         _download(path)
-    state = {name: value for name, value in _read(path).items() if not name.startswith("fc.")}
-    own = policy.trunk.state_dict()
-    wrong = sorted(name for name in own if name not in state or state[name].shape != own[name].shape)
-    if wrong:
-        raise CheckpointError(
-            f"baselines.resnet_oracle.weights={path}: got no tensor {wrong[0]} of its shape, expected the weights of "
-            "torchvision's ResNet-18: give another file, or set it to scratch"
-        )
-    policy.trunk.load_state_dict({name: state[name] for name in own})
+    key, cure, own = "baselines.resnet_oracle.weights", "set it to scratch", policy.trunk.state_dict()
+    state = read_published(path, key, "ResNet-18", cure)
+    names = {name: name for name in own}
+    where = f"{key}={path} (torchvision's ResNet-18)"
+    policy.trunk.load_state_dict(pick_published(state, names, own, where, f"give another, or {cure}"))
     return "imagenet"
 
 
@@ -124,20 +119,6 @@ def _download(path: Path) -> None:
             f"baselines.resnet_oracle.weights=download: got {error}, expected a network: put the file at {path}, "
             "or set it to scratch"
         ) from error
-
-
-def _read(path: Path) -> dict[str, Tensor]:
-    if path.suffix == ".safetensors":
-        return load_tensors(path)
-    try:
-        # Published as a pickle; read as tensors only.
-        state: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
-        raise CheckpointError(
-            f"baselines.resnet_oracle.weights={path}: got {str(error).splitlines()[0]}, expected a file of ResNet-18's "
-            "weights: check the path, or set it to scratch"
-        ) from error
-    return state
 
 
 def resnet_actor(policy: ResNetPolicy) -> Actor:

@@ -1,4 +1,4 @@
-"""OCVP-Seq with an action token (Villar-Corrales et al., 2023), as the dynamics of SOLD (Mosbach et al., 2025, section
+"""OCVP-Seq (Villar-Corrales et al., 2023), with an action token as the dynamics of SOLD (Mosbach et al., 2025, section
 3.2) have it.
 
     S^_{t+1} = S_t + head(X_t^{1..N}),   X_t^0 = [Lin(S_t), Lin(a_t)] + code(t),   X <- time(objects(X)) in every layer
@@ -19,12 +19,15 @@ from playslot_rl.modules.transformer import TransformerBlock
 
 
 class OCVPSeq(AutoregressivePredictor):
-    """Action-conditioned slot predictor.
+    """Slot predictor, conditioned on actions where there are any.
+
+    Note: OCVP-Seq attends over time without a mask. Here a frame sees its past only, so that a prediction does not
+    depend on what comes after it and keys and values can be kept; sizes and parameters are the same.
 
     Args:
         config: sizes; a layer is one block over objects and one over time.
         slot_dim: D.
-        action_dim: A, of all conditions together.
+        action_dim: A, of all conditions together; 0 has none.
 
     Example:
         >>> import torch
@@ -38,9 +41,10 @@ class OCVPSeq(AutoregressivePredictor):
         super().__init__(config)
         c = config
         self.embed_slots = nn.Linear(slot_dim, c.dim)
-        self.embed_action = nn.Linear(action_dim, c.dim)
-        self.objects = nn.ModuleList(TransformerBlock(c.dim, c.heads, c.head_dim, c.mlp_dim) for _ in range(c.layers))
-        self.time = nn.ModuleList(TransformerBlock(c.dim, c.heads, c.head_dim, c.mlp_dim) for _ in range(c.layers))
+        self.embed_action = nn.Linear(action_dim, c.dim) if action_dim else None
+        sizes = (c.dim, c.heads, c.head_dim, c.mlp_dim, c.project_out)
+        self.objects = nn.ModuleList(TransformerBlock(*sizes) for _ in range(c.layers))
+        self.time = nn.ModuleList(TransformerBlock(*sizes) for _ in range(c.layers))
         self.norm = nn.LayerNorm(c.dim)
         self.head = nn.Linear(c.dim, slot_dim)
         self._start_still()
@@ -49,15 +53,17 @@ class OCVPSeq(AutoregressivePredictor):
         self, slots: Tensor, condition: Condition, code: Tensor, mask: Tensor | None, past: Layers | None
     ) -> tuple[Tensor, Layers]:
         b, s, n = slots.shape[:3]
-        action = self.embed_action(torch.cat(condition, dim=-1)).unsqueeze(2)
-        x = torch.cat((self.embed_slots(slots), action), dim=2) + code
+        x = self.embed_slots(slots)
+        if self.embed_action is not None:
+            x = torch.cat((x, self.embed_action(torch.cat(condition, dim=-1)).unsqueeze(2)), dim=2)
+        x, m = x + code, x.shape[2]
         if mask is not None and mask.dim() > 2:
-            mask = mask.repeat_interleave(n + 1, dim=0)
+            mask = mask.repeat_interleave(m, dim=0)
         kept: Layers = []
         for i, (objects, time) in enumerate(zip(self.objects, self.time, strict=True)):
-            y, _ = objects(x.reshape(b * s, n + 1, -1))
-            y = y.view(b, s, n + 1, -1).transpose(1, 2).reshape(b * (n + 1), s, -1)
+            y, _ = objects(x.reshape(b * s, m, -1))
+            y = y.view(b, s, m, -1).transpose(1, 2).reshape(b * m, s, -1)
             y, keys_values = time(y, mask, None if past is None else past[i])
             kept.append(keys_values)
-            x = y.view(b, n + 1, s, -1).transpose(1, 2)
+            x = y.view(b, m, s, -1).transpose(1, 2)
         return self._output(x[:, :, :n], slots), kept

@@ -1,0 +1,1 @@
+"""What the models of the video comparison share: one protocol, one stage's clips."""

@@ -1,0 +1,62 @@
+"""The rows a predictor has in the table: as it is, and what puts its number in its place."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from playslot_rl.baselines.caddy.model import CADDY
+from playslot_rl.baselines.svg.model import SVG
+from playslot_rl.baselines.video.predictor import VideoPredictor
+from playslot_rl.baselines.video.scores import Predict, as_function
+
+
+class Row(NamedTuple):
+    """One row of a model.
+
+    Attributes:
+        name: empty for the model as it is.
+        sees: what it is told of the true future.
+        predict: see `Predict`.
+        shuffled: latents come from another clip.
+    """
+
+    name: str
+    sees: str
+    predict: Predict
+    shuffled: bool = False
+
+
+def method_rows(model: VideoPredictor, seed: int) -> list[Row]:
+    """All rows of a trained model.
+
+    Args:
+        model: in evaluation mode.
+        seed: S.
+    """
+    plain = as_function(model, seed)
+    if not model.infers:
+        return [Row("", "nothing", plain)]
+    rows = [Row("", "latents of the true future", plain), Row("latents of another clip", "nothing", plain, True)]
+    if isinstance(model, SVG):
+        rows.append(Row("latents drawn from the prior", "nothing", _from_prior(model, seed)))
+    if isinstance(model, CADDY):
+        rows.append(Row("actions alone, v = 0", "actions of the true future", _without_variability(model, seed)))
+    return rows
+
+
+def _from_prior(model: SVG, seed: int) -> Predict:
+    def predict(frames: Tensor, donors: Tensor | None, actions: Tensor | None) -> Tensor:  # noqa: ARG001
+        return model.sample(frames, seed, torch.Generator(frames.device).manual_seed(0))
+
+    return predict
+
+
+def _without_variability(model: CADDY, seed: int) -> Predict:
+    def predict(frames: Tensor, donors: Tensor | None, actions: Tensor | None) -> Tensor:  # noqa: ARG001
+        latents = model.infer(frames)
+        return model.rollout(frames[:, :seed], latents._replace(v=torch.zeros_like(latents.v)))
+
+    return predict

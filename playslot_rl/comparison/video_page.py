@@ -1,0 +1,185 @@
+"""`video.md`, its plot and its picture sheets.
+
+Shapes: P predicted frames, H W image height and width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.progress import format_seconds
+from playslot_rl.visualization.charts import VIDEO_STYLES, Theme, legend, new_figure, style_axes
+from playslot_rl.visualization.document import table
+from playslot_rl.visualization.grid import image_grid
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+LAST_FRAME = "last seed frame, repeated"
+RECONSTRUCTION = "SAVi's reconstruction of the true frames"
+
+PAPER = {
+    "block_push": {"svg": "20.96 / 0.898", "caddy": "21.18 / 0.901", "slotformer": "17.22 / 0.729",
+                   "ocvp_seq": "17.26 / 0.751", "playslot": "21.41 / 0.890"},
+    "button_press": {"svg": "32.23 / 0.950", "caddy": "24.58 / 0.853", "slotformer": "19.52 / 0.762",
+                     "ocvp_seq": "19.55 / 0.762", "playslot": "26.03 / 0.878"},
+    "grid_shapes": {"svg": "38.10 / 0.988", "caddy": "39.16 / 0.986", "slotformer": "19.74 / 0.795",
+                    "ocvp_seq": "18.86 / 0.791", "playslot": "54.09 / 0.996"},
+    "sketchy": {"svg": "24.24 / 0.813", "caddy": "23.65 / 0.809", "slotformer": "21.17 / 0.751",
+                "ocvp_seq": "21.23 / 0.752", "playslot": "24.43 / 0.815"},
+}  # fmt: skip
+"""PSNR and SSIM of the paper's Table 1 (6 seed frames, 15 predicted); larger models, other renderings, days of GPU."""
+
+
+def video_page(result: Mapping[str, Any]) -> str:
+    """The page, Markdown.
+
+    Args:
+        result: what `video.json` holds.
+    """
+    trained = result["trained"]
+    lead = (
+        f"Preset `{result['preset']}`, training seeds {', '.join(map(str, result['seeds']))}; clips of "
+        f"{trained['seed_frames']} and {trained['predicted_frames']} frames in training, the same videos for every "
+        f"method. Tested on {result['predicted_frames']} predicted frames of clips of episodes that no training and "
+        "no validation saw. Means over frames, clips and seeds; in brackets the 95 % bootstrap interval over clips. "
+        "What a model is told of the true future is a column: latents are inferred from it, as in the paper."
+    )
+    parts = [f"# {result['env']}: video prediction", lead, "![PSNR and SSIM over the step](video.png)"]
+    for shown in result["seed_frames"]:
+        parts += [f"## {shown} seed frame{'s' if shown > 1 else ''}", _scores(result, shown)]
+        parts.append(f"![True frames, and each model's](frames_{shown}.png)")
+    parts += ["## Training", _trainings(result), "## Footnotes", "\n".join(f"- {note}" for note in _notes(result))]
+    return "\n\n".join(parts) + "\n"
+
+
+def _scores(result: Mapping[str, Any], shown: int) -> str:
+    paper = PAPER.get(result["env"], {}) if shown == 6 and result["predicted_frames"] == 15 else {}
+    rows = [row for row in result["summary"] if row["seed_frames"] == shown]
+    rows.sort(
+        key=lambda row: (row["method"] is not None, result["methods"].index(row["method"]) if row["method"] else 0)
+    )
+    body = []
+    for row in rows:
+        title = f"{row['title']}, {row['row']}" if row["row"] else row["title"]
+        said = paper.get(row["method"], "–") if not row["row"] else "–"
+        body.append([title, *(_cell(row, name) for name in ("psnr", "ssim", "lpips")), row["sees"], said])
+    headers = ["", "PSNR, dB", "SSIM", "LPIPS", "told of the true future", "the paper's PSNR / SSIM"]
+    return table(headers, body)
+
+
+def _cell(row: Mapping[str, Any], name: str) -> str:
+    if row[name] is None:
+        return "not available"
+    digits = 2 if name == "psnr" else 3
+    low, high = row[f"{name}_ci95"]
+    return f"{row[name]:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def _trainings(result: Mapping[str, Any]) -> str:
+    body = []
+    for job in result["jobs"]:
+        if job["status"] != "done":
+            body.append([job["name"], job["status"], "–", "–", "–", "–", job["error"] or "–"])
+            continue
+        tried = ", ".join(f"{trial['rate']:g}: {trial['psnr']:.2f} dB" for trial in job["tried"] or [])
+        improving = {True: "still rising", False: "no longer rising", None: "one validation"}[job["still_improving"]]
+        ended = "–" if job["validation_psnr"] is None else f"{job['validation_psnr']:.2f} dB, {improving}"
+        body.append(
+            [
+                job["name"],
+                f"{job['parameters']:,}",
+                f"{job['steps']:,}",
+                format_seconds(job["train_seconds"]),
+                f"{job['rate']:g}",
+                tried or "–",
+                ended,
+            ]
+        )
+    return table(["training", "parameters", "steps", "time", "learning rate, factor", "tried", "validation"], body)
+
+
+def _notes(result: Mapping[str, Any]) -> list[str]:
+    notes = [
+        (
+            "The last seed frame repeated is what every model has to exceed; SAVi's reconstruction of the true frames "
+            "is what no model on its slots can."
+        ),
+        "Latents of another clip: what a model loses by them is what its control brings.",
+        f"LPIPS: {result['lpips']}.",
+    ]
+    if "caddy" in result["methods"]:
+        notes.append(
+            f"CADDY's perceptual loss: {'on' if result['perceptual'] else 'off, no VGG19 weights were given'}."
+        )
+    failed = [f"**{job['name']}: failed.** {job['error']}" for job in result["jobs"] if job["status"] == "failed"]
+    waiting = [job["name"] for job in result["jobs"] if job["status"] not in ("done", "failed")]
+    notes += failed or ["Failures: none."]
+    if waiting:
+        notes.append(f"Not finished: {len(waiting)} of {len(result['jobs'])} trainings; the same command carries on.")
+    at = result["hardware"]
+    notes.append(
+        f"Made by `{result['command']}` at commit {result['commit'] or 'unknown'}; {at['machine']}, {at['cores']} "
+        f"cores, {at['gpu'] or 'no GPU'}; {format_seconds(result['seconds'])} in all."
+    )
+    return notes
+
+
+def video_figure(result: Mapping[str, Any], theme: Theme) -> Figure:
+    """PSNR and SSIM over the predicted step, one row of panels a number of seed frames.
+
+    Args:
+        result: what `video.json` holds.
+        theme: page.
+    """
+    shown = result["seed_frames"]
+    figure = new_figure(9.6, 0.6 + 3.1 * len(shown))
+    steps = np.arange(1, result["predicted_frames"] + 1)
+    for i, number in enumerate(shown):
+        for j, (name, label) in enumerate((("psnr", "PSNR, dB"), ("ssim", "SSIM"))):
+            axes = figure.add_subplot(len(shown), 2, 2 * i + j + 1)
+            rows = [r for r in result["summary"] if r["seed_frames"] == number and not r["row"]]
+            for row in rows:
+                _curve(axes, steps, row, name, theme)
+            axes.set_title(f"{number} seed frame{'s' if number > 1 else ''}", color=theme.text, fontsize=10)
+            axes.set_xlabel("predicted frame")
+            axes.set_ylabel(label)
+            style_axes(axes, theme)
+    legend(figure, theme, loc="outside lower center", ncols=4, fontsize=9)
+    return figure
+
+
+def _curve(axes: Any, steps: npt.NDArray[np.int64], row: Mapping[str, Any], name: str, theme: Theme) -> None:
+    style = VIDEO_STYLES.get(row["method"] or "")
+    colour = theme.series[7 if style is None else style.colour]
+    line = "-" if style is not None else "--" if row["title"] == RECONSTRUCTION else ":"
+    low, high = np.asarray(row[f"{name}_steps_ci95"]).T
+    axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)
+    marker = "" if style is None else style.marker
+    label = row["title"]
+    axes.plot(steps, row[f"{name}_steps"], line, color=colour, marker=marker, markersize=4, linewidth=1.4, label=label)
+
+
+def video_sheet(
+    truth: npt.NDArray[np.uint8], predictions: Mapping[str, npt.NDArray[np.uint8]], columns: int = 6
+) -> Image.Image:
+    """True frames and each model's, the first clips of the test, not chosen.
+
+    Args:
+        truth: (clips, P, H, W, 3).
+        predictions: of the same shape, by title.
+        columns: frames of each clip, evenly spread.
+    """
+    at = np.unique(np.linspace(0, truth.shape[1] - 1, min(columns, truth.shape[1])).round().astype(int))
+    strips: list[npt.NDArray[np.uint8]] = []
+    labels: list[str] = []
+    for clip in range(len(truth)):
+        for title, frames in {"true": truth, **predictions}.items():
+            strips.append(frames[clip, at])
+            labels.append(title)
+    return image_grid(np.stack(strips), labels, [f"+{step + 1}" for step in at])

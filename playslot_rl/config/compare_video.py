@@ -1,0 +1,78 @@
+"""Config of `playslot compare-video` (the group `compare_video` of the experiment's config)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final, Literal, get_args
+
+from playslot_rl.config.compare import LAUNCHERS
+from playslot_rl.config.plain import check
+from playslot_rl.config.roles import SEED, Checked, at_least, role, within
+
+VideoMethod = Literal["svg", "caddy", "slotformer", "ocvp_seq", "playslot", "playslot_m"]
+VIDEO_METHODS: Final[tuple[VideoMethod, ...]] = get_args(VideoMethod)
+"""`playslot` is the world model with InvDyn_S, `playslot_m` the one with InvDyn_M."""
+
+TITLES: Final[dict[VideoMethod, str]] = {
+    "svg": "SVG-LP",
+    "caddy": "CADDY",
+    "slotformer": "SlotFormer",
+    "ocvp_seq": "OCVP-Seq",
+    "playslot": "PlaySlot",
+    "playslot_m": "PlaySlot (InvDyn_M)",
+}
+ON_SLOTS: Final = ("slotformer", "ocvp_seq", "playslot", "playslot_m")
+
+
+@dataclass(frozen=True)
+class CompareVideoConfig(Checked):
+    """What is compared. On the command line the keys are `methods=`, `seeds=` and `hydra.launcher=`, without the
+    group's name.
+
+    Attributes:
+        methods: names of `VIDEO_METHODS`.
+        seeds: training seeds.
+        trained_seed, trained_frames: seed frames and predicted frames of a training clip, the same for all methods.
+        shown: numbers of seed frames that are tested, each with `predicted` frames after them.
+        predicted: frames that a test predicts.
+        test: data set the test clips are of; empty records one with `data.root` empty, and else keeps some of its
+            episodes.
+        tested: fraction of the episodes that are kept for the test where there is no such data set; validation clips,
+            which choose the learning rate, are of others.
+        episodes: expert episodes that a recorded test set has.
+        clips: clips of these that are scored, at most.
+        pictures: of so many of them the predictions are drawn.
+        minutes: wall-clock budget of each training, from its measured steps a second; 0 trains the preset's steps.
+        rates: factors of the preset's learning rate, of which each method takes the one that is best on validation
+            clips; one of them means no choice.
+        trial_steps: steps of each trial.
+        launcher, hydra: as for `compare`.
+    """
+
+    group = "compare_video."
+    methods: tuple[VideoMethod, ...] = ("svg", "caddy", "slotformer", "ocvp_seq", "playslot")
+    seeds: tuple[int, ...] = field(default=(0, 1, 2), metadata=SEED)
+    trained_seed: int = field(default=6, metadata=at_least(1))
+    trained_frames: int = field(default=8, metadata=at_least(1))
+    shown: tuple[int, ...] = field(default=(6, 1), metadata=at_least(1, "numbers of at least 1"))
+    predicted: int = field(default=15, metadata=at_least(1))
+    test: str = field(default="", metadata=role("folder"))
+    episodes: int = field(default=40, metadata=at_least(2))
+    tested: float = field(default=0.1, metadata=within(lambda share: 0 < share < 1, "a fraction in (0, 1)"))
+    clips: int = field(default=64, metadata=at_least(2))
+    pictures: int = field(default=3, metadata=at_least(1))
+    minutes: float = field(default=0.0, metadata=at_least(0, "0 (the preset's steps) or more"))
+    rates: tuple[float, ...] = field(default=(0.3, 1.0, 3.0), metadata=within(lambda rate: rate > 0, "above 0"))
+    trial_steps: int = field(default=150, metadata=at_least(2))
+    launcher: str = ""
+    hydra: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("methods", "seeds", "shown", "rates"):
+            values = getattr(self, name)
+            check(len(values) > 0, f"{self.group}{name}", values, "at least one")
+            check(len(set(values)) == len(values), f"{self.group}{name}", values, "each one once")
+        known = ", ".join(LAUNCHERS)
+        check(self.launcher in ("", *LAUNCHERS), "hydra.launcher", self.launcher, f"one of {known}")
+        check(not self.hydra or bool(self.launcher), "hydra", self.hydra, "hydra.launcher=NAME with it")

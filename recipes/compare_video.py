@@ -1,0 +1,161 @@
+"""`playslot compare-video methods=M,... seeds=S,... out=DIR`: video predictors side by side (docs/video.md)."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.errors import PlaySlotError
+from playslot_rl.recipes.run import parent_run
+
+TEST_SEED = 1_000_003
+"""Of a recorded test set: no collection of a preset has it, so that no shipped model has seen its episodes."""
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+
+def main(config: ExperimentConfig) -> None:
+    """Run what is missing, reuse what is done, write `OUT/video.json`, `.md`, `.png`, `.svg` and sheets of frames.
+
+    Raises:
+        ConfigError, DataError, CheckpointError: what is asked for cannot be compared; before anything is computed.
+        PlaySlotError: a job failed; the others have finished, and the table says so.
+        KeyboardInterrupt: Ctrl-C; the same command carries on.
+    """
+    from playslot_rl.comparison.launch import comparison_lock, open_comparison, run_due
+    from playslot_rl.comparison.video_plan import video_job_config, video_job_record, video_jobs
+    from playslot_rl.comparison.video_report import VideoComparison
+    from playslot_rl.evaluation.lpips import open_lpips
+
+    began, own = time.monotonic(), config.compare_video
+    out = Path(config.out or f"runs/video_{config.env.name}_{config.preset}")
+    run = parent_run(config, out) if config.run else ""
+    data = replace(config.data, tested=own.tested if config.data.root and not own.test else 0.0)
+    config = replace(config, out=str(out), run=run, data=data, demos=None)
+    lpips = open_lpips(config.metrics.lpips_weights)  # a wrong file is refused before anything is computed
+    if config.data.root:
+        _check_clips(config)
+    open_comparison(out)
+    with comparison_lock(out):
+        config = _prepare(config, out)
+        _check_clips(config)
+        parents, jobs = _parents(config), {}
+        for job in video_jobs(config, out):
+            jobs[job] = video_job_record(job, video_job_config(config, job, config.run), parents)
+        references, truth = _references(config, out, parents)
+        report = VideoComparison(config, out, jobs, references, truth, lpips.reason, began)
+        run_due("compare-video", report, own.launcher, own.hydra)
+        failed = [job for job in report.write() if job["status"] == "failed"]
+    print(report.table(), flush=True)
+    print(f"compare-video: {time.monotonic() - began:.0f} s, {out / 'video.md'}", flush=True)
+    if failed:
+        names = ", ".join(job["name"] for job in failed)
+        raise PlaySlotError(
+            f"compare-video: {len(failed)} of {len(jobs)} trainings failed ({names}), the others finished; "
+            f"{out / 'video.md'} says why, and the same command tries them again"
+        )
+
+
+def _check_clips(config: ExperimentConfig) -> None:
+    """Refuse data without enough clips, before anything long is computed.
+
+    Raises:
+        DataError: too few episodes, or none as long as a clip of training or test.
+    """
+    from playslot_rl.comparison.video_clips import open_clips
+    from playslot_rl.data.windows import Clips
+    from playslot_rl.training.record import open_videos
+
+    own = config.compare_video
+    for shown in own.shown:
+        open_clips(config, shown + own.predicted, own.clips)
+    trained = open_videos(config, config.data.root, "compare-video")
+    Clips(trained, own.trained_seed + own.trained_frames, config.data.validation, config.seed)
+
+
+def _prepare(config: ExperimentConfig, out: Path) -> ExperimentConfig:
+    """Record or find the videos, and train or find the SAVi that methods on slots share.
+
+    Raises:
+        DataError, CheckpointError, OutputError, TrainingError: see `playslot_rl.errors`.
+    """
+    from playslot_rl.collectors import collect
+    from playslot_rl.comparison.video_plan import uses_slots
+    from playslot_rl.envs import PROCEDURAL
+    from playslot_rl.recipes import train_slots
+    from playslot_rl.recipes.pipeline import collect_demos, collect_videos
+    from playslot_rl.training.runs import slots_checkpoint
+
+    own = config.compare_video
+    if not config.data.root:
+        data = collect_demos(config, out) if config.collect.learn_from_demos else config.data
+        config = replace(config, data=collect_videos(replace(config, data=data), out))
+        config = replace(config, data=replace(config.data, demos="", held_out=0))
+        if not own.test:
+            test, want = out / "data" / "test", config.collect
+            policy = "random" if config.env.name in PROCEDURAL else "expert"
+            collect(config, policy, own.episodes, want.expert_steps, test, TEST_SEED, config.workers)
+            config = replace(config, compare_video=replace(own, test=str(test)))
+    if uses_slots(config):
+        if config.run:
+            slots_checkpoint(config.run)
+        else:
+            model = out / "world_model"
+            train_slots.main(replace(config, out=str(model), run=""))
+            config = replace(config, run=str(model))
+    return config
+
+
+def _parents(config: ExperimentConfig) -> dict[str, str]:
+    from playslot_rl.comparison.video_clips import open_clips
+    from playslot_rl.comparison.video_plan import uses_slots
+    from playslot_rl.training.record import open_videos
+    from playslot_rl.training.runs import slots_checkpoint
+
+    parents = {
+        "videos": open_videos(config, config.data.root, "compare-video").fingerprint,
+        "test": open_clips(config, 2, 2)[0].fingerprint,
+    }
+    if uses_slots(config):
+        parents["slots"] = slots_checkpoint(config.run).fingerprint
+    return parents
+
+
+def _references(
+    config: ExperimentConfig, out: Path, parents: dict[str, str]
+) -> tuple[list[dict[str, Any]], dict[int, npt.NDArray[np.uint8]]]:
+    """Scores of the rows that need no training, and the true frames of the first clips."""
+    from playslot_rl.baselines.video.scores import as_function, score_clips
+    from playslot_rl.baselines.video.slots import LastFrame, Reconstruction
+    from playslot_rl.comparison.video_clips import open_clips
+    from playslot_rl.comparison.video_page import LAST_FRAME, RECONSTRUCTION
+    from playslot_rl.comparison.video_report import read_references
+    from playslot_rl.config import to_dict
+    from playslot_rl.evaluation.lpips import open_lpips
+    from playslot_rl.recipes.run import open_device
+    from playslot_rl.storage.atomic import write_json
+    from playslot_rl.training.runs import load_savi
+
+    own, device = config.compare_video, open_device(config)
+    network = open_lpips(config.metrics.lpips_weights).network
+    asked = [own.shown, own.predicted, own.clips, own.tested, network is not None]
+    print_ = hashlib.sha256(repr([asked, to_dict(config.env), sorted(parents.items())]).encode()).hexdigest()[:16]
+    models: dict[str, tuple[str, Any]] = {LAST_FRAME: ("nothing", LastFrame())}
+    if "slots" in parents:
+        models[RECONSTRUCTION] = ("the frames themselves", Reconstruction(load_savi(config.run, device)))
+    stored = read_references(out / "references.json", print_)
+    rows, truth = stored or [], {}
+    for shown in own.shown:
+        source, at = open_clips(config, shown + own.predicted, own.clips)
+        truth[shown] = source.frames[at[: own.pictures, shown:]]
+        for title, (sees, model) in models.items() if stored is None else ():
+            scores, _ = score_clips(as_function(model, shown), source, at, shown, device, lpips=network)
+            rows.append({"title": title, "sees": sees, "seed_frames": shown, **scores})
+    write_json(out / "references.json", {"fingerprint": print_, "rows": rows})
+    return rows, truth

@@ -1,0 +1,131 @@
+"""One training of a video comparison: the learning rate that suits it, the training, its scores on held-out clips.
+
+Started by `playslot_rl.recipes.compare_job`, which says how it ended.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from playslot_rl.config import ExperimentConfig, from_dict
+
+if TYPE_CHECKING:
+    from playslot_rl.comparison.video_plan import VideoJob
+
+
+def run(record: dict[str, Any]) -> None:
+    """Choose, train, score; finished parts are skipped.
+
+    Raises:
+        PlaySlotError: whatever the training or its data refuse.
+    """
+    from playslot_rl.comparison.video_plan import VideoJob
+
+    job = VideoJob(record["method"], int(record["seed"]), Path(record["out"]))
+    config = _chosen(job, from_dict(ExperimentConfig, record["config"]), record)
+    _train(job, config)
+    _score(job, config, record)
+
+
+def _train(job: VideoJob, config: ExperimentConfig) -> None:
+    from playslot_rl.recipes import train_baseline, train_dynamics
+
+    if job.trained_as == "playslot":
+        train_dynamics.main(config)
+    else:
+        train_baseline.main(config)
+
+
+def _chosen(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> ExperimentConfig:
+    """The config with the learning rate that was best after short trials, and the steps that fit the budget."""
+    from playslot_rl.comparison.video_plan import asked_of, training_of, with_training
+    from playslot_rl.storage.atomic import write_json
+
+    asked, own, path = asked_of(record), training_of(config, job.method), job.choice
+    stored = json.loads(path.read_text()) if path.is_file() else {}
+    if stored.get("fingerprint") != record["fingerprint"]:
+        tried = []
+        if len(asked.rates) > 1 or asked.minutes:
+            tried = [_trial(job, config, rate, asked.trial_steps) for rate in asked.rates]
+        best = max(tried, key=lambda trial: float(trial["psnr"])) if tried else {"rate": asked.rates[0]}
+        seconds = min((float(trial["seconds_a_step"]) for trial in tried), default=0.0)
+        steps = max(1, round(60 * asked.minutes / seconds)) if asked.minutes and seconds else own.steps
+        stored = {"fingerprint": record["fingerprint"], "rate": best["rate"], "steps": steps, "tried": tried}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, stored)
+    optim = replace(own.optim, lr=own.optim.lr * float(stored["rate"]))
+    return with_training(config, job.method, steps=int(stored["steps"]), optim=optim)
+
+
+def _trial(job: VideoJob, config: ExperimentConfig, rate: float, steps: int) -> dict[str, float]:
+    """Validation PSNR after a short training with a factor of the learning rate, and what a step takes."""
+    from playslot_rl.comparison.video_plan import training_of, with_training
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+
+    own = training_of(config, job.method)
+    out = job.trials / f"rate_{rate:g}"
+    optim = replace(own.optim, lr=own.optim.lr * rate, warmup_steps=min(own.optim.warmup_steps, steps // 4))
+    changes: dict[str, Any] = {"steps": steps, "optim": optim, "checkpoint_every": steps, "validate_every": steps}
+    _train(job, replace(with_training(config, job.method, **changes), out=str(out)))
+    done = read_stage(checkpoint_folder(out, job.stage), job.stage)
+    return {
+        "rate": rate,
+        "psnr": float(done.meta["metrics"].get("psnr", float("-inf"))),
+        "seconds_a_step": float(done.meta["seconds"]) / steps,
+    }
+
+
+def _score(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> None:
+    """Write `RUN/video.json` and the predictions of the first clips."""
+    import numpy as np
+
+    from playslot_rl.baselines.video.load import load_video
+    from playslot_rl.baselines.video.rows import method_rows
+    from playslot_rl.baselines.video.scores import score_clips
+    from playslot_rl.comparison.video_clips import open_clips
+    from playslot_rl.comparison.video_plan import asked_of
+    from playslot_rl.evaluation.lpips import open_lpips
+    from playslot_rl.recipes.run import open_device
+    from playslot_rl.storage.atomic import explain_write_errors, write_json
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+
+    asked, device, began = asked_of(record), open_device(config), time.monotonic()
+    model = load_video(job.trained_as, job.run, device)
+    done = read_stage(checkpoint_folder(job.run, job.stage), job.stage)
+    network = open_lpips(config.metrics.lpips_weights).network
+    scores, pictures = [], dict[str, Any]()
+    for shown in asked.shown:
+        source, rows = open_clips(config, shown + asked.predicted, asked.clips)
+        for row in method_rows(model, shown):
+            values, frames = score_clips(
+                row.predict, source, rows, shown, device, lpips=network, shuffled=row.shuffled, shown=asked.pictures
+            )
+            scores.append({"row": row.name, "seed_frames": shown, "sees": row.sees, **values})
+            if not row.name:
+                pictures[f"shown_{shown}"] = frames
+    with explain_write_errors(job.pictures):
+        np.savez_compressed(job.pictures, **pictures)
+    write_json(
+        job.scores,
+        {
+            "fingerprint": record["fingerprint"],
+            "scores": scores,
+            "metrics": done.meta["metrics"],
+            "validation": _validations(job),
+            "steps": done.meta["steps"],
+            "train_seconds": done.meta["seconds"],
+            "score_seconds": round(time.monotonic() - began, 1),
+            "choice": json.loads(job.choice.read_text()),
+        },
+    )
+
+
+def _validations(job: VideoJob) -> list[dict[str, float]]:
+    """PSNR on validation clips over the steps of the training."""
+    path = job.run / job.stage / "metrics.jsonl"
+    rows = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+    return [{"step": r["step"], "psnr": r["psnr"]} for r in rows if r.get("split") == "validation" and "psnr" in r]

@@ -1,0 +1,129 @@
+"""`playslot compare-video`: every method in one table, resumed, and refused in one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import playslot, refused, run_jobs_here, smoke
+
+from playslot_rl.config.compare_video import TITLES, VIDEO_METHODS
+
+METHODS = ",".join(VIDEO_METHODS)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A comparison of all methods on ButtonPress, from nothing."""
+    out = tmp_path_factory.mktemp("video") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        run_jobs_here(patch)
+        smoke("compare-video", "env=button_press", f"methods={METHODS}", f"out={out}")
+    return out
+
+
+def result(out: Path) -> dict[str, Any]:
+    values: dict[str, Any] = json.loads((out / "video.json").read_text())
+    return values
+
+
+def test_every_method_has_its_row_for_each_number_of_seed_frames(finished: Path) -> None:
+    found = result(finished)
+    plain = {(row["title"], row["seed_frames"]) for row in found["summary"] if not row["row"]}
+    references = {"last seed frame, repeated", "SAVi's reconstruction of the true frames"}
+    assert plain == {(title, shown) for title in {*TITLES.values(), *references} for shown in (2, 1)}
+    for row in found["summary"]:
+        assert len(row["psnr_steps"]) == 3
+        low, high = row["psnr_ci95"]
+        assert low <= row["psnr"] <= high
+        assert row["lpips"] is None
+
+
+def test_what_puts_a_number_in_its_place_stands_beside_it(finished: Path) -> None:
+    rows = {(row["method"], row["row"]) for row in result(finished)["summary"]}
+    shuffled = {method for method, row in rows if row == "latents of another clip"}
+    assert shuffled == {"svg", "caddy", "playslot", "playslot_m"}
+    assert ("svg", "latents drawn from the prior") in rows
+    assert ("caddy", "actions alone, v = 0") in rows
+
+
+def test_what_a_model_was_told_of_the_future_is_a_column(finished: Path) -> None:
+    told = {row["method"]: row["sees"] for row in result(finished)["summary"] if not row["row"]}
+    assert {told[name] for name in ("slotformer", "ocvp_seq")} == {"nothing"}
+    assert {told[name] for name in ("svg", "caddy", "playslot")} == {"latents of the true future"}
+
+
+def test_a_training_says_what_it_cost_and_whether_it_was_done(finished: Path) -> None:
+    for job in result(finished)["jobs"]:
+        assert job["status"] == "done"
+        assert job["parameters"] > 0
+        assert [trial["rate"] for trial in job["tried"]] == [1.0, 3.0]
+        assert job["rate"] == max(job["tried"], key=lambda trial: trial["psnr"])["rate"]
+        assert job["validation_psnr"] is not None
+
+
+def test_page_plot_and_sheets_are_there(finished: Path) -> None:
+    page = (finished / "video.md").read_text()
+    assert "| SVG-LP |" in page
+    assert "LPIPS: AlexNet's weights are not at hand" in page
+    for name in ("video.png", "video.svg", "frames_2.png", "frames_1.png"):
+        assert (finished / name).stat().st_size > 1000
+
+
+def test_all_models_predict_the_same_clips(finished: Path) -> None:
+    shapes = set()
+    for file in sorted(finished.glob("runs/*/video.npz")):
+        with np.load(file) as stored:
+            shapes.add(stored["shown_2"].shape)
+    assert shapes == {(2, 3, 64, 64, 3)}
+
+
+def test_the_same_command_trains_nothing_again_and_gives_the_same_numbers(finished: Path) -> None:
+    before = result(finished)
+    done = smoke("compare-video", "env=button_press", f"methods={METHODS}", f"out={finished}")
+    assert done.out.count("done before, skipped") == len(VIDEO_METHODS)
+    assert result(finished)["summary"] == before["summary"]
+
+
+@pytest.mark.usefixtures("started")
+def test_a_method_that_fails_leaves_a_row_that_says_so(finished: Path, tmp_path: Path) -> None:
+    """A learning rate that blows up ends one training, not the others."""
+    data = f"{finished}/data/random"
+    done = playslot(
+        "compare-video", "env=button_press", "preset=smoke", f"data.root={data}", "methods=svg,slotformer",
+        f"run={finished}/world_model", "baselines.svg.optim.lr=1e30", f"out={tmp_path / 'out'}", "threads=1",
+        "device=cpu",
+    )  # fmt: skip
+    assert done.code == 1
+    assert "1 of 2 trainings failed (svg-s0)" in done.err
+    status = {job["name"]: job["status"] for job in result(tmp_path / "out")["jobs"]}
+    assert status == {"svg-s0": "failed", "slotformer-s0": "done"}
+    assert "**svg-s0: failed.**" in (tmp_path / "out" / "video.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("methods=dreamer",), r"compare_video\.methods: got 'dreamer', expected one of svg, caddy"),
+        (("methods=svg,svg",), r"compare_video\.methods: .*each one once"),
+        (("seeds=-1",), r"compare_video\.seeds: got -1, expected a non-negative"),
+        (("compare_video.predicted=0",), r"compare_video\.predicted: got 0, expected at least 1"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
+    refused("compare-video", "preset=smoke", f"out={tmp_path / 'out'}", *arguments, message=message, code=2)
+    assert not (tmp_path / "out").exists()
+
+
+def test_clips_that_do_not_fit_are_refused_before_anything_is_trained(finished: Path, tmp_path: Path) -> None:
+    data, out = f"data.root={finished}/data/random", tmp_path / "out"
+    for change, message in (
+        ("compare_video.predicted=30", "got episodes of at most 7 frames .* expected at least one of 32"),
+        ("compare_video.trained_frames=30", "got episodes of at most 7 frames .* expected at least one of 32"),
+        ("compare_video.tested=0.9", "expected at least 4, two of them to train on"),
+    ):
+        refused("compare-video", "preset=smoke", data, "methods=svg", change, f"out={out}", message=message)
+        assert not out.exists()
