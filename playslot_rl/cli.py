@@ -132,14 +132,15 @@ COMMANDS: Final[dict[str, Command]] = {
         "Trains every model with every seed on the same clips, and predicts the same held-out ones, of any LeRobot "
         "data set with a camera (data.root=) or of videos recorded once into OUT/data. Writes OUT/video.json, .md, "
         ".png, .svg and sheets of frames. What is done is reused, so the same command carries on after a stop. Here "
-        "seeds= and methods= are lists; compare_video.minutes= gives every training the same time. SAVi is run=, or "
-        "trained once into OUT/world_model. Jobs run one after the other, or by a Hydra launcher, as those of compare.",
+        "seeds= and methods= are lists; compare_video.budget_minutes= gives every training the same time. SAVi is "
+        "run=, or trained once into OUT/world_model. Jobs run one after the other, or by a Hydra launcher, as those of "
+        "compare.",
         (
             (
                 "playslot compare-video env=block_push preset=compact methods=svg,caddy,slotformer,ocvp_seq,playslot "
                 "seeds=0 run=pretrained out=runs/video"
             ),
-            "playslot compare-video data.root=data/mine env=sketchy seeds=0 compare_video.minutes=15 out=runs/video",
+            "playslot compare-video data.root=data/mine env=sketchy compare_video.budget_minutes=15 out=runs/video",
         ),
     ),
     "demo": Command(

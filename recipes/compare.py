@@ -26,7 +26,7 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.recipes import compare_data
     from playslot_rl.recipes.run import parent_run
 
-    began = time.monotonic()
+    began, wanted = time.monotonic(), config.compare
     out = Path(config.out or f"runs/compare_{config.env.name}_{config.preset}")
     run = parent_run(config, out) if config.run else ""  # `pretrained` is the task's own
     config = replace(config, episodes=config.episodes or DEFAULT_EPISODES, out=str(out), run=run)
@@ -42,7 +42,7 @@ def main(config: ExperimentConfig) -> None:
             records[job] = job_record(job, own, parents.of(job))
         report = Comparison(config, out, records, began)
         report.references()
-        run_due("compare", report, config.compare.launcher, config.compare.hydra)
+        run_due("compare", report, wanted.launcher, wanted.hydra)
         failed = report.write()
     print(report.table(), flush=True)
     print(f"compare: {time.monotonic() - began:.0f} s, {out / 'comparison.md'}", flush=True)

@@ -49,11 +49,11 @@ def _chosen(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> 
     stored = json.loads(path.read_text()) if path.is_file() else {}
     if stored.get("fingerprint") != record["fingerprint"]:
         tried = []
-        if len(asked.rates) > 1 or asked.minutes:
+        if len(asked.rates) > 1 or asked.budget_minutes:
             tried = [_trial(job, config, rate, asked.trial_steps) for rate in asked.rates]
         best = max(tried, key=lambda trial: float(trial["psnr"])) if tried else {"rate": asked.rates[0]}
         seconds = min((float(trial["seconds_a_step"]) for trial in tried), default=0.0)
-        steps = max(1, round(60 * asked.minutes / seconds)) if asked.minutes and seconds else own.steps
+        steps = max(1, round(60 * asked.budget_minutes / seconds)) if asked.budget_minutes and seconds else own.steps
         stored = {"fingerprint": record["fingerprint"], "rate": best["rate"], "steps": steps, "tried": tried}
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, stored)

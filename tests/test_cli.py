@@ -27,6 +27,7 @@ COMMANDS = [
     "export",
     "pipeline",
     "compare",
+    "compare-video",
     "demo",
     "bench",
     "doctor",
@@ -81,7 +82,7 @@ def test_every_example_in_the_help_is_accepted(command: str, recipe: Callable[[s
         assert words[:2] == ["playslot", command]
         typed = [word for word in words[2:] if "=" in word]
         # Examples name runs that are not here: compose them as a command that reads no run.
-        assert compose(typed, command if command == "compare" else "collect")
+        assert compose(typed, command if command.startswith("compare") else "collect")
 
 
 def test_help_names_every_command_and_is_quick_to_load() -> None:

@@ -142,7 +142,7 @@ class VideoComparison:
             "seed_frames": list(own.shown),
             "predicted_frames": own.predicted,
             "trained": {"seed_frames": own.trained_seed, "predicted_frames": own.trained_frames},
-            "minutes": own.minutes,
+            "budget_minutes": own.budget_minutes,
             "lpips": self._reason or "available",
             "summary": summarise_video(jobs, self._references),
             "jobs": [{key: value for key, value in job.items() if key != "scores"} for job in jobs],

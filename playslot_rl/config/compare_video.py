@@ -42,7 +42,8 @@ class CompareVideoConfig(Checked):
         episodes: expert episodes that a recorded test set has.
         clips: clips of these that are scored, at most.
         pictures: of so many of them the predictions are drawn.
-        minutes: wall-clock budget of each training, from its measured steps a second; 0 trains the preset's steps.
+        budget_minutes: wall-clock budget of each training, from its measured steps a second; 0 trains the preset's
+            steps.
         rates: factors of the preset's learning rate, of which each method takes the one that is best on validation
             clips; one of them means no choice.
         trial_steps: steps of each trial.
@@ -61,7 +62,7 @@ class CompareVideoConfig(Checked):
     tested: float = field(default=0.1, metadata=within(lambda share: 0 < share < 1, "a fraction in (0, 1)"))
     clips: int = field(default=64, metadata=at_least(2))
     pictures: int = field(default=3, metadata=at_least(1))
-    minutes: float = field(default=0.0, metadata=at_least(0, "0 (the preset's steps) or more"))
+    budget_minutes: float = field(default=0.0, metadata=at_least(0, "0 (the preset's steps) or more"))
     rates: tuple[float, ...] = field(default=(0.3, 1.0, 3.0), metadata=within(lambda rate: rate > 0, "above 0"))
     trial_steps: int = field(default=150, metadata=at_least(2))
     launcher: str = ""

@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import DynamicsStageConfig, ExperimentConfig, VideoStageConfig, to_dict
 from playslot_rl.config.methods import METHODS
 from playslot_rl.recipes.run import open_device, open_run, parent_run, require_parent
 
@@ -58,7 +58,7 @@ def _record_on_slots(config: ExperimentConfig) -> StageRecord:
     run = open_run(config)
     slots = slots_checkpoint(parent_run(config, run))
     require_parent(config, run, slots, "image_size")
-    sizes = uncontrolled(config.model, getattr(config.baselines, config.method))
+    sizes = uncontrolled(config.model, config.baselines, config.method)
     return _record(config, to_dict(replace(sizes, savi=stage_model(slots)[0].savi)), {"slots": slots})
 
 
@@ -69,11 +69,13 @@ def _on_pixels(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.baselines.video.load import build_pixel_model
     from playslot_rl.seeding import global_seed
 
-    own, device = getattr(config.baselines, config.method), open_device(config)
+    own: VideoStageConfig = getattr(config.baselines, config.method)
+    device = open_device(config)
     with global_seed(config.seed, 0, config.method):
         model = build_pixel_model(config.method, config.baselines, config.env.image_size).to(device)
     clips = record.clips(own.seed_frames + own.predicted_frames)
-    stage = CADDYStage(model, clips, own) if isinstance(model, CADDY) else SVGStage(model, clips, own)
+    sizes = config.baselines
+    stage = CADDYStage(model, clips, sizes.caddy) if isinstance(model, CADDY) else SVGStage(model, clips, sizes.svg)
     return _training(config, record, stage, device)
 
 
@@ -86,8 +88,9 @@ def _on_slots(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.training.stage_dynamics import DynamicsStage
     from playslot_rl.world_model import WorldModel
 
-    own, device, slots = getattr(config.baselines, config.method), open_device(config), record.parents["slots"]
-    sizes = replace(uncontrolled(config.model, own), savi=stage_model(slots)[0].savi)
+    own: DynamicsStageConfig = getattr(config.baselines, config.method)
+    device, slots = open_device(config), record.parents["slots"]
+    sizes = replace(uncontrolled(config.model, config.baselines, config.method), savi=stage_model(slots)[0].savi)
     with global_seed(config.seed, 0, config.method):
         world = WorldModel(sizes, config.env)
     load_weights(slots, {"savi": world.savi})

@@ -194,11 +194,23 @@ def test_roles_say_what_each_key_counts_for() -> None:
     }
     call = {"out", "run", "episodes", "policy", "protocol", "workers", "collector", "device", "export"}
     assert keys_of(ExperimentConfig, "call") == call
-    machine = {"device", "threads", "workers", "logging", "collector", "compare", "preset", "out", "run"}
+    machine = {
+        "device",
+        "threads",
+        "workers",
+        "logging",
+        "collector",
+        "compare",
+        "compare_video",
+        "metrics",
+        "preset",
+        "out",
+        "run",
+    }
     named = {"data.root", "data.demos", "data.cache", "baselines.lapo.world", "behaviour.policy_from"}
     measures = {"data.held_out", "collect.validation_episodes"}
     assert keys_of(ExperimentConfig, "machine") == machine | named | measures
-    weights = {"slots.start_from", "baselines.caddy.perceptual"}
+    weights = {"slots.start_from", "baselines.caddy.perceptual", "metrics.lpips_weights", "compare_video.test"}
     assert keys_of(ExperimentConfig, "folder") == {"out", "run"} | weights | named
 
 

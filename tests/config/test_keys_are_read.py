@@ -26,6 +26,7 @@ LOOPS = (
     "playslot_rl/modules/predictors/",
     "playslot_rl/baselines/online/",
     "recipes/baselines/online.py",
+    "recipes/baselines/video.py",
 )
 """Where a config known only by its base class is any stage's; elsewhere it is a stage of exactly that class."""
 

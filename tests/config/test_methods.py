@@ -28,7 +28,7 @@ def test_every_spelling_of_a_method_is_that_method(name: str) -> None:
     if METHODS[name].actor:
         assert compose(wanted, "compare").compare.methods == (name,)
     else:
-        with pytest.raises(ConfigError, match=f"methods: got {name}, expected methods that act"):
+        with pytest.raises(ConfigError, match=f"methods: got '{name}', expected methods that act"):
             compose(wanted, "compare")
 
 

@@ -15,8 +15,6 @@ from playslot_rl.config import (
     CADDYConfig,
     EnvConfig,
     ModelConfig,
-    OCVPSeqConfig,
-    SlotFormerConfig,
     SVGConfig,
 )
 from playslot_rl.config.baselines import BaselinesConfig
@@ -50,8 +48,9 @@ def build_pixel_model(method: str, config: BaselinesConfig, image_size: int) -> 
     return SVG(config.svg, image_size) if method == "svg" else CADDY(config.caddy, image_size)
 
 
-def uncontrolled(model: ModelConfig, own: SlotFormerConfig | OCVPSeqConfig) -> ModelConfig:
-    """The sizes of a world model in which nothing is inferred and `own.predictor` predicts."""
+def uncontrolled(model: ModelConfig, config: BaselinesConfig, method: str) -> ModelConfig:
+    """The sizes of a world model in which nothing is inferred, and SlotFormer or OCVP-Seq predicts."""
+    own = config.slotformer if method == "slotformer" else config.ocvp_seq
     inverse = replace(model.inverse_dynamics, mode="none", variant="single")
     return replace(model, inverse_dynamics=inverse, predictor=own.predictor)
 
