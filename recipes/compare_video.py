@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -23,21 +24,34 @@ if TYPE_CHECKING:
 def main(config: ExperimentConfig) -> None:
     """Run what is missing, reuse what is done, write `OUT/video.json`, `.md`, `.png`, `.svg` and sheets of frames.
 
+    With `objects=` this is done for each number of them, in `OUT/objects_N`, and `OUT` gets the table of all.
+
     Raises:
         ConfigError, DataError, CheckpointError: what is asked for cannot be compared; before anything is computed.
         PlaySlotError: a job failed; the others have finished, and the table says so.
         KeyboardInterrupt: Ctrl-C; the same command carries on.
     """
+    config = replace(config, out=config.out or f"runs/video_{config.env.name}_{config.preset}")
+    if config.compare_video.objects:
+        from playslot_rl.recipes.compare_video_objects import each_number
+
+        each_number(config, compare)
+    else:
+        compare(config)
+
+
+def compare(config: ExperimentConfig) -> None:
+    """One comparison, into `config.out`; raises as `main` does."""
     from playslot_rl.comparison.launch import comparison_lock, open_comparison, run_due
-    from playslot_rl.comparison.video_plan import video_job_config, video_job_record, video_jobs
+    from playslot_rl.comparison.video_plan import check_variants, video_job_config, video_job_record, video_jobs
     from playslot_rl.comparison.video_report import VideoComparison
     from playslot_rl.evaluation.lpips import open_lpips
 
-    began, own = time.monotonic(), config.compare_video
-    out = Path(config.out or f"runs/video_{config.env.name}_{config.preset}")
+    began, own, out = time.monotonic(), config.compare_video, Path(config.out)
+    check_variants(config)
     run = parent_run(config, out) if config.run else ""
     data = replace(config.data, tested=own.tested if config.data.root and not own.test else 0.0)
-    config = replace(config, out=str(out), run=run, data=data, demos=None)
+    config = replace(config, run=run, data=data, demos=None)
     lpips = open_lpips(config.metrics.lpips_weights)  # a wrong file is refused before anything is computed
     if config.data.root:
         _check_clips(config)
@@ -68,13 +82,13 @@ def _check_clips(config: ExperimentConfig) -> None:
     Raises:
         DataError: too few episodes, or none as long as a clip of training or test.
     """
-    from playslot_rl.comparison.video_clips import open_clips
+    from playslot_rl.comparison.video_clips import open_clips, test_sets
     from playslot_rl.data.windows import Clips
     from playslot_rl.training.record import open_videos
 
     own = config.compare_video
-    for shown in own.shown:
-        open_clips(config, shown + own.predicted, own.clips)
+    for test, shown in itertools.product(test_sets(config).values(), own.shown):
+        open_clips(config, test, shown + own.predicted, own.clips)
     trained = open_videos(config, config.data.root, "compare-video")
     Clips(trained, own.trained_seed + own.trained_frames, config.data.validation, config.seed)
 
@@ -98,10 +112,13 @@ def _prepare(config: ExperimentConfig, out: Path) -> ExperimentConfig:
         config = replace(config, data=collect_videos(replace(config, data=data), out))
         config = replace(config, data=replace(config.data, demos="", held_out=0))
         if not own.test:
-            test, want = out / "data" / "test", config.collect
-            policy = "random" if config.env.name in PROCEDURAL else "expert"
-            collect(config, policy, own.episodes, want.expert_steps, test, TEST_SEED, config.workers)
-            config = replace(config, compare_video=replace(own, test=str(test)))
+            tests = {policy: out / "data" / "test" / policy for policy in own.tested_on}
+            if config.env.name in PROCEDURAL:
+                tests = {"random": out / "data" / "test" / "random"}  # there is no expert
+            for policy, test in tests.items():
+                steps = config.collect.expert_steps if policy == "expert" else config.collect.random_steps
+                collect(config, policy, own.episodes, steps, test, TEST_SEED, config.workers)
+            config = replace(config, compare_video=replace(own, test=",".join(map(str, tests.values()))))
     if uses_slots(config):
         if config.run:
             slots_checkpoint(config.run)
@@ -113,15 +130,14 @@ def _prepare(config: ExperimentConfig, out: Path) -> ExperimentConfig:
 
 
 def _parents(config: ExperimentConfig) -> dict[str, str]:
-    from playslot_rl.comparison.video_clips import open_clips
+    from playslot_rl.comparison.video_clips import open_clips, test_sets
     from playslot_rl.comparison.video_plan import uses_slots
     from playslot_rl.training.record import open_videos
     from playslot_rl.training.runs import slots_checkpoint
 
-    parents = {
-        "videos": open_videos(config, config.data.root, "compare-video").fingerprint,
-        "test": open_clips(config, 2, 2)[0].fingerprint,
-    }
+    parents = {"videos": open_videos(config, config.data.root, "compare-video").fingerprint}
+    for label, test in test_sets(config).items():
+        parents[f"test {label}".strip()] = open_clips(config, test, 2, 2)[0].fingerprint
     if uses_slots(config):
         parents["slots"] = slots_checkpoint(config.run).fingerprint
     return parents
@@ -129,11 +145,11 @@ def _parents(config: ExperimentConfig) -> dict[str, str]:
 
 def _references(
     config: ExperimentConfig, out: Path, parents: dict[str, str]
-) -> tuple[list[dict[str, Any]], dict[int, npt.NDArray[np.uint8]]]:
+) -> tuple[list[dict[str, Any]], dict[tuple[str, int], npt.NDArray[np.uint8]]]:
     """Scores of the rows that need no training, and the true frames of the first clips."""
     from playslot_rl.baselines.video.scores import as_function, score_clips
     from playslot_rl.baselines.video.slots import LastFrame, Reconstruction
-    from playslot_rl.comparison.video_clips import open_clips
+    from playslot_rl.comparison.video_clips import open_clips, test_sets
     from playslot_rl.comparison.video_page import LAST_FRAME, RECONSTRUCTION
     from playslot_rl.comparison.video_report import read_references
     from playslot_rl.config import to_dict
@@ -144,18 +160,18 @@ def _references(
 
     own, device = config.compare_video, open_device(config)
     network = open_lpips(config.metrics.lpips_weights).network
-    asked = [own.shown, own.predicted, own.clips, own.tested, network is not None]
+    asked = [own.shown, own.predicted, own.clips, own.tested, list(test_sets(config)), network is not None]
     print_ = hashlib.sha256(repr([asked, to_dict(config.env), sorted(parents.items())]).encode()).hexdigest()[:16]
     models: dict[str, tuple[str, Any]] = {LAST_FRAME: ("nothing", LastFrame())}
     if "slots" in parents:
         models[RECONSTRUCTION] = ("the frames themselves", Reconstruction(load_savi(config.run, device)))
     stored = read_references(out / "references.json", print_)
     rows, truth = stored or [], {}
-    for shown in own.shown:
-        source, at = open_clips(config, shown + own.predicted, own.clips)
-        truth[shown] = source.frames[at[: own.pictures, shown:]]
+    for (label, test), shown in itertools.product(test_sets(config).items(), own.shown):
+        source, at = open_clips(config, test, shown + own.predicted, own.clips)
+        truth[label, shown] = source.frames[at[: own.pictures, shown:]]
         for title, (sees, model) in models.items() if stored is None else ():
             scores, _ = score_clips(as_function(model, shown), source, at, shown, device, lpips=network)
-            rows.append({"title": title, "sees": sees, "seed_frames": shown, **scores})
+            rows.append({"title": title, "row": "", "sees": sees, "clips_of": label, "seed_frames": shown, **scores})
     write_json(out / "references.json", {"fingerprint": print_, "rows": rows})
     return rows, truth

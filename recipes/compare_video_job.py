@@ -5,6 +5,7 @@ Started by `playslot_rl.recipes.compare_job`, which says how it ended.
 
 from __future__ import annotations
 
+import itertools
 import json
 import time
 from dataclasses import replace
@@ -25,7 +26,7 @@ def run(record: dict[str, Any]) -> None:
     """
     from playslot_rl.comparison.video_plan import VideoJob
 
-    job = VideoJob(record["method"], int(record["seed"]), Path(record["out"]))
+    job = VideoJob(record["method"], int(record["seed"]), Path(record["out"]), record["variant"])
     config = _chosen(job, from_dict(ExperimentConfig, record["config"]), record)
     _train(job, config)
     _score(job, config, record)
@@ -86,7 +87,7 @@ def _score(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> N
     from playslot_rl.baselines.video.load import load_video
     from playslot_rl.baselines.video.rows import method_rows
     from playslot_rl.baselines.video.scores import score_clips
-    from playslot_rl.comparison.video_clips import open_clips
+    from playslot_rl.comparison.video_clips import open_clips, test_sets
     from playslot_rl.comparison.video_plan import asked_of
     from playslot_rl.evaluation.lpips import open_lpips
     from playslot_rl.recipes.run import open_device
@@ -98,15 +99,15 @@ def _score(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> N
     done = read_stage(checkpoint_folder(job.run, job.stage), job.stage)
     network = open_lpips(config.metrics.lpips_weights).network
     scores, pictures = [], dict[str, Any]()
-    for shown in asked.shown:
-        source, rows = open_clips(config, shown + asked.predicted, asked.clips)
+    for (label, test), shown in itertools.product(test_sets(config).items(), asked.shown):
+        source, rows = open_clips(config, test, shown + asked.predicted, asked.clips)
         for row in method_rows(model, shown):
             values, frames = score_clips(
                 row.predict, source, rows, shown, device, lpips=network, shuffled=row.shuffled, shown=asked.pictures
             )
-            scores.append({"row": row.name, "seed_frames": shown, "sees": row.sees, **values})
+            scores.append({"row": row.name, "clips_of": label, "seed_frames": shown, "sees": row.sees, **values})
             if not row.name:
-                pictures[f"shown_{shown}"] = frames
+                pictures[f"{label}_{shown}"] = frames
     with explain_write_errors(job.pictures):
         np.savez_compressed(job.pictures, **pictures)
     write_json(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.demonstrations import split_tested
 from playslot_rl.data.source import EpisodeFrames, open_sources
@@ -9,11 +11,18 @@ from playslot_rl.data.windows import IntArray, spread_windows
 from playslot_rl.errors import DataError
 
 
-def open_clips(config: ExperimentConfig, frames: int, count: int) -> tuple[EpisodeFrames, IntArray]:
-    """The test episodes, of `compare_video.test` or else those kept of `data.root`, and clips of them.
+def test_sets(config: ExperimentConfig) -> dict[str, str]:
+    """The data sets whose clips are tested, by folder name; one of them, or episodes kept of `data.root`, has none."""
+    roots = [part.strip() for part in config.compare_video.test.split(",") if part.strip()]
+    return {Path(root).name: root for root in roots} if len(roots) > 1 else {"": "".join(roots)}
+
+
+def open_clips(config: ExperimentConfig, test: str, frames: int, count: int) -> tuple[EpisodeFrames, IntArray]:
+    """Clips of a test set.
 
     Args:
-        config: `data`, `env`, `compare_video`.
+        config: `data`, `env`.
+        test: the data set; empty takes the episodes that are kept of `data.root`.
         frames: T, of a clip.
         count: clips, at most; they do not overlap, and are spread evenly over the episodes.
 
@@ -23,14 +32,14 @@ def open_clips(config: ExperimentConfig, frames: int, count: int) -> tuple[Episo
     Raises:
         DataError: too few episodes, none so long, fewer than two clips, or a data set that cannot be read.
     """
-    data, root = config.data, config.compare_video.test or config.data.root
-    size, resize = config.env.image_size, data.resize
-    source = open_sources(root, data.camera, data.cache, image_size=size, resize=resize)
-    tested = source if config.compare_video.test else split_tested(source, data.tested)[1]
+    data, size = config.data, config.env.image_size
+    source = open_sources(test or data.root, data.camera, data.cache, image_size=size, resize=data.resize)
+    tested = source if test else split_tested(source, data.tested)[1]
     rows = spread_windows(tested.starts, tested.lengths, frames, count, range(tested.episodes))
     if len(rows) < 2:
+        place, cure = ("compare_video.test", "") if test else ("data.root", ", or raise compare_video.tested")
         raise DataError(
-            f"data.root={root}: got {len(rows)} held-out clip of {frames} frames, expected at least 2: collect more "
-            "episodes, or raise compare_video.tested"
+            f"{place}={test or data.root}: got {len(rows)} held-out clip of {frames} frames, expected at least 2: "
+            f"collect more episodes{cure}"
         )
     return tested, rows

@@ -5,7 +5,8 @@ Shapes: P predicted frames, H W image height and width.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,7 +30,7 @@ PAPER = {
     "button_press": {"svg": "32.23 / 0.950", "caddy": "24.58 / 0.853", "slotformer": "19.52 / 0.762",
                      "ocvp_seq": "19.55 / 0.762", "playslot": "26.03 / 0.878"},
     "grid_shapes": {"svg": "38.10 / 0.988", "caddy": "39.16 / 0.986", "slotformer": "19.74 / 0.795",
-                    "ocvp_seq": "18.86 / 0.791", "playslot": "54.09 / 0.996"},
+                    "ocvp_seq": "18.86 / 0.791", "playslot_m": "54.09 / 0.996"},
     "sketchy": {"svg": "24.24 / 0.813", "caddy": "23.65 / 0.809", "slotformer": "21.17 / 0.751",
                 "ocvp_seq": "21.23 / 0.752", "playslot": "24.43 / 0.815"},
 }  # fmt: skip
@@ -51,23 +52,57 @@ def video_page(result: Mapping[str, Any]) -> str:
         "What a model is told of the true future is a column: latents are inferred from it, as in the paper."
     )
     parts = [f"# {result['env']}: video prediction", lead, "![PSNR and SSIM over the step](video.png)"]
-    for shown in result["seed_frames"]:
-        parts += [f"## {shown} seed frame{'s' if shown > 1 else ''}", _scores(result, shown)]
-        parts.append(f"![True frames, and each model's](frames_{shown}.png)")
+    for label, shown in itertools.product(result["tested_on"], result["seed_frames"]):
+        parts += [f"## {_heading(label, shown)}", _scores(result, label, shown)]
+        parts.append(f"![True frames, and each model's]({sheet_name(label, shown)})")
     parts += ["## Training", _trainings(result), "## Footnotes", "\n".join(f"- {note}" for note in _notes(result))]
     return "\n\n".join(parts) + "\n"
 
 
-def _scores(result: Mapping[str, Any], shown: int) -> str:
+def objects_page(found: Mapping[str, Mapping[str, Any]]) -> str:
+    """The page over numbers of objects, Markdown.
+
+    Args:
+        found: what `video.json` of each number holds, by the number.
+    """
+    first = next(iter(found.values()))
+    parts = [
+        f"# {first['env']}: video prediction over the number of objects",
+        "PSNR in dB and SSIM over the predicted frames; each number has its videos, its SAVi and a page of its own, "
+        "with intervals: " + ", ".join(f"[{number}](objects_{number}/video.md)" for number in found) + ".",
+    ]
+    for shown in first["seed_frames"]:
+        cells: dict[str, dict[str, str]] = {}
+        for number, result in found.items():
+            for row in result["summary"]:
+                if row["seed_frames"] == shown:
+                    title = f"{row['title']}, {row['row']}" if row["row"] else row["title"]
+                    cells.setdefault(title, {})[number] = f"{row['psnr']:.2f} / {row['ssim']:.3f}"
+        body = [[title, *(values.get(number, "–") for number in found)] for title, values in cells.items()]
+        parts += [f"## {_heading('', shown)}", table(["objects", *found], body)]
+    return "\n\n".join(parts) + "\n"
+
+
+def sheet_name(label: str, shown: int) -> str:
+    """File of the frames of a test set (empty where it is the only one) after some seed frames."""
+    return f"frames_{label}_{shown}.png" if label else f"frames_{shown}.png"
+
+
+def _heading(label: str, shown: int) -> str:
+    frames = f"{shown} seed frame{'s' if shown > 1 else ''}"
+    return f"{label} clips, {frames}" if label else frames
+
+
+def _scores(result: Mapping[str, Any], label: str, shown: int) -> str:
     paper = PAPER.get(result["env"], {}) if shown == 6 and result["predicted_frames"] == 15 else {}
-    rows = [row for row in result["summary"] if row["seed_frames"] == shown]
+    rows = [row for row in result["summary"] if (row["clips_of"], row["seed_frames"]) == (label, shown)]
     rows.sort(
         key=lambda row: (row["method"] is not None, result["methods"].index(row["method"]) if row["method"] else 0)
     )
     body = []
     for row in rows:
         title = f"{row['title']}, {row['row']}" if row["row"] else row["title"]
-        said = paper.get(row["method"], "–") if not row["row"] else "–"
+        said = "–" if row["row"] or row["variant"] else paper.get(row["method"], "–")
         body.append([title, *(_cell(row, name) for name in ("psnr", "ssim", "lpips")), row["sees"], said])
     headers = ["", "PSNR, dB", "SSIM", "LPIPS", "told of the true future", "the paper's PSNR / SSIM"]
     return table(headers, body)
@@ -113,6 +148,11 @@ def _notes(result: Mapping[str, Any]) -> list[str]:
         "Latents of another clip: what a model loses by them is what its control brings.",
         f"LPIPS: {result['lpips']}.",
     ]
+    if result["slots_of"] and not result["test"]:
+        notes.append(
+            f"The slots are those of {result['slots_of']}, trained elsewhere; where its videos were these, it may have "
+            "seen the episodes that are tested. The rows of the models on frames have not."
+        )
     if "caddy" in result["methods"]:
         notes.append(
             f"CADDY's perceptual loss: {'on' if result['perceptual'] else 'off, no VGG19 weights were given'}."
@@ -131,32 +171,42 @@ def _notes(result: Mapping[str, Any]) -> list[str]:
 
 
 def video_figure(result: Mapping[str, Any], theme: Theme) -> Figure:
-    """PSNR and SSIM over the predicted step, one row of panels a number of seed frames.
+    """PSNR and SSIM over the predicted step, one row of panels a test set and number of seed frames.
 
     Args:
         result: what `video.json` holds.
         theme: page.
     """
-    shown = result["seed_frames"]
+    from matplotlib.ticker import MaxNLocator
+
+    shown = list(itertools.product(result["tested_on"], result["seed_frames"]))
     figure = new_figure(9.6, 0.6 + 3.1 * len(shown))
     steps = np.arange(1, result["predicted_frames"] + 1)
-    for i, number in enumerate(shown):
+    for i, (clips, number) in enumerate(shown):
         for j, (name, label) in enumerate((("psnr", "PSNR, dB"), ("ssim", "SSIM"))):
             axes = figure.add_subplot(len(shown), 2, 2 * i + j + 1)
-            rows = [r for r in result["summary"] if r["seed_frames"] == number and not r["row"]]
+            here = [r for r in result["summary"] if (r["clips_of"], r["seed_frames"]) == (clips, number)]
+            rows = [row for row in here if not row["row"]]
+            variants = [row["title"] for row in rows if row["variant"]]
             for row in rows:
-                _curve(axes, steps, row, name, theme)
-            axes.set_title(f"{number} seed frame{'s' if number > 1 else ''}", color=theme.text, fontsize=10)
+                _curve(axes, steps, row, name, theme, variants)
+            axes.set_title(_heading(clips, number), color=theme.text, fontsize=10)
             axes.set_xlabel("predicted frame")
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             axes.set_ylabel(label)
             style_axes(axes, theme)
     legend(figure, theme, loc="outside lower center", ncols=4, fontsize=9)
     return figure
 
 
-def _curve(axes: Any, steps: npt.NDArray[np.int64], row: Mapping[str, Any], name: str, theme: Theme) -> None:
+def _curve(
+    axes: Any, steps: npt.NDArray[np.int64], row: Mapping[str, Any], name: str, theme: Theme, variants: Sequence[str]
+) -> None:
     style = VIDEO_STYLES.get(row["method"] or "")
-    colour = theme.series[7 if style is None else style.colour]
+    number = 7 if style is None else style.colour
+    if row["variant"]:  # of one method: each has a colour of its own
+        number = variants.index(row["title"]) % 7
+    colour = theme.series[number]
     line = "-" if style is not None else "--" if row["title"] == RECONSTRUCTION else ":"
     low, high = np.asarray(row[f"{name}_steps_ci95"]).T
     axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)

@@ -10,10 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl.comparison.plan import absolute
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.compare_video import ON_SLOTS, TITLES, CompareVideoConfig, VideoMethod
 from playslot_rl.config.methods import MethodName
 from playslot_rl.config.roles import without
+from playslot_rl.errors import ConfigError
+
+NOT_OF_A_JOB = ("methods", "seeds", "vary", "values", "objects", "launcher", "hydra")
+"""Settings of the whole comparison: another choice of them leaves a job as it is."""
 
 
 @dataclass(frozen=True)
@@ -24,21 +28,23 @@ class VideoJob:
         method: what is trained.
         seed: of the training.
         out: folder of the comparison.
+        variant: setting and value it is trained with, as `mode=hybrid`; empty trains it as the config says.
     """
 
     method: VideoMethod
     seed: int
     out: Path
+    variant: str = ""
 
     @property
     def name(self) -> str:
-        """Such as `svg-s0`."""
-        return f"{self.method}-s{self.seed}"
+        """Such as `svg-s0`, or `playslot-mode=hybrid-s0`."""
+        return "-".join(part for part in (self.method, self.variant, f"s{self.seed}") if part)
 
     @property
     def title(self) -> str:
         """As tables and plots name it."""
-        return TITLES[self.method]
+        return f"{TITLES[self.method]}, {self.variant}" if self.variant else TITLES[self.method]
 
     @property
     def trained_as(self) -> MethodName:
@@ -89,7 +95,49 @@ class VideoJob:
 def video_jobs(config: ExperimentConfig, out: Path) -> list[VideoJob]:
     """All trainings, in the order in which they run: the methods side by side, seed by seed."""
     wanted = config.compare_video
-    return [VideoJob(method, seed, out) for seed in wanted.seeds for method in wanted.methods]
+    name = wanted.vary.rpartition(".")[2]
+    variants = [f"{name}={value}" for value in wanted.values] or [""]
+    return [
+        VideoJob(method, seed, out, variant)
+        for seed in wanted.seeds
+        for method in wanted.methods
+        for variant in (variants if method.startswith("playslot") else [""])
+    ]
+
+
+def check_variants(config: ExperimentConfig) -> None:
+    """Refuse a setting that is not there, and values it cannot have.
+
+    Raises:
+        ConfigError: one line.
+    """
+    own = config.compare_video
+    for value in own.values:
+        _with_setting(config, own.vary, value)
+
+
+def _parsed(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text  # a name, such as `hybrid`
+
+
+def _with_setting(config: ExperimentConfig, key: str, text: str) -> ExperimentConfig:
+    """The config with one setting under `model` or `dynamics` changed."""
+    values = to_dict(config)
+    group, _, name = key.rpartition(".")
+    at: Any = values
+    for part in group.split("."):
+        at = at.get(part, {}) if isinstance(at, dict) else {}
+    settable = key.startswith(("model.", "dynamics.")) and name in at and not isinstance(at[name], dict)
+    if not settable:
+        raise ConfigError(f"vary: got {key!r}, expected a setting under model or dynamics")
+    at[name] = _parsed(text)
+    try:
+        return from_dict(ExperimentConfig, values)
+    except ValueError as error:
+        raise ConfigError(f"values: got {text!r} for {key}: {error}") from None
 
 
 def uses_slots(config: ExperimentConfig) -> bool:
@@ -119,9 +167,11 @@ def video_job_config(config: ExperimentConfig, job: VideoJob, world: str) -> Exp
         world: run folder of the SAVi, or `pretrained`.
     """
     own = config.compare_video
-    if job.method == "playslot_m":
-        inverse = replace(config.model.inverse_dynamics, variant="multi")
+    if job.trained_as == "playslot":  # whatever the task brings: the two rows are these two
+        inverse = replace(config.model.inverse_dynamics, variant="multi" if job.method == "playslot_m" else "single")
         config = replace(config, model=replace(config.model, inverse_dynamics=inverse))
+    if job.variant:
+        config = _with_setting(config, own.vary, job.variant.partition("=")[2])
     config = with_training(config, job.method, seed_frames=own.trained_seed, predicted_frames=own.trained_frames)
     data = replace(
         config.data,
@@ -133,7 +183,7 @@ def video_job_config(config: ExperimentConfig, job: VideoJob, world: str) -> Exp
     )
     return replace(
         config,
-        compare_video=replace(own, test=absolute(own.test)),
+        compare_video=replace(own, test=",".join(absolute(part.strip()) for part in own.test.split(",") if part)),
         method=job.trained_as,
         seed=job.seed,
         data=data,
@@ -152,7 +202,7 @@ def video_job_record(job: VideoJob, config: ExperimentConfig, parents: Mapping[s
         parents: fingerprints of the slots and the videos it builds on.
     """
     own = to_dict(config.compare_video)
-    asked = {key: own[key] for key in own if key not in ("methods", "seeds", "launcher", "hydra")}
+    asked = {key: own[key] for key in own if key not in NOT_OF_A_JOB}
     result = without(config, "machine")
     result.pop("compare_video", None)
     result["baselines"] = result["baselines"].get(job.method, {})  # another method's settings are none of this job's
@@ -163,6 +213,7 @@ def video_job_record(job: VideoJob, config: ExperimentConfig, parents: Mapping[s
         "name": job.name,
         "method": job.method,
         "seed": job.seed,
+        "variant": job.variant,
         "out": absolute(str(job.out)),
         "asked": asked,
         "fingerprint": hashlib.sha256(identity.encode()).hexdigest()[:16],
@@ -172,6 +223,4 @@ def video_job_record(job: VideoJob, config: ExperimentConfig, parents: Mapping[s
 
 def asked_of(record: Mapping[str, Any]) -> CompareVideoConfig:
     """The comparison's settings that a job's file names."""
-    from playslot_rl.config.plain import from_dict
-
     return from_dict(CompareVideoConfig, dict(record["asked"]))

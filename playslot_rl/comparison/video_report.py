@@ -17,7 +17,8 @@ import numpy.typing as npt
 from playslot_rl.baselines.video.scores import bootstrap
 from playslot_rl.comparison.launch import Status, read_status
 from playslot_rl.comparison.report import count_parameters, read_json
-from playslot_rl.comparison.video_page import video_figure, video_page, video_sheet
+from playslot_rl.comparison.video_clips import test_sets
+from playslot_rl.comparison.video_page import sheet_name, video_figure, video_page, video_sheet
 from playslot_rl.comparison.video_plan import VideoJob
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.success import hardware
@@ -27,6 +28,8 @@ from playslot_rl.visualization.charts import LIGHT, figure_bytes
 from playslot_rl.visualization.grid import png
 
 METRICS = ("psnr", "ssim", "lpips")
+KIND = ("row", "sees", "clips_of", "seed_frames")
+"""What tells the scores of one training apart."""
 FALLING = 0.05
 """Gain in dB between the last two validations above which a training was not done."""
 
@@ -48,6 +51,7 @@ def job_summary(job: VideoJob, fingerprint: str) -> dict[str, Any]:
         "name": job.name,
         "method": job.method,
         "title": job.title,
+        "variant": job.variant,
         "seed": job.seed,
         "status": status.status,
         "error": status.error or None,
@@ -63,27 +67,25 @@ def job_summary(job: VideoJob, fingerprint: str) -> dict[str, Any]:
 
 
 def summarise_video(jobs: Sequence[Mapping[str, Any]], references: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """One row a method, kind of row and number of seed frames: means over training seeds and clips.
+    """One row a method, kind of row, test set and number of seed frames: means over training seeds and clips.
 
-    Keys: `method` (null for references), `title`, `row`, `sees`, `seed_frames`, `seeds`, `clips`, and for each of
-    `psnr`, `ssim` and `lpips` its mean, `NAME_ci95` (bootstrap over clips, of each clip's mean over the seeds and
-    steps), and `NAME_steps` with `NAME_steps_ci95` (P); null where it was not measured.
+    Keys: `method` (null for references), `title`, `variant`, `row`, `sees`, `clips_of`, `seed_frames`, `seeds`,
+    `clips`, and for each of `psnr`, `ssim` and `lpips` its mean, `NAME_ci95` (bootstrap over clips, of each clip's mean
+    over the seeds and steps), and `NAME_steps` with `NAME_steps_ci95` (P); null where it was not measured.
     """
     groups: dict[tuple[Any, ...], list[tuple[int | None, Mapping[str, Any]]]] = {}
     for job in jobs:
         for score in job["scores"]:
-            key = (job["method"], job["title"], score["row"], score["sees"], score["seed_frames"])
+            key = (job["method"], job["title"], job["variant"], *(score[name] for name in KIND))
             groups.setdefault(key, []).append((job["seed"], score))
     for score in references:
-        key = (None, score["title"], "", score["sees"], score["seed_frames"])
+        key = (None, score["title"], "", *(score[name] for name in KIND))
         groups.setdefault(key, []).append((None, score))
     rows = []
-    for (method, title, row, sees, shown), group in groups.items():
+    for key, group in groups.items():
         seeds = sorted(seed for seed, _ in group if seed is not None)
-        summary = {
-            "method": method, "title": title, "row": row, "sees": sees, "seed_frames": shown, "seeds": seeds,
-            "clips": len(group[0][1]["psnr"]),
-        }  # fmt: skip
+        summary = dict(zip(("method", "title", "variant", *KIND), key, strict=True))
+        summary |= {"seeds": seeds, "clips": len(group[0][1]["psnr"])}
         for name in METRICS:
             summary |= _of_metric(name, [score[name] for _, score in group])
         rows.append(summary)
@@ -110,7 +112,7 @@ class VideoComparison:
         out: its folder.
         jobs: all of them, with what their files say.
         references: scores of the rows that need no training, by number of seed frames.
-        truth: frames of the first clips by number of seed frames, uint8 (clips, P, H, W, 3).
+        truth: frames of the first clips by test set and number of seed frames, uint8 (clips, P, H, W, 3).
         lpips_reason: why LPIPS is not available; empty where it is.
         began: `time.monotonic()` at the start of the command.
     """
@@ -121,7 +123,7 @@ class VideoComparison:
         out: Path,
         jobs: Mapping[VideoJob, Mapping[str, Any]],
         references: Sequence[Mapping[str, Any]],
-        truth: Mapping[int, npt.NDArray[np.uint8]],
+        truth: Mapping[tuple[str, int], npt.NDArray[np.uint8]],
         lpips_reason: str,
         began: float,
     ) -> None:
@@ -139,6 +141,7 @@ class VideoComparison:
             "data": config.data.root,
             "methods": list(own.methods),
             "seeds": list(own.seeds),
+            "tested_on": list(test_sets(config)),
             "seed_frames": list(own.shown),
             "predicted_frames": own.predicted,
             "trained": {"seed_frames": own.trained_seed, "predicted_frames": own.trained_frames},
@@ -146,6 +149,8 @@ class VideoComparison:
             "lpips": self._reason or "available",
             "summary": summarise_video(jobs, self._references),
             "jobs": [{key: value for key, value in job.items() if key != "scores"} for job in jobs],
+            "test": own.test,
+            "slots_of": "" if config.run == str(self.out / "world_model") else config.run,
             "perceptual": bool(config.baselines.caddy.perceptual),
             "seconds": round(self._spent + time.monotonic() - self._began, 1),
             "command": made["command"],
@@ -157,7 +162,11 @@ class VideoComparison:
     def ended(self, job: VideoJob) -> None:
         """Say how a job ended, and write what there is so far."""
         summary = job_summary(job, str(self.jobs[job]["fingerprint"]))
-        rates = [f"{np.mean(s['psnr']):.2f} dB after {s['seed_frames']}" for s in summary["scores"] if not s["row"]]
+        rates = [
+            f"{np.mean(s['psnr']):.2f} dB after {s['seed_frames']}{s['clips_of'] and ' of ' + s['clips_of']}"
+            for s in summary["scores"]
+            if not s["row"]
+        ]
         print(f"{job.name}: {summary['error'] or ', '.join(rates) or summary['status']}", flush=True)
         self.write(pictures=False)
 
@@ -173,19 +182,19 @@ class VideoComparison:
         if pictures:
             for kind in ("png", "svg"):
                 write_bytes(self.out / f"video.{kind}", figure_bytes(video_figure(result, LIGHT), LIGHT, kind))
-            for shown, truth in self.truth.items():
-                sheet = video_sheet(truth, self._predictions(shown))
-                write_bytes(self.out / f"frames_{shown}.png", png(sheet))
+            for (label, shown), truth in self.truth.items():
+                sheet = video_sheet(truth, self._predictions(f"{label}_{shown}"))
+                write_bytes(self.out / sheet_name(label, shown), png(sheet))
         return [job for job in result["jobs"] if job["status"] != "done"]
 
-    def _predictions(self, shown: int) -> dict[str, npt.NDArray[np.uint8]]:
+    def _predictions(self, name: str) -> dict[str, npt.NDArray[np.uint8]]:
         """Predictions of the first clips by title, of the first training seed that is done."""
         found: dict[str, npt.NDArray[np.uint8]] = {}
         for job in self.jobs:
             if job.title not in found and job.pictures.is_file():
                 with np.load(job.pictures) as stored:
-                    if f"shown_{shown}" in stored:
-                        found[job.title] = stored[f"shown_{shown}"]
+                    if name in stored:
+                        found[job.title] = stored[name]
         return found
 
     def table(self) -> str:

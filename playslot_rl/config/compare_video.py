@@ -26,8 +26,8 @@ ON_SLOTS: Final = ("slotformer", "ocvp_seq", "playslot", "playslot_m")
 
 @dataclass(frozen=True)
 class CompareVideoConfig(Checked):
-    """What is compared. On the command line the keys are `methods=`, `seeds=` and `hydra.launcher=`, without the
-    group's name.
+    """What is compared. On the command line the keys are `methods=`, `seeds=`, `vary=`, `values=`, `objects=` and
+    `hydra.launcher=`, without the group's name.
 
     Attributes:
         methods: names of `VIDEO_METHODS`.
@@ -35,11 +35,16 @@ class CompareVideoConfig(Checked):
         trained_seed, trained_frames: seed frames and predicted frames of a training clip, the same for all methods.
         shown: numbers of seed frames that are tested, each with `predicted` frames after them.
         predicted: frames that a test predicts.
-        test: data set the test clips are of; empty records one with `data.root` empty, and else keeps some of its
-            episodes.
+        test: data sets the test clips are of, separated by commas; each is a table of its own. Empty records them with
+            `data.root` empty, and else keeps some of its episodes.
+        tested_on: policies of the test sets that are recorded; of drawn clips there is but one kind.
         tested: fraction of the episodes that are kept for the test where there is no such data set; validation clips,
             which choose the learning rate, are of others.
-        episodes: expert episodes that a recorded test set has.
+        episodes: that a recorded test set has.
+        vary: setting under `model` or `dynamics` that PlaySlot is trained with in each of `values`, such as
+            `model.inverse_dynamics.mode`; empty trains it as the config says.
+        values: of that setting.
+        objects: with `env=grid_shapes`, numbers of objects: one comparison each, and one table of all.
         clips: clips of these that are scored, at most.
         pictures: of so many of them the predictions are drawn.
         budget_minutes: wall-clock budget of each training, from its measured steps a second; 0 trains the preset's
@@ -58,6 +63,10 @@ class CompareVideoConfig(Checked):
     shown: tuple[int, ...] = field(default=(6, 1), metadata=at_least(1, "numbers of at least 1"))
     predicted: int = field(default=15, metadata=at_least(1))
     test: str = field(default="", metadata=role("folder"))
+    tested_on: tuple[Literal["expert", "random"], ...] = ("expert",)
+    vary: str = ""
+    values: tuple[str, ...] = ()
+    objects: tuple[int, ...] = field(default=(), metadata=at_least(1, "numbers of at least 1"))
     episodes: int = field(default=40, metadata=at_least(2))
     tested: float = field(default=0.1, metadata=within(lambda share: 0 < share < 1, "a fraction in (0, 1)"))
     clips: int = field(default=64, metadata=at_least(2))
@@ -70,10 +79,12 @@ class CompareVideoConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("methods", "seeds", "shown", "rates"):
+        for name in ("methods", "seeds", "shown", "rates", "tested_on"):
+            check(len(getattr(self, name)) > 0, f"{self.group}{name}", getattr(self, name), "at least one")
+        for name in ("methods", "seeds", "shown", "rates", "tested_on", "values", "objects"):
             values = getattr(self, name)
-            check(len(values) > 0, f"{self.group}{name}", values, "at least one")
             check(len(set(values)) == len(values), f"{self.group}{name}", values, "each one once")
+        check(bool(self.vary) == bool(self.values), f"{self.group}values", self.values, "vary=SETTING and values=A,B")
         known = ", ".join(LAUNCHERS)
         check(self.launcher in ("", *LAUNCHERS), "hydra.launcher", self.launcher, f"one of {known}")
         check(not self.hydra or bool(self.launcher), "hydra", self.hydra, "hydra.launcher=NAME with it")

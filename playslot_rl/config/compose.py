@@ -26,7 +26,10 @@ CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
 CONTINUES: Final = frozenset({"evaluate", "export", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
-COMPARISONS: Final = {"compare": ("methods", "demos", "labels", "seeds"), "compare-video": ("methods", "seeds")}
+COMPARISONS: Final = {
+    "compare": ("methods", "demos", "labels", "seeds"),
+    "compare-video": ("methods", "seeds", "vary", "values", "objects"),
+}
 """Commands with a group of their own in the config, and its keys that go without its name."""
 SHIPPED: Final = "pretrained"
 """`run=pretrained` names the task's shipped world model, `run=pretrained/ENV` one of them: no run folders."""

@@ -11,6 +11,7 @@ from playslot_rl.baselines.caddy.model import CADDY
 from playslot_rl.baselines.svg.model import SVG
 from playslot_rl.baselines.video.predictor import VideoPredictor
 from playslot_rl.baselines.video.scores import Predict, as_function
+from playslot_rl.baselines.video.slots import SlotVideo
 
 
 class Row(NamedTuple):
@@ -39,7 +40,8 @@ def method_rows(model: VideoPredictor, seed: int) -> list[Row]:
     plain = as_function(model, seed)
     if not model.infers:
         return [Row("", "nothing", plain)]
-    rows = [Row("", "latents of the true future", plain), Row("latents of another clip", "nothing", plain, True)]
+    told = "actions" if isinstance(model, SlotVideo) and model.needs_actions else "latents"
+    rows = [Row("", f"{told} of the true future", plain), Row(f"{told} of another clip", "nothing", plain, True)]
     if isinstance(model, SVG):
         rows.append(Row("latents drawn from the prior", "nothing", _from_prior(model, seed)))
     if isinstance(model, CADDY):

@@ -57,7 +57,7 @@ def score_clips(
         seed: S.
         device: where the model computes.
         lpips: network, or None.
-        shuffled: latents come from the next clip, so that none keeps its own.
+        shuffled: latents, or real actions, past the seed come from the next clip, so that none keeps its own.
         shown: of so many first clips the predictions are kept.
 
     Returns:
@@ -76,7 +76,12 @@ def score_clips(
         donors = normalise(source.pixels(rows[order[part]]).to(device)) if shuffled else None
         actions = None
         if source.actions is not None:
-            actions = torch.from_numpy(source.actions[rows[part][:, :-1]]).to(device)
+            moves = source.actions[rows[part][:, :-1]]
+            if shuffled:
+                moves = np.concatenate(
+                    (moves[:, : seed - 1], source.actions[rows[order[part]][:, seed - 1 : -1]]), axis=1
+                )
+            actions = torch.from_numpy(moves).to(device)
         predicted = predict(frames, donors, actions)
         scores = frame_scores(predicted, frames[:, seed:], lpips)
         for name, values in scores._asdict().items():
