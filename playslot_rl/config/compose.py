@@ -125,6 +125,11 @@ def _compare_keys(overrides: Sequence[str], command: str) -> list[str]:
         name = key.strip().lstrip("+")
         if equals and name in lists:
             inside = _unquote(value.strip()).removeprefix("[").removesuffix("]")
+            if name == "vary":  # one key, no list
+                kept.append(f"{group}.{name}={inside}")
+                continue
+            if name == "values":  # of whatever kind the setting is: text until then
+                inside = ",".join(_quote(_unquote(part.strip())) for part in inside.split(",") if part.strip())
             kept.append(f"{group}.{name}=[{inside}]")
         elif equals and name == "hydra.launcher":
             kept.append(f"{group}.launcher={value}")

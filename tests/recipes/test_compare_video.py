@@ -53,7 +53,7 @@ def test_what_puts_a_number_in_its_place_stands_beside_it(finished: Path) -> Non
 def test_what_a_model_was_told_of_the_future_is_a_column(finished: Path) -> None:
     told = {row["method"]: row["sees"] for row in result(finished)["summary"] if not row["row"]}
     assert {told[name] for name in ("slotformer", "ocvp_seq")} == {"nothing"}
-    assert {told[name] for name in ("svg", "caddy", "playslot")} == {"latents of the true future"}
+    assert {told[name] for name in ("svg", "caddy", "playslot", "playslot_m")} == {"latents of the true future"}
 
 
 def test_a_training_says_what_it_cost_and_whether_it_was_done(finished: Path) -> None:
@@ -111,6 +111,7 @@ def test_a_method_that_fails_leaves_a_row_that_says_so(finished: Path, tmp_path:
         (("methods=svg,svg",), r"compare_video\.methods: .*each one once"),
         (("seeds=-1",), r"compare_video\.seeds: got -1, expected a non-negative"),
         (("compare_video.predicted=0",), r"compare_video\.predicted: got 0, expected at least 1"),
+        (("vary=model.inverse_dynamics.mode",), r"compare_video\.values: got \(\), expected vary=SETTING and values="),
     ],
 )
 def test_what_cannot_be_asked_is_refused(tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
@@ -127,3 +128,60 @@ def test_clips_that_do_not_fit_are_refused_before_anything_is_trained(finished: 
     ):
         refused("compare-video", "preset=smoke", data, "methods=svg", change, f"out={out}", message=message)
         assert not out.exists()
+
+
+@pytest.mark.usefixtures("started")
+def test_a_setting_of_playslot_is_varied_on_two_kinds_of_clips(finished: Path, tmp_path: Path) -> None:
+    """Action representation in one command; real actions count as what they are."""
+    out, data = tmp_path / "out", finished / "data"
+    smoke(
+        "compare-video", "env=button_press", f"run={finished}/world_model", "methods=playslot",
+        f"data.root={data}/random", f"compare_video.test='{data}/test/expert,{data}/random'",
+        "vary=model.inverse_dynamics.mode", "values=discrete,ground_truth", "compare_video.rates=[1.0]", f"out={out}",
+    )  # fmt: skip
+    rows = [row for row in result(out)["summary"] if row["method"] and row["seed_frames"] == 2]
+    assert {(row["title"], row["row"], row["clips_of"]) for row in rows} == {
+        (f"PlaySlot, mode={mode}", row, clips)
+        for mode, shuffled in (("discrete", "latents of another clip"), ("ground_truth", "actions of another clip"))
+        for row in ("", shuffled)
+        for clips in ("expert", "random")
+    }
+    modes = {name: json.loads((out / "runs" / name / "config.json").read_text()) for name in
+             ("playslot-mode=discrete-s0", "playslot-mode=ground_truth-s0")}  # fmt: skip
+    assert [stored["model"]["inverse_dynamics"]["mode"] for stored in modes.values()] == ["discrete", "ground_truth"]
+    assert all((out / f"frames_{clips}_2.png").is_file() for clips in ("expert", "random"))
+
+
+@pytest.mark.usefixtures("started")
+def test_numbers_of_objects_have_one_table(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    smoke(
+        "compare-video", "env=grid_shapes", "methods=playslot,playslot_m", "objects=1,2", "slots.start_from=",
+        "compare_video.rates=[1.0]", f"out={out}",
+    )  # fmt: skip
+    found = result(out)["objects"]
+    assert list(found) == ["1", "2"]
+    for number, part in found.items():
+        run = json.loads((out / f"objects_{number}" / "runs" / "playslot-s0" / "config.json").read_text())
+        assert run["env"]["action_dim"] == 2 * int(number)
+        assert {row["method"] for row in part["summary"]} == {None, "playslot", "playslot_m"}
+    variants = [
+        json.loads((out / "objects_2" / "runs" / f"{name}-s0" / "config.json").read_text())["model"]["inverse_dynamics"]
+        for name in ("playslot", "playslot_m")
+    ]
+    assert [variant["variant"] for variant in variants] == ["single", "multi"]
+    assert "| PlaySlot (InvDyn_M) |" in (out / "video.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("vary=model.nothing", "values=1"), "vary: got 'model.nothing', expected a setting under model or dynamics"),
+        (("vary=model.inverse_dynamics.mode", "values=loud"), "values: got 'loud' for model.inverse_dynamics.mode"),
+        (("objects=1,2",), "objects: got a task or videos with a number of objects of their own"),
+    ],
+)
+def test_what_cannot_be_varied_is_refused(tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
+    out = tmp_path / "out"
+    refused("compare-video", "env=button_press", "methods=playslot", f"out={out}", *arguments, message=message)
+    assert not out.exists()
