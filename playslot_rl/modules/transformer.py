@@ -103,9 +103,11 @@ class SlotTokenEncoder(nn.Module):
         lead = slots.shape[:-2]
         tokens = self.to_token(self.norm(slots.reshape(-1, *slots.shape[-2:])))
         x = torch.cat((self.act_token.expand(tokens.shape[0], 1, -1), tokens), dim=1)
-        for block in self.blocks:
+        for block in self.blocks[:-1]:
             x, _ = block(x)
-        return x[:, 0].reshape(*lead, -1)
+        # Of the last layer nothing but [ACT] is read: the rest of it is not computed.
+        summary: Tensor = self.blocks[-1](x, wanted=slice(0, 1))[0]
+        return summary[:, 0].reshape(*lead, -1)
 
 
 def sinusoidal_code(length: int, dim: int) -> Tensor:

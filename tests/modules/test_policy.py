@@ -7,6 +7,7 @@ import torch
 from playslot_rl.config import ActionDecoderConfig, PolicyConfig
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.modules.transformer import SlotTokenEncoder
 
 SMALL = PolicyConfig(dim=16, layers=2, heads=2, head_dim=8, mlp_dim=32)
 
@@ -47,3 +48,17 @@ def test_decoded_actions_stay_inside_the_action_space() -> None:
     assert actions.abs().max() <= 1
     assert actions.abs().max() > 0.99
     assert sum(isinstance(layer, torch.nn.Linear) for layer in decoder.layers) == 3
+
+
+def test_the_last_layer_computes_the_act_token_alone_and_loses_nothing() -> None:
+    torch.manual_seed(0)
+    encoder, slots = SlotTokenEncoder(16, 32, 2, 2, 16, 64), torch.randn(3, 5, 16)
+    tokens = encoder.to_token(encoder.norm(slots))
+    x = torch.cat((encoder.act_token.expand(3, 1, -1), tokens), dim=1)
+    for block in encoder.blocks:
+        x, _ = block(x)
+    torch.testing.assert_close(encoder(slots), x[:, 0])
+    widths: list[tuple[int, ...]] = []
+    encoder.blocks[-1].mlp.register_forward_hook(lambda _module, given, _out: widths.append(tuple(given[0].shape)))
+    encoder(slots)
+    assert widths == [(3, 1, 32)]
