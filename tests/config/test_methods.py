@@ -30,7 +30,7 @@ def test_every_spelling_of_a_method_is_that_method(name: str) -> None:
     if acts:
         assert compose(wanted, "compare").compare.methods == (name,)
     elif name != "caddy":
-        with pytest.raises(ConfigError, match=f"methods: got {name}, expected methods that act"):
+        with pytest.raises(ConfigError, match=f"methods: got '{name}', expected methods that act"):
             compose(wanted, "compare")
 
 
