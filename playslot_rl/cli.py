@@ -74,10 +74,10 @@ COMMANDS: Final[dict[str, Command]] = {
     ),
     "train-baseline": Command(
         "one of the methods PlaySlot is compared with, as a run of its own",
-        "Trains method=slot_oracle, resnet_oracle, lapo, dreamer or sold (docs/baselines.md) into out=; `playslot "
-        "evaluate run=OUT` then measures it as it does PlaySlot. run= is the world model whose slots slot_oracle and "
-        "sold build on; settings come from env= and preset=, not from that run. demos=N takes the first N "
-        "demonstrations.",
+        "Trains method=slot_oracle, resnet_oracle, lapo, caddy_policy, caddy_oracle, dreamer or sold "
+        "(docs/baselines.md) into out=; `playslot evaluate run=OUT` then measures it as it does PlaySlot. run= is the "
+        "world model whose slots slot_oracle and sold build on; settings come from env= and preset=, not from that "
+        "run. demos=N takes the first N demonstrations.",
         (
             "playslot train-baseline method=slot_oracle run=pretrained data.demos=data/expert demos=50 out=runs/oracle",
             "playslot train-baseline method=lapo data.root=data/random data.demos=data/expert out=runs/lapo",

@@ -38,7 +38,7 @@ def main(config: ExperimentConfig) -> None:
         plain = replace(config, compare=CompareConfig(evaluation_seed=config.compare.evaluation_seed))
         parents, records = compare_data.Parents(config, out), {}
         for job in jobs(config, out):
-            own = job_config(plain, job, config.run, str(out / "lapo_world") if job.method == "lapo" else "")
+            own = job_config(plain, job, config.run)
             records[job] = job_record(job, own, parents.of(job))
         report = Comparison(config, out, records, began)
         report.references()

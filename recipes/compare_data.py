@@ -1,7 +1,8 @@
-"""What the jobs of a comparison share, made once: demonstrations, videos, the world model, LAPO's models."""
+"""What the jobs of a comparison share, made once: demonstrations, videos, the world model, other models of videos."""
 
 from __future__ import annotations
 
+import importlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -46,24 +47,25 @@ def prepare(config: ExperimentConfig, out: Path) -> ExperimentConfig:
     Raises:
         DataError, CheckpointError, OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.comparison.plan import uses_demos, uses_slots
+    from playslot_rl.comparison.plan import latent_models, model_folder, uses_demos, uses_slots
     from playslot_rl.recipes import train_dynamics, train_slots
-    from playslot_rl.recipes.baselines import lapo
     from playslot_rl.recipes.pipeline import collect_videos
 
-    methods = config.compare.methods
+    models = latent_models(config)
     world = uses_slots(config) and not config.run
     if uses_demos(config) or (world and config.collect.learn_from_demos):
         config = replace(config, data=_demos(config, out))
-    if (world or "lapo" in methods) and not config.data.root:
+    if (world or models) and not config.data.root:
         config = replace(config, data=collect_videos(config, out))
     if world:
         model = out / "world_model"
         for stage in (train_slots, train_dynamics):
             stage.main(replace(config, out=str(model), run=""))
         config = replace(config, run=str(model))
-    if "lapo" in methods:
-        lapo.train_model(replace(config, out=str(out / "lapo_world"), run="", method="lapo"), out / "lapo_world")
+    for name, method in models.items():
+        folder = model_folder(out, name)
+        recipe = importlib.import_module(f"playslot_rl.recipes.{METHODS[method].recipe}")
+        recipe.train_model(replace(config, out=str(folder), run="", method=method), folder)
     return config
 
 
@@ -121,17 +123,17 @@ class Parents:
     """
 
     def __init__(self, config: ExperimentConfig, out: Path) -> None:
-        from playslot_rl.comparison.plan import uses_demos, uses_slots
+        from playslot_rl.comparison.plan import latent_models, model_folder, uses_demos, uses_slots
         from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
         from playslot_rl.training.record import open_videos
         from playslot_rl.training.runs import world_model_checkpoints
 
         stages = world_model_checkpoints(config.run).items() if uses_slots(config) else ()
         self._world = {name: stage.fingerprint for name, stage in stages}
-        self._lapo = {}
-        if "lapo" in config.compare.methods:
-            stage = read_stage(checkpoint_folder(out / "lapo_world", "lapo_model"), "lapo_model")
-            self._lapo = {"lapo_model": stage.fingerprint}
+        self._models = {
+            stage: read_stage(checkpoint_folder(model_folder(out, stage), stage), stage).fingerprint
+            for stage in latent_models(config)
+        }
         self._demos = open_videos(config, config.data.demos, "compare") if uses_demos(config) else None
 
     def of(self, job: Job) -> dict[str, str]:
@@ -139,8 +141,8 @@ class Parents:
         from playslot_rl.data.demonstrations import first_demonstrations
 
         prints = dict(self._world) if METHODS[job.method].slots else {}
-        if job.method == "lapo":
-            prints |= self._lapo
+        if model := METHODS[job.method].model:
+            prints[model] = self._models[model]
         if job.demos is not None and self._demos is not None:
             prints["demos"] = first_demonstrations(self._demos, job.demos).fingerprint  # the draw is in its config
         return prints

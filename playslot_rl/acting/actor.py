@@ -14,11 +14,13 @@ from typing import Final, Literal
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import nn
 
 from playslot_rl import keys
+from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.world_model import frame_parser_module
+from playslot_rl.world_model import action_decoder_module, frame_parser_module
 
 RANDOM_STREAM: Final = 7
 """Keeps random actions apart from the environment's own stream of the same seed."""
@@ -108,6 +110,12 @@ class ReactiveActor(Actor):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The module's action."""
         return self.module(tensordict)
+
+
+def latent_actor(policy: nn.Module, decoder: ActionDecoder) -> Actor:
+    """The actor of a policy from frames (n, 3, H, W) to latent actions (n, Z), which a decoder turns into real ones."""
+    choose = TensorDictModule(policy, in_keys=[keys.PIXELS], out_keys=[keys.LATENT_ACTION])
+    return ReactiveActor(TensorDictSequential(choose, action_decoder_module(decoder)))
 
 
 class ExpertActor(Actor):

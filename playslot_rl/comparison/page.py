@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from playslot_rl.config.methods import METHODS
+from playslot_rl.config.methods import LATENT_MODELS, METHODS
 from playslot_rl.progress import format_seconds
 from playslot_rl.visualization.charts import METHOD_STYLES, Theme, legend, new_figure, step_axis, style_axes
 from playslot_rl.visualization.document import table
@@ -147,7 +147,7 @@ def _acting_cost(result: Result) -> list[str]:
 
 def _shared(result: Result) -> list[str]:
     """Models that were trained once, on unlabelled videos, for all demonstrations and seeds."""
-    notes, world, lapo = [], result.get("world_model"), result.get("lapo_model")
+    notes, world = [], result.get("world_model")
     rest = "the same for every number of demonstrations and every seed"
     if result["learn_from_demos"]:
         rest += "; the preset's own demonstrations are among them, as videos"
@@ -156,10 +156,10 @@ def _shared(result: Result) -> list[str]:
             f"World model of the methods on slots ({world['source']}; slots {world['fingerprints']['slots']}): "
             f"{world['seconds']:.0f} s of training on {world['episodes']} videos without actions, {rest}."
         )
-    if lapo:
+    for stage, model in result["latent_models"].items():
         notes.append(
-            f"LAPO's inverse and forward model: {lapo['seconds']:.0f} s of training on {lapo['episodes']} videos "
-            f"without actions, {rest}."
+            f"{LATENT_MODELS[stage]}: {model['seconds']:.0f} s of training on {model['episodes']} videos without "
+            f"actions, {rest}."
         )
     return notes
 

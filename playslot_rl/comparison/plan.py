@@ -69,6 +69,12 @@ class Job:
         return method_stage(self.method)
 
     @property
+    def model(self) -> Path | None:
+        """Run folder of the model of unlabelled videos that it takes, made once for all; None where it takes none."""
+        stage = METHODS[self.method].model
+        return model_folder(self.out, stage) if stage else None
+
+    @property
     def wave(self) -> int:
         """Those whose policy others take over come first; these would train it again, side by side."""
         return int(self.policy_of is not None)
@@ -95,7 +101,7 @@ def jobs(config: ExperimentConfig, out: Path) -> list[Job]:
 
 def _of_demonstrations(method: MethodName, demos: int, seed: int, out: Path, labels: Sequence[int]) -> list[Job]:
     """One job, or one for each number of labels where the method's policy needs none and serves them all."""
-    if not labels or method not in ("playslot", "lapo"):
+    if not labels or not METHODS[method].decodes:
         return [Job(method, demos, seed, out)]
     return [Job(method, demos, seed, out, n, None if n == labels[0] else labels[0]) for n in labels]
 
@@ -108,6 +114,16 @@ def uses_demos(config: ExperimentConfig) -> bool:
 def uses_slots(config: ExperimentConfig) -> bool:
     """Whether a method builds on a world model."""
     return any(METHODS[m].slots for m in config.compare.methods)
+
+
+def latent_models(config: ExperimentConfig) -> dict[str, MethodName]:
+    """Stages of the models of unlabelled videos that methods build on, and for each of them a method that does."""
+    return {METHODS[m].model: m for m in config.compare.methods if METHODS[m].model}
+
+
+def model_folder(out: Path, stage: str) -> Path:
+    """Run folder of such a model in a comparison: `OUT/lapo_world`, `OUT/caddy_world`."""
+    return out / f"{stage.removesuffix('_model')}_world"
 
 
 def check_comparison(config: ExperimentConfig) -> None:
@@ -167,7 +183,7 @@ def check_demos(config: ExperimentConfig, episodes: int, where: str) -> None:
         )
 
 
-def job_config(config: ExperimentConfig, job: Job, world: str, lapo_world: str) -> ExperimentConfig:
+def job_config(config: ExperimentConfig, job: Job, world: str) -> ExperimentConfig:
     """What a job trains with.
 
     Labels are the job's, else `behaviour.labelled_demos` or, with fewer demonstrations, all of them. PlaySlot's own
@@ -178,11 +194,12 @@ def job_config(config: ExperimentConfig, job: Job, world: str, lapo_world: str) 
         config: of the comparison, with `data` complete.
         job: which one.
         world: run folder of the world model, or `pretrained`.
-        lapo_world: run folder of LAPO's inverse and forward model.
     """
     labelled = job.labels or min(config.behaviour.labelled_demos, job.demos or config.behaviour.labelled_demos)
     policy = "" if job.policy_of is None else absolute(str(replace(job, labels=job.policy_of).run))
-    lapo = replace(config.baselines.lapo, world=absolute(lapo_world))
+    own = {}
+    if job.model is not None:
+        own = {job.method: replace(getattr(config.baselines, job.method), world=absolute(str(job.model)))}
     data = replace(
         config.data,
         root=",".join(absolute(part.strip()) for part in config.data.root.split(",")),
@@ -200,7 +217,7 @@ def job_config(config: ExperimentConfig, job: Job, world: str, lapo_world: str) 
         run=absolute(world) if METHODS[job.method].slots else "",
         protocol="simulation",
         behaviour=replace(config.behaviour, labelled_demos=labelled, oracle=False, policy_from=policy),
-        baselines=replace(config.baselines, lapo=lapo),
+        baselines=replace(config.baselines, **own),
         evaluation=replace(config.evaluation, references=False),
         logging=replace(config.logging, progress=False),
     )

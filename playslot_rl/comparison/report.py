@@ -14,7 +14,7 @@ from typing import Any
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.comparison.launch import Status, read_status
 from playslot_rl.comparison.page import comparison_figure, comparison_page, failures
-from playslot_rl.comparison.plan import Job, uses_slots
+from playslot_rl.comparison.plan import Job, latent_models, model_folder, uses_slots
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import shipped
 from playslot_rl.config.methods import METHODS
@@ -245,7 +245,7 @@ class Comparison:
             "references": self._references,
             "rows": rows,
             "world_model": self._world_model(),
-            "lapo_model": self._lapo_model(),
+            "latent_models": self._latent_models(),
             "learn_from_demos": config.collect.learn_from_demos,
             "frame_skip": config.env.frame_skip,
             "seconds": round(self._spent + time.monotonic() - self._began, 1),
@@ -270,9 +270,10 @@ class Comparison:
             "episodes": stages["slots"].meta.get("episodes"),
         }
 
-    def _lapo_model(self) -> dict[str, Any] | None:
-        """What all of LAPO's jobs share."""
-        if "lapo" not in self.config.compare.methods:
-            return None
-        stage = read_stage(checkpoint_folder(self.out / "lapo_world", "lapo_model"), "lapo_model")
-        return {name: stage.meta.get(name) for name in ("fingerprint", "seconds", "episodes")}
+    def _latent_models(self) -> dict[str, dict[str, Any]]:
+        """What all jobs of LAPO's share, and all of CADDY's, by stage."""
+        found = {}
+        for name in latent_models(self.config):
+            stage = read_stage(checkpoint_folder(model_folder(self.out, name), name), name)
+            found[name] = {key: stage.meta.get(key) for key in ("fingerprint", "seconds", "episodes")}
+        return found

@@ -4,6 +4,8 @@
 `to_dict` is its inverse; `fingerprint` names a config by its content (all three: `playslot_rl.config.plain`).
 """
 
+from playslot_rl.config.baselines import CADDYOracleConfig as CADDYOracleConfig
+from playslot_rl.config.baselines import CADDYPolicyConfig as CADDYPolicyConfig
 from playslot_rl.config.baselines import DreamerConfig as DreamerConfig
 from playslot_rl.config.baselines import LAPOConfig as LAPOConfig
 from playslot_rl.config.baselines import OnlineConfig as OnlineConfig

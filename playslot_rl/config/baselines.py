@@ -101,6 +101,43 @@ class LAPOConfig(Checked):
 
 
 @dataclass(frozen=True)
+class CADDYPolicyConfig(Checked):
+    """Schedule of CADDY's policy; its model is `baselines.caddy`. The action decoder's size is `model.action_decoder`,
+    its inputs, loss and labels are `behaviour`'s, as for PlaySlot.
+
+    Attributes:
+        shift: shift of frames in the policy's training, pixels.
+        policy: training of the policy.
+        decoder_steps: optimiser steps of the action decoder.
+        decoder_lr: its base learning rate; the rest is as for the policy.
+        world: run whose CADDY is taken; empty trains one on `data.root`.
+    """
+
+    group = "baselines.caddy_policy."
+    shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
+    policy: StageConfig = field(default_factory=lambda: _stage(20_000, 2e-4, "constant"))
+    decoder_steps: int = field(default=20_000, metadata=at_least(1))
+    decoder_lr: float = 2e-4
+    world: str = field(default="", metadata=role("machine", "folder"))
+
+
+@dataclass(frozen=True)
+class CADDYOracleConfig(Checked):
+    """Schedule of the CADDY Oracle; its model is `baselines.caddy`, its loss `behaviour.loss`.
+
+    Attributes:
+        shift: shift of frames in training, pixels.
+        policy: its training.
+        world: run whose CADDY is taken; empty trains one on `data.root`.
+    """
+
+    group = "baselines.caddy_oracle."
+    shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
+    policy: StageConfig = field(default_factory=lambda: _stage(20_000, 2e-4, "constant"))
+    world: str = field(default="", metadata=role("machine", "folder"))
+
+
+@dataclass(frozen=True)
 class OnlineConfig(Checked):
     """Acting, replay and schedule of a method that learns by acting.
 
@@ -289,5 +326,7 @@ class BaselinesConfig:
     sold: SOLDConfig = field(default_factory=SOLDConfig)
     svg: SVGConfig = field(default_factory=SVGConfig)
     caddy: CADDYConfig = field(default_factory=CADDYConfig)
+    caddy_policy: CADDYPolicyConfig = field(default_factory=CADDYPolicyConfig)
+    caddy_oracle: CADDYOracleConfig = field(default_factory=CADDYOracleConfig)
     slotformer: SlotFormerConfig = field(default_factory=SlotFormerConfig)
     ocvp_seq: OCVPSeqConfig = field(default_factory=OCVPSeqConfig)

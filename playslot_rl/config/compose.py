@@ -106,7 +106,9 @@ def _method_names(key: str, value: str) -> str:
     text = _unquote(value.strip())
     words = text.removeprefix("[").removesuffix("]").split(",")
     try:
-        names = ",".join(canonical_method(_unquote(word.strip())) for word in words if word.strip())
+        names = ",".join(
+            canonical_method(_unquote(word.strip()), key == "compare.methods") for word in words if word.strip()
+        )
     except ConfigError as error:
         raise ConfigError(f"{key}: {error}") from None
     return f"[{names}]" if text.startswith("[") else names

@@ -11,7 +11,7 @@ from playslot_rl.errors import ConfigError
 
 MethodName = Literal[
     "playslot", "slot_oracle", "resnet_oracle", "slot_bc", "resnet_bc", "lapo", "dreamer", "sold",
-    "svg", "caddy", "slotformer", "ocvp_seq",
+    "caddy_policy", "caddy_oracle", "svg", "caddy", "slotformer", "ocvp_seq",
 ]  # fmt: skip
 
 
@@ -28,6 +28,10 @@ class Method:
         slots: it builds on a world model's slots.
         stage: stage of its run whose checkpoint is the method's; empty means its name.
         labelled_only: it learns from labelled demonstrations alone; what they leave out, it never sees.
+        decodes: its policy clones latent actions and needs no label; a decoder reads those of the labelled
+            demonstrations.
+        model: stage of the model of unlabelled videos that it builds on, see `LATENT_MODELS`; its recipe has a
+            `train_model(config, run)`, and its group of `baselines` a key `world` that takes it from another run.
         aliases: what people call it besides its name and its title.
     """
 
@@ -38,11 +42,15 @@ class Method:
     slots: bool = False
     stage: str = ""
     labelled_only: bool = False
+    decodes: bool = False
+    model: str = ""
     aliases: tuple[str, ...] = ()
 
 
 METHODS: Final[dict[str, Method]] = {
-    "playslot": Method("PlaySlot", "train_policy", "playslot_rl.acting.agent:load_actor", slots=True, stage="policy"),
+    "playslot": Method(
+        "PlaySlot", "train_policy", "playslot_rl.acting.agent:load_actor", slots=True, stage="policy", decodes=True
+    ),
     "slot_oracle": Method(
         "Slot Oracle", "baselines.slot_oracle", "playslot_rl.baselines.oracles.slot:load_actor", slots=True
     ),
@@ -67,14 +75,25 @@ METHODS: Final[dict[str, Method]] = {
         stage="resnet_oracle",
         labelled_only=True,
     ),
-    "lapo": Method("LAPO", "baselines.lapo", "playslot_rl.baselines.lapo.load:load_actor"),
+    "lapo": Method(
+        "LAPO", "baselines.lapo", "playslot_rl.baselines.lapo.load:load_actor", decodes=True, model="lapo_model"
+    ),
     "dreamer": Method("DreamerV3", "baselines.online", "playslot_rl.baselines.dreamer.actor:load_actor", online=True),
     "sold": Method("SOLD", "baselines.online", "playslot_rl.baselines.sold.actor:load_actor", online=True, slots=True),
+    "caddy_policy": Method(
+        "CADDY", "baselines.caddy", "playslot_rl.baselines.caddy.load:load_policy", decodes=True, model="caddy"
+    ),
+    "caddy_oracle": Method(
+        "CADDY Oracle", "baselines.caddy", "playslot_rl.baselines.caddy.load:load_oracle", model="caddy"
+    ),
     "svg": Method("SVG-LP", "baselines.video", aliases=("SVG",)),
     "caddy": Method("CADDY", "baselines.video"),
     "slotformer": Method("SlotFormer", "baselines.video", slots=True),
     "ocvp_seq": Method("OCVP-Seq", "baselines.video", slots=True, aliases=("OCVP",)),
 }
+
+LATENT_MODELS: Final = {"lapo_model": "LAPO's inverse and forward model", "caddy": "CADDY's video model"}
+"""Models of unlabelled videos that methods build on, by stage: as pages name them. A comparison trains each once."""
 
 
 def method_stage(method: str) -> str:
@@ -82,8 +101,14 @@ def method_stage(method: str) -> str:
     return METHODS[method].stage or method
 
 
-def canonical_method(text: str) -> MethodName:
+def canonical_method(text: str, acting: bool = False) -> MethodName:
     """The method that somebody names, by its name, title or alias; case, spaces, `-` and `_` do not matter.
+
+    CADDY is two methods: `caddy` predicts videos, and `caddy_policy`, of the title CADDY, acts.
+
+    Args:
+        text: what was typed.
+        acting: a word that names two methods means the one that acts; else a name comes before a title.
 
     Raises:
         ConfigError: there is no such method.
@@ -91,9 +116,15 @@ def canonical_method(text: str) -> MethodName:
     Examples:
         >>> canonical_method("DreamerV3"), canonical_method("slot-oracle")
         ('dreamer', 'slot_oracle')
+        >>> canonical_method("CADDY"), canonical_method("CADDY", acting=True)
+        ('caddy', 'caddy_policy')
     """
     names: tuple[MethodName, ...] = get_args(MethodName)
-    known = {_plain(word): name for name in names for word in (name, METHODS[name].title, *METHODS[name].aliases)}
+    words = [(word, name) for name in names for word in (METHODS[name].title, *METHODS[name].aliases)]
+    words += [(name, name) for name in names]  # of equal words the last one counts
+    if acting:
+        words.sort(key=lambda pair: bool(METHODS[pair[1]].actor))
+    known = {_plain(word): name for word, name in words}
     if _plain(text) in known:
         return known[_plain(text)]
     near = difflib.get_close_matches(_plain(text), known, n=1)

@@ -23,6 +23,9 @@ from playslot_rl.config import ActionDecoderConfig
 from playslot_rl.modules.transformer import SlotTokenEncoder
 from playslot_rl.modules.whitening import Whitening
 
+SAME = 1e-6
+"""Standard deviation up to which numbers count as the same."""
+
 
 class ActionDecoder(nn.Module):
     """Real action from a latent action.
@@ -71,12 +74,17 @@ class ActionDecoder(nn.Module):
 
     @torch.no_grad()
     def standardise(self, z: Tensor) -> None:
-        """Take mean and scale, or the whitening, from latent actions (M, Z)."""
+        """Take mean and scale, or the whitening, from latent actions (M, Z).
+
+        A number that is the same in all of them keeps its scale: divided by next to nothing, one that differs later
+        would drown the others.
+        """
         if self.whitening is not None:
             self.whitening.fit(z)
             return
         self.mean.copy_(z.mean(dim=0))
-        self.scale.copy_(z.std(dim=0).clamp(min=1e-6))
+        spread = z.std(dim=0)
+        self.scale.copy_(torch.where(spread > SAME, spread, 1.0))
 
     def forward(self, z: Tensor, slots: Tensor | None = None) -> Tensor:
         """Latent actions (..., Z), and slots (..., N, D) if it reads them and there are some, to actions (..., A)."""

@@ -1,6 +1,6 @@
 """Supervised regression as a stage of `fit`: one network, inputs by row, targets by row.
 
-The oracles, the action decoders and LAPO's latent policy are all trained by it.
+The oracles, the action decoders and the baselines' latent policies are all trained by it.
 
 Shapes: M rows of training data, b rows of a batch, H W image height and width; inputs and targets have any shape after
 their first dimension.
@@ -199,12 +199,13 @@ class RegressionStage:
 
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
         """Unexplained fraction of the targets' variance, of each of the checks."""
-        return {name: self._unexplained(*examples) for name, examples in self.checks.items()}
+        return {name: unexplained(*self.compared(*examples)) for name, examples in self.checks.items()}
 
-    def _unexplained(self, inputs: Inputs, targets: Tensor) -> float:
+    def compared(self, inputs: Inputs, targets: Tensor) -> tuple[Tensor, Tensor]:
+        """The network's outputs, and the targets, on those of some examples that a validation looks at."""
         count = min(self.validated or len(targets), len(targets))
         rows = torch.linspace(0, len(targets) - 1, count, device=targets.device).long()
-        return unexplained(apply_rows(self.criterion.network, inputs, rows), targets[rows])
+        return apply_rows(self.criterion.network, inputs, rows), targets[rows]
 
 
 @torch.no_grad()

@@ -59,6 +59,8 @@ METHOD_STYLES: Final = {
     "resnet_oracle": MethodStyle(1, "v"),
     "slot_bc": MethodStyle(2, "<"),
     "resnet_bc": MethodStyle(1, ">"),
+    "caddy_policy": MethodStyle(6, "X"),
+    "caddy_oracle": MethodStyle(7, "p"),
     "dreamer": MethodStyle(3, "D"),
     "sold": MethodStyle(4, "P"),
 }

@@ -6,22 +6,17 @@ actions of `behaviour.labelled_demos` of them. `baselines.lapo.world=RUN` takes 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import adopt_policy, held_out_text, open_device, open_run, require_parent
+from playslot_rl.recipes.baselines.cloning import BEHAVIOUR, cloning, model_of
+from playslot_rl.recipes.run import open_device, open_run
 
 if TYPE_CHECKING:
     from playslot_rl.storage.checkpoints import StageCheckpoint
-    from playslot_rl.training.fit import Part
     from playslot_rl.training.record import StageRecord, Training
-
-
-BEHAVIOUR = ("labelled_demos", "decoder_inputs", "trim_pixels", "trim_margin")
-"""Settings of the behaviour stage that count for LAPO, too."""
 
 
 def main(config: ExperimentConfig) -> None:
@@ -34,15 +29,9 @@ def main(config: ExperimentConfig) -> None:
     """
     from playslot_rl.baselines.lapo.load import MODEL, NAME, sizes_of
     from playslot_rl.data.demonstrations import require_labelled
-    from playslot_rl.storage.checkpoints import (
-        StageCheckpoint,
-        checkpoint_folder,
-        read_stage,
-        require_config,
-        require_whole,
-    )
+    from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.record import StageRecord, run_stage
-    from playslot_rl.training.runs import adopt_stage, run_folder
+    from playslot_rl.training.runs import adopt_stage
 
     run, own, parents = open_run(config), config.baselines.lapo, dict[str, StageCheckpoint]()
     stored = {
@@ -70,19 +59,8 @@ def main(config: ExperimentConfig) -> None:
     )
     record.data.require_actions(config.env.action_dim)
     require_labelled(config.behaviour.labelled_demos, record.data.episodes)  # before anything is computed
-    if own.world:
-        model = read_stage(checkpoint_folder(run_folder(own.world), MODEL), MODEL)
-        require_whole(model)
-        require_parent(config, run, model, "image_size")
-        require_config(model, {NAME: sizes_of(own)})
-    parents[MODEL] = model if own.world else train_model(config, run)
-
-    def prepare() -> Training:
-        training = _training(config, record)
-        adopt_policy(config, record, own.policy.steps)
-        return training
-
-    run_stage(record, prepare)
+    parents[MODEL] = model_of(config, run, MODEL, own.world, train_model, {NAME: sizes_of(own)})
+    run_stage(record, lambda: _training(config, record))
 
 
 def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
@@ -127,29 +105,10 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
 
 
 def _training(config: ExperimentConfig, record: StageRecord) -> Training:
-    """Latent policy, then action decoder."""
     from playslot_rl.baselines.lapo.behaviour import LAPOBehaviour
-    from playslot_rl.baselines.lapo.load import MODEL, NAME
-    from playslot_rl.training.fit import Part
-    from playslot_rl.training.record import Training
+    from playslot_rl.baselines.lapo.load import MODEL
 
-    own, device, split = config.baselines.lapo, open_device(config), record.demos
-    behaviour = LAPOBehaviour(config, record.parents[MODEL], split, device)
-    labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
-
-    def parts() -> Iterator[Part]:
-        yield Part(f"{NAME}.policy", behaviour.policy_stage(), own.policy, lr_key="baselines.lapo.policy.optim.lr")
-        decoding = replace(own.policy, steps=own.decoder_steps, optim=replace(own.policy.optim, lr=own.decoder_lr))
-        yield Part(
-            f"{NAME}.action_decoder",
-            behaviour.decoder_stage(),
-            decoding,
-            folder="decoder",
-            lr_key="baselines.lapo.decoder_lr",
-            identity=labelled,
-        )
-
-    demos, whole = split.trained.episodes, int((split.trained.lengths - 1).sum())
-    kept = {"kept_rows": round(len(behaviour.trained.actions) / whole, 4)}
-    said = f"{NAME}: {demos} demos, {labelled['labelled_demos']} labelled, {held_out_text(split)}"
-    return Training(parts(), device, lambda _: f"{said}, {record.folder}", extra={"demos": demos, **labelled, **kept})
+    own, device = config.baselines.lapo, open_device(config)
+    decoding = replace(own.policy, steps=own.decoder_steps, optim=replace(own.policy.optim, lr=own.decoder_lr))
+    behaviour = LAPOBehaviour(config, record.parents[MODEL], record.demos, device)
+    return cloning(config, record, behaviour, own.policy, decoding)

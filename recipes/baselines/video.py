@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 
 
 def main(config: ExperimentConfig) -> None:
+    """Train `config.method`, see `train`."""
+    train(config)
+
+
+def train(config: ExperimentConfig) -> StageCheckpoint:
     """Train `config.method` into `OUT/METHOD`; killed, the same command carries on; finished, it says so.
 
     Raises:
@@ -32,7 +37,7 @@ def main(config: ExperimentConfig) -> None:
 
     record = _record_on_slots(config) if METHODS[config.method].slots else _record(config, to_dict(config.model), {})
     prepare = _on_slots if METHODS[config.method].slots else _on_pixels
-    run_stage(record, lambda: prepare(config, record))
+    return run_stage(record, lambda: prepare(config, record))
 
 
 def _record(config: ExperimentConfig, model: dict[str, Any], parents: Mapping[str, StageCheckpoint]) -> StageRecord:

@@ -11,12 +11,12 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import Actor, ExpertActor, RandomActor
+from playslot_rl.acting.actor import Actor, ExpertActor, RandomActor, ReactiveActor, latent_actor
 from playslot_rl.acting.agent import ImaginationActor, oracle_actor, playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config.compose import compose
 from playslot_rl.testing import tiny_agent, tiny_config
-from playslot_rl.world_model import Agent
+from playslot_rl.world_model import Agent, oracle_module
 
 STEPS = 4
 FRAMES = torch.randint(256, (STEPS, 3, 3, 64, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
@@ -35,12 +35,24 @@ def resnet() -> Actor:
 
 
 def lapo() -> Actor:
-    from playslot_rl.baselines.lapo.load import LAPOPolicy, lapo_actor
+    from playslot_rl.baselines.lapo.load import LAPOPolicy
     from playslot_rl.modules.action_decoder import ActionDecoder
 
     config = compose(["preset=smoke"])
     own = config.baselines.lapo
-    return lapo_actor(LAPOPolicy(own, 64), ActionDecoder(config.model.action_decoder, own.latent_dim, 4))
+    return latent_actor(LAPOPolicy(own, 64), ActionDecoder(config.model.action_decoder, own.latent_dim, 4))
+
+
+def caddy(oracle: bool) -> Actor:
+    from playslot_rl.baselines.caddy.heads import MovesHead, OnFrames, StateHead
+    from playslot_rl.baselines.caddy.model import CADDY
+    from playslot_rl.modules.action_decoder import ActionDecoder
+
+    config = compose(["preset=smoke"])
+    encoder, width = CADDY(config.baselines.caddy, 64).encoder, config.baselines.caddy.encoder[-1]
+    if oracle:
+        return ReactiveActor(oracle_module(OnFrames(encoder, StateHead(width, 4)), keys.PIXELS))
+    return latent_actor(OnFrames(encoder, MovesHead(width, 3, 2)), ActionDecoder(config.model.action_decoder, 5, 4))
 
 
 def dreamer() -> Actor:
@@ -66,6 +78,8 @@ ACTORS: dict[str, Callable[[], Actor]] = {
     "slot_oracle": lambda: oracle_actor(agent()),
     "resnet_oracle": resnet,
     "lapo": lapo,
+    "caddy_policy": lambda: caddy(oracle=False),
+    "caddy_oracle": lambda: caddy(oracle=True),
     "dreamer": dreamer,
     "sold": sold,
     "random": lambda: RandomActor(STEPS, 4),

@@ -31,23 +31,25 @@ def test_bc_has_a_job_for_each_number_of_labels_and_the_oracles_one_for_all() ->
     ]  # fmt: skip
 
 
-def test_the_policy_is_trained_once_for_all_numbers_of_labels() -> None:
-    first, second = jobs(compared("methods=playslot", "demos=100", "labels=5,25", "seeds=0"), OUT)
+@pytest.mark.parametrize("method", ["playslot", "lapo", "caddy_policy"])
+def test_the_policy_is_trained_once_for_all_numbers_of_labels(method: str) -> None:
+    first, second = jobs(compared(f"methods={method}", "demos=100", "labels=5,25", "seeds=0"), OUT)
     assert (first.policy_of, second.policy_of) == (None, 5)
-    config = compared("methods=playslot", "demos=100", "labels=5,25")
-    assert job_config(config, first, "pretrained", "").behaviour.policy_from == ""
-    assert job_config(config, second, "pretrained", "").behaviour.policy_from == str(first.run.resolve())
+    config = compared(f"methods={method}", "demos=100", "labels=5,25")
+    assert job_config(config, first, "pretrained").behaviour.policy_from == ""
+    assert job_config(config, second, "pretrained").behaviour.policy_from == str(first.run.resolve())
 
 
 @pytest.mark.parametrize(
     ("method", "demos", "labels", "expected"),
-    [("playslot", 100, 5, (100, 5)), ("lapo", 100, 25, (100, 25)), ("slot_bc", 5, 5, (5, 5)),
-     ("resnet_bc", 25, 25, (25, 25)), ("slot_oracle", 100, None, (100, 50))],
+    [("playslot", 100, 5, (100, 5)), ("lapo", 100, 25, (100, 25)), ("caddy_policy", 100, 25, (100, 25)),
+     ("slot_bc", 5, 5, (5, 5)), ("resnet_bc", 25, 25, (25, 25)), ("slot_oracle", 100, None, (100, 50)),
+     ("caddy_oracle", 100, None, (100, 50))],
 )  # fmt: skip
 def test_every_method_learns_from_the_draw_of_its_seed(
     method: Any, demos: int, labels: int | None, expected: tuple[int, int]
 ) -> None:
-    own = job_config(compared(), Job(method, demos, 7, OUT, labels), "pretrained", "")
+    own = job_config(compared(), Job(method, demos, 7, OUT, labels), "pretrained")
     assert (own.demos, own.behaviour.labelled_demos) == expected
     assert own.data.draw == 7, "the same draw for all methods: BC's labelled demonstrations are PlaySlot's"
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from playslot_rl.comparison.plan import Job, check_comparison, check_demos, job_config, job_record, jobs
+from playslot_rl.comparison.plan import Job, check_comparison, check_demos, job_config, job_record, jobs, latent_models
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import compose
+from playslot_rl.config.methods import METHODS, MethodName
 from playslot_rl.errors import CheckpointError, ConfigError
 
 OUT = Path("out")
@@ -45,24 +46,38 @@ def test_a_job_has_its_own_folder_and_playslot_both_protocols() -> None:
 
 @pytest.mark.parametrize(("demos", "labels"), [(10, 10), (50, 50), (150, 50)])
 def test_labels_are_the_presets_or_all_there_are(demos: int, labels: int) -> None:
-    own = job_config(compared(), Job("playslot", demos, 2, OUT), "pretrained", "")
+    own = job_config(compared(), Job("playslot", demos, 2, OUT), "pretrained")
     assert (own.behaviour.labelled_demos, own.demos, own.seed, own.run) == (labels, demos, 2, "pretrained")
     assert not own.behaviour.oracle
     assert not own.evaluation.references
 
 
-def test_only_methods_on_slots_get_the_world_model_and_only_lapo_lapos() -> None:
+def test_only_methods_on_slots_get_the_world_model() -> None:
     config = compared()
-    assert job_config(config, Job("resnet_oracle", 10, 0, OUT), "world", "").run == ""
-    assert job_config(config, Job("sold", None, 0, OUT), "world", "").run == str(Path("world").resolve())
-    assert job_config(config, Job("lapo", 10, 0, OUT), "world", "models").baselines.lapo.world == str(
-        Path("models").resolve()
-    )
+    assert job_config(config, Job("resnet_oracle", 10, 0, OUT), "world").run == ""
+    assert job_config(config, Job("sold", None, 0, OUT), "world").run == str(Path("world").resolve())
+
+
+@pytest.mark.parametrize(
+    ("method", "folder"), [("lapo", "lapo_world"), ("caddy_policy", "caddy_world"), ("caddy_oracle", "caddy_world")]
+)
+def test_a_model_of_videos_is_made_once_for_all_jobs_that_build_on_it(method: MethodName, folder: str) -> None:
+    config = compared(f"methods=slot_oracle,{method}")
+    assert latent_models(config) == {METHODS[method].model: method}
+    for demos, seed in ((10, 0), (50, 4)):
+        own = job_config(config, Job(method, demos, seed, OUT), "world").baselines
+        assert getattr(own, method).world == str((OUT / folder).resolve())
+    others = job_config(config, Job("slot_oracle", 10, 0, OUT), "world").baselines
+    assert getattr(others, method).world == ""
+
+
+def test_caddys_policy_and_oracle_share_one_model() -> None:
+    assert latent_models(compared("methods=caddy_policy,caddy_oracle,lapo")).keys() == {"caddy", "lapo_model"}
 
 
 def test_a_jobs_name_for_its_content_ignores_the_machine_and_nothing_else() -> None:
     config, job = compared(), Job("playslot", 10, 0, OUT)
-    own = job_config(config, job, "pretrained", "")
+    own = job_config(config, job, "pretrained")
     name = job_record(job, own, {"slots": "a"})["fingerprint"]
     assert job_record(job, replace(own, device="cpu", threads=1, workers=3), {"slots": "a"})["fingerprint"] == name
     changed = replace(own, behaviour=replace(own.behaviour, steps=7))
@@ -80,7 +95,7 @@ def test_a_jobs_name_for_its_content_ignores_the_machine_and_nothing_else() -> N
 def test_a_methods_settings_are_those_of_its_own_jobs_only() -> None:
     def names(*typed: str) -> list[str]:
         config = compared("methods=playslot,lapo,dreamer", "demos=10", "seeds=0", *typed)
-        return [job_record(job, job_config(config, job, "", ""), {})["fingerprint"] for job in jobs(config, OUT)]
+        return [job_record(job, job_config(config, job, ""), {})["fingerprint"] for job in jobs(config, OUT)]
 
     playslot, lapo, dreamer = names()
     assert names("baselines.dreamer.minutes=5")[:2] == [playslot, lapo]

@@ -207,7 +207,8 @@ def test_roles_say_what_each_key_counts_for() -> None:
         "out",
         "run",
     }
-    named = {"data.root", "data.demos", "data.cache", "baselines.lapo.world", "behaviour.policy_from"}
+    named = {"data.root", "data.demos", "data.cache", "behaviour.policy_from"}
+    named |= {f"baselines.{method}.world" for method in ("lapo", "caddy_policy", "caddy_oracle")}
     measures = {"data.held_out", "collect.validation_episodes"}
     assert keys_of(ExperimentConfig, "machine") == machine | named | measures
     weights = {"slots.start_from", "baselines.caddy.perceptual", "metrics.lpips_weights", "compare_video.test"}
@@ -248,7 +249,9 @@ def test_a_group_checks_its_ranges_under_its_own_name() -> None:
                 yield from groups(value, f"{prefix}{field.name}.")
 
     checked = {prefix: config for prefix, config in groups(compose()) if isinstance(config, Checked)}
-    shared = {"baselines.lapo.model.", "baselines.lapo.policy."}
+    shared = {"baselines.lapo.model."} | {
+        f"baselines.{method}.policy." for method in ("lapo", "caddy_policy", "caddy_oracle")
+    }
     assert {prefix: config.group for prefix, config in checked.items()} == {
         prefix: "" if prefix in shared else prefix for prefix in checked
     }
@@ -263,6 +266,8 @@ def test_a_group_checks_its_ranges_under_its_own_name() -> None:
         ("model.inverse_dynamics.decay=1.0", r"model.inverse_dynamics.decay: got 1.0, expected a number in \(0, 1\)"),
         ("behaviour.steps=0", "behaviour.steps: got 0, expected at least 1"),
         ("baselines.dreamer.sequence=1", r"baselines.dreamer.sequence: got 1, expected 0 \(whole episodes\), or"),
+        ("baselines.caddy_policy.shift=17", "baselines.caddy_policy.shift: got 17, expected 0 to 16 pixels"),
+        ("baselines.caddy_oracle.policy.steps=0", "steps: got 0, expected at least 1"),
         ("baselines.sold.savi_steps=-1", "baselines.sold.savi_steps: got -1, expected 0 or more"),
         ("compare.seeds=[0,-1]", "compare.seeds: got -1, expected a non-negative integer"),
     ],

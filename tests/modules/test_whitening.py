@@ -135,6 +135,14 @@ def test_its_loss_reads_what_it_reads() -> None:
     assert state.network.encoder.to_token.weight.grad is not None
 
 
+def test_a_number_that_training_latents_share_does_not_drown_the_others() -> None:
+    decoder, z = ActionDecoder(ActionDecoderConfig(hidden_dim=16), 5, 4), latents(50)
+    z[:, 0] = 0.0  # such as an action that no labelled demonstration has
+    decoder.standardise(z)
+    assert float(decoder.scale[0]) == 1.0
+    torch.testing.assert_close(decoder.scale[1:], z[:, 1:].std(dim=0))
+
+
 def test_widths_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match=r"model\.action_decoder\.state_dim: got 10, expected a multiple of 4 heads"):
         ActionDecoder(ActionDecoderConfig(state_dim=10, reads_slots=True), 5, 4, 6)

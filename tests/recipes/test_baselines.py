@@ -13,11 +13,13 @@ from commands import ONE_CORE, contents, killed_at_first_checkpoint, refused, sm
 from playslot_rl.config import to_dict
 from playslot_rl.config.compose import compose
 
-METHODS = ("slot_oracle", "resnet_oracle", "lapo")
+METHODS = ("slot_oracle", "resnet_oracle", "lapo", "caddy_policy", "caddy_oracle")
 SECOND_HALF = {
     "slot_oracle": ("behaviour.steps=60", "behaviour.checkpoint_every=5"),
     "resnet_oracle": ("baselines.resnet_oracle.steps=6", "baselines.resnet_oracle.checkpoint_every=1"),
     "lapo": ("baselines.lapo.policy.steps=80", "baselines.lapo.policy.checkpoint_every=5"),
+    "caddy_policy": ("baselines.caddy_policy.policy.steps=80", "baselines.caddy_policy.policy.checkpoint_every=5"),
+    "caddy_oracle": ("baselines.caddy_oracle.policy.steps=80", "baselines.caddy_oracle.policy.checkpoint_every=5"),
 }
 
 
@@ -43,7 +45,10 @@ def _meta(run: Path, stage: str) -> dict[str, Any]:
     return values
 
 
-@pytest.mark.parametrize(("method", "labels"), [("slot_oracle", 4), ("resnet_oracle", 4), ("lapo", 3)])
+@pytest.mark.parametrize(
+    ("method", "labels"),
+    [("slot_oracle", 4), ("resnet_oracle", 4), ("lapo", 3), ("caddy_policy", 3), ("caddy_oracle", 4)],
+)
 def test_a_baseline_is_a_run_that_says_what_it_saw(trained: dict[str, Path], method: str, labels: int) -> None:
     run = trained[method]
     meta = _meta(run, method)
@@ -90,14 +95,49 @@ def test_imagination_is_refused(trained: dict[str, Path]) -> None:
             message="protocol: got imagination for method=lapo, expected simulation")  # fmt: skip
 
 
-def test_lapos_models_are_taken_from_another_run(trained: dict[str, Path], shared_run: Path, tmp_path: Path) -> None:
-    out = tmp_path / "few"
-    smoke(*_command("lapo", shared_run, out, "demos=3", f"baselines.lapo.world={trained['lapo']}"))
-    assert weights(out, "lapo_model") == weights(trained["lapo"], "lapo_model")
-    assert weights(out, "lapo") != weights(trained["lapo"], "lapo")
-    assert not (out / "lapo_model" / "checkpoints").exists(), "nothing was trained there"
+@pytest.mark.parametrize(
+    ("method", "source", "stage"),
+    [
+        ("lapo", "lapo", "lapo_model"),
+        ("caddy_policy", "caddy_oracle", "caddy"),
+        ("caddy_oracle", "caddy_policy", "caddy"),
+    ],
+)
+def test_a_model_of_videos_is_taken_from_another_run(
+    trained: dict[str, Path], shared_run: Path, tmp_path: Path, method: str, source: str, stage: str
+) -> None:
+    out, world = tmp_path / "few", f"baselines.{method}.world={trained[source]}"
+    smoke(*_command(method, shared_run, out, "demos=3", world))
+    assert weights(out, stage) == weights(trained[source], stage)
+    assert weights(out, method) != weights(trained[method], method)
+    assert not (out / stage / "checkpoints").exists(), "nothing was trained there"
+    refused(*_command(method, shared_run, tmp_path / "x", world, "env.image_size=32", "data.resize=true"),
+            message="env.image_size: got 32, expected 64, with which .* was trained")  # fmt: skip
+    refused(*_command(method, shared_run, tmp_path / "x", f"baselines.{method}.world={shared_run}"),
+            message=f"{method}.world=.*: got no .*{stage}/checkpoint, expected a run with .* leave it out")  # fmt: skip
+    assert not (tmp_path / "x").exists()
+
+
+def test_lapos_models_of_other_sizes_are_refused(trained: dict[str, Path], shared_run: Path, tmp_path: Path) -> None:
     refused(*_command("lapo", shared_run, tmp_path / "x", f"baselines.lapo.world={trained['lapo']}",
                       "baselines.lapo.codes=3"), message="lapo.codes: got 3, expected 4")  # fmt: skip
+
+
+def test_caddys_methods_find_the_caddy_that_was_trained_into_their_run(shared_run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    smoke("train-baseline", "method=caddy", f"data.root={shared_run / 'data' / 'random'}", f"out={out}")
+    before = weights(out, "caddy")
+    done = smoke(*_command("caddy_oracle", shared_run, out))
+    assert "caddy: finished before" in done.out
+    assert weights(out, "caddy") == before
+
+
+def test_a_policy_on_another_caddy_is_refused(trained: dict[str, Path], shared_run: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(trained["caddy_policy"], tmp_path / "run"))
+    shutil.rmtree(run / "caddy")
+    smoke("train-baseline", "method=caddy", f"data.root={shared_run / 'data' / 'random'}", f"out={run}", "seed=1")
+    refused("evaluate", f"run={run}", "method=caddy_policy",
+            message="was trained on caddy [0-9a-f]{16}, got caddy [0-9a-f]{16}")  # fmt: skip
 
 
 def test_playslot_learns_from_the_first_demonstrations(shared_run: Path, demos: Path, tmp_path: Path) -> None:
@@ -112,7 +152,7 @@ def test_playslot_learns_from_the_first_demonstrations(shared_run: Path, demos: 
     assert weights(few, "policy") != weights(shared_run, "policy")
 
 
-@pytest.mark.parametrize("method", ["playslot", "lapo"])
+@pytest.mark.parametrize("method", ["playslot", "lapo", "caddy_policy"])
 def test_more_labels_than_demonstrations_are_refused(shared_run: Path, tmp_path: Path, method: str) -> None:
     command = [*_command(method, shared_run, tmp_path / "new", "demos=2"), f"run={shared_run}"]
     refused(*command, message="behaviour.labelled_demos: got 3, expected at most the 2 demonstrations")
@@ -155,7 +195,8 @@ def test_a_nan_stops_with_the_last_good_checkpoint(
         return {"loss": losses["loss"] * float("nan")} if step == 1 else losses
 
     monkeypatch.setattr(RegressionStage, "loss", poisoned)
-    every = {"slot_oracle": "behaviour", "resnet_oracle": "baselines.resnet_oracle", "lapo": "baselines.lapo.policy"}
+    every = {"slot_oracle": "behaviour", "resnet_oracle": "baselines.resnet_oracle"}
+    every |= {name: f"baselines.{name}.policy" for name in METHODS[2:]}
     message = "loss is nan at step 2, expected a finite number; the last good checkpoint is .*step_0*1"
     refused(*_command(method, shared_run, tmp_path / "run", f"{every[method]}.checkpoint_every=1"), message=message)
 

@@ -92,6 +92,23 @@ def test_a_method_that_crashes_is_a_row_and_the_others_finish(
     assert {row["status"] for row in _result(tmp_path / "out")["rows"]} == {"done"}
 
 
+def test_caddy_and_its_oracle_are_compared_on_one_model(shared_run: Path, tmp_path: Path, started: list[str]) -> None:
+    out = tmp_path / "out"
+    done = playslot(*_arguments(shared_run, out, "methods=CADDY,CADDY Oracle", "demos=3", "labels=1,2"))
+    assert (done.code, done.err) == (0, "")
+    assert started == ["caddy_policy-d3-l1-s0", "caddy_policy-d3-l2-s0", "caddy_oracle-d3-s0"]
+    metas = [json.loads(path.read_text()) for path in (out / "runs").glob("*/caddy_*/checkpoint/meta.json")]
+    assert len(metas) == 3
+    assert {meta["parents"]["caddy"] for meta in metas} == {_result(out)["latent_models"]["caddy"]["fingerprint"]}
+    first, second = (out / "runs" / f"caddy_policy-d3-l{n}-s0" / "caddy_policy" for n in (1, 2))
+    kept = "checkpoints/step_00000006/state.json"
+    assert (second / kept).read_bytes() == (first / kept).read_bytes(), "the policy needs no label: trained once"
+    assert [row["labelled_demos"] for row in _result(out)["summary"]] == [1, 2, 3]
+    page = (out / "comparison.md").read_text()
+    assert "CADDY's video model: " in page
+    assert "With the actions of all 3: CADDY Oracle" in page
+
+
 def test_a_changed_setting_is_not_mixed_with_old_results(shared_run: Path, tmp_path: Path, started: list[str]) -> None:
     command = _arguments(shared_run, tmp_path / "out", "methods=slot_oracle", "demos=2")
     assert playslot(*command).code == 0
@@ -173,14 +190,23 @@ def test_a_folder_of_something_else_is_refused(shared_run: Path, tmp_path: Path)
 @pytest.mark.slow
 def test_from_nothing_data_and_world_model_are_made_once(tmp_path: Path, started: list[str]) -> None:
     out = tmp_path / "out"
-    command = ["compare", "preset=smoke", "methods=slot_oracle,lapo", "demos=3", f"out={out}", "episodes=2", *ONE_CORE]
+    command = [
+        "compare",
+        "preset=smoke",
+        "methods=slot_oracle,lapo,CADDY,caddy_oracle",
+        "demos=3",
+        f"out={out}",
+        "episodes=2",
+        *ONE_CORE,
+    ]
     done = playslot(*command)
     assert (done.code, done.err) == (0, "")
     assert {path.name for path in (out / "data").iterdir() if path.is_dir()} == {"expert", "random"}
     assert (out / "world_model" / "dynamics" / "checkpoint").is_dir()
     assert (out / "lapo_world" / "lapo_model" / "checkpoint").is_dir()
+    assert (out / "caddy_world" / "caddy" / "checkpoint").is_dir()
     assert _result(out)["world_model"]["source"] == "world_model"
-    shared = {name: contents(out / name) for name in ("data", "world_model", "lapo_world")}
+    shared = {name: contents(out / name) for name in ("data", "world_model", "lapo_world", "caddy_world")}
     assert playslot(*command, "demos=3,6").code == 0
     assert {name: contents(out / name) for name in shared} == shared
 

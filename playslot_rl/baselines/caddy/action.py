@@ -76,6 +76,24 @@ class Latents(NamedTuple):
     p: Tensor
 
 
+class Trunk(nn.Sequential):
+    """Two residual blocks, the first of which halves, and the mean over the map that is left.
+
+    Args:
+        in_channels: C.
+        channels: of the blocks, the width of what is left.
+    """
+
+    def __init__(self, in_channels: int, channels: int) -> None:
+        super().__init__(Res(in_channels, channels, 2), Res(channels, channels))
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """(B, C, h, w), h and w even, to (B, channels)."""
+        for block in self:
+            maps = block(maps)
+        return maps.mean(dim=(-2, -1))
+
+
 class ActionNetwork(nn.Module):
     """A.
 
@@ -92,7 +110,7 @@ class ActionNetwork(nn.Module):
     def __init__(self, in_channels: int, channels: int, latent_dim: int, actions: int, decay: float) -> None:
         super().__init__()
         self.decay = decay
-        self.trunk = nn.Sequential(Res(in_channels, channels, 2), Res(channels, channels))
+        self.trunk = Trunk(in_channels, channels)
         self.to_mean = nn.Linear(channels, latent_dim)
         self.to_var = nn.Linear(channels, latent_dim)
         self.to_logits = nn.Linear(latent_dim, actions)
@@ -100,7 +118,7 @@ class ActionNetwork(nn.Module):
 
     def pose(self, features: Tensor) -> Gaussian:
         """(mu, var) of frames, from their features s m (..., C, h, w) with h and w even: each (..., Z), float32."""
-        flat = self.trunk(features.flatten(0, -4)).mean(dim=(-2, -1))
+        flat = self.trunk(features.flatten(0, -4))
         mean, var = self.to_mean(flat), self.to_var(flat).abs()
         leading = features.shape[:-3]
         return Gaussian(mean.float().unflatten(0, leading), var.float().unflatten(0, leading))

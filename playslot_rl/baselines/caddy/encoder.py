@@ -11,6 +11,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from playslot_rl.baselines.caddy.blocks import Res, convolution
+from playslot_rl.frames import normalise
 
 
 class Encoder(nn.Module):
@@ -37,3 +38,8 @@ class Encoder(nn.Module):
         """Frames (B, 3, H, W) in [-1, 1] to states (B, C, H/8, W/8) and maps (B, 1, H/8, W/8) in (0, 1)."""
         out: Tensor = self.network(x)
         return out[:, :-1], out[:, -1:].sigmoid()
+
+
+def inside(frames: Tensor) -> Tensor:
+    """Frames of any shape, uint8 or float [0, 1], to what E reads, in [-1, 1]."""
+    return normalise(frames) * 2 - 1

@@ -27,12 +27,11 @@ from torch import Tensor, nn
 
 from playslot_rl.baselines.caddy.action import ActionNetwork, Gaussian, Latents, Moves, chosen, gumbel_softmax
 from playslot_rl.baselines.caddy.dynamics import Dynamics
-from playslot_rl.baselines.caddy.encoder import Encoder
+from playslot_rl.baselines.caddy.encoder import Encoder, inside
 from playslot_rl.baselines.caddy.generator import Generator, Pyramid
 from playslot_rl.baselines.caddy.information import ActionInformation
 from playslot_rl.baselines.video.predictor import check_clip
 from playslot_rl.config.video import CADDYConfig
-from playslot_rl.frames import normalise
 
 
 class Generated(NamedTuple):
@@ -130,7 +129,7 @@ class CADDY(nn.Module):
         times = frozenset(range(1, steps) if wanted is None else wanted)
         if steps < 2 or not times or not times <= set(range(1, steps)):
             raise ValueError(f"clip: got {steps} frames, {sorted(times)} wanted, expected some of 1 to T-1")
-        s, attended = self._encode(_inside(frames))
+        s, attended = self._encode(inside(frames))
         pose = self.action.pose(attended)
         moves = self.action.moves(_some(pose, 0, -1), _some(pose, 1, None), noise)
         a = gumbel_softmax(moves.logits, temperature, noise)
@@ -180,7 +179,7 @@ class CADDY(nn.Module):
             ValueError: frames of another size.
         """
         self._check(frames)
-        pose = self.action.pose(self._encode(_inside(frames))[1])
+        pose = self.action.pose(self._encode(inside(frames))[1])
         moves = self.action.moves(_some(pose, 0, -1), _some(pose, 1, None))
         a = chosen(moves.p)
         return Latents(a, self.action.variability(a, moves.d), moves.p)
@@ -202,7 +201,7 @@ class CADDY(nn.Module):
         shown, moves = seed.shape[1], latents.a.shape[1]
         if moves < shown:
             raise ValueError(f"latents: got {moves} moves, expected at least {shown}, to lead past the seed")
-        s, _ = self._encode(_inside(seed))
+        s, _ = self._encode(inside(seed))
         generated = self._unroll(s, latents.a, latents.v, frozenset(range(shown, moves + 1)))
         return (generated.frames[-1] + 1) / 2
 
@@ -260,10 +259,6 @@ class CADDY(nn.Module):
         expected = (3, self.image_size, self.image_size)
         if frames.ndim != 5 or frames.shape[2:] != expected:
             raise ValueError(f"frames: got shape {tuple(frames.shape)}, expected (B, T, {expected})")
-
-
-def _inside(frames: Tensor) -> Tensor:
-    return normalise(frames) * 2 - 1
 
 
 def _some(pose: Gaussian, first: int, last: int | None) -> Gaussian:

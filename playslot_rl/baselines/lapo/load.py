@@ -9,17 +9,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
-from playslot_rl import keys
-from playslot_rl.acting.actor import Actor
+from playslot_rl.acting.actor import Actor, latent_actor
 from playslot_rl.baselines.lapo.model import EncoderMLP
 from playslot_rl.config.baselines import LAPOConfig
 from playslot_rl.config.plain import to_dict
 from playslot_rl.frames import normalise
 from playslot_rl.modules.action_decoder import ActionDecoder
-from playslot_rl.world_model import action_decoder_module
 
 NAME: Final = "lapo"
 MODEL: Final = "lapo_model"
@@ -42,14 +39,6 @@ class LAPOPolicy(nn.Module):
         """Frames (B, 3, H, W), uint8 or float [0, 1], to latent actions (B, Z)."""
         z: Tensor = self.network(normalise(pixels))
         return z
-
-
-def lapo_actor(policy: LAPOPolicy, decoder: ActionDecoder) -> Actor:
-    """The actor of networks in evaluation mode."""
-    from playslot_rl.acting.actor import ReactiveActor
-
-    choose = TensorDictModule(policy, in_keys=[keys.PIXELS], out_keys=[keys.LATENT_ACTION])
-    return ReactiveActor(TensorDictSequential(choose, action_decoder_module(decoder)))
 
 
 def sizes_of(config: LAPOConfig) -> dict[str, Any]:
@@ -77,4 +66,4 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
     load_weights(done, {"policy": policy, "action_decoder": decoder})
     freeze_on(policy, device)
     freeze_on(decoder, device)
-    return lapo_actor(policy, decoder)
+    return latent_actor(policy, decoder)

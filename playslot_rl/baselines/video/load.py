@@ -7,19 +7,18 @@ from pathlib import Path
 
 import torch
 
+from playslot_rl.baselines.caddy.load import load_model
 from playslot_rl.baselines.caddy.model import CADDY
 from playslot_rl.baselines.svg.model import SVG
 from playslot_rl.baselines.video.predictor import VideoPredictor
 from playslot_rl.baselines.video.slots import SlotVideo
 from playslot_rl.config import (
-    CADDYConfig,
     EnvConfig,
     ModelConfig,
     SVGConfig,
 )
 from playslot_rl.config.baselines import BaselinesConfig
 from playslot_rl.storage.checkpoints import (
-    StageCheckpoint,
     checkpoint_folder,
     load_weights,
     read_stage,
@@ -34,9 +33,6 @@ from playslot_rl.training.runs import (
     stage_model,
 )
 from playslot_rl.world_model import WorldModel
-
-PIXELS = ("svg", "caddy")
-"""Methods that predict frames; the others predict slots."""
 
 
 def build_pixel_model(method: str, config: BaselinesConfig, image_size: int) -> SVG | CADDY:
@@ -69,8 +65,11 @@ def load_video(method: str, run: Path | str, device: torch.device | str = "cpu")
     if method == "playslot":
         return SlotVideo(load_world_model(run, device))
     done = read_stage(checkpoint_folder(run_folder(run), method), method)
-    if method in PIXELS:
-        model = _stored_pixel_model(method, done, stage_config(done, EnvConfig, "env").image_size)
+    if method == "caddy":
+        return load_model(done, device)
+    if method == "svg":
+        with torch.random.fork_rng(devices=[]):
+            model = SVG(stage_config(done, SVGConfig, method), stage_config(done, EnvConfig, "env").image_size)
         load_weights(done, {method: model})
         freeze_on(model, device)
         return model
@@ -83,10 +82,3 @@ def load_video(method: str, run: Path | str, device: torch.device | str = "cpu")
     load_weights(done, {"inverse_dynamics": world.inverse_dynamics, "predictor": world.predictor})
     freeze_on(world, device)
     return SlotVideo(world)
-
-
-def _stored_pixel_model(method: str, done: StageCheckpoint, image_size: int) -> SVG | CADDY:
-    with torch.random.fork_rng(devices=[]):
-        if method == "svg":
-            return SVG(stage_config(done, SVGConfig, method), image_size)
-        return CADDY(stage_config(done, CADDYConfig, method), image_size)

@@ -9,7 +9,8 @@ import pytest
 import torch
 from clips import moving_square
 
-from playslot_rl.baselines.lapo.load import LAPOPolicy, lapo_actor
+from playslot_rl.acting.actor import latent_actor
+from playslot_rl.baselines.lapo.load import LAPOPolicy
 from playslot_rl.baselines.lapo.model import ForwardModel, InverseModel
 from playslot_rl.baselines.lapo.stage import LAPOModelStage, infer_latents
 from playslot_rl.config import ActionDecoderConfig, OptimConfig, StageConfig
@@ -118,7 +119,7 @@ def test_the_actor_decodes_the_policys_latent() -> None:
     torch.manual_seed(0)
     config = replace(CONFIG, channels=(4, 4))
     policy, decoder = LAPOPolicy(config, 32), ActionDecoder(ActionDecoderConfig(8), config.latent_dim, 4)
-    actor = lapo_actor(policy, decoder)
+    actor = latent_actor(policy, decoder)
     pixels = torch.randint(256, (3, 3, 32, 32), dtype=torch.uint8)
     out = actor(actor.reset([1, 2, 3]).set(keys.PIXELS, pixels))
     torch.testing.assert_close(out[keys.ACTION], decoder(policy(pixels.float() / 255)))

@@ -1,0 +1,132 @@
+"""What methods share whose model tells latent actions in videos: a policy clones them, a decoder makes them real.
+
+    z_t = what the frozen model infers from (o_t, o_{t+1})
+    pi(o_t) ~ z_t                       on the videos of all demonstrations, no action read
+    L_a = mean (D(z_t) - a_t)^2         on the labelled ones
+
+The decoder is PlaySlot's, on the same labels, and is fed alike (`behaviour.decoder_inputs`). Policies clone what moves:
+still transitions are left out (`behaviour.trim_pixels`).
+
+Shapes: M transitions, Z latent-action width, A action dim.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from playslot_rl.config import ExperimentConfig, Precision
+from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, moving_frames
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.losses.behaviour import ActionDecoderLoss
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.training.stage_regression import (
+    FrameInputs,
+    Inputs,
+    RegressionStage,
+    TensorInputs,
+    apply_rows,
+    demonstrated_frames,
+)
+
+
+class Seen(NamedTuple):
+    """Transitions of demonstrations.
+
+    Attributes:
+        inputs: what the policy reads of the frame before each, M of them.
+        latents: what the model infers (M, Z).
+        actions: real ones (M, A) in [-1, 1].
+        episode: whose they are (M,).
+    """
+
+    inputs: Inputs
+    latents: Tensor
+    actions: Tensor
+    episode: npt.NDArray[np.int64]
+
+
+class LatentCloning(ABC):
+    """Policy and decoder, untrained, with the stages that train them one after the other.
+
+    A method makes `policy` and `decoder` after this, which asks it for `infer` and `observe`.
+
+    Args:
+        config: labels, trimming, what the decoder is fed.
+        demos: demonstrations, and those that are held out.
+        device: where to compute.
+        shift: of frames in the policy's training, pixels.
+
+    Raises:
+        DataError: demonstrations without actions, or in which nothing moves.
+    """
+
+    policy: nn.Module
+    decoder: ActionDecoder
+
+    def __init__(self, config: ExperimentConfig, demos: DemonstrationSplit, device: torch.device, shift: int) -> None:
+        self.config, self.device = config, device
+        self.trained = self._seen(demos.trained, shift)
+        self.held_out = None if demos.held_out is None else self._seen(demos.held_out)
+
+    @abstractmethod
+    def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
+        """Latent actions (M, Z) of transitions, by the frozen model."""
+
+    def observe(self, frames: FrameInputs) -> Inputs:
+        """What the policy reads of frames: themselves."""
+        return frames
+
+    def chosen(self, outputs: Tensor) -> Tensor:
+        """The latent actions (M, Z) that the policy's outputs (M, ...) stand for: themselves."""
+        return outputs
+
+    @abstractmethod
+    def policy_stage(self) -> RegressionStage:
+        """Latent actions from frames of all demonstrations, no action read."""
+
+    @abstractmethod
+    def decoder_stage(self) -> RegressionStage:
+        """Real actions of the labelled demonstrations, from inferred latents, the policy's, or both."""
+
+    def decoding(self, loss: str, batch_size: int, precision: Precision) -> RegressionStage:
+        """The decoder's stage, once the policy is trained.
+
+        Args:
+            loss: `l2` or `l1`.
+            batch_size, precision: of its training.
+        """
+        labelled = np.flatnonzero(self.trained.episode < self.config.behaviour.labelled_demos)
+        inputs, actions = self._decoded(self.trained, torch.from_numpy(labelled).to(self.device))
+        held_out = None
+        if self.held_out is not None:
+            held_out = self._decoded(self.held_out, torch.arange(len(self.held_out.actions), device=self.device))
+        self.decoder.standardise(inputs.values)
+        return RegressionStage(
+            "action_decoder",
+            ActionDecoderLoss(self.decoder, loss),
+            inputs,
+            actions,
+            batch_size,
+            held_out=held_out,
+            precision=precision,
+        )
+
+    def _seen(self, source: EpisodeFrames, shift: int = 0) -> Seen:
+        moves = moving_frames(source, self.config.behaviour.trim_pixels, self.config.behaviour.trim_margin)
+        frames, actions = demonstrated_frames(source, moves, self.config.env.action_dim, self.device, shift)
+        return Seen(self.observe(frames), self.infer(source, moves), actions, moves.episode)
+
+    def _decoded(self, seen: Seen, rows: Tensor) -> tuple[TensorInputs, Tensor]:
+        """What the decoder regresses from, and what it should give, on rows of demonstrations."""
+        kind = self.config.behaviour.decoder_inputs
+        inputs: list[Tensor] = [] if kind == "policy" else [seen.latents[rows]]
+        if kind != "inverse_dynamics":
+            self.policy.eval()
+            inputs.append(self.chosen(apply_rows(self.policy, seen.inputs, rows)))
+        return TensorInputs(torch.cat(inputs)), seen.actions[rows].repeat(len(inputs), 1)

@@ -1,0 +1,133 @@
+"""`playslot train-baseline method=caddy_policy|caddy_oracle data.root=VIDEOS data.demos=DEMOS out=DIR`: CADDY acts.
+
+CADDY learns from the videos (`OUT/caddy`, as `method=caddy` trains it) and is frozen. `caddy_policy` clones the actions
+and variabilities that it infers from the demonstrations' videos, and decodes them by the real actions of
+`behaviour.labelled_demos`; `caddy_oracle` clones the real actions of all. `baselines.METHOD.world=RUN` takes the CADDY
+of another run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.recipes.baselines.cloning import BEHAVIOUR, cloning, model_of
+from playslot_rl.recipes.run import held_out_text, open_device, open_run
+
+if TYPE_CHECKING:
+    from playslot_rl.storage.checkpoints import StageCheckpoint
+    from playslot_rl.training.record import StageRecord, Training
+
+
+def main(config: ExperimentConfig) -> None:
+    """Train `config.method` into `OUT/METHOD`; killed, the same command carries on; finished, it says so.
+
+    Raises:
+        CheckpointError: `out` was begun otherwise, or `baselines.METHOD.world` has no finished CADDY of such frames.
+        DataError: no videos, too few demonstrations, or none with actions.
+        OutputError, TrainingError: see `playslot_rl.errors`.
+    """
+    from playslot_rl.baselines.caddy.load import MODEL, POLICY
+    from playslot_rl.data.demonstrations import require_labelled
+    from playslot_rl.storage.checkpoints import StageCheckpoint
+    from playslot_rl.training.record import run_stage
+
+    run, parents = open_run(config), dict[str, StageCheckpoint]()
+    acts = config.method == POLICY
+    record = _policy_record(config, run, parents) if acts else _oracle_record(config, run, parents)
+    record.data.require_actions(config.env.action_dim)
+    if acts:
+        require_labelled(config.behaviour.labelled_demos, record.data.episodes)  # before anything is computed
+    world = config.baselines.caddy_policy.world if acts else config.baselines.caddy_oracle.world
+    parents[MODEL] = model_of(config, run, MODEL, world, train_model)
+    run_stage(record, lambda: (_policy if acts else _oracle)(config, record))
+
+
+def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
+    """Train CADDY on `data.root` into `RUN/caddy`, or find it there.
+
+    Raises:
+        CheckpointError, DataError, OutputError, TrainingError: see `playslot_rl.errors`.
+    """
+    from playslot_rl.baselines.caddy.load import MODEL
+    from playslot_rl.recipes.baselines import video
+
+    return video.train(replace(config, method=MODEL, out=str(run), run=""))
+
+
+def _policy_record(config: ExperimentConfig, run: Path, parents: dict[str, StageCheckpoint]) -> StageRecord:
+    from playslot_rl.baselines.caddy.load import MODEL, POLICY
+    from playslot_rl.training.record import StageRecord
+    from playslot_rl.training.runs import adopt_stage
+
+    own = config.baselines.caddy_policy
+    trim = {key: getattr(config.behaviour, key) for key in ("trim_pixels", "trim_margin")}
+    return StageRecord(
+        POLICY,
+        run,
+        config,
+        stored={
+            "env": to_dict(config.env),
+            "model": to_dict(config.model),
+            "behaviour": to_dict(replace(config.behaviour, policy_from="")),
+            POLICY: to_dict(replace(own, world="")),
+        },
+        counts=("model.action_decoder", "behaviour.loss"),
+        settings=(*(f"behaviour.{key}" for key in BEHAVIOUR), POLICY),
+        identity={"shift": own.shift, **trim},
+        parents=parents,
+        role="demos",
+        ready=lambda: adopt_stage(parents[MODEL], run),
+    )
+
+
+def _oracle_record(config: ExperimentConfig, run: Path, parents: dict[str, StageCheckpoint]) -> StageRecord:
+    from playslot_rl.baselines.caddy.load import MODEL, ORACLE
+    from playslot_rl.training.record import StageRecord
+    from playslot_rl.training.runs import adopt_stage
+
+    own = config.baselines.caddy_oracle
+    return StageRecord(
+        ORACLE,
+        run,
+        config,
+        stored={
+            "env": to_dict(config.env),
+            "behaviour": to_dict(config.behaviour),
+            ORACLE: to_dict(replace(own, world="")),
+        },
+        counts=("behaviour.loss", "behaviour.trim_pixels", "behaviour.trim_margin", f"{ORACLE}.shift"),
+        parents=parents,
+        role="demos",
+        ready=lambda: adopt_stage(parents[MODEL], run),
+    )
+
+
+def _policy(config: ExperimentConfig, record: StageRecord) -> Training:
+    from playslot_rl.baselines.caddy.behaviour import CADDYBehaviour
+    from playslot_rl.baselines.caddy.load import MODEL
+
+    own, device = config.baselines.caddy_policy, open_device(config)
+    decoding = replace(own.policy, steps=own.decoder_steps, optim=replace(own.policy.optim, lr=own.decoder_lr))
+    behaviour = CADDYBehaviour(config, record.parents[MODEL], record.demos, device)
+    return cloning(config, record, behaviour, own.policy, decoding)
+
+
+def _oracle(config: ExperimentConfig, record: StageRecord) -> Training:
+    from playslot_rl.baselines.caddy.behaviour import oracle_stage
+    from playslot_rl.baselines.caddy.load import MODEL
+    from playslot_rl.training.fit import Part
+    from playslot_rl.training.record import Training
+
+    own, device, split = config.baselines.caddy_oracle, open_device(config), record.demos
+    stage = oracle_stage(config, record.parents[MODEL], split, device)
+    demos, whole = int((split.trained.lengths >= 2).sum()), int((split.trained.lengths - 1).sum())
+    said = f"{record.name}: {demos} demos, all labelled, {held_out_text(split)}"
+    return Training(
+        [Part(f"{record.name}.policy", stage, own.policy, lr_key=f"baselines.{record.name}.policy.optim.lr")],
+        device,
+        lambda _: f"{said}, {record.folder}",
+        extra={"demos": demos, "labelled_demos": demos, "kept_rows": round(len(stage.targets) / whole, 4)},
+    )

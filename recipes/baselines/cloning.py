@@ -1,0 +1,100 @@
+"""What the recipes share of methods that clone the latent actions of a model of unlabelled videos."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from playslot_rl.config import ExperimentConfig, StageConfig
+from playslot_rl.config.methods import LATENT_MODELS
+from playslot_rl.recipes.run import adopt_policy, held_out_text, require_parent
+
+if TYPE_CHECKING:
+    from playslot_rl.baselines.cloning import LatentCloning
+    from playslot_rl.storage.checkpoints import StageCheckpoint
+    from playslot_rl.training.fit import Part
+    from playslot_rl.training.record import StageRecord, Training
+
+BEHAVIOUR: Final = ("labelled_demos", "decoder_inputs", "trim_pixels", "trim_margin")
+"""Settings of the behaviour stage that count for them, too."""
+
+
+def model_of(
+    config: ExperimentConfig,
+    run: Path,
+    stage: str,
+    world: str,
+    train: Callable[[ExperimentConfig, Path], StageCheckpoint],
+    sizes: Mapping[str, Any] | None = None,
+) -> StageCheckpoint:
+    """The model that a method builds on: of another run, or trained on `data.root` into its own.
+
+    Args:
+        config: of the command.
+        run: the method's run.
+        stage: the model's, one of `LATENT_MODELS`.
+        world: the other run; empty trains.
+        train: trains the model into a run, or finds it there.
+        sizes: parts of the config that another run's model must share.
+
+    Raises:
+        CheckpointError: no finished model there, one of other frames or sizes, or `run` has another one of its own.
+        DataError, OutputError, TrainingError: see `playslot_rl.errors`.
+    """
+    from playslot_rl.errors import CheckpointError
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, require_whole
+
+    if not world:
+        return train(config, run)
+    folder = checkpoint_folder(Path(world), stage)
+    if not (folder / "meta.json").is_file():
+        raise CheckpointError(
+            f"baselines.{config.method}.world={world}: got no {folder}, expected a run with {LATENT_MODELS[stage]}: "
+            "name another, or leave it out to train one"
+        )
+    model = read_stage(folder, stage)
+    require_whole(model)
+    require_parent(config, run, model, "image_size")
+    require_config(model, sizes or {})
+    return model
+
+
+def cloning(
+    config: ExperimentConfig, record: StageRecord, behaviour: LatentCloning, policy: StageConfig, decoding: StageConfig
+) -> Training:
+    """Latent policy, then action decoder; the policy is taken over where another run has trained it.
+
+    Args:
+        config: of the command.
+        record: the method's stage.
+        behaviour: what is trained.
+        policy, decoding: schedules, `baselines.METHOD.policy` and of the decoder.
+    """
+    from playslot_rl.training.fit import Part
+    from playslot_rl.training.record import Training
+
+    name, split = record.name, record.demos
+    labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
+
+    def parts() -> Iterator[Part]:
+        yield Part(f"{name}.policy", behaviour.policy_stage(), policy, lr_key=f"baselines.{name}.policy.optim.lr")
+        yield Part(
+            f"{name}.action_decoder",
+            behaviour.decoder_stage(),
+            decoding,
+            folder="decoder",
+            lr_key=f"baselines.{name}.decoder_lr",
+            identity=labelled,
+        )
+
+    adopt_policy(config, record, policy.steps)
+    demos, whole = split.trained.episodes, int((split.trained.lengths - 1).sum())
+    kept = {"kept_rows": round(len(behaviour.trained.actions) / whole, 4)}
+    said = f"{name}: {demos} demos, {labelled['labelled_demos']} labelled, {held_out_text(split)}"
+    return Training(
+        parts(),
+        behaviour.device,
+        lambda _: f"{said}, {record.folder}",
+        extra={"demos": demos, **labelled, **kept},
+    )
