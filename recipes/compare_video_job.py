@@ -87,7 +87,7 @@ def _score(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> N
     from playslot_rl.baselines.video.load import load_video
     from playslot_rl.baselines.video.rows import method_rows
     from playslot_rl.baselines.video.scores import score_clips
-    from playslot_rl.comparison.video_clips import open_clips, test_sets
+    from playslot_rl.comparison.video_clips import open_clips, sheet_name, test_sets
     from playslot_rl.comparison.video_plan import asked_of
     from playslot_rl.evaluation.lpips import open_lpips
     from playslot_rl.recipes.run import open_device
@@ -107,7 +107,7 @@ def _score(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> N
             )
             scores.append({"row": row.name, "clips_of": label, "seed_frames": shown, "sees": row.sees, **values})
             if not row.name:
-                pictures[f"{label}_{shown}"] = frames
+                pictures[sheet_name(label, shown)] = frames
     with explain_write_errors(job.pictures):
         np.savez_compressed(job.pictures, **pictures)
     write_json(

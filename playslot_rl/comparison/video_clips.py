@@ -17,6 +17,11 @@ def test_sets(config: ExperimentConfig) -> dict[str, str]:
     return {Path(root).name: root for root in roots} if len(roots) > 1 else {"": "".join(roots)}
 
 
+def sheet_name(label: str, shown: int) -> str:
+    """Name of the frames of a test set (empty where it is the only one) after some seed frames."""
+    return f"frames_{label}_{shown}" if label else f"frames_{shown}"
+
+
 def open_clips(config: ExperimentConfig, test: str, frames: int, count: int) -> tuple[EpisodeFrames, IntArray]:
     """Clips of a test set.
 

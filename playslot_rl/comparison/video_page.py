@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from playslot_rl.comparison.video_clips import sheet_name
 from playslot_rl.progress import format_seconds
 from playslot_rl.visualization.charts import VIDEO_STYLES, Theme, legend, new_figure, style_axes
 from playslot_rl.visualization.document import table
@@ -54,7 +55,7 @@ def video_page(result: Mapping[str, Any]) -> str:
     parts = [f"# {result['env']}: video prediction", lead, "![PSNR and SSIM over the step](video.png)"]
     for label, shown in itertools.product(result["tested_on"], result["seed_frames"]):
         parts += [f"## {_heading(label, shown)}", _scores(result, label, shown)]
-        parts.append(f"![True frames, and each model's]({sheet_name(label, shown)})")
+        parts.append(f"![True frames, and each model's]({sheet_name(label, shown)}.png)")
     parts += ["## Training", _trainings(result), "## Footnotes", "\n".join(f"- {note}" for note in _notes(result))]
     return "\n\n".join(parts) + "\n"
 
@@ -81,11 +82,6 @@ def objects_page(found: Mapping[str, Mapping[str, Any]]) -> str:
         body = [[title, *(values.get(number, "–") for number in found)] for title, values in cells.items()]
         parts += [f"## {_heading('', shown)}", table(["objects", *found], body)]
     return "\n\n".join(parts) + "\n"
-
-
-def sheet_name(label: str, shown: int) -> str:
-    """File of the frames of a test set (empty where it is the only one) after some seed frames."""
-    return f"frames_{label}_{shown}.png" if label else f"frames_{shown}.png"
 
 
 def _heading(label: str, shown: int) -> str:

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from playslot_rl.baselines.video.scores import bootstrap
 from playslot_rl.comparison.launch import Status, read_status
 from playslot_rl.comparison.report import count_parameters, read_json
-from playslot_rl.comparison.video_clips import test_sets
-from playslot_rl.comparison.video_page import sheet_name, video_figure, video_page, video_sheet
+from playslot_rl.comparison.video_clips import sheet_name, test_sets
+from playslot_rl.comparison.video_page import video_figure, video_page, video_sheet
 from playslot_rl.comparison.video_plan import VideoJob
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.success import hardware
@@ -183,8 +183,8 @@ class VideoComparison:
             for kind in ("png", "svg"):
                 write_bytes(self.out / f"video.{kind}", figure_bytes(video_figure(result, LIGHT), LIGHT, kind))
             for (label, shown), truth in self.truth.items():
-                sheet = video_sheet(truth, self._predictions(f"{label}_{shown}"))
-                write_bytes(self.out / sheet_name(label, shown), png(sheet))
+                name = sheet_name(label, shown)
+                write_bytes(self.out / f"{name}.png", png(video_sheet(truth, self._predictions(name))))
         return [job for job in result["jobs"] if job["status"] != "done"]
 
     def _predictions(self, name: str) -> dict[str, npt.NDArray[np.uint8]]:

@@ -77,7 +77,7 @@ def test_all_models_predict_the_same_clips(finished: Path) -> None:
     shapes = set()
     for file in sorted(finished.glob("runs/*/video.npz")):
         with np.load(file) as stored:
-            shapes.add(stored["shown_2"].shape)
+            shapes.add(stored["frames_2"].shape)
     assert shapes == {(2, 3, 64, 64, 3)}
 
 
@@ -135,7 +135,7 @@ def test_a_setting_of_playslot_is_varied_on_two_kinds_of_clips(finished: Path, t
     """Action representation in one command; real actions count as what they are."""
     out, data = tmp_path / "out", finished / "data"
     smoke(
-        "compare-video", "env=button_press", f"run={finished}/world_model", "methods=playslot",
+        "compare-video", "preset=smoke", "env=button_press", f"run={finished}/world_model", "methods=playslot",
         f"data.root={data}/random", f"compare_video.test='{data}/test/expert,{data}/random'",
         "vary=model.inverse_dynamics.mode", "values=discrete,ground_truth", "compare_video.rates=[1.0]", f"out={out}",
     )  # fmt: skip
