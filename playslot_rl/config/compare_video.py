@@ -85,6 +85,13 @@ class CompareVideoConfig(Checked):
             values = getattr(self, name)
             check(len(set(values)) == len(values), f"{self.group}{name}", values, "each one once")
         check(bool(self.vary) == bool(self.values), f"{self.group}values", self.values, "vary=SETTING and values=A,B")
+        trained = self.trained_seed + self.trained_frames
+        check(
+            max(self.shown) < trained,
+            f"{self.group}shown",
+            self.shown,
+            f"fewer than a training clip's {trained} frames",
+        )
         known = ", ".join(LAUNCHERS)
         check(self.launcher in ("", *LAUNCHERS), "hydra.launcher", self.launcher, f"one of {known}")
         check(not self.hydra or bool(self.launcher), "hydra", self.hydra, "hydra.launcher=NAME with it")

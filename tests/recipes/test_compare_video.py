@@ -111,6 +111,10 @@ def test_a_method_that_fails_leaves_a_row_that_says_so(finished: Path, tmp_path:
         (("methods=svg,svg",), r"compare_video\.methods: .*each one once"),
         (("seeds=-1",), r"compare_video\.seeds: got -1, expected a non-negative"),
         (("compare_video.predicted=0",), r"compare_video\.predicted: got 0, expected at least 1"),
+        (
+            ("compare_video.shown=[4]",),
+            r"compare_video\.shown: got \(4,\), expected fewer than a training clip's 4 frames",
+        ),
         (("vary=model.inverse_dynamics.mode",), r"compare_video\.values: got \(\), expected vary=SETTING and values="),
     ],
 )
@@ -185,3 +189,11 @@ def test_what_cannot_be_varied_is_refused(tmp_path: Path, arguments: tuple[str, 
     out = tmp_path / "out"
     refused("compare-video", "env=button_press", "methods=playslot", f"out={out}", *arguments, message=message)
     assert not out.exists()
+
+
+def test_no_predictor_attends_to_more_frames_than_its_training_clips_show(finished: Path) -> None:
+    for name in ("playslot-s0", "playslot_m-s0", "slotformer-s0", "ocvp_seq-s0"):
+        stored = json.loads((finished / "runs" / name / "config.json").read_text())
+        method = name.removesuffix("-s0")
+        at = stored["model"] if method.startswith("playslot") else stored["baselines"][method]
+        assert at["predictor"]["context"] == 3
