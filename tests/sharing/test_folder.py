@@ -183,7 +183,8 @@ def test_the_front_door_saves_and_loads(agent: Agent, tmp_path: Path) -> None:
         playslot_rl.PlaySlot.from_pretrained(tmp_path / "policy", device="cpu"),
         playslot_rl.load(tmp_path / "policy", device="cpu"),
     ):
-        assert all((loaded.act(frame) == e).all() for frame, e in zip(frames, expected, strict=True))
+        # Products of one row may differ in the last bit with where in memory the weights lie.
+        np.testing.assert_allclose([loaded.act(frame) for frame in frames], expected, atol=1e-6)
     again = playslot_rl.load(tmp_path / "policy", device="cpu")
     again.save_pretrained(tmp_path / "again")
     assert read_config(tmp_path / "again") == read_config(tmp_path / "policy")
