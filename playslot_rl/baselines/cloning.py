@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from playslot_rl.config import ExperimentConfig, Precision
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, moving_frames
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.losses.behaviour import ActionDecoderLoss
+from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.training.stage_regression import (
     FrameInputs,
@@ -93,6 +93,27 @@ class LatentCloning(ABC):
     @abstractmethod
     def decoder_stage(self) -> RegressionStage:
         """Real actions of the labelled demonstrations, from inferred latents, the policy's, or both."""
+
+    def cloning[S: RegressionStage](
+        self, kind: type[S], criterion: BehaviourLoss, batch_size: int, precision: Precision
+    ) -> S:
+        """The policy's stage.
+
+        Args:
+            kind: of it.
+            criterion: what the policy's outputs and the inferred latents are compared by.
+            batch_size, precision: of its training.
+        """
+        return kind(
+            "policy",
+            criterion,
+            self.trained.inputs,
+            self.trained.latents,
+            batch_size,
+            held_out=self.held_out and (self.held_out.inputs, self.held_out.latents),
+            validated=1024,
+            precision=precision,
+        )
 
     def decoding(self, loss: str, batch_size: int, precision: Precision) -> RegressionStage:
         """The decoder's stage, once the policy is trained.

@@ -110,9 +110,8 @@ def _policy(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.baselines.caddy.load import MODEL
 
     own, device = config.baselines.caddy_policy, open_device(config)
-    decoding = replace(own.policy, steps=own.decoder_steps, optim=replace(own.policy.optim, lr=own.decoder_lr))
     behaviour = CADDYBehaviour(config, record.parents[MODEL], record.demos, device)
-    return cloning(config, record, behaviour, own.policy, decoding)
+    return cloning(config, record, behaviour, own)
 
 
 def _oracle(config: ExperimentConfig, record: StageRecord) -> Training:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from playslot_rl.config import ExperimentConfig, StageConfig
+from playslot_rl.config import CADDYPolicyConfig, ExperimentConfig, LAPOConfig
 from playslot_rl.config.methods import LATENT_MODELS
 from playslot_rl.recipes.run import adopt_policy, held_out_text, require_parent
 
@@ -61,7 +62,7 @@ def model_of(
 
 
 def cloning(
-    config: ExperimentConfig, record: StageRecord, behaviour: LatentCloning, policy: StageConfig, decoding: StageConfig
+    config: ExperimentConfig, record: StageRecord, behaviour: LatentCloning, own: LAPOConfig | CADDYPolicyConfig
 ) -> Training:
     """Latent policy, then action decoder; the policy is taken over where another run has trained it.
 
@@ -69,12 +70,13 @@ def cloning(
         config: of the command.
         record: the method's stage.
         behaviour: what is trained.
-        policy, decoding: schedules, `baselines.METHOD.policy` and of the decoder.
+        own: the method's schedules.
     """
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
 
-    name, split = record.name, record.demos
+    name, split, policy = record.name, record.demos, own.policy
+    decoding = replace(policy, steps=own.decoder_steps, optim=replace(policy.optim, lr=own.decoder_lr))
     labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
 
     def parts() -> Iterator[Part]:

@@ -109,6 +109,5 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.baselines.lapo.load import MODEL
 
     own, device = config.baselines.lapo, open_device(config)
-    decoding = replace(own.policy, steps=own.decoder_steps, optim=replace(own.policy.optim, lr=own.decoder_lr))
     behaviour = LAPOBehaviour(config, record.parents[MODEL], record.demos, device)
-    return cloning(config, record, behaviour, own.policy, decoding)
+    return cloning(config, record, behaviour, own)

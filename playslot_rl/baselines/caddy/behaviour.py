@@ -152,16 +152,8 @@ class CADDYBehaviour(LatentCloning):
 
     def policy_stage(self) -> RegressionStage:
         """See `LatentCloning`."""
-        return MovesStage(
-            "policy",
-            MovesLoss(self.policy),
-            self.trained.inputs,
-            self.trained.latents,
-            self.own.policy.batch_size,
-            held_out=self.held_out and (self.held_out.inputs, self.held_out.latents),
-            validated=1024,
-            precision=self.own.policy.precision,
-        )
+        own = self.own.policy
+        return self.cloning(MovesStage, MovesLoss(self.policy), own.batch_size, own.precision)
 
     def decoder_stage(self) -> RegressionStage:
         """See `LatentCloning`."""

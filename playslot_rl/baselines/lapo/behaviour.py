@@ -58,18 +58,9 @@ class LAPOBehaviour(LatentCloning):
 
     def policy_stage(self) -> RegressionStage:
         """See `LatentCloning`."""
-        criterion = BehaviourLoss(self.policy, self.own.loss)
+        own, criterion = self.own.policy, BehaviourLoss(self.policy, self.own.loss)
         criterion.set_keys(observation=keys.PIXELS)
-        return RegressionStage(
-            "policy",
-            criterion,
-            self.trained.inputs,
-            self.trained.latents,
-            self.own.policy.batch_size,
-            held_out=self.held_out and (self.held_out.inputs, self.held_out.latents),
-            validated=1024,
-            precision=self.own.policy.precision,
-        )
+        return self.cloning(RegressionStage, criterion, own.batch_size, own.precision)
 
     def decoder_stage(self) -> RegressionStage:
         """See `LatentCloning`."""
