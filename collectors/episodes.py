@@ -38,19 +38,25 @@ EPISODE_STEP: Final = "episode_step"
 POLICY_STREAM: Final = 2
 """Spawn key of the policy's random numbers; the environment uses 0 and 1 of the same seed."""
 MAX_REDRAWS: Final = 20
+REST: Final = 0.02
+"""An expert none of whose numbers is larger holds still."""
 
 
 class CollectionPolicy(nn.Module):
-    """Uniform actions in [-1, 1], or the expert's with Gaussian noise.
+    """Uniform actions in [-1, 1], or the expert's a* with Gaussian noise.
+
+        a = clip(a* + noise e + d disturbance e', -1, 1),   e, e' ~ N(0, I),   d ~ Bernoulli(disturbed) while a* moves
 
     Args:
         name: `random` or `expert`.
-        noise: standard deviation for the expert's actions; the sum is clipped to [-1, 1].
+        noise: standard deviation of what is added to all of the expert's actions.
+        disturbed: probability that an action of which a number exceeds `REST` is disturbed.
+        disturbance: standard deviation of what is then added.
     """
 
-    def __init__(self, name: str, noise: float = 0.0) -> None:
+    def __init__(self, name: str, noise: float = 0.0, disturbed: float = 0.0, disturbance: float = 0.0) -> None:
         super().__init__()
-        self.name, self.noise = name, noise
+        self.name, self.noise, self.disturbed, self.disturbance = name, noise, disturbed, disturbance
 
     def forward(self, expert: Tensor, seed: Tensor, step: Tensor) -> Tensor:
         """Action float32 (A,) from the expert's (A,), the episode's seed (1,) and its step (1,)."""
@@ -58,16 +64,21 @@ class CollectionPolicy(nn.Module):
         width = expert.shape[-1]
         if self.name == "random":
             return torch.from_numpy(rng.uniform(-1.0, 1.0, width).astype(np.float32))
-        if self.noise == 0.0:
+        if not self.noise and not self.disturbed:
             return expert.clone()
-        noise = rng.normal(0.0, self.noise, width).astype(np.float32)
+        noise = np.zeros(width, np.float32)
+        if self.noise:
+            noise += rng.normal(0.0, self.noise, width).astype(np.float32)
+        if rng.uniform() < self.disturbed and float(expert.abs().max()) > REST:
+            noise += rng.normal(0.0, self.disturbance, width).astype(np.float32)
         return (expert + torch.from_numpy(noise)).clamp(-1.0, 1.0)
 
 
 def make_policy(spec: CollectionSpec) -> TensorDictModule:
     """A collection's policy: reads `keys.EXPERT_ACTION`, `EPISODE_SEED`, `EPISODE_STEP` and writes `keys.ACTION`."""
     reads = [keys.EXPERT_ACTION, EPISODE_SEED, EPISODE_STEP]
-    return TensorDictModule(CollectionPolicy(spec.policy, spec.noise), in_keys=reads, out_keys=[keys.ACTION])
+    policy = CollectionPolicy(spec.policy, spec.noise, spec.disturbed, spec.disturbance)
+    return TensorDictModule(policy, in_keys=reads, out_keys=[keys.ACTION])
 
 
 class SeededView(TensorView):

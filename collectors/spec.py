@@ -26,6 +26,8 @@ class CollectionSpec:
         steps: agent steps of each; an episode has one more frame.
         seed: base seed.
         noise: standard deviation of Gaussian noise on the expert's actions.
+        disturbed: probability that a step in which the expert moves is disturbed.
+        disturbance: standard deviation of the noise in such a step; 0 where there is none.
         storage: `image` or `video`.
         env: the task; its `max_steps` equals `steps`.
         render: how frames are drawn.
@@ -37,6 +39,8 @@ class CollectionSpec:
     steps: int
     seed: int
     noise: float = 0.0
+    disturbed: float = 0.0
+    disturbance: float = 0.0
     storage: Literal["image", "video"] = "image"
     env: EnvConfig = field(default_factory=EnvConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
@@ -71,9 +75,11 @@ class CollectionSpec:
             raise ConfigError(f"steps: got {steps}, expected at least 2; set collect.{policy}_steps")
         if not 0 <= seed <= LARGEST_SEED + 1:  # `pipeline` collects some episodes with the seed after the typed one
             raise ConfigError(f"seed: got {seed}, expected 0 to {LARGEST_SEED}; choose a smaller one")
-        noise = config.collect.noise if policy == "expert" else 0.0
-        env = replace(config.env, max_steps=steps)
-        return cls(policy, episodes, steps, seed, noise, config.collect.storage, env, config.render)
+        env, want = replace(config.env, max_steps=steps), config.collect
+        expert = policy == "expert"
+        noise, disturbed = (want.noise, want.disturbed) if expert else (0.0, 0.0)
+        disturbance = want.disturbance if disturbed else 0.0
+        return cls(policy, episodes, steps, seed, noise, disturbed, disturbance, want.storage, env, config.render)
 
     def episode_seed(self, index: int) -> int:
         """Seed of episode `index`."""

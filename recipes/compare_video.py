@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -82,13 +81,13 @@ def _check_clips(config: ExperimentConfig) -> None:
     Raises:
         DataError: too few episodes, or none as long as a clip of training or test.
     """
-    from playslot_rl.comparison.video_clips import open_clips, test_sets
+    from playslot_rl.comparison.video_clips import tested_clips
     from playslot_rl.data.windows import Clips
     from playslot_rl.training.record import open_videos
 
     own = config.compare_video
-    for test, shown in itertools.product(test_sets(config).values(), own.shown):
-        open_clips(config, test, shown + own.predicted, own.clips)
+    for _ in tested_clips(config):
+        pass
     trained = open_videos(config, config.data.root, "compare-video")
     Clips(trained, own.trained_seed + own.trained_frames, config.data.validation, config.seed)
 
@@ -149,7 +148,7 @@ def _references(
     """Scores of the rows that need no training, and the true frames of the first clips."""
     from playslot_rl.baselines.video.scores import as_function, score_clips
     from playslot_rl.baselines.video.slots import LastFrame, Reconstruction
-    from playslot_rl.comparison.video_clips import open_clips, test_sets
+    from playslot_rl.comparison.video_clips import test_sets, tested_clips
     from playslot_rl.comparison.video_page import LAST_FRAME, RECONSTRUCTION
     from playslot_rl.comparison.video_report import read_references
     from playslot_rl.config import to_dict
@@ -167,8 +166,7 @@ def _references(
         models[RECONSTRUCTION] = ("the frames themselves", Reconstruction(load_savi(config.run, device)))
     stored = read_references(out / "references.json", print_)
     rows, truth = stored or [], {}
-    for (label, test), shown in itertools.product(test_sets(config).items(), own.shown):
-        source, at = open_clips(config, test, shown + own.predicted, own.clips)
+    for label, shown, source, at in tested_clips(config):
         truth[label, shown] = source.frames[at[: own.pictures, shown:]]
         for title, (sees, model) in models.items() if stored is None else ():
             scores, _ = score_clips(as_function(model, shown), source, at, shown, device, lpips=network)

@@ -5,7 +5,6 @@ Started by `playslot_rl.recipes.compare_job`, which says how it ended.
 
 from __future__ import annotations
 
-import itertools
 import json
 import time
 from dataclasses import replace
@@ -87,7 +86,7 @@ def _score(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> N
     from playslot_rl.baselines.video.load import load_video
     from playslot_rl.baselines.video.rows import method_rows
     from playslot_rl.baselines.video.scores import score_clips
-    from playslot_rl.comparison.video_clips import open_clips, sheet_name, test_sets
+    from playslot_rl.comparison.video_clips import sheet_name, tested_clips
     from playslot_rl.comparison.video_plan import asked_of
     from playslot_rl.evaluation.lpips import open_lpips
     from playslot_rl.recipes.run import open_device
@@ -99,8 +98,7 @@ def _score(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> N
     done = read_stage(checkpoint_folder(job.run, job.stage), job.stage)
     network = open_lpips(config.metrics.lpips_weights).network
     scores, pictures = [], dict[str, Any]()
-    for (label, test), shown in itertools.product(test_sets(config).items(), asked.shown):
-        source, rows = open_clips(config, test, shown + asked.predicted, asked.clips)
+    for label, shown, source, rows in tested_clips(config):
         for row in method_rows(model, shown):
             values, frames = score_clips(
                 row.predict, source, rows, shown, device, lpips=network, shuffled=row.shuffled, shown=asked.pictures

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.demonstrations import split_tested
@@ -15,6 +17,34 @@ def test_sets(config: ExperimentConfig) -> dict[str, str]:
     """The data sets whose clips are tested, by folder name; one of them, or episodes kept of `data.root`, has none."""
     roots = [part.strip() for part in config.compare_video.test.split(",") if part.strip()]
     return {Path(root).name: root for root in roots} if len(roots) > 1 else {"": "".join(roots)}
+
+
+class Tested(NamedTuple):
+    """Clips that are predicted from some seed frames on.
+
+    Attributes:
+        label: of their test set; empty where it is the only one.
+        shown: seed frames.
+        source: the episodes.
+        rows: of each clip's frames, int64 (clips, shown + predicted).
+    """
+
+    label: str
+    shown: int
+    source: EpisodeFrames
+    rows: IntArray
+
+
+def tested_clips(config: ExperimentConfig) -> Iterator[Tested]:
+    """The clips of each test set after each number of seed frames.
+
+    Raises:
+        DataError: see `open_clips`.
+    """
+    own = config.compare_video
+    for label, test in test_sets(config).items():
+        for shown in own.shown:
+            yield Tested(label, shown, *open_clips(config, test, shown + own.predicted, own.clips))
 
 
 def sheet_name(label: str, shown: int) -> str:
