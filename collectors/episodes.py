@@ -38,25 +38,19 @@ EPISODE_STEP: Final = "episode_step"
 POLICY_STREAM: Final = 2
 """Spawn key of the policy's random numbers; the environment uses 0 and 1 of the same seed."""
 MAX_REDRAWS: Final = 20
-REST: Final = 0.02
-"""An expert none of whose numbers is larger holds still."""
 
 
 class CollectionPolicy(nn.Module):
-    """Uniform actions in [-1, 1], or the expert's a* with Gaussian noise.
-
-        a = clip(a* + noise e + d disturbance e', -1, 1),   e, e' ~ N(0, I),   d ~ Bernoulli(disturbed) while a* moves
+    """Uniform actions in [-1, 1], or the expert's with Gaussian noise.
 
     Args:
         name: `random` or `expert`.
-        noise: standard deviation of what is added to all of the expert's actions.
-        disturbed: probability that an action of which a number exceeds `REST` is disturbed.
-        disturbance: standard deviation of what is then added.
+        noise: standard deviation for the expert's actions; the sum is clipped to [-1, 1].
     """
 
-    def __init__(self, name: str, noise: float = 0.0, disturbed: float = 0.0, disturbance: float = 0.0) -> None:
+    def __init__(self, name: str, noise: float = 0.0) -> None:
         super().__init__()
-        self.name, self.noise, self.disturbed, self.disturbance = name, noise, disturbed, disturbance
+        self.name, self.noise = name, noise
 
     def forward(self, expert: Tensor, seed: Tensor, step: Tensor) -> Tensor:
         """Action float32 (A,) from the expert's (A,), the episode's seed (1,) and its step (1,)."""
@@ -64,21 +58,16 @@ class CollectionPolicy(nn.Module):
         width = expert.shape[-1]
         if self.name == "random":
             return torch.from_numpy(rng.uniform(-1.0, 1.0, width).astype(np.float32))
-        if not self.noise and not self.disturbed:
+        if self.noise == 0.0:
             return expert.clone()
-        noise = np.zeros(width, np.float32)
-        if self.noise:
-            noise += rng.normal(0.0, self.noise, width).astype(np.float32)
-        if rng.uniform() < self.disturbed and float(expert.abs().max()) > REST:
-            noise += rng.normal(0.0, self.disturbance, width).astype(np.float32)
+        noise = rng.normal(0.0, self.noise, width).astype(np.float32)
         return (expert + torch.from_numpy(noise)).clamp(-1.0, 1.0)
 
 
 def make_policy(spec: CollectionSpec) -> TensorDictModule:
     """A collection's policy: reads `keys.EXPERT_ACTION`, `EPISODE_SEED`, `EPISODE_STEP` and writes `keys.ACTION`."""
     reads = [keys.EXPERT_ACTION, EPISODE_SEED, EPISODE_STEP]
-    policy = CollectionPolicy(spec.policy, spec.noise, spec.disturbed, spec.disturbance)
-    return TensorDictModule(policy, in_keys=reads, out_keys=[keys.ACTION])
+    return TensorDictModule(CollectionPolicy(spec.policy, spec.noise), in_keys=reads, out_keys=[keys.ACTION])
 
 
 class SeededView(TensorView):
@@ -91,16 +80,19 @@ class SeededView(TensorView):
     Args:
         env: the task.
         jobs: the first episodes.
+        options: of each of its resets.
 
     Attributes:
         jobs: episodes that have not been started: place in the collection and seed of each.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]] = ()) -> None:
+    def __init__(
+        self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]] = (), options: dict[str, Any] | None = None
+    ) -> None:
         counter = gym.spaces.Box(0, 2**62, (1,), np.int64)
         counters = dict.fromkeys((EPISODE_INDEX, EPISODE_SEED, EPISODE_STEP, REDRAWN), counter)
         super().__init__(env, {keys.EXPERT_ACTION: env.action_space, **counters})
-        self.jobs = deque(jobs)
+        self.jobs, self.options = deque(jobs), options
         self._running: tuple[int, int] | None = None
         self._episode_seed = self._redrawn = self._step = 0
 
@@ -129,7 +121,7 @@ class SeededView(TensorView):
         first, self._step = self._running[1], 0
         for attempt in range(MAX_REDRAWS):
             self._episode_seed, self._redrawn = first + attempt * redraw_stride(first), attempt
-            observation, info = self.env.reset(seed=self._episode_seed)
+            observation, info = self.env.reset(seed=self._episode_seed, options=self.options)
             if not info["success"]:
                 return self.view(observation, info), info
         self._running = None
@@ -164,7 +156,8 @@ class TaskMaker:
 
     def __call__(self) -> EnvBase:
         """The environment."""
-        self._view = SeededView(make_env(self.spec.env, self.spec.render))
+        lead = {"lead_in": self.spec.lead_in, "lead_noise": self.spec.lead_noise} if self.spec.lead_in else None
+        self._view = SeededView(make_env(self.spec.env, self.spec.render), options=lead)
         return wrap(self._view)
 
     def add(self, index: int) -> None:

@@ -26,8 +26,8 @@ class CollectionSpec:
         steps: agent steps of each; an episode has one more frame.
         seed: base seed.
         noise: standard deviation of Gaussian noise on the expert's actions.
-        disturbed: probability that a step in which the expert moves is disturbed.
-        disturbance: standard deviation of the noise in such a step; 0 where there is none.
+        lead_in: at most so many unrecorded agent steps of the expert, disturbed, before the first frame.
+        lead_noise: standard deviation of the noise in them; 0 where there are none.
         storage: `image` or `video`.
         env: the task; its `max_steps` equals `steps`.
         render: how frames are drawn.
@@ -39,8 +39,8 @@ class CollectionSpec:
     steps: int
     seed: int
     noise: float = 0.0
-    disturbed: float = 0.0
-    disturbance: float = 0.0
+    lead_in: int = 0
+    lead_noise: float = 0.0
     storage: Literal["image", "video"] = "image"
     env: EnvConfig = field(default_factory=EnvConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
@@ -77,9 +77,9 @@ class CollectionSpec:
             raise ConfigError(f"seed: got {seed}, expected 0 to {LARGEST_SEED}; choose a smaller one")
         env, want = replace(config.env, max_steps=steps), config.collect
         expert = policy == "expert"
-        noise, disturbed = (want.noise, want.disturbed) if expert else (0.0, 0.0)
-        disturbance = want.disturbance if disturbed else 0.0
-        return cls(policy, episodes, steps, seed, noise, disturbed, disturbance, want.storage, env, config.render)
+        noise, lead_in = (want.noise, want.lead_in) if expert else (0.0, 0)
+        lead_noise = want.lead_noise if lead_in else 0.0
+        return cls(policy, episodes, steps, seed, noise, lead_in, lead_noise, want.storage, env, config.render)
 
     def episode_seed(self, index: int) -> int:
         """Seed of episode `index`."""
