@@ -80,19 +80,16 @@ class SeededView(TensorView):
     Args:
         env: the task.
         jobs: the first episodes.
-        options: of each of its resets.
 
     Attributes:
         jobs: episodes that have not been started: place in the collection and seed of each.
     """
 
-    def __init__(
-        self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]] = (), options: dict[str, Any] | None = None
-    ) -> None:
+    def __init__(self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]] = ()) -> None:
         counter = gym.spaces.Box(0, 2**62, (1,), np.int64)
         counters = dict.fromkeys((EPISODE_INDEX, EPISODE_SEED, EPISODE_STEP, REDRAWN), counter)
         super().__init__(env, {keys.EXPERT_ACTION: env.action_space, **counters})
-        self.jobs, self.options = deque(jobs), options
+        self.jobs = deque(jobs)
         self._running: tuple[int, int] | None = None
         self._episode_seed = self._redrawn = self._step = 0
 
@@ -121,7 +118,7 @@ class SeededView(TensorView):
         first, self._step = self._running[1], 0
         for attempt in range(MAX_REDRAWS):
             self._episode_seed, self._redrawn = first + attempt * redraw_stride(first), attempt
-            observation, info = self.env.reset(seed=self._episode_seed, options=self.options)
+            observation, info = self.env.reset(seed=self._episode_seed)
             if not info["success"]:
                 return self.view(observation, info), info
         self._running = None
@@ -156,8 +153,7 @@ class TaskMaker:
 
     def __call__(self) -> EnvBase:
         """The environment."""
-        lead = {"lead_in": self.spec.lead_in, "lead_noise": self.spec.lead_noise} if self.spec.lead_in else None
-        self._view = SeededView(make_env(self.spec.env, self.spec.render), options=lead)
+        self._view = SeededView(make_env(self.spec.env, self.spec.render))
         return wrap(self._view)
 
     def add(self, index: int) -> None:

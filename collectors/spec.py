@@ -26,8 +26,6 @@ class CollectionSpec:
         steps: agent steps of each; an episode has one more frame.
         seed: base seed.
         noise: standard deviation of Gaussian noise on the expert's actions.
-        lead_in: at most so many unrecorded agent steps of the expert, disturbed, before the first frame.
-        lead_noise: standard deviation of the noise in them; 0 where there are none.
         storage: `image` or `video`.
         env: the task; its `max_steps` equals `steps`.
         render: how frames are drawn.
@@ -39,8 +37,6 @@ class CollectionSpec:
     steps: int
     seed: int
     noise: float = 0.0
-    lead_in: int = 0
-    lead_noise: float = 0.0
     storage: Literal["image", "video"] = "image"
     env: EnvConfig = field(default_factory=EnvConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
@@ -75,11 +71,9 @@ class CollectionSpec:
             raise ConfigError(f"steps: got {steps}, expected at least 2; set collect.{policy}_steps")
         if not 0 <= seed <= LARGEST_SEED + 1:  # `pipeline` collects some episodes with the seed after the typed one
             raise ConfigError(f"seed: got {seed}, expected 0 to {LARGEST_SEED}; choose a smaller one")
-        env, want = replace(config.env, max_steps=steps), config.collect
-        expert = policy == "expert"
-        noise, lead_in = (want.noise, want.lead_in) if expert else (0.0, 0)
-        lead_noise = want.lead_noise if lead_in else 0.0
-        return cls(policy, episodes, steps, seed, noise, lead_in, lead_noise, want.storage, env, config.render)
+        noise = config.collect.noise if policy == "expert" else 0.0
+        env = replace(config.env, max_steps=steps)
+        return cls(policy, episodes, steps, seed, noise, config.collect.storage, env, config.render)
 
     def episode_seed(self, index: int) -> int:
         """Seed of episode `index`."""

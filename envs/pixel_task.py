@@ -133,34 +133,21 @@ class PixelTask(gym.Env[Observation, Action]):
 
         Args:
             seed: the episode's seed; None draws the next one from the environment's generator.
-            options: `{"lead_in": n, "lead_noise": s}` lets the expert act before the first observation, for at most n
-                agent steps, with Gaussian noise of standard deviation s: for demonstrations (`collect.lead_in`).
+            options: unused.
 
         Returns:
             The first observation and `{"success": bool}`: True for an episode that starts solved, which only random
             warm-up steps can make.
         """
+        del options
         super().reset(seed=seed)
         episode = int(self.np_random.integers(2**31)) if seed is None else seed
-        lead = options or {}
-        self._start(np.random.SeedSequence(episode), int(lead.get("lead_in", 0)), float(lead.get("lead_noise", 0.0)))
+        task, warmup = (np.random.default_rng(s) for s in np.random.SeedSequence(episode).spawn(2))
+        self._begin(task)
+        for _ in range(self.config.warmup_steps):
+            self._simulate(warmup.uniform(-1.0, 1.0, ACTION_DIM).astype(np.float32))
         self._steps = 0
         return self._observe(self.draw_resets), {"success": self._solved()}
-
-    def _start(self, episode: np.random.SeedSequence, most: int, noise: float) -> None:
-        """The state of the first observation; a lead-in that solves the task is halved until it does not."""
-        task, warmup, lead = episode.spawn(3)
-        steps = int(np.random.default_rng(lead).integers(most + 1))
-        while True:
-            self._begin(np.random.default_rng(task))
-            rng = np.random.default_rng(warmup)
-            for _ in range(self.config.warmup_steps):
-                self._simulate(rng.uniform(-1.0, 1.0, ACTION_DIM).astype(np.float32))
-            rng = np.random.default_rng(lead)
-            actions = (self.expert_action() + rng.normal(0.0, noise, ACTION_DIM) for _ in range(steps))
-            if not any(self._simulate(np.clip(action, -1.0, 1.0).astype(np.float32))[1] for action in actions):
-                return
-            steps //= 2
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One agent step.

@@ -78,7 +78,7 @@ def collect_videos(config: ExperimentConfig, folder: Path) -> DataConfig:
         # Random actions never reach the object. Videos of a noisy expert (no action is read from them) show the world
         # model the places a policy goes to; the paper has 9,000 random episodes instead.
         noisy = folder / "data" / "noisy_expert"
-        noise = replace(config, collect=replace(want, noise=want.exploration_noise, lead_in=0))
+        noise = replace(config, collect=replace(want, noise=want.exploration_noise))
         # The next base seed: no episode of the demonstrations comes twice.
         collect(noise, "expert", want.noisy_episodes, want.expert_steps, noisy, config.seed + 1, config.workers)
         roots.append(str(noisy))

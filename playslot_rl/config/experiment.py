@@ -57,11 +57,6 @@ class CollectConfig(Checked):
             any data set, at most so many of its last episodes, beyond those trained on, are looked at in validation.
         expert_steps: agent steps of each; clips go on past success.
         noise: standard deviation of Gaussian noise added to the expert's actions.
-        lead_in: at most so many agent steps of a disturbed expert come before an expert's episode begins, unrecorded:
-            from there demonstrations show how it finds back, and all that is recorded is what it means (DART, Laskey
-            et al. 2017, has both by recording the action that was meant; a video shows only the other). 0 has none
-            (paper). What is evaluated begins without.
-        lead_noise: standard deviation of the Gaussian noise on the actions of these steps.
         noisy_episodes: episodes of the noisy expert that `pipeline` adds to the world model's videos.
         exploration_noise: standard deviation of its noise.
         learn_from_demos: whether the world model learns from the demonstrations' videos too (never their actions).
@@ -75,8 +70,6 @@ class CollectConfig(Checked):
     validation_episodes: int = field(default=10, metadata=role("machine") | at_least(0, "0 or more"))
     expert_steps: int = 20
     noise: float = 0.0
-    lead_in: int = field(default=0, metadata=at_least(0, "0 (none) or more"))
-    lead_noise: float = field(default=0.5, metadata=at_least(0, "0 or more"))
     noisy_episodes: int = 0
     exploration_noise: float = 0.5
     learn_from_demos: bool = False
