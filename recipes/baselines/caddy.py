@@ -111,7 +111,7 @@ def _policy(config: ExperimentConfig, record: StageRecord) -> Training:
 
     own, device = config.baselines.caddy_policy, open_device(config)
     behaviour = CADDYBehaviour(config, record.parents[MODEL], record.demos, device)
-    return cloning(config, record, behaviour, own)
+    return cloning(config, record, behaviour, own.policy, own.decoder_steps, own.decoder_lr)
 
 
 def _oracle(config: ExperimentConfig, record: StageRecord) -> Training:

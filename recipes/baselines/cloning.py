@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from playslot_rl.config import CADDYPolicyConfig, ExperimentConfig, LAPOConfig
+from playslot_rl.config import ExperimentConfig, StageConfig
 from playslot_rl.config.methods import LATENT_MODELS
 from playslot_rl.recipes.run import adopt_policy, held_out_text, require_parent
 
@@ -62,7 +62,12 @@ def model_of(
 
 
 def cloning(
-    config: ExperimentConfig, record: StageRecord, behaviour: LatentCloning, own: LAPOConfig | CADDYPolicyConfig
+    config: ExperimentConfig,
+    record: StageRecord,
+    behaviour: LatentCloning,
+    policy: StageConfig,
+    decoder_steps: int,
+    decoder_lr: float,
 ) -> Training:
     """Latent policy, then action decoder; the policy is taken over where another run has trained it.
 
@@ -70,13 +75,14 @@ def cloning(
         config: of the command.
         record: the method's stage.
         behaviour: what is trained.
-        own: the method's schedules.
+        policy: its schedule, `baselines.METHOD.policy`.
+        decoder_steps, decoder_lr: the decoder's; the rest is as for the policy.
     """
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
 
-    name, split, policy = record.name, record.demos, own.policy
-    decoding = replace(policy, steps=own.decoder_steps, optim=replace(policy.optim, lr=own.decoder_lr))
+    name, split = record.name, record.demos
+    decoding = replace(policy, steps=decoder_steps, optim=replace(policy.optim, lr=decoder_lr))
     labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
 
     def parts() -> Iterator[Part]:

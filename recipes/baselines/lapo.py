@@ -110,4 +110,4 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
 
     own, device = config.baselines.lapo, open_device(config)
     behaviour = LAPOBehaviour(config, record.parents[MODEL], record.demos, device)
-    return cloning(config, record, behaviour, own)
+    return cloning(config, record, behaviour, own.policy, own.decoder_steps, own.decoder_lr)
