@@ -26,8 +26,8 @@ ENVIRONMENTS: dict[str, tuple[str, str]] = {
 PROCEDURAL = ("grid_shapes",)
 """Environments that are drawn, not simulated: they give videos, there is nothing to act on and no success."""
 
-RECORDED = ("sketchy",)
-"""Names of data sets recorded on real robots: settings for training on them."""
+RECORDED = ("sketchy", "video")
+"""Videos that were recorded elsewhere: settings for training on them. `video` is any LeRobot data set."""
 
 
 EASY: Final = BlocksConfig(distractors=0, colour="mediumblue")

@@ -113,6 +113,16 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot pipeline preset=smoke out=runs/smoke",
         ),
     ),
+    "adopt": Command(
+        "any LeRobot data set with a camera becomes a world model to play with",
+        "Looks at the set, chooses frame size, stride, slots and prototypes by short trainings and says why, trains "
+        "SAVi and dynamics within `minutes`, and writes the report card. No action is needed. The same command carries "
+        "on after a kill; choices are in OUT/adopt.json.",
+        (
+            "playslot adopt data.root=data/mine out=runs/mine",
+            "playslot adopt data.root=data/mine data.camera=observation.images.top minutes=30 out=runs/mine",
+        ),
+    ),
     "compare": Command(
         "methods side by side: success against demonstrations, table and plot",
         "Trains and evaluates every method with every number of demonstrations and every seed, on the same held-out "

@@ -26,7 +26,13 @@ if TYPE_CHECKING:
 
     ParsedVideos = tuple[EpisodeFrames, npt.NDArray[np.float32]]
 
-OURS = ("slots", "dynamics", "policy", "world_model.json")  # known names of a run folder without config.json
+OURS = (
+    "slots",
+    "dynamics",
+    "policy",
+    "world_model.json",
+    "adopt.json",
+)  # known names of a run folder without config.json
 
 
 def stored_result(path: Path, facts: Mapping[str, Any]) -> dict[str, Any] | None:

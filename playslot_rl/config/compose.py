@@ -66,6 +66,8 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
             _check_choice(group, pairs[group])
     try:
         run = _expand_home(_unquote(pairs.get("run", "")))
+        if command == "adopt":
+            pairs.setdefault("env", "video")
         continues = command in CONTINUES and run != "" and not shipped(run)
         if shipped(run) and run != SHIPPED:
             pairs.setdefault("env", run.partition("/")[2])  # the task that the model is named after

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from playslot_rl.config.adopt import AdoptConfig
 from playslot_rl.config.baselines import BaselinesConfig
 from playslot_rl.config.compare import CompareConfig
 from playslot_rl.config.compare_video import CompareVideoConfig
@@ -27,6 +28,7 @@ class DataConfig(Checked):
         draw: seed of the draw that decides which demonstrations are the first ones, of those that are not held out;
             None takes them in the order in which they were recorded.
         camera: image feature(s) to read, separated by commas; empty means the only one.
+        stride: of each episode every `stride`-th frame is read (`playslot_rl.data.stride`).
         resize: resize frames of another size than `env.image_size` (area averaging) instead of refusing them.
         cache: folder of the frame and slot caches; empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
         validation: fraction of episodes held out from training.
@@ -39,6 +41,7 @@ class DataConfig(Checked):
     held_out: int = field(default=0, metadata=role("machine") | at_least(0, "0 or more"))
     draw: int | None = field(default=None, metadata=SEED)
     camera: str = ""
+    stride: int = field(default=1, metadata=at_least(1, "1 (every frame) or more"))
     resize: bool = False
     cache: str = field(default="", metadata=role("machine", "folder"))
     validation: float = field(default=0.05, metadata=within(lambda value: 0 <= value < 1, "a fraction in [0, 1)"))
@@ -162,6 +165,7 @@ class ExperimentConfig(Checked):
         device: torch device; empty means a GPU if there is one.
         threads: torch threads; 0 leaves torch's choice.
         method: what `train-baseline` trains (a name of `playslot_rl.config.methods`).
+        minutes: of wall-clock time that `adopt` may take.
         demos: demonstrations of the data set to use, the first ones; None means all.
     """
 
@@ -175,6 +179,7 @@ class ExperimentConfig(Checked):
     protocol: Literal["simulation", "imagination", "slots"] = field(default="simulation", metadata=role("call"))
     device: str = field(default="", metadata=role("call", "machine"))
     threads: int = field(default=0, metadata=role("machine"))
+    minutes: float = field(default=60.0, metadata=role("call", "machine") | within(lambda v: v > 0, "above 0"))
     method: MethodName = "playslot"
     demos: int | None = field(default=None, metadata=at_least(1))
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -192,4 +197,5 @@ class ExperimentConfig(Checked):
     metrics: MetricsConfig = field(default_factory=MetricsConfig, metadata=role("machine"))
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     logging: LoggingConfig = field(default_factory=LoggingConfig, metadata=role("machine"))
+    adopt: AdoptConfig = field(default_factory=AdoptConfig, metadata=role("call", "machine"))
     export: ExportConfig = field(default_factory=ExportConfig, metadata=role("call"))

@@ -57,11 +57,14 @@ class SlotsStageConfig(StageConfig):
     Attributes:
         clip_frames: frames per clip.
         start_from: run (or `pretrained/ENV`) whose SAVi this one starts from; empty starts from scratch (paper).
+        patience: end before `steps` once the error on held-out clips has not fallen for so many validations, with the
+            weights that had the lowest; 0 trains all steps.
     """
 
     group = "slots."
     clip_frames: int = 8
     start_from: str = field(default="", metadata=role("folder"))
+    patience: int = field(default=0, metadata=at_least(0, "0 (train all steps) or more"))
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,7 @@ class DynamicsStageConfig(StageConfig):
         teacher_steps: first steps in which every input is a parsed slot (one parallel pass; 0 in the paper).
         decoded_frames: predicted frames decoded for the image loss, drawn at random; 0 decodes all of them.
         image_weight, slot_weight, vq_weight: loss weights (lambda of Eq. "full loss").
+        patience: as for the slots, by the slots' error.
     """
 
     group = "dynamics."
@@ -86,6 +90,7 @@ class DynamicsStageConfig(StageConfig):
     image_weight: float = 1.0
     slot_weight: float = 1.0
     vq_weight: float = 0.25
+    patience: int = field(default=0, metadata=at_least(0, "0 (train all steps) or more"))
 
 
 @dataclass(frozen=True)

@@ -85,6 +85,7 @@ def resize_frames(frames: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.ui
 def _image_frames(
     contents: Contents, camera: str, spans: Sequence[Span], problems: Problems
 ) -> Iterator[tuple[int, Decoded]]:
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     wanted = {row for span in spans for row in range(span.start, span.stop)}
@@ -102,7 +103,7 @@ def _image_frames(
             begin = row
             for batch in file.iter_batches(ROWS_A_PIECE, columns=[camera]):
                 here = [i for i in range(len(batch)) if row + i in wanted]
-                cells = batch.column(0).take(here).to_pylist()
+                cells = batch.column(0).take(pa.array(here, pa.int64())).to_pylist()  # there may be none
                 for i, result in zip(here, pool.map(decode, cells), strict=True):
                     if isinstance(result, str):
                         fault = f"cannot be decoded ({result}), expected a PNG or JPEG image"

@@ -15,6 +15,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.roles import fixed_keys
 from playslot_rl.data.demonstrations import DemonstrationSplit, episode_range, split_demonstrations, split_tested
 from playslot_rl.data.source import EpisodeFrames, concatenate, open_sources
+from playslot_rl.data.stride import every
 from playslot_rl.data.windows import Clips
 from playslot_rl.errors import CheckpointError, DataError
 from playslot_rl.storage.checkpoints import (
@@ -40,7 +41,8 @@ def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrame
 
     def opened(root: str) -> EpisodeFrames:
         size, resize = config.env.image_size, config.data.resize
-        return open_sources(root, config.data.camera, config.data.cache, image_size=size, resize=resize)
+        found = open_sources(root, config.data.camera, config.data.cache, image_size=size, resize=resize)
+        return every(found, config.data.stride)
 
     if not roots:
         raise DataError(f"{what}: got no data set, expected data.root=DIR; record one by `playslot collect`")

@@ -44,9 +44,12 @@ def read_latents(model: WorldModel, root: Path, given: ReportInput, most_episode
     """Latent actions of up to `most_episodes` episodes of a data set, with the probe where it has actions."""
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.data.source import open_sources
+    from playslot_rl.data.stride import every
 
     data = given.config.data
-    source = open_sources([root], camera=data.camera, cache=data.cache)
+    size = given.config.env.image_size
+    source = open_sources([root], data.camera, data.cache, image_size=size, resize=data.resize)
+    source = every(source, data.stride)
     prints = str(given.metas.get("slots", {}).get("fingerprint", ""))
     slots = slot_cache(source, model.savi, prints, data.cache, module_device(model))
     starts, lengths = source.starts[:most_episodes], source.lengths[:most_episodes]

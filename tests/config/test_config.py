@@ -25,7 +25,7 @@ from playslot_rl.config.roles import Checked, fixed_keys, keys_of, without
 from playslot_rl.errors import ConfigError
 
 PRESETS = ["compact", "paper", "smoke"]
-ENVS = ["block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "grid_shapes", "sketchy"]
+ENVS = ["block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "grid_shapes", "sketchy", "video"]
 
 
 def store(config: ExperimentConfig, run: Path) -> Path:

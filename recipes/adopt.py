@@ -1,0 +1,147 @@
+"""`playslot adopt data.root=SET out=RUN minutes=60`: any LeRobot set with a camera becomes a playable world model.
+
+    look at the set -> frame size, stride -> trials -> slots, prototypes -> SAVi, dynamics -> report card
+
+What was chosen, and why, is written to `RUN/adopt.json` as soon as it is known: a second call goes on from there.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.data.survey import Choice, Survey, choose_size, choose_stride, survey
+from playslot_rl.errors import ConfigError, DataError
+from playslot_rl.recipes import train_dynamics, train_slots
+from playslot_rl.recipes.adopt_trials import (
+    choose_prototypes,
+    choose_slots,
+    scheduled,
+    seconds_a_step,
+    steps_within,
+    with_prototypes,
+    with_slots,
+)
+from playslot_rl.recipes.run import open_run
+from playslot_rl.storage.atomic import write_json
+
+SHARES: Final = {"slots_trials": 0.18, "slots": 0.42, "dynamics_trial": 0.06, "dynamics": 0.28}
+"""Of the time; the rest is for looking, parsing and the report card."""
+NAME: Final = "adopt.json"
+
+
+class Decisions:
+    """What was decided, by name, in `RUN/adopt.json`.
+
+    Args:
+        run: the run folder.
+        facts: what the decisions depend on.
+
+    Raises:
+        ConfigError: the run was begun with other facts.
+    """
+
+    def __init__(self, run: Path, facts: dict[str, Any]) -> None:
+        self.path = run / NAME
+        stored: dict[str, Any] = json.loads(self.path.read_text()) if self.path.is_file() else {}
+        facts = json.loads(json.dumps(facts))
+        for key, value in stored.get("facts", facts).items():
+            if facts.get(key) != value:
+                raise ConfigError(
+                    f"{key}: got {facts.get(key)}, expected {value}, with which out={run} was begun: leave it, or use "
+                    "another out="
+                )
+        self.facts, self.made = facts, dict[str, Any](stored.get("choices", {}))
+
+    def __call__(self, name: str, decide: Callable[[], Choice]) -> int:
+        """The value of a decision, made now if it was not made before; it is said and written."""
+        if name not in self.made:
+            value, reason = decide()
+            self.made[name] = {"value": value, "reason": reason}
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            write_json(self.path, {"facts": self.facts, "choices": self.made})
+        print(f"{name}: {self.made[name]['value']} ({self.made[name]['reason']})", flush=True)
+        return int(self.made[name]["value"])
+
+
+def main(config: ExperimentConfig) -> None:
+    """Choose, train and report.
+
+    Raises:
+        ConfigError: no data set or several, or a task of the simulator's in `env`.
+        DataError: no camera, several and none named, one-frame episodes, or frames that never change.
+        OutputError, CheckpointError, TrainingError: as the stages.
+    """
+    if config.env.name != "video":
+        raise ConfigError(f"env: got {config.env.name}, expected video: adopt reads recorded videos; leave env= out")
+    if not config.data.root or "," in config.data.root:
+        raise ConfigError(
+            f"data.root: got {config.data.root or 'nothing'}, expected one data set, such as data.root=SET"
+        )
+    run = open_run(config)
+    seen = survey(config.data.root, config.data.camera)
+    asked = {"minutes": config.minutes, "seed": config.seed, "preset": config.preset, **to_dict(config.adopt)}
+    decide = Decisions(run, {"data.root": config.data.root, "camera": seen.camera, **asked})
+    config = _for_frames(config, seen, decide)
+    budget = {name: 60 * config.minutes * share for name, share in SHARES.items()}
+
+    config = _chosen_slots(replace(config, out=str(run), run=""), run, decide, budget)
+    train_slots.main(config)
+    config = _chosen_prototypes(config, run, decide, budget)
+    train_dynamics.main(config)
+    print(f"play it: playslot play run={run} data.root={config.data.root}")
+
+
+def _for_frames(config: ExperimentConfig, seen: Survey, decide: Decisions) -> ExperimentConfig:
+    """The config with frame size, stride, and clips that the episodes have room for."""
+    size = decide("frame size", lambda: choose_size(seen))
+    stride = decide("stride", lambda: choose_stride(seen, size))
+    kept = sorted(-(-int(length) // stride) for length in seen.lengths)
+    typical = kept[len(kept) // 2]
+    if typical < 3:
+        raise DataError(f"{seen.root}: got episodes of {typical} frames, expected at least 3 in half of them")
+    dynamics = config.dynamics
+    predicted = min(dynamics.predicted_frames, typical - dynamics.seed_frames)
+    return replace(
+        config,
+        env=replace(config.env, image_size=size, action_dim=max(1, seen.action_dim), max_steps=max(2, typical - 1)),
+        data=replace(config.data, camera=seen.camera, stride=stride, resize=True),
+        slots=replace(config.slots, clip_frames=min(config.slots.clip_frames, typical)),
+        dynamics=replace(dynamics, predicted_frames=predicted),
+    )
+
+
+def _chosen_slots(config: ExperimentConfig, run: Path, decide: Decisions, budget: dict[str, float]) -> ExperimentConfig:
+    """The config with the number of slots and with the steps that fit."""
+    trials, tried = run / "trials", config.adopt.slots
+    milliseconds = decide(
+        "milliseconds a step of SAVi", lambda: _timed(with_slots(config, max(tried)), "slots", trials)
+    )
+    if len(tried) > 1:
+        steps = steps_within(budget["slots_trials"] / len(tried), milliseconds / 1000)
+        slots = decide("slots", lambda: choose_slots(config, trials, steps))
+    else:
+        slots = decide("slots", lambda: Choice(tried[0], "as asked for"))
+    steps = steps_within(budget["slots"], milliseconds / 1000)
+    return scheduled(with_slots(config, slots), "slots", steps, config.adopt.patience)
+
+
+def _chosen_prototypes(
+    config: ExperimentConfig, run: Path, decide: Decisions, budget: dict[str, float]
+) -> ExperimentConfig:
+    """The config with the number of prototypes and with the steps that fit."""
+    trials, child = run / "trials", replace(config, run=str(run))
+    milliseconds = decide("milliseconds a step of the dynamics", lambda: _timed(child, "dynamics", trials))
+    steps = steps_within(budget["dynamics_trial"], milliseconds / 1000)
+    prototypes = decide("prototypes", lambda: choose_prototypes(config, run, trials / "prototypes", steps))
+    steps = steps_within(budget["dynamics"], milliseconds / 1000)
+    return scheduled(with_prototypes(config, prototypes), "dynamics", steps, config.adopt.patience)
+
+
+def _timed(config: ExperimentConfig, stage: str, trials: Path) -> Choice:
+    seconds = seconds_a_step(config, stage, trials / f"time_{stage}")
+    return Choice(max(1, round(1000 * seconds)), "measured here, the first steps included")

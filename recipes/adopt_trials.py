@@ -1,0 +1,118 @@
+"""Short trainings by which `playslot adopt` chooses slots and prototypes, and learns what a step takes.
+
+Each is a run of its own below `OUT/trials`, finished or carried on like any other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.data.survey import Choice
+
+TIMED_STEPS: Final = 8
+SHORTEST: Final = 20
+"""Steps of a training at least, however little time there is."""
+CARRIED: Final = 0.95
+"""Share of the transitions that the prototypes in use have to carry."""
+FEWEST: Final = 4
+"""Prototypes at least."""
+
+
+def steps_within(seconds: float, seconds_a_step: float) -> int:
+    """Optimiser steps that fit into some seconds."""
+    return max(SHORTEST, int(seconds / max(seconds_a_step, 1e-6)))
+
+
+def with_slots(config: ExperimentConfig, slots: int) -> ExperimentConfig:
+    """The config with another number of slots."""
+    return replace(config, model=replace(config.model, savi=replace(config.model.savi, n_slots=slots)))
+
+
+def with_prototypes(config: ExperimentConfig, prototypes: int) -> ExperimentConfig:
+    """The config with another number of prototypes."""
+    own = replace(config.model.inverse_dynamics, n_prototypes=prototypes)
+    return replace(config, model=replace(config.model, inverse_dynamics=own))
+
+
+def scheduled(config: ExperimentConfig, stage: str, steps: int, patience: int = 0) -> ExperimentConfig:
+    """The config with so many steps of `slots` or `dynamics`: warm-up and teacher forcing shrink with them."""
+    own: Any = getattr(config, stage)
+    share = min(1.0, steps / own.steps)
+    tenth = max(1, steps // 10)
+    changes: dict[str, Any] = {"steps": steps, "validate_every": tenth, "checkpoint_every": tenth, "patience": patience}
+    changes["optim"] = replace(own.optim, warmup_steps=round(own.optim.warmup_steps * share))
+    if stage == "dynamics":
+        changes["teacher_steps"] = round(own.teacher_steps * share)
+    return replace(config, **{stage: replace(own, **changes)})
+
+
+def seconds_a_step(config: ExperimentConfig, stage: str, out: Path) -> float:
+    """Seconds that a step takes, measured; nothing else of that training is kept in mind."""
+    from playslot_rl.recipes import train_dynamics, train_slots
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+
+    timed = scheduled(config, stage, TIMED_STEPS)
+    if stage == "dynamics":  # steps with a teacher are much cheaper than rollouts
+        timed = replace(timed, dynamics=replace(timed.dynamics, teacher_steps=0))
+    (train_slots if stage == "slots" else train_dynamics).main(replace(timed, out=str(out)))
+    return float(read_stage(checkpoint_folder(out, stage), stage).meta["seconds"]) / TIMED_STEPS
+
+
+def choose_slots(config: ExperimentConfig, out: Path, steps: int) -> Choice:
+    """The smallest number of slots that reconstructs held-out clips nearly as well as the best of those tried.
+
+    Args:
+        config: with everything else chosen.
+        out: folder of the trials.
+        steps: of each.
+    """
+    from playslot_rl.recipes import train_slots
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+
+    errors = {}
+    for slots in sorted(config.adopt.slots):
+        folder = out / f"slots_{slots}"
+        train_slots.main(scheduled(replace(with_slots(config, slots), out=str(folder)), "slots", steps))
+        errors[slots] = float(read_stage(checkpoint_folder(folder, "slots"), "slots").meta["metrics"]["mse"])
+    enough = min(errors.values()) * (1 + config.adopt.tolerance)
+    slots = min(slots for slots, error in errors.items() if error <= enough)
+    listed = ", ".join(f"{slots}: {error:.5f}" for slots, error in errors.items())
+    return Choice(slots, f"held-out squared error after {steps} steps by number of slots: {listed}")
+
+
+def choose_prototypes(config: ExperimentConfig, run: Path, out: Path, steps: int) -> Choice:
+    """As many prototypes as carry nearly all transitions when there are more than enough.
+
+    Args:
+        config: with everything else chosen.
+        run: whose slots the trial builds on.
+        out: folder of the trial.
+        steps: of it.
+    """
+    import numpy as np
+
+    from playslot_rl.data.slot_cache import slot_cache
+    from playslot_rl.evaluation.probes import infer_latents
+    from playslot_rl.recipes import train_dynamics
+    from playslot_rl.training.record import open_videos
+    from playslot_rl.training.runs import load_world_model, slots_checkpoint
+    from playslot_rl.world_model import module_device
+
+    many = config.adopt.prototypes
+    trial = scheduled(with_prototypes(config, many), "dynamics", steps)
+    train_dynamics.main(replace(trial, run=str(run), out=str(out)))
+    model = load_world_model(out, config.device or "cpu")
+    source = open_videos(config, config.data.root, "adopt")
+    slots = slot_cache(
+        source, model.savi, slots_checkpoint(out).fingerprint, config.data.cache, module_device(model), False
+    )
+    _, codes, _ = infer_latents(model.inverse_dynamics, slots, source.starts, source.lengths)
+    shares = np.sort(np.bincount(codes.reshape(-1), minlength=many) / codes.size)[::-1]
+    needed = int(np.searchsorted(np.cumsum(shares), CARRIED)) + 1
+    said = (
+        f"{min(needed, many)} of {many} prototypes carry {100 * CARRIED:.0f} % of the transitions after {steps} steps"
+    )
+    return Choice(max(FEWEST, min(needed, many)), said)
