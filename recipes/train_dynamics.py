@@ -21,7 +21,7 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.seeding import global_seed
     from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
     from playslot_rl.training.fit import Part
-    from playslot_rl.training.patience import Patience
+    from playslot_rl.training.patience import patience_of
     from playslot_rl.training.record import StageRecord, Training, run_stage
     from playslot_rl.training.runs import adopt_stage, run_folder, stage_model
     from playslot_rl.training.stage_dynamics import DynamicsStage
@@ -50,7 +50,7 @@ def main(config: ExperimentConfig) -> None:
         cached = slot_cache(source, world.savi, slots.fingerprint, config.data.cache, device, config.logging.progress)
         clips = record.clips(own.seed_frames + own.predicted_frames)
         stage = DynamicsStage(world, clips, cached, own)
-        patience = Patience(own.patience, "mse_slot") if own.patience else None
+        patience = patience_of(own.patience, "mse_slot")
         return Training(
             [Part("dynamics", stage, own, patience=patience)], device, said, extra={"episodes": source.episodes}
         )

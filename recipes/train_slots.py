@@ -15,7 +15,7 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.modules.savi import SAVi
     from playslot_rl.seeding import global_seed
     from playslot_rl.training.fit import Part
-    from playslot_rl.training.patience import Patience
+    from playslot_rl.training.patience import patience_of
     from playslot_rl.training.record import StageRecord, Training, run_stage
     from playslot_rl.training.runs import load_savi, slots_checkpoint
     from playslot_rl.training.stage_slots import SlotsStage, warm_start
@@ -33,7 +33,7 @@ def main(config: ExperimentConfig) -> None:
         device, source = open_device(config), record.data
         with global_seed(config.seed, 0, "slots"):
             savi = SAVi(config.model.savi, config.env.image_size).to(device)
-        patience = Patience(own.patience, "mse") if own.patience else None
+        patience = patience_of(own.patience, "mse")
         started: dict[str, str] = {}
         if own.start_from:
             warm_start(savi, load_savi(own.start_from, device), own.start_from)

@@ -26,6 +26,7 @@ COMMANDS = [
     "evaluate",
     "export",
     "pipeline",
+    "adopt",
     "compare",
     "compare-video",
     "demo",

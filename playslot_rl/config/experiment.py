@@ -179,7 +179,7 @@ class ExperimentConfig(Checked):
     protocol: Literal["simulation", "imagination", "slots"] = field(default="simulation", metadata=role("call"))
     device: str = field(default="", metadata=role("call", "machine"))
     threads: int = field(default=0, metadata=role("machine"))
-    minutes: float = field(default=60.0, metadata=role("call", "machine") | within(lambda v: v > 0, "above 0"))
+    minutes: float = field(default=60.0, metadata=role("call", "machine", "free") | within(lambda v: v > 0, "above 0"))
     method: MethodName = "playslot"
     demos: int | None = field(default=None, metadata=at_least(1))
     env: EnvConfig = field(default_factory=EnvConfig)

@@ -1,6 +1,6 @@
 """Looking at a data set before anything is trained on it: how large its frames have to be, and how far apart.
 
-    d_k(t, x) = max_c |o_{t+k}(x, c) - o_t(x, c)|,   M_k(t) = {x : d_k(t, x) > theta},   theta = max(10, 6 sigma)
+    d_k(t, x) = max_c |o_{t+k}(x, c) - o_t(x, c)|,   M_k(t) = {x : d_k(t, x) > theta},   theta = 6 sigma, 10 to 40
     v_k(t) = sum_{x in M} d_k(t, x) / sum_{x in M} |grad o(x)|
 
 in grey levels of 255, with sigma the camera's noise, a robust deviation of d_1 where it is smallest, and o the mean of
@@ -72,7 +72,7 @@ class Survey:
     @property
     def threshold(self) -> float:
         """theta, grey levels."""
-        return max(10.0, 6.0 * self.noise)
+        return min(40.0, max(10.0, 6.0 * self.noise))  # where everything moves all the time, that is no noise
 
 
 def survey(root: str | Path, camera: str = "") -> Survey:

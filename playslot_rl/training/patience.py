@@ -19,6 +19,11 @@ from playslot_rl.storage.tensors import load_modules, load_tensors, module_tenso
 BEST = "best.safetensors"
 
 
+def patience_of(checks: int, watched: str) -> Patience | None:
+    """The `Patience` of a config's number of validations, of which 0 has none."""
+    return Patience(checks, watched) if checks else None
+
+
 @dataclass(frozen=True)
 class Patience:
     """When to stop.

@@ -17,6 +17,7 @@ from playslot_rl.recipes.run import open_device, open_run, parent_run, require_p
 
 if TYPE_CHECKING:
     from playslot_rl.storage.checkpoints import StageCheckpoint
+    from playslot_rl.training.patience import Patience
     from playslot_rl.training.record import StageRecord, Training
 
 
@@ -89,6 +90,7 @@ def _on_slots(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.seeding import global_seed
     from playslot_rl.storage.checkpoints import load_weights
+    from playslot_rl.training.patience import patience_of
     from playslot_rl.training.runs import stage_model
     from playslot_rl.training.stage_dynamics import DynamicsStage
     from playslot_rl.world_model import WorldModel
@@ -103,16 +105,18 @@ def _on_slots(config: ExperimentConfig, record: StageRecord) -> Training:
     source = record.data
     cached = slot_cache(source, world.savi, slots.fingerprint, config.data.cache, device, config.logging.progress)
     stage = DynamicsStage(world, record.clips(own.seed_frames + own.predicted_frames), cached, own)
-    return _training(config, record, stage, device)
+    return _training(config, record, stage, device, patience_of(own.patience, "mse_slot"))
 
 
-def _training(config: ExperimentConfig, record: StageRecord, stage: Any, device: Any) -> Training:
+def _training(
+    config: ExperimentConfig, record: StageRecord, stage: Any, device: Any, patience: Patience | None = None
+) -> Training:
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
 
     own, name = getattr(config.baselines, config.method), config.method
     return Training(
-        [Part(f"baselines.{name}", stage, own)],
+        [Part(f"baselines.{name}", stage, own, patience=patience)],
         device,
         lambda metrics: f"{name}: {metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {record.folder}",
         extra={"episodes": record.data.episodes},

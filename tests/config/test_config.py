@@ -192,7 +192,19 @@ def test_roles_say_what_each_key_counts_for() -> None:
     assert keys_of(DreamerConfig, "free") == {"minutes", "replay_on_disk", "evaluate_every"} | looking - {
         "validate_every"
     }
-    call = {"out", "run", "episodes", "policy", "protocol", "workers", "collector", "device", "export"}
+    call = {
+        "out",
+        "run",
+        "episodes",
+        "policy",
+        "protocol",
+        "workers",
+        "collector",
+        "device",
+        "export",
+        "adopt",
+        "minutes",
+    }
     assert keys_of(ExperimentConfig, "call") == call
     machine = {
         "device",
@@ -200,9 +212,11 @@ def test_roles_say_what_each_key_counts_for() -> None:
         "workers",
         "logging",
         "collector",
+        "adopt",
         "compare",
         "compare_video",
         "metrics",
+        "minutes",
         "preset",
         "out",
         "run",

@@ -1,0 +1,37 @@
+"""Every k-th frame: the rows, and the actions that lead from one kept row to the next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from playslot_rl.data.source import open_source
+from playslot_rl.data.stride import every
+
+
+def test_rows_of_each_episode_from_its_first_frame_on(foreign_images: Path, tmp_path: Path) -> None:
+    source = open_source(foreign_images, cache=tmp_path)  # episodes of 5, 3 and 7 frames
+    kept = every(source, 3)
+    assert kept.lengths.tolist() == [2, 1, 3]
+    assert kept.starts.tolist() == [0, 2, 3]
+    rows = [0, 3, 5, 8, 11, 14]
+    assert np.array_equal(kept.frames[:], np.asarray(source.frames)[rows])
+    assert np.array_equal(kept.frames[np.array([[1, 4]])], np.asarray(source.frames)[[[3, 11]]])
+    assert (len(kept.frames), kept.frames.shape) == (6, (6, 32, 32, 3))
+    assert kept.fps == pytest.approx(10 / 3)
+
+
+def test_an_action_is_the_mean_of_those_up_to_the_next_kept_row(foreign_images: Path, tmp_path: Path) -> None:
+    kept = every(open_source(foreign_images, cache=tmp_path), 3)
+    # The t-th action is (t, -t); an episode's last one is padding.
+    assert kept.require_actions()[:, 0].tolist() == [1, 3, 0.5, 1, 4, 6]
+
+
+def test_another_stride_is_another_data_set_and_one_is_the_set_itself(foreign_images: Path, tmp_path: Path) -> None:
+    source = open_source(foreign_images, cache=tmp_path)
+    assert every(source, 1) is source
+    assert len({every(source, stride).fingerprint for stride in (1, 2, 3)}) == 3
+    with pytest.raises(ValueError, match="got 0, expected 1"):
+        every(source, 0)

@@ -1,0 +1,94 @@
+"""`playslot adopt`: any LeRobot set with a camera becomes a world model; choices are made once and said."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import refused, smoke
+
+from playslot_rl.config.compose import compose
+from playslot_rl.recipes.adopt_trials import SHORTEST, scheduled, steps_within
+
+QUICK = ("minutes=0.02", "adopt.slots=[2,3]", "adopt.prototypes=4")
+
+
+def write_set(root: Path, lengths: tuple[int, ...], speed: int, cameras: tuple[str, ...] = ("top",)) -> Path:
+    """A square that moves over frames of 40x48, by LeRobot's own writer; no actions."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    shape = {"dtype": "image", "shape": (80, 96, 3), "names": ["height", "width", "channels"]}
+    features: dict[str, Any] = {f"observation.images.{name}": shape for name in cameras}
+    data = LeRobotDataset.create("me/any", fps=30, features=features, root=root, use_videos=False)
+    for length in lengths:
+        for t in range(length):
+            frame = np.full((80, 96, 3), 60, np.uint8)
+            frame[30:50, 10 + speed * t : 30 + speed * t] = 220
+            data.add_frame({**dict.fromkeys(features, frame), "task": "move"})
+        data.save_episode(parallel_encoding=False)
+    data.finalize()
+    return root
+
+
+@pytest.fixture(scope="module")
+def any_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_set(tmp_path_factory.mktemp("any") / "set", (24, 30, 26, 24, 28), speed=2)
+
+
+def test_a_set_that_nobody_prepared_becomes_a_world_model(any_set: Path, tmp_path: Path) -> None:
+    import playslot_rl
+
+    run = tmp_path / "run"
+    done = smoke("adopt", f"data.root={any_set}", f"out={run}", *QUICK)
+    made = json.loads((run / "adopt.json").read_text())["choices"]
+    assert made["frame size"]["value"] == 64
+    assert made["slots"]["value"] in (2, 3)
+    assert made["prototypes"]["value"] == 4
+    assert all(f"{name}: {choice['value']} (" in done.out for name, choice in made.items())
+    assert f"playslot play run={run} data.root={any_set}" in done.out
+    model = playslot_rl.load(run, device="cpu")
+    assert model.world_model.slot_shape[0] == made["slots"]["value"]
+    assert json.loads((run / "config.json").read_text())["data"]["stride"] == made["stride"]["value"]
+
+    again = smoke("adopt", f"data.root={any_set}", f"out={run}", *QUICK)
+    assert json.loads((run / "adopt.json").read_text())["choices"] == made
+    assert again.out.count("finished before") == 2
+    refused(
+        "adopt", f"data.root={any_set}", f"out={run}", *QUICK, "minutes=3", message="minutes: got 3.0, expected 0.02"
+    )
+
+
+def test_what_cannot_be_adopted_is_refused_before_anything_is_written(
+    any_set: Path, foreign: Path, tmp_path: Path
+) -> None:
+    run, out = tmp_path / "run", f"out={tmp_path / 'run'}"
+    still = write_set(tmp_path / "still", (4, 4), speed=0)
+    frames = write_set(tmp_path / "frames", (1, 1), speed=2)
+    for message, given in {
+        r"got 2 cameras .* set data\.camera=": (f"data.root={foreign}", out),
+        "frames of observation.images.top that never change": (f"data.root={still}", out),
+        "episodes of one frame": (f"data.root={frames}", out),
+        r"data\.root: got nothing": (out,),
+        r"data\.root: got .*, expected one data set": (f"data.root={still},{frames}", out),
+        "env: got button_press, expected video": ("env=button_press", f"data.root={any_set}", out),
+        "out: got nothing": (f"data.root={any_set}",),
+        "no such folder, expected a LeRobot data set": (f"data.root={tmp_path / 'none'}", out),
+    }.items():
+        refused("adopt", *given, message=message)
+    refused("adopt", f"data.root={any_set}", out, "minutes=0", message="minutes: got 0.0, expected above 0", code=2)
+    assert not run.exists()
+
+
+def test_schedules_shrink_with_the_time_that_there_is() -> None:
+    config = compose(["preset=compact"], "adopt")
+    short = scheduled(config, "dynamics", config.dynamics.steps // 4, patience=3).dynamics
+    assert short.teacher_steps == config.dynamics.teacher_steps // 4
+    assert short.optim.warmup_steps == config.dynamics.optim.warmup_steps // 4
+    assert (short.patience, short.validate_every) == (3, short.steps // 10)
+    long = scheduled(config, "slots", 2 * config.slots.steps).slots
+    assert long.optim.warmup_steps == config.slots.optim.warmup_steps
+    assert steps_within(60, 0.5) == 120
+    assert steps_within(0.1, 0.5) == SHORTEST
