@@ -8,12 +8,13 @@ What was chosen, and why, is written to `RUN/adopt.json` as soon as it is known:
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import ExperimentConfig, SAViConfig, to_dict
 from playslot_rl.data.survey import Choice, Survey, choose_size, choose_stride, survey
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.recipes import train_dynamics, train_slots
@@ -109,10 +110,23 @@ def _for_frames(config: ExperimentConfig, seen: Survey, decide: Decisions) -> Ex
     return replace(
         config,
         env=replace(config.env, image_size=size, action_dim=max(1, seen.action_dim), max_steps=max(2, typical - 1)),
+        model=replace(config.model, savi=savi_for(config.model.savi, size)),
         data=replace(config.data, camera=seen.camera, stride=stride, resize=True),
         slots=replace(config.slots, clip_frames=min(config.slots.clip_frames, typical)),
         dynamics=replace(dynamics, predicted_frames=predicted),
     )
+
+
+def savi_for(savi: SAViConfig, size: int) -> SAViConfig:
+    """The preset's SAVi, which is for 64 pixels, for frames of another size: one doubling more or less in the decoder,
+    and, of the strided encoder, as many tokens."""
+    widths, strides = savi.decoder_channels, savi.encoder_strides
+    if savi.decoder == "pixel_shuffle":
+        doublings = int(math.log2(size // 8))
+        widths = (*widths, *widths[-1:] * doublings)[:doublings]
+    if savi.encoder == "strided" and size > 64:
+        strides = (*strides[:-1], 2)
+    return replace(savi, decoder_channels=widths, encoder_strides=strides)
 
 
 def _chosen_slots(config: ExperimentConfig, run: Path, decide: Decisions, budget: dict[str, float]) -> ExperimentConfig:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from commands import refused, smoke
 
 from playslot_rl.config.compose import compose
+from playslot_rl.modules.savi import SAVi
+from playslot_rl.recipes.adopt import savi_for
 from playslot_rl.recipes.adopt_trials import SHORTEST, scheduled, steps_within
 
 QUICK = ("minutes=0.02", "adopt.slots=[2,3]", "adopt.prototypes=4")
@@ -80,6 +84,14 @@ def test_what_cannot_be_adopted_is_refused_before_anything_is_written(
         refused("adopt", *given, message=message)
     refused("adopt", f"data.root={any_set}", out, "minutes=0", message="minutes: got 0.0, expected above 0", code=2)
     assert not run.exists()
+
+
+@pytest.mark.parametrize("preset", ["smoke", "compact", "paper"])
+@pytest.mark.parametrize("size", [32, 64, 128])
+def test_every_preset_has_a_savi_for_every_frame_size(preset: str, size: int) -> None:
+    sizes = savi_for(compose([f"preset={preset}"], "adopt").model.savi, size)
+    savi = SAVi(replace(sizes, decoder_channels=tuple(4 for _ in sizes.decoder_channels)), size)
+    assert savi.decode(torch.zeros(1, sizes.n_slots, sizes.slot_dim)).frames.shape == (1, 3, size, size)
 
 
 def test_schedules_shrink_with_the_time_that_there_is() -> None:

@@ -1,0 +1,30 @@
+"""The scripts of docs/adopt.md record sets that are sound; they need a renderer and take a while."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from commands import smoke
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "adopt.md"
+SCRIPTS = re.findall(r"^```py\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
+
+
+def test_there_are_two() -> None:
+    assert len(SCRIPTS) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_set_recorded_as_the_page_says_can_be_adopted(number: int, tmp_path: Path) -> None:
+    script, changed = re.subn(r"for episode in range\(\d+\)", "for episode in range(3)", SCRIPTS[number])
+    assert changed == 1
+    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True, capture_output=True)
+    (made,) = (tmp_path / "data").iterdir()
+    run = tmp_path / "run"
+    smoke("adopt", f"data.root={made}", f"out={run}", "minutes=0.02", "adopt.slots=[2]", "adopt.prototypes=4")
+    assert (run / "dynamics" / "checkpoint" / "weights.safetensors").is_file()
