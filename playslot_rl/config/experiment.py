@@ -127,6 +127,20 @@ class ExportConfig:
 
 
 @dataclass(frozen=True)
+class PlayConfig(Checked):
+    """The page of `play`.
+
+    Attributes:
+        show: open it in the browser; its address is printed in any case.
+        fps: imagined frames a second of free play, at first; the page has a slider for it.
+    """
+
+    group = "play."
+    show: bool = False
+    fps: float = field(default=8.0, metadata=between(1, 15, "1 to 15"))
+
+
+@dataclass(frozen=True)
 class MetricsConfig:
     """Metrics that need something from elsewhere.
 
@@ -163,6 +177,7 @@ class ExperimentConfig(Checked):
         threads: torch threads; 0 leaves torch's choice.
         method: what `train-baseline` trains (a name of `playslot_rl.config.methods`).
         demos: demonstrations of the data set to use, the first ones; None means all.
+        port: of the page of `play`; 0 (or nothing) takes 8080, or the next one that is free.
     """
 
     preset: str = field(default="paper", metadata=role("machine"))
@@ -177,6 +192,7 @@ class ExperimentConfig(Checked):
     threads: int = field(default=0, metadata=role("machine"))
     method: MethodName = "playslot"
     demos: int | None = field(default=None, metadata=at_least(1))
+    port: int = field(default=0, metadata=role("call", "machine") | between(0, 65535, "0 (any) to 65535"))
     env: EnvConfig = field(default_factory=EnvConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     data: DataConfig = field(default_factory=DataConfig)
@@ -193,3 +209,4 @@ class ExperimentConfig(Checked):
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     logging: LoggingConfig = field(default_factory=LoggingConfig, metadata=role("machine"))
     export: ExportConfig = field(default_factory=ExportConfig, metadata=role("call"))
+    play: PlayConfig = field(default_factory=PlayConfig, metadata=role("call", "machine"))

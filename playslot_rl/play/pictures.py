@@ -14,7 +14,7 @@ import numpy.typing as npt
 from PIL import Image
 from PIL.ImageColor import getrgb
 
-from playslot_rl.play.session import Look
+from playslot_rl.play.session import Look, PlaySession
 from playslot_rl.play.timeline import Frame, SceneMoment
 from playslot_rl.visualization.charts import OKABE_ITO
 from playslot_rl.visualization.grid import side_by_side
@@ -59,6 +59,32 @@ def with_masks(look: Look, chosen: int | None = None) -> Frame:
     mixed = share[..., None] * colours[owner] + (1 - share[..., None]) * look.frame
     out: Frame = np.clip(mixed, 0, 255).astype(np.uint8)
     return out
+
+
+def strip(look: Look, session: PlaySession, chosen: int | None, gap: int) -> Frame:
+    """What each slot draws, side by side in the order of their numbers; an empty place where one was removed.
+
+    A bar above says its colour, one below that it is frozen; the chosen one has a frame.
+
+    Returns:
+        uint8 (H, N * W + (N - 1) * gap, 3).
+    """
+    n = session.world_model.slot_shape[0]
+    height, width = look.frame.shape[:2]
+    picture = np.full((height, n * width + (n - 1) * gap, 3), 255, np.uint8)
+    for number in range(n):
+        cell = picture[:, number * (width + gap) : number * (width + gap) + width]
+        if number not in session.now.present:
+            cell[:] = 232
+            continue
+        cell[:] = look.objects[session.now.present.index(number)]
+        colour = getrgb(colour_of(number))
+        cell[:3] = colour
+        if number in session.now.frozen:
+            cell[-3:] = (30, 120, 255)
+        if number == chosen:
+            cell[:, :2] = cell[:, -2:] = cell[-2:] = colour
+    return picture
 
 
 def animated(frames: Frame, fps: float = ANIMATION_FPS, scale: int = 1, last_s: float = 0.6) -> bytes:

@@ -105,7 +105,9 @@ class PlaySession:
         present = tuple(range(self.world_model.slot_shape[0]))
         true = None if start.twin is None or self.agent is None else start.twin.first
         self.start = start
-        self.timeline = Timeline(SceneMoment(0, None, 0, state, present, frozenset(), self._draw(state, present), true=true))
+        self.timeline = Timeline(
+            SceneMoment(0, None, 0, state, present, frozenset(), self._draw(state, present), true=true)
+        )
 
     def close(self) -> None:
         """Free the simulator."""
@@ -302,22 +304,30 @@ class PlaySession:
         return self._look[1]
 
     @torch.no_grad()
-    def preview(self, steps: int = PREVIEW, variability: float = 0.0, slot: int | None = None) -> Frame:
-        """What holding each prototype would do here; the session is left as it is.
+    def preview(
+        self,
+        prototypes: Sequence[int] | None = None,
+        variability: float = 0.0,
+        slot: int | None = None,
+        steps: int = PREVIEW,
+    ) -> Frame:
+        """What holding some prototypes would do here; the session is left as it is.
 
         Args:
-            steps: P.
+            prototypes: their numbers, K' of them; None takes all.
             variability, slot: see `latent`.
+            steps: P.
 
         Returns:
-            uint8 (K, P + 1, H, W, 3), the present frame first.
+            uint8 (K', P + 1, H, W, 3), the present frame first.
         """
-        now, k = self.now, len(self.prototypes)
+        numbers = range(len(self.prototypes)) if prototypes is None else prototypes
+        now, k = self.now, len(numbers)
         ahead = ImaginationSession(self.world_model)
         ahead.restore(now.state)
         ahead.branch(k)
         rows = list(now.present)
-        latents = torch.stack([self.latent(number, variability, slot) for number in range(k)])
+        latents = torch.stack([self.latent(number, variability, slot) for number in numbers])
         held = [row for row, number in enumerate(rows) if number in now.frozen]
         frames = [np.broadcast_to(now.frame, (k, *now.frame.shape))]
         for _ in range(steps):

@@ -227,7 +227,9 @@ def picture_start(model: WorldModel, content: bytes, name: str = "picture", seed
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         if isinstance(error, DataError):
             raise
-        raise DataError(f"{name}: got no picture that can be read, expected a PNG or JPEG file: choose another") from error
+        raise DataError(
+            f"{name}: got no picture that can be read, expected a PNG or JPEG file: choose another"
+        ) from error
     height, width = pixels.shape[:2]
     cut = min(height, width)
     top, left = (height - cut) // 2, (width - cut) // 2

@@ -131,7 +131,7 @@ class Timeline:
             found.append(newest[found[-1].number])
         return found
 
-    def forks(self) -> list[int]:
-        """Numbers of the moments from which more than one goes on."""
-        parents = [moment.parent for moment in self.moments if moment.parent is not None]
-        return sorted({parent for parent in parents if parents.count(parent) > 1}) if parents else []
+    def tips(self) -> list[SceneMoment]:
+        """The last moment of each branch, in the order of making."""
+        parents = {moment.parent for moment in self.moments}
+        return [moment for moment in self.moments if moment.number not in parents]
