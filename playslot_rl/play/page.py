@@ -22,6 +22,8 @@ REST_S: Final = 0.7
 """Seconds without a step after which the prototypes' animations are made anew."""
 ME: Final = "me"
 GAP: Final = 4
+MOST_BYTES: Final = 50_000_000
+"""Of an uploaded picture."""
 
 HELP: Final = (
     "Keys: 0-9 prototypes, U undo, R reset, space free play, M masks. Click a slot in the picture or in the strip to "
@@ -115,10 +117,10 @@ class PlayPage:
         self.protos: list[Any] = []
         with ui.row().classes("items-start gap-1"):
             for number in range(len(self.session.prototypes)):
-                with ui.button(color="white").props("dense no-caps padding=2px") as button:
-                    with ui.column().classes("gap-0 items-center proto"):
-                        self.protos.append(ui.image().style("width: 72px; height: 72px"))
-                        ui.label(str(number)).classes("text-black text-xs")
+                button = ui.button(color="white").props("dense no-caps padding=2px")
+                with button, ui.column().classes("gap-0 items-center proto"):
+                    self.protos.append(ui.image().style("width: 72px; height: 72px"))
+                    ui.label(str(number)).classes("text-black text-xs")
                 button.mark(f"prototype-{number}").tooltip(f"prototype {number}: key {number}")
                 button.on("mousedown", lambda _, k=number: self._on_down(k))
                 for event in ("mouseup", "mouseleave"):
@@ -329,8 +331,8 @@ class PlayPage:
             self.pressed = None
         self._run()
 
-    def _on_free(self, event: events.ValueChangeEventArguments[bool]) -> None:
-        self.free = event.value
+    def _on_free(self, event: events.ValueChangeEventArguments[bool | None]) -> None:
+        self.free = bool(event.value)
         if not self.free:
             self.pressed = None
         elif self.driver == ME and self.pressed is None:
@@ -357,8 +359,8 @@ class PlayPage:
         self._halt()
         await self._work(self.session.reset)
 
-    def _on_place(self, event: events.ValueChangeEventArguments[float]) -> Awaitable[Any] | None:
-        if self._showing or not self.begun:
+    def _on_place(self, event: events.ValueChangeEventArguments[float | None]) -> Awaitable[Any] | None:
+        if self._showing or not self.begun or event.value is None:
             return None
         branch = self.session.timeline.branch()
         number = branch[min(int(event.value), len(branch) - 1)].number

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 from PIL.ImageColor import getrgb
 
@@ -132,10 +131,9 @@ def error_curve(errors: Sequence[float | None], at: int) -> str:
 
     points = [place(step, error) for step, error in enumerate(errors) if error is not None]
     line = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-    here: npt.ArrayLike = []
-    if at < len(errors) and errors[at] is not None:
-        here = place(at, float(errors[at] or 0.0))
-    dot = f'<circle cx="{here[0]:.1f}" cy="{here[1]:.1f}" r="4" fill="#D55E00"/>' if here else ""  # type: ignore[index]
+    error_here = errors[at] if at < len(errors) else None
+    here = None if error_here is None else place(at, error_here)
+    dot = f'<circle cx="{here[0]:.1f}" cy="{here[1]:.1f}" r="4" fill="#D55E00"/>' if here else ""
     text = 'font-size="10" font-family="sans-serif" fill="#767676"'
     return (
         f'<svg width="{width}" height="{height}" xmlns="http://www.w3.org/2000/svg">'

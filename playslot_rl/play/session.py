@@ -1,7 +1,7 @@
 """One player's session: steps, touches, time travel; no browser is needed.
 
-Shapes: N slots of the world model, n of them still there, K prototypes, P imagined frames, D slot width, Z latent-action
-width, A action width, H W image height and width. "[N,]" is there with one latent action per slot.
+Shapes: N slots of the world model, n of them still there, K prototypes, P imagined frames, D slot width,
+Z latent-action width, A action width, H W image height and width. "[N,]" is there with one latent action per slot.
 """
 
 from __future__ import annotations
@@ -105,9 +105,8 @@ class PlaySession:
         present = tuple(range(self.world_model.slot_shape[0]))
         true = None if start.twin is None or self.agent is None else start.twin.first
         self.start = start
-        self.timeline = Timeline(
-            SceneMoment(0, None, 0, state, present, frozenset(), self._draw(state, present), true=true)
-        )
+        frame = self._draw(state, present)
+        self.timeline = Timeline(SceneMoment(0, None, 0, state, present, frozenset(), frame, true=true))
 
     def close(self) -> None:
         """Free the simulator."""

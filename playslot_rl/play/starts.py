@@ -82,7 +82,8 @@ class RecordedStarts:
         self, model: WorldModel, source: EpisodeFrames, make_task: Callable[[], Task] | None = None, seed: int = 0
     ) -> None:
         self.model, self.source, self.make_task, self.seed = model, source, make_task, seed
-        usable = source.seeds is not None and source.actions is not None
+        actions = source.actions
+        usable = source.seeds is not None and actions is not None and actions.shape[1] == model.env.action_dim
         self._simulated = make_task is not None and usable
 
     @property

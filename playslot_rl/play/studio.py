@@ -1,7 +1,7 @@
 """What all pages share: one model, one worker, the places to start from.
 
-Models, simulators and their renderers belong to one thread, so every call that touches them goes through the worker, one
-after the other: several pages at once take turns, and the server's own thread stays free for clicks.
+Models, simulators and their renderers belong to one thread, so every call that touches them goes through the worker,
+one after the other: several pages at once take turns, and the server's own thread stays free for clicks.
 
 Shapes: K prototypes, N slots, D slot width, Z latent-action width.
 """

@@ -1,7 +1,7 @@
 """The moments of a session as a tree: going back forgets nothing, and every moment can be a fork.
 
-Shapes: N slots of the world model, n of them still there, D slot width, Z latent-action width, A action width, H W image
-height and width. "[N,]" is there with one latent action per slot.
+Shapes: N slots of the world model, n of them still there, D slot width, Z latent-action width, A action width,
+H W image height and width. "[N,]" is there with one latent action per slot.
 """
 
 from __future__ import annotations
