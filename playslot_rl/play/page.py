@@ -8,6 +8,8 @@ import time
 from collections.abc import Awaitable, Callable
 from typing import Any, Final
 
+import numpy as np
+import numpy.typing as npt
 from nicegui import events, ui
 
 from playslot_rl.errors import PlaySlotError, explain
@@ -46,6 +48,8 @@ class PlayPage:
         self.begun = self.closed = False
         self.masks, self.driver, self.hold = False, ME, False
         self.chosen: int | None = None
+        self.under: int | None = None  # the slot under the mouse, where each has actions of its own
+        self._owner: npt.NDArray[np.int64] | None = None
         self.pressed: int | None = None  # the prototype that is held, or that free play goes on with
         self.free, self.variability, self.fps = False, 0.0, studio.fps
         self.donor = 0
@@ -77,15 +81,16 @@ class PlayPage:
 
     def _build_scene(self) -> None:
         side, n = self.studio.world_model.env.image_size, self.studio.world_model.slot_shape[0]
+        watched = ["mousedown", "mousemove"] if self.session.per_slot else ["mousedown"]
         ui.label(self.studio.title).classes("text-lg font-medium")
         self.status = ui.label("starting ...").mark("status")
         with ui.row().classes("no-wrap gap-3"):
             with ui.column().classes("gap-1"):
                 ui.label("imagined").classes("text-sm text-gray-500")
-                self.scene = ui.interactive_image(
-                    size=(side, side), on_mouse=self._on_scene, events=["mousedown"]
-                ).mark("scene")
-                self.scene.classes("pixels").style("width: 384px")
+                self.scene = ui.interactive_image(size=(side, side), on_mouse=self._on_scene, events=watched).mark(
+                    "scene"
+                )
+                self.scene.classes("pixels").style("width: 384px").on("mouseleave", lambda _: self._leave())
             with ui.column().classes("gap-1") as self.true_column:
                 ui.label("simulator, the decoded actions").classes("text-sm text-gray-500")
                 self.true = ui.interactive_image(size=(side, side)).classes("pixels").style("width: 384px")
@@ -191,6 +196,7 @@ class PlayPage:
         if self.chosen is not None and self.chosen not in session.now.present:
             self.chosen = None
         look = session.look()
+        self._owner = look.owner
         found = {"scene": pictures.encode(pictures.with_masks(look, self.chosen) if self.masks else look.frame)}
         if session.now.true is not None:
             found["true"] = pictures.encode(session.now.true)
@@ -229,6 +235,14 @@ class PlayPage:
             self.tips.set_options(tips, value=timeline.branch()[-1].number)
         self._showing = False
 
+    @property
+    def target(self) -> int | None:
+        """The slot that actions go to: the one under the mouse, else the chosen one; None where all share one."""
+        if not self.session.per_slot:
+            return None
+        found = self.chosen if self.under is None else self.under
+        return found if found in self.session.now.present else None
+
     async def _step(self) -> None:
         """One step by whoever steers."""
         driver, session = self.driver, self.session
@@ -236,7 +250,7 @@ class PlayPage:
             await self._work(lambda: session.drive(driver))
         elif self.pressed is not None:
             k, s = self.pressed, self.variability
-            slot = self.chosen if session.per_slot else None
+            slot = self.target
             await self._work(lambda: session.press(k, s, slot))
 
     async def _tick(self) -> None:
@@ -274,8 +288,7 @@ class PlayPage:
 
     def _animate(self, number: int) -> bytes:
         """The small animation of a prototype; in the worker."""
-        slot = self.chosen if self.session.per_slot else None
-        return pictures.animated(self.session.preview([number], self.variability, slot)[0])
+        return pictures.animated(self.session.preview([number], self.variability, self.target)[0])
 
     async def _begin(self) -> None:
         if self._start_key[0]:
@@ -389,24 +402,29 @@ class PlayPage:
         await self._work(lambda: self.session.begin(start()), begins=True)
 
     async def _on_scene(self, event: events.MouseEventArguments) -> None:
-        if not self.begun:
+        if self._owner is None:
             return
-        side = self.studio.world_model.env.image_size
+        side = len(self._owner)
         x, y = (min(max(int(v), 0), side - 1) for v in (event.image_x, event.image_y))
-        await self._choose(lambda: int(self.session.look().owner[y, x]))
+        slot = int(self._owner[y, x])
+        if event.type == "mousemove":
+            self.under = slot
+        else:
+            await self._choose(slot)
+
+    def _leave(self) -> None:
+        self.under = None
 
     async def _on_strip(self, event: events.MouseEventArguments) -> None:
         if not self.begun:
             return
         cell = int(event.image_x // (self.studio.world_model.env.image_size + GAP))
         if cell in self.session.now.present:
-            await self._choose(lambda: cell)
+            await self._choose(cell)
 
-    async def _choose(self, slot: Callable[[], int]) -> None:
-        def choose() -> None:
-            self.chosen = slot()
-
-        await self._work(choose)
+    async def _choose(self, slot: int) -> None:
+        self.chosen = slot
+        await self._work(lambda: None)
 
     async def _touch(self, work: Callable[[int], Any]) -> None:
         slot = self.chosen

@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("nicegui", reason="the extra `play` is not installed")
@@ -24,7 +25,7 @@ from playslot_rl.play.server import choose_port, serve_pictures
 from playslot_rl.play.starts import RecordedStarts, SimulatedStarts
 from playslot_rl.play.studio import Studio
 from playslot_rl.recipes import play
-from playslot_rl.world_model import Agent
+from playslot_rl.world_model import Agent, WorldModel
 
 
 @pytest.fixture
@@ -92,7 +93,7 @@ def test_keys_step_undo_and_reset_and_the_buttons_touch_and_record(studio: Studi
         await until(lambda: bool(session.now.frozen))
         user.find(marker="remove").click()
         await until(lambda: len(session.now.present) == 3)
-        assert page.chosen is None
+        await until(lambda: page.chosen is None)
         user.find(marker="record").click()
         await until(lambda: "recording-001" in page.recorded.text)
         picture = await user.http_client.get(page.scene.source)
@@ -158,6 +159,26 @@ def test_without_a_policy_the_button_says_so(agent: Agent, recorded: RecordedSta
         await user.should_see("this model has no policy: playslot train-policy makes one")
         await pages[0]._on_down(0)
         assert pages[0].session.now.true is None
+
+    simulate(studio, script)
+    studio.close()
+
+
+def test_actions_go_to_the_slot_under_the_mouse_where_each_has_its_own(
+    many: WorldModel, recorded: RecordedStarts, tmp_path: Path
+) -> None:
+    studio = Studio(many, None, RecordedStarts(many, recorded.source), None, tmp_path)
+
+    async def script(user: User, pages: list[PlayPage]) -> None:
+        page, owner = pages[0], pages[0].session.look().owner
+        for slot in sorted(set(owner.flatten().tolist()))[:2]:
+            y, x = np.argwhere(owner == slot)[0].tolist()
+            place = {"image_x": x + 0.5, "image_y": y + 0.5, **MOUSE}
+            user.find(marker="scene").trigger("mouse", {"mouse_event_type": "mousemove", **place})
+            await until(lambda: page.under == slot)  # noqa: B023
+            await page._on_down(1)
+            assert page.session.now.label == f"prototype 1, slot {slot + 1}"
+            await page._on_undo()
 
     simulate(studio, script)
     studio.close()

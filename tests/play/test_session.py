@@ -149,8 +149,8 @@ def test_a_swapped_slot_comes_from_elsewhere_and_the_past_is_forgotten(session: 
         session.swap(3, other[:5])
 
 
-def test_actions_go_to_one_slot_where_each_has_its_own() -> None:
-    session = PlaySession(model_of_many())
+def test_actions_go_to_one_slot_where_each_has_its_own(many: WorldModel) -> None:
+    session = PlaySession(many)
     assert session.per_slot
     start = torch.randn(1, 4, 32, generator=torch.Generator().manual_seed(0))
     session.begin(start_of(start))
@@ -235,16 +235,6 @@ def test_wrong_presses_are_refused(session: PlaySession, monkeypatch: pytest.Mon
     with pytest.raises(ValueError, match="got a full timeline"):
         session.press(0)
     assert len(session.timeline.moments) == 2
-
-
-def model_of_many() -> WorldModel:
-    """A world model with one latent action per slot."""
-    config = tiny_config(multi=True)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        model = WorldModel(config.model, config.env)
-        model.inverse_dynamics.split(torch.randn(64, 8))
-    return model.eval().requires_grad_(False)
 
 
 def start_of(slots: Tensor) -> Start:
