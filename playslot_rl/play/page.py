@@ -31,7 +31,7 @@ HELP: Final = (
     "Keys: 0-9 prototypes, U undo, R reset, space free play, M masks. Click a slot in the picture or in the strip to "
     "choose it."
 )
-STYLE: Final = ".pixels img { image-rendering: pixelated } .proto img { image-rendering: pixelated; width: 72px }"
+STYLE: Final = ".pixels img { image-rendering: pixelated } .proto img { image-rendering: pixelated; width: 66px }"
 
 
 class PlayPage:
@@ -124,7 +124,7 @@ class PlayPage:
             for number in range(len(self.session.prototypes)):
                 button = ui.button(color="white").props("dense no-caps padding=2px")
                 with button, ui.column().classes("gap-0 items-center proto"):
-                    self.protos.append(ui.image().style("width: 72px; height: 72px"))
+                    self.protos.append(ui.image().style("width: 66px; height: 66px"))
                     ui.label(str(number)).classes("text-black text-xs")
                 button.mark(f"prototype-{number}").tooltip(f"prototype {number}: key {number}")
                 button.on("mousedown", lambda _, k=number: self._on_down(k))
@@ -355,8 +355,7 @@ class PlayPage:
     def _on_driver(self, event: events.ValueChangeEventArguments[Any]) -> None:
         self.driver = str(event.value)
         self.pressed = None
-        if self.driver != ME and not self.free:
-            self.free_switch.set_value(True)
+        self.free_switch.set_value(self.driver != ME)  # who gives back stops
         self._run()
 
     async def _on_masks(self) -> None:
