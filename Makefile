@@ -38,12 +38,13 @@ exit 1
 endef
 export FIND_PYTHON
 
-.PHONY: help setup demo test test-all lint format typing lock clean FORCE
+.PHONY: help setup demo test test-all test-browser lint format typing lock clean FORCE
 
 help:
 	@echo "make demo      set up, then the main job: success in simulation and in imagination, in minutes"
 	@echo "make test      set up, then the quick tests"
 	@echo "make test-all  set up, then all tests"
+	@echo "make test-browser  the page of playslot play in headless Chromium (Debian, Ubuntu: apt-get install chromium)"
 	@echo "make lint      ruff, format check, mypy strict"
 	@echo "make setup     .venv with the pinned packages and $(BIN)/playslot"
 	@echo "make format    format the code"
@@ -72,11 +73,21 @@ demo: $(STAMP)
 	@$(BIN)/playslot demo $(ARGS)
 
 test: $(STAMP)
-	@$(BIN)/python -m pytest -m "not slow" $(PARALLEL) $(ARGS)
+	@$(BIN)/python -m pytest -m "not slow and not browser" $(PARALLEL) $(ARGS)
 
 # The slow ones kill processes and count on time: one after the other.
 test-all: test
-	@$(BIN)/python -m pytest -m slow $(ARGS)
+	@$(BIN)/python -m pytest -m "slow and not browser" $(ARGS)
+
+# Playwright (161 MB) is installed here only. The browser is the system's: Playwright's own need not be downloaded.
+test-browser: $(STAMP)
+	@if ! command -v chromium >/dev/null && ! command -v chromium-browser >/dev/null \
+		&& ! command -v google-chrome >/dev/null; then \
+		echo "error: found no Chromium. Install it (Debian, Ubuntu: apt-get install --no-install-recommends chromium)" >&2; \
+		exit 1; \
+	fi
+	@$(UV) pip install --quiet --compile-bytecode -r pyproject.toml --extra browser
+	@$(BIN)/python -m pytest -m browser $(ARGS)
 
 lint: $(STAMP) typing
 	@$(BIN)/ruff check .
@@ -97,7 +108,7 @@ typing:
 	@for folder in envs collectors recipes; do ln -sfn "../../$$folder" .typing/playslot_rl/; done
 
 lock: $(UV)
-	@$(UV) pip compile pyproject.toml --extra dev --upgrade --generate-hashes --python-version 3.12 --quiet \
+	@$(UV) pip compile pyproject.toml --extra dev --extra play --upgrade --generate-hashes --python-version 3.12 --quiet \
 		--no-header --no-annotate --no-emit-index-url --no-emit-find-links --output-file $(LOCK)
 	@echo "renewed $(LOCK); make setup installs it"
 

@@ -105,6 +105,19 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot export run=runs/demo out=policies/press export.repo=me/press export.private=true",
         ),
     ),
+    "play": Command(
+        "steer the imagined future of a scene, in the browser",
+        "Opens a page on this machine (127.0.0.1) and prints its address: start from a frame of the run's data, of "
+        "data.root, of a fresh simulator episode or from a picture; steer by prototypes and variability, freeze, "
+        "remove and swap slots, go back and branch, hand over to the policy, see the decoded actions in the simulator "
+        "beside it, and record it all. Recordings go to RUN/play, to runs/play for a shipped model, or to OUT/play. "
+        "play.show=true opens the browser. Ctrl-C ends it.",
+        (
+            "playslot play run=pretrained",
+            "playslot play run=pretrained/block_push_easy data.root=data/expert port=8090",
+            "playslot play run=runs/mine play.show=true",
+        ),
+    ),
     "pipeline": Command(
         "all stages from nothing: data, three trainings, evaluation, report",
         "Runs every stage and skips the finished ones, so the same command carries on after a stop.",

@@ -25,6 +25,7 @@ COMMANDS = [
     "train-baseline",
     "evaluate",
     "export",
+    "play",
     "pipeline",
     "adopt",
     "compare",

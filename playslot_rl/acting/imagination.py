@@ -185,12 +185,13 @@ class ImaginationEnv(ModelBasedEnvBase):
             self.generator.manual_seed(seed)
 
 
-def latent_actions(world_model: WorldModel, given: npt.NDArray[Any] | Tensor) -> Tensor:
+def latent_actions(world_model: WorldModel, given: npt.NDArray[Any] | Tensor, n_slots: int | None = None) -> Tensor:
     """Latent actions of some steps, given as they are or as prototypes by number.
 
     Args:
         world_model: whose they are.
         given: float ([B,] P, [N,] Z), or integer ([B,] P, [N]) numbers of prototypes.
+        n_slots: N, where it is not the world model's (`ImaginationSession.keep`).
 
     Returns:
         ([B,] P, [N,] Z), on the world model's device.
@@ -200,6 +201,8 @@ def latent_actions(world_model: WorldModel, given: npt.NDArray[Any] | Tensor) ->
     """
     values = torch.as_tensor(given).to(module_device(world_model))
     shape = world_model.latent_shape
+    if n_slots is not None and world_model.inverse_dynamics.per_slot:
+        shape = (n_slots, *shape[1:])
     if not values.is_floating_point():
         numbers, prototypes = values.long(), world_model.inverse_dynamics.prototypes
         if numbers.numel() and not 0 <= int(numbers.min()) <= int(numbers.max()) < len(prototypes):
@@ -288,6 +291,48 @@ class ImaginationSession:
         """Repeat each of the B episodes, to go on in as many ways: B * `candidates` rows, an episode's together."""
         self._state = self._present().repeat_interleave(candidates, dim=0)
 
+    def put(self, slots: Tensor, *, forget: bool = False) -> None:
+        """Put other slots in the place of the present ones, as the newest frame that the predictor sees.
+
+        Args:
+            slots: (B, N, D), of as many slots as there are.
+            forget: drop the earlier frames too, which another scene would contradict.
+
+        Raises:
+            ValueError: another shape.
+        """
+        state = self.state
+        if slots.shape != state[keys.SLOTS].shape:
+            got, expected = tuple(slots.shape), tuple(state[keys.SLOTS].shape)
+            raise ValueError(f"put: got slots of shape {got}, expected {expected}")
+        state[keys.SLOTS] = slots.clone()
+        state[keys.SLOT_HISTORY][:, -1] = slots
+        if forget:
+            state[keys.SLOT_HISTORY][:, :-1] = 0
+            state[keys.ACTION_HISTORY].zero_()
+            state[keys.HISTORY_LENGTH].fill_(1)
+        self._state = state
+
+    def keep(self, rows: Sequence[int]) -> None:
+        """Go on with some of the slots only: the others have never been there.
+
+        Args:
+            rows: of the present slots, in the order in which they go on; at least one.
+
+        Raises:
+            ValueError: none, one twice, or one that is not there.
+        """
+        state = self.state
+        n = state[keys.SLOTS].shape[1]
+        if not rows or len(set(rows)) != len(rows) or not set(rows) <= set(range(n)):
+            raise ValueError(f"keep: got slots {list(rows)}, expected at least one of 0 to {n - 1}, each once")
+        index = torch.as_tensor(rows, device=self._env.device)
+        state[keys.SLOTS] = state[keys.SLOTS][:, index]
+        state[keys.SLOT_HISTORY] = state[keys.SLOT_HISTORY][:, :, index]
+        if self.world_model.inverse_dynamics.per_slot:
+            state[keys.ACTION_HISTORY] = state[keys.ACTION_HISTORY][:, :, index]
+        self._state = state
+
     def step(self, latents: Tensor | None = None, *, prototypes: Sequence[int] | Tensor | None = None) -> Tensor:
         """One step of all episodes.
 
@@ -304,7 +349,8 @@ class ImaginationSession:
         if (latents is None) == (prototypes is None):
             raise ValueError("step: got latents and prototypes, or neither, expected one of them")
         state = self._present()
-        z = latent_actions(self.world_model, torch.as_tensor(prototypes) if latents is None else latents)
+        n_slots = state[keys.SLOTS].shape[1]
+        z = latent_actions(self.world_model, torch.as_tensor(prototypes) if latents is None else latents, n_slots)
         if z.shape[: -len(self.world_model.latent_shape)] != state.batch_size:
             raise ValueError(
                 f"step: got actions of shape {tuple(z.shape)}, expected one for each of {len(state)} episodes"

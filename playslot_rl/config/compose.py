@@ -24,7 +24,7 @@ from playslot_rl.errors import ConfigError
 
 CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
-CONTINUES: Final = frozenset({"evaluate", "export", "train-dynamics", "train-policy"})
+CONTINUES: Final = frozenset({"evaluate", "export", "play", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
 COMPARISONS: Final = {
     "compare": ("methods", "demos", "labels", "seeds"),
@@ -98,6 +98,8 @@ def _parse(overrides: Sequence[str]) -> dict[str, str]:
             raise ConfigError(_unknown_key(key))
         if hint in (MethodName, tuple[MethodName, ...]):
             value = _method_names(key, value)
+        if key == "port" and not value.strip():
+            value = "0"  # `port=`: any
         pairs.pop(key, None)  # the order of the arguments is kept: a later one wins
         pairs[key] = _unquote(value) if key in GROUPS else value
     return pairs

@@ -130,6 +130,20 @@ class ExportConfig:
 
 
 @dataclass(frozen=True)
+class PlayConfig(Checked):
+    """The page of `play`.
+
+    Attributes:
+        show: open it in the browser; its address is printed in any case.
+        fps: imagined frames a second of free play, at first; the page has a slider for it.
+    """
+
+    group = "play."
+    show: bool = False
+    fps: float = field(default=8.0, metadata=between(1, 15, "1 to 15"))
+
+
+@dataclass(frozen=True)
 class MetricsConfig:
     """Metrics that need something from elsewhere.
 
@@ -167,6 +181,7 @@ class ExperimentConfig(Checked):
         method: what `train-baseline` trains (a name of `playslot_rl.config.methods`).
         minutes: of wall-clock time that `adopt` may take.
         demos: demonstrations of the data set to use, the first ones; None means all.
+        port: of the page of `play`; 0 (or nothing) takes 8080, or the next one that is free.
     """
 
     preset: str = field(default="paper", metadata=role("machine"))
@@ -182,6 +197,7 @@ class ExperimentConfig(Checked):
     minutes: float = field(default=60.0, metadata=role("call", "machine", "free") | within(lambda v: v > 0, "above 0"))
     method: MethodName = "playslot"
     demos: int | None = field(default=None, metadata=at_least(1))
+    port: int = field(default=0, metadata=role("call", "machine") | between(0, 65535, "0 (any) to 65535"))
     env: EnvConfig = field(default_factory=EnvConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     data: DataConfig = field(default_factory=DataConfig)
@@ -199,3 +215,4 @@ class ExperimentConfig(Checked):
     logging: LoggingConfig = field(default_factory=LoggingConfig, metadata=role("machine"))
     adopt: AdoptConfig = field(default_factory=AdoptConfig, metadata=role("call", "machine"))
     export: ExportConfig = field(default_factory=ExportConfig, metadata=role("call"))
+    play: PlayConfig = field(default_factory=PlayConfig, metadata=role("call", "machine"))

@@ -11,19 +11,23 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from playslot_rl.config import ModelConfig, OptimConfig, Precision, PredictorConfig, SAViConfig
+from playslot_rl.config import EnvConfig, ModelConfig, OptimConfig, Precision, PredictorConfig, SAViConfig
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.predictors.cocvp import COCVP
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.modules.savi.decoder import BroadcastDecoder
 from playslot_rl.training.fit import build_adam, clip_gradients, trainable_parameters
 
-Case = Literal["savi_step", "dynamics_step", "rollout_cache"]
+if TYPE_CHECKING:
+    from playslot_rl.world_model import WorldModel
+
+Case = Literal["savi_step", "dynamics_step", "rollout_cache", "play_step"]
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,7 @@ class Sizes:
         dynamics_batch, seed_frames, predicted_frames: clips and frames of the dynamics step.
         decoded_frames: predicted frames that its extra row decodes.
         rollout_batch, rollout_slots, rollout_steps: of the rollout.
+        play_slots, play_steps: of a game: four slots are what a task has, the steps fill the predictor's context.
         episodes, episode_frames: the data set that windows are read from.
         window, window_batch: frames a window, windows a batch.
         loader_batches: batches a repeat that LeRobotDataset + DataLoader delivers.
@@ -56,6 +61,8 @@ class Sizes:
     rollout_batch: int = 64
     rollout_slots: int = 8
     rollout_steps: int = 15
+    play_slots: int = 4
+    play_steps: int = 30
     episodes: int = 40
     episode_frames: int = 21
     window: int = 14
@@ -77,8 +84,9 @@ def quick_sizes() -> Sizes:
     )
     return Sizes(
         model=small, image_size=32, savi_batch=1, savi_frames=2, dynamics_batch=1, seed_frames=2, predicted_frames=2,
-        decoded_frames=1, rollout_batch=2, rollout_slots=3, rollout_steps=5, episodes=3, episode_frames=8, window=4,
-        window_batch=2, loader_batches=1, cache_batches=2, fast_frames=2, full_frames=1, repeats=1,
+        decoded_frames=1, rollout_batch=2, rollout_slots=3, rollout_steps=5, play_slots=3, play_steps=2, episodes=3,
+        episode_frames=8, window=4, window_batch=2, loader_batches=1, cache_batches=2, fast_frames=2, full_frames=1,
+        repeats=1,
     )  # fmt: skip
 
 
@@ -94,6 +102,7 @@ class Variant:
         allocator: keep freed memory (`playslot_rl.allocator`).
         cached: rollout with cached keys and values.
         decoded_frames: predicted frames decoded for the image loss; 0 decodes all.
+        shipped: the world model that ships for ButtonPress, in the place of `Sizes.model`.
     """
 
     case: Case
@@ -103,6 +112,7 @@ class Variant:
     allocator: bool = True
     cached: bool = True
     decoded_frames: int = 0
+    shipped: bool = False
 
 
 def savi_variants() -> dict[str, Variant]:
@@ -133,6 +143,12 @@ def rollout_variants() -> dict[str, Variant]:
     return {"full": Variant("rollout_cache", cached=False), "cached": Variant("rollout_cache")}
 
 
+def play_variants() -> dict[str, Variant]:
+    """The shipped model as `playslot play` runs it, in fp32, and one of the paper's sizes in both precisions."""
+    plain = Variant("play_step", precision="fp32", channels_last=False)
+    return {"shipped": replace(plain, shipped=True), "paper_fp32": plain, "paper_bf16": Variant("play_step")}
+
+
 Step = Callable[[], Tensor]
 """Computes once and returns a scalar, the loss where there is one."""
 
@@ -143,7 +159,7 @@ _ACTION_DIM = 4
 def build_step(variant: Variant, sizes: Sizes) -> Step:
     """Networks and data of a variant, the same for all variants, and the function to time."""
     torch.manual_seed(0)
-    steps = {"savi_step": _savi_step, "dynamics_step": _dynamics_step, "rollout_cache": _rollout}
+    steps = {"savi_step": _savi_step, "dynamics_step": _dynamics_step, "rollout_cache": _rollout, "play_step": _play}
     return steps[variant.case](variant, sizes)
 
 
@@ -224,6 +240,41 @@ def _rollout(variant: Variant, sizes: Sizes) -> Step:
         return rollout(seed, p, v).square().mean()
 
     return step
+
+
+def _play(variant: Variant, sizes: Sizes) -> Step:
+    """A game from its start: each step is predicted, decoded and encoded as what the page sends."""
+    from playslot_rl.play.pictures import encode, strip, with_masks
+    from playslot_rl.play.session import PlaySession
+    from playslot_rl.play.starts import Start
+    from playslot_rl.training.runs import load_world_model
+
+    model = load_world_model("pretrained") if variant.shipped else _play_model(variant, sizes)
+    session, side = PlaySession(model), model.env.image_size
+    first = Start("", np.zeros((side, side, 3), np.uint8), torch.randn(1, *model.slot_shape))
+
+    @torch.no_grad()
+    def step() -> Tensor:
+        session.begin(first)
+        for number in range(sizes.play_steps):
+            session.press(number % len(session.prototypes), 1.0)
+            look = session.look()
+            encode(look.frame)
+            encode(with_masks(look))
+            encode(strip(look, session, None, 4))
+        return session.slots.square().mean()
+
+    return step
+
+
+def _play_model(variant: Variant, sizes: Sizes) -> WorldModel:
+    from playslot_rl.world_model import WorldModel
+
+    savi = replace(sizes.model.savi, n_slots=sizes.play_slots)
+    model = WorldModel(replace(sizes.model, savi=savi), EnvConfig(image_size=sizes.image_size))
+    model.savi = build_savi(variant, replace(sizes, model=replace(sizes.model, savi=savi)))
+    model.inverse_dynamics.split(torch.randn(64, model.inverse_dynamics.latent_dim))  # sets the codebook
+    return model.eval()
 
 
 def _training_step(modules: dict[str, torch.nn.Module], loss: Step) -> Step:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from playslot_rl.config import BlocksConfig, EnvConfig
-from playslot_rl.speed.cases import Sizes, dynamics_variants, rollout_variants, savi_variants
+from playslot_rl.speed.cases import Sizes, dynamics_variants, play_variants, rollout_variants, savi_variants
 from playslot_rl.threads import available_cores
 from playslot_rl.visualization import document
 
@@ -20,8 +20,9 @@ TARGETS: Final = {
     "window_sampling": 20.0,
     "render": 12.0,
     "render_block_push": 5.0,
+    "play_step": 10.0,
 }
-"""Ratios that the project asks of itself (on two CPU cores)."""
+"""Ratios that the project asks of itself (on two CPU cores); of `play_step`, imagined frames a second."""
 
 Figures = dict[str, Any]
 
@@ -38,7 +39,8 @@ def measure(
         say: told what is being timed.
 
     Returns:
-        For each key of `TARGETS` a dict with `ratio`, `unit` and the medians it was made of; and `machine`.
+        For each key of `TARGETS` a dict with `ratio`, `unit` and the medians it was made of; and `machine`. The
+        `ratio` of `play_step` is no ratio of two paths but imagined frames a second.
 
     Raises:
         PlaySlotError: a child died. RenderError: no GL backend.
@@ -55,6 +57,8 @@ def measure(
     dynamics = race(dynamics_variants(sizes.decoded_frames), sizes, threads)
     say("rollout, cached against full")
     rollout = race(rollout_variants(), sizes, threads)
+    say("playing in imagination")
+    play = race(play_variants(), sizes, threads)
     say("window sampling against LeRobotDataset + DataLoader")
     rates = sampling_rates(sizes)
     say("rendering, fast against default")
@@ -68,12 +72,19 @@ def measure(
         "window_sampling": {"ratio": rates["cache"] / rates["lerobot"], "unit": "frames/s", **rates},
         "render": _entry(render, "full", "fast"),
         "render_block_push": _entry(blocks, "full", "fast"),
+        "play_step": _played(play, sizes.play_steps),
         "machine": {**_machine(), "threads": threads, "repeats": sizes.repeats, "quick": quick},
     }
 
 
 def _entry(seconds: Mapping[str, float], slow: str, fast: str) -> Figures:
     return {"ratio": seconds[slow] / seconds[fast], "unit": "s", **seconds}
+
+
+def _played(seconds: Mapping[str, float], steps: int) -> Figures:
+    """Imagined frames a second with the shipped model, and the seconds of one frame, by name."""
+    one = {name: value / steps for name, value in seconds.items()}
+    return {"ratio": 1.0 / one["shipped"], "unit": "s", **one}
 
 
 def _machine() -> Figures:

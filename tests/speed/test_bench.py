@@ -30,6 +30,7 @@ from playslot_rl.speed.cases import (
     build_step,
     dynamics_loss,
     dynamics_variants,
+    play_variants,
     quick_sizes,
     rollout_variants,
     savi_variants,
@@ -68,6 +69,14 @@ def test_every_variant_of_a_case_computes_the_same_thing(case: str, sizes: Sizes
     first = next(iter(values.values()))
     assert list(values.values()) == pytest.approx([first] * len(values), rel=0.02 if exact else 1e-5)
     assert math.isfinite(first)
+
+
+def test_a_game_is_the_same_whatever_it_is_computed_with(sizes: Sizes) -> None:
+    rows = play_variants()
+    shipped = [float(build_step(rows["shipped"], sizes)()) for _ in range(2)]
+    assert shipped[0] == shipped[1]
+    fp32, bf16 = (float(build_step(rows[name], sizes)()) for name in ("paper_fp32", "paper_bf16"))
+    assert fp32 == pytest.approx(bf16, rel=0.02)
 
 
 def test_a_training_step_changes_the_weights(sizes: Sizes) -> None:
@@ -150,6 +159,9 @@ def test_the_command_writes_every_key_with_its_ratio_and_medians(
     sampling = figures["window_sampling"]
     assert sampling["ratio"] == pytest.approx(sampling["cache"] / sampling["lerobot"])
     assert set(savi_variants()) <= set(figures["savi_step"])
+    played = figures["play_step"]
+    assert set(play_variants()) <= set(played)
+    assert played["ratio"] == pytest.approx(1 / played["shipped"])
     assert figures["machine"]["quick"] is True
     printed = capsys.readouterr().out
     assert table(figures) in printed

@@ -1,0 +1,455 @@
+"""The page: one player's view of a session, by NiceGUI; what it does is in `playslot_rl.play.session`."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from nicegui import events, ui
+
+from playslot_rl.errors import PlaySlotError, explain
+from playslot_rl.play import pictures
+from playslot_rl.play.gallery import Gallery
+from playslot_rl.play.recording import Shown, record
+from playslot_rl.play.starts import Start, picture_start
+from playslot_rl.play.studio import Studio
+
+TICK_S: Final = 0.02
+REST_S: Final = 0.7
+"""Seconds without a step after which the prototypes' animations are made anew."""
+ME: Final = "me"
+GAP: Final = 4
+MOST_BYTES: Final = 50_000_000
+"""Of an uploaded picture."""
+
+HELP: Final = (
+    "Keys: 0-9 prototypes, U undo, R reset, space free play, M masks. Click a slot in the picture or in the strip to "
+    "choose it."
+)
+STYLE: Final = ".pixels img { image-rendering: pixelated } .proto img { image-rendering: pixelated; width: 66px }"
+
+
+class PlayPage:
+    """The page of one client.
+
+    Args:
+        studio: what all pages share.
+        gallery: serves this page's pictures.
+    """
+
+    def __init__(self, studio: Studio, gallery: Gallery) -> None:
+        self.studio, self.gallery = studio, gallery
+        self.session = studio.session()
+        self.begun = self.closed = False
+        self.masks, self.driver, self.hold = False, ME, False
+        self.chosen: int | None = None
+        self.under: int | None = None  # the slot under the mouse, where each has actions of its own
+        self._owner: npt.NDArray[np.int64] | None = None
+        self.pressed: int | None = None  # the prototype that is held, or that free play goes on with
+        self.free, self.variability, self.fps = False, 0.0, studio.fps
+        self.donor = 0
+        self._due = self._moved = 0.0
+        self._lock = asyncio.Lock()
+        self._stale = self._showing = False
+        self._start_key: tuple[str, int, int] = (next(iter(studio.sources), ""), 0, 0)
+
+    # --- layout ----------------------------------------------------------------------------------------------------
+
+    def build(self) -> None:
+        """Lay the page out; the session begins when it is there."""
+        ui.add_css(STYLE)
+        ui.page_title("playslot play")
+        with ui.row().classes("w-full no-wrap items-start gap-6 p-2"):
+            with ui.column().classes("gap-2"):
+                self._build_scene()
+            with ui.column().classes("gap-3 grow"):
+                self._build_starts()
+                self._build_steering()
+                self._build_time()
+                self._build_touch()
+                self._build_record()
+        ui.keyboard(on_key=self._on_key, repeating=False)
+        self.ticker = ui.timer(TICK_S, self._tick, active=False)
+        ui.timer(0.4, self._refresh_previews)
+        ui.timer(0.05, self._begin, once=True)
+        ui.context.client.on_delete(self.close)
+
+    def _build_scene(self) -> None:
+        side, n = self.studio.world_model.env.image_size, self.studio.world_model.slot_shape[0]
+        watched = ["mousedown", "mousemove"] if self.session.per_slot else ["mousedown"]
+        ui.label(self.studio.title).classes("text-lg font-medium")
+        self.status = ui.label("starting ...").mark("status")
+        with ui.row().classes("no-wrap gap-3"):
+            with ui.column().classes("gap-1"):
+                ui.label("imagined").classes("text-sm text-gray-500")
+                self.scene = ui.interactive_image(size=(side, side), on_mouse=self._on_scene, events=watched).mark(
+                    "scene"
+                )
+                self.scene.classes("pixels").style("width: 384px").on("mouseleave", lambda _: self._leave())
+            with ui.column().classes("gap-1") as self.true_column:
+                ui.label("simulator, the decoded actions").classes("text-sm text-gray-500")
+                self.true = ui.interactive_image(size=(side, side)).classes("pixels").style("width: 384px")
+        width = n * side + (n - 1) * GAP
+        self.strip = ui.interactive_image(size=(width, side), on_mouse=self._on_strip, events=["mousedown"])
+        self.strip.classes("pixels").style(f"width: {min(780, 110 * n)}px").mark("strip")
+        with ui.row().classes("items-center"):
+            ui.switch("masks", on_change=self._on_masks).mark("masks").bind_value(self, "masks")
+            self.curve_title = ui.label("error over time (RMS, of 1)").classes("text-sm text-gray-500")
+            self.curve = ui.html("", sanitize=False).mark("curve")
+        ui.label(HELP).classes("text-sm text-gray-500")
+
+    def _build_starts(self) -> None:
+        sources = self.studio.sources
+        with ui.row().classes("items-center gap-2"):
+            self.source = ui.select(sources or {"": "no data set, no simulator"}, value=next(iter(sources), ""))
+            self.source.props("dense").mark("source")
+            self.number = ui.number("episode", value=0, min=0, step=1, format="%d").props("dense").classes("w-20")
+            self.step = ui.number("frame", value=0, min=0, step=1, format="%d").props("dense").classes("w-20")
+            ui.button("Start here", on_click=self._on_start).props("dense no-caps").mark("start")
+            ui.button("Next episode", on_click=self._on_next).props("dense no-caps flat").mark("next")
+            ui.upload(
+                label="or a picture", auto_upload=True, on_upload=self._on_upload, max_file_size=50_000_000
+            ).props("accept=image/* dense flat bordered").classes("w-44").style("max-height: 56px; min-height: 0").mark(
+                "upload"
+            )
+
+    def _build_steering(self) -> None:
+        self.protos: list[Any] = []
+        with ui.row().classes("items-start gap-1"):
+            for number in range(len(self.session.prototypes)):
+                button = ui.button(color="white").props("dense no-caps padding=2px")
+                with button, ui.column().classes("gap-0 items-center proto"):
+                    self.protos.append(ui.image().style("width: 66px; height: 66px"))
+                    ui.label(str(number)).classes("text-black text-xs")
+                button.mark(f"prototype-{number}").tooltip(f"prototype {number}: key {number}")
+                button.on("mousedown", lambda _, k=number: self._on_down(k))
+                for event in ("mouseup", "mouseleave"):
+                    button.on(event, lambda _: self._on_up())
+        with ui.row().classes("items-center gap-4"):
+            ui.label("variability")
+            slider = ui.slider(min=-3, max=3, step=0.1, value=0, on_change=self._on_variability).props("label")
+            slider.classes("w-48").mark("variability").bind_value(self, "variability")
+            if not self.session.varies:
+                slider.disable()
+                ui.label("the predictor of this model sees prototypes only").classes("text-sm text-gray-500")
+            ui.toggle({False: "tap", True: "hold"}, value=False).props("dense no-caps").bind_value(self, "hold")
+        with ui.row().classes("items-center gap-4"):
+            names = {ME: "I steer", **{name: driver.title for name, driver in self.session.drivers.items()}}
+            self.hand = ui.toggle(names, value=ME, on_change=self._on_driver).props("dense no-caps").mark("driver")
+            if "policy" not in names:
+                ui.button("latent policy").props("dense no-caps disable").mark("no-policy")
+                ui.label("this model has no policy: playslot train-policy makes one").classes("text-sm text-gray-500")
+            self.free_switch = ui.switch("free play", on_change=self._on_free).mark("free")
+            ui.slider(min=1, max=15, step=1, value=self.fps).props("label").classes("w-32").bind_value(self, "fps")
+            ui.label("frames a second").classes("text-sm")
+
+    def _build_time(self) -> None:
+        with ui.row().classes("items-center gap-2 w-full"):
+            ui.button("Undo", on_click=self._on_undo).props("dense no-caps").mark("undo")
+            ui.button("Reset", on_click=self._on_reset).props("dense no-caps").mark("reset")
+            self.place = ui.slider(min=0, max=1, step=1, value=0, on_change=self._on_place).props("label")
+            self.place.classes("w-64").mark("place")
+            self.tips = ui.select({0: "start"}, value=0, on_change=self._on_tip, label="branch").props("dense")
+            self.tips.classes("w-48").mark("tips")
+
+    def _build_touch(self) -> None:
+        with ui.row().classes("items-center gap-2"):
+            self.which = ui.label("no slot chosen").mark("which")
+            for title, work in (("Freeze or let go", self._freeze), ("Remove", self._remove), ("Swap", self._swap)):
+                ui.button(title, on_click=work).props("dense no-caps").mark(title.split()[0].lower())
+
+    def _build_record(self) -> None:
+        with ui.row().classes("items-center gap-2"):
+            kinds = {"imagined": "imagined frames", "true": "true frames"}
+            self.shown = ui.select(kinds, value="imagined").props("dense")
+            ui.button("Record", on_click=self._on_record).props("dense no-caps").mark("record")
+            self.recorded = ui.label("").classes("text-sm").mark("recorded")
+
+    # --- doing -----------------------------------------------------------------------------------------------------
+
+    async def _work(self, work: Callable[[], Any], *, begins: bool = False) -> bool:
+        """Have the worker do something with the session and show what came of it; an error is told in one line."""
+        async with self._lock:
+            if self.closed or not (self.begun or begins):
+                return False
+            try:
+                await self.studio.do(work)
+                if begins:
+                    self.begun, self.chosen = True, None
+                drawn = await self.studio.do(self._paint)
+            except (PlaySlotError, ValueError) as error:
+                self._halt()
+                ui.notify(explain(error) if isinstance(error, PlaySlotError) else str(error), type="warning")
+                return False
+            if not self.closed:
+                self._show(drawn)
+            return True
+
+    def _paint(self) -> dict[str, bytes]:
+        """The pictures of the present moment; in the worker."""
+        session = self.session
+        if self.chosen is not None and self.chosen not in session.now.present:
+            self.chosen = None
+        look = session.look()
+        self._owner = look.owner
+        found = {"scene": pictures.encode(pictures.with_masks(look, self.chosen) if self.masks else look.frame)}
+        if session.now.true is not None:
+            found["true"] = pictures.encode(session.now.true)
+        found["strip"] = pictures.encode(pictures.strip(look, session, self.chosen, GAP))
+        return found
+
+    def _show(self, drawn: dict[str, bytes]) -> None:
+        session, timeline = self.session, self.session.timeline
+        self.scene.set_source(self.gallery.put("scene", drawn["scene"]))
+        self.strip.set_source(self.gallery.put("strip", drawn["strip"]))
+        self.true_column.set_visibility("true" in drawn)
+        self.curve_title.set_visibility("true" in drawn)
+        self.curve.set_visibility("true" in drawn)
+        branch = timeline.branch()
+        if "true" in drawn:
+            self.true.set_source(self.gallery.put("true", drawn["true"]))
+            self.curve.set_content(pictures.error_curve([moment.error for moment in branch], session.now.depth))
+        self._show_time(len(branch))
+        now = session.now
+        error = "" if now.error is None else f", error {now.error:.3f}"
+        self.status.set_text(f"{session.start.title}; moment {now.depth}, {now.label}{error}")
+        if self.chosen is None:
+            self.which.set_text("no slot chosen" + (": actions go to all" if session.per_slot else ""))
+        else:
+            frozen = ", frozen" if self.chosen in now.frozen else ""
+            self.which.set_text(f"slot {self.chosen + 1}{frozen}")
+        self._stale, self._moved = True, time.monotonic()
+
+    def _show_time(self, moments: int) -> None:
+        """Timeline slider and list of branches, without setting off their own handlers."""
+        timeline, self._showing = self.session.timeline, True
+        self.place.props(f"max={max(1, moments - 1)}")
+        self.place.set_value(timeline.now.depth)
+        if not self.ticker.active:  # the list is long, and nobody reads it while it grows
+            tips = {tip.number: f"{tip.depth} moments, {tip.label}" for tip in timeline.tips()}
+            self.tips.set_options(tips, value=timeline.branch()[-1].number)
+        self._showing = False
+
+    @property
+    def target(self) -> int | None:
+        """The slot that actions go to: the one under the mouse, else the chosen one; None where all share one."""
+        if not self.session.per_slot:
+            return None
+        found = self.chosen if self.under is None else self.under
+        return found if found in self.session.now.present else None
+
+    async def _step(self) -> None:
+        """One step by whoever steers."""
+        driver, session = self.driver, self.session
+        if driver != ME:
+            await self._work(lambda: session.drive(driver))
+        elif self.pressed is not None:
+            k, s = self.pressed, self.variability
+            slot = self.target
+            await self._work(lambda: session.press(k, s, slot))
+
+    async def _tick(self) -> None:
+        """A step where one is due; the timer runs only while something is held or plays by itself."""
+        now = time.monotonic()
+        if now >= self._due and not self._lock.locked():
+            self._due = max(now, self._due + 1.0 / self.fps)
+            await self._step()
+
+    def _run(self) -> None:
+        """Run the timer if there is something to run for."""
+        playing = self.free and (self.driver != ME or self.pressed is not None)
+        self.ticker.active = playing or (self.hold and self.pressed is not None)
+
+    def _halt(self) -> None:
+        self.free = False
+        self.pressed = None
+        self.free_switch.set_value(False)
+        self._run()
+
+    async def _refresh_previews(self) -> None:
+        """The prototypes' animations, when the player has paused; one after the other, so that a key waits for one."""
+        paused = time.monotonic() - self._moved > REST_S and not self.ticker.active
+        if not self._stale or not paused or self.closed or not self.begun:
+            return
+        self._stale = False
+        self._show_time(len(self.session.timeline.branch()))
+        for number in range(len(self.protos)):
+            async with self._lock:
+                if self._stale or self.closed:
+                    return
+                content = await self.studio.do(functools.partial(self._animate, number))
+            if not self.closed:
+                self.protos[number].set_source(self.gallery.put(f"prototype-{number}", content, "image/gif"))
+
+    def _animate(self, number: int) -> bytes:
+        """The small animation of a prototype; in the worker."""
+        return pictures.animated(self.session.preview([number], self.variability, self.target)[0])
+
+    async def _begin(self) -> None:
+        if self._start_key[0]:
+            await self._start_at(self._start_key)
+        else:
+            self.status.set_text("nothing to start from: upload a picture, or give data.root=")
+
+    async def _start_at(self, key: tuple[str, int, int]) -> None:
+        if await self._work(lambda: self.session.begin(self.studio.start(*key)), begins=True):
+            self._start_key = key
+
+    def close(self) -> None:
+        """The client is gone: no more steps; the simulator is freed by the worker."""
+        if not self.closed:
+            self.closed = True
+            self.ticker.active = False
+            self.gallery.close()
+            self.studio.call(self.session.close)
+
+    # --- events ----------------------------------------------------------------------------------------------------
+
+    async def _on_key(self, event: events.KeyEventArguments) -> None:
+        number = event.key.number
+        if number is not None and number < len(self.session.prototypes):
+            if event.action.keydown:
+                await self._on_down(number)
+            elif event.action.keyup:
+                self._on_up()
+        elif event.action.keydown:
+            await self._on_letter(str(event.key.name).lower())
+
+    async def _on_letter(self, name: str) -> None:
+        actions: dict[str, Callable[[], Awaitable[None]]] = {"u": self._on_undo, "r": self._on_reset}
+        if name in actions:
+            await actions[name]()
+        elif name == "m":
+            self.masks = not self.masks
+        elif name in (" ", "space"):
+            self.free_switch.set_value(not self.free)
+
+    async def _on_down(self, prototype: int) -> None:
+        if self.driver != ME:
+            self.hand.set_value(ME)  # a press takes over
+        self.pressed = prototype
+        if not (self.free or self.hold):
+            await self._step()
+        else:
+            self._due = 0.0
+        self._run()
+
+    def _on_up(self) -> None:
+        if not self.free:
+            self.pressed = None
+        self._run()
+
+    def _on_free(self, event: events.ValueChangeEventArguments[bool | None]) -> None:
+        self.free = bool(event.value)
+        if not self.free:
+            self.pressed = None
+        elif self.driver == ME and self.pressed is None:
+            self.pressed = 0
+        self._run()
+
+    def _on_driver(self, event: events.ValueChangeEventArguments[Any]) -> None:
+        self.driver = str(event.value)
+        self.pressed = None
+        self.free_switch.set_value(self.driver != ME)  # who gives back stops
+        self._run()
+
+    async def _on_masks(self) -> None:
+        await self._work(lambda: None)
+
+    def _on_variability(self) -> None:
+        self._stale, self._moved = True, time.monotonic()
+
+    async def _on_undo(self) -> None:
+        await self._work(self.session.undo)
+
+    async def _on_reset(self) -> None:
+        self._halt()
+        await self._work(self.session.reset)
+
+    def _on_place(self, event: events.ValueChangeEventArguments[float | None]) -> Awaitable[Any] | None:
+        if self._showing or not self.begun or event.value is None:
+            return None
+        branch = self.session.timeline.branch()
+        number = branch[min(int(event.value), len(branch) - 1)].number
+        return self._work(lambda: self.session.go(number))
+
+    def _on_tip(self, event: events.ValueChangeEventArguments[Any]) -> Awaitable[Any] | None:
+        if self._showing or not self.begun or event.value is None:
+            return None
+        return self._work(lambda: self.session.go(int(event.value)))
+
+    async def _on_start(self) -> None:
+        self._halt()
+        await self._start_at((str(self.source.value), int(self.number.value or 0), int(self.step.value or 0)))
+
+    async def _on_next(self) -> None:
+        self.number.set_value(int(self.number.value or 0) + 1)
+        await self._on_start()
+
+    async def _on_upload(self, event: events.UploadEventArguments) -> None:
+        content, name, model = await event.file.read(), event.file.name, self.studio.world_model
+
+        def start() -> Start:
+            return picture_start(model, content, name)
+
+        self._halt()
+        await self._work(lambda: self.session.begin(start()), begins=True)
+
+    async def _on_scene(self, event: events.MouseEventArguments) -> None:
+        if self._owner is None:
+            return
+        side = len(self._owner)
+        x, y = (min(max(int(v), 0), side - 1) for v in (event.image_x, event.image_y))
+        slot = int(self._owner[y, x])
+        if event.type == "mousemove":
+            self.under = slot
+        else:
+            await self._choose(slot)
+
+    def _leave(self) -> None:
+        self.under = None
+
+    async def _on_strip(self, event: events.MouseEventArguments) -> None:
+        if not self.begun:
+            return
+        cell = int(event.image_x // (self.studio.world_model.env.image_size + GAP))
+        if cell in self.session.now.present:
+            await self._choose(cell)
+
+    async def _choose(self, slot: int) -> None:
+        self.chosen = slot
+        await self._work(lambda: None)
+
+    async def _touch(self, work: Callable[[int], Any]) -> None:
+        slot = self.chosen
+        if slot is None:
+            ui.notify("choose a slot first: click it in the picture or in the strip", type="info")
+        else:
+            await self._work(lambda: work(slot))
+
+    async def _freeze(self) -> None:
+        await self._touch(lambda slot: self.session.freeze(slot, slot not in self.session.now.frozen))
+
+    async def _remove(self) -> None:
+        await self._touch(self.session.remove)
+
+    async def _swap(self) -> None:
+        donors = self.studio.donors
+        if donors is None:
+            ui.notify("there is no other scene to take a slot from: give data.root=", type="info")
+            return
+        self.donor = (self.donor + 1) % len(donors)
+        scene = donors[self.donor]
+        await self._touch(lambda slot: self.session.swap(slot, scene[slot], f"another scene ({self.donor})"))
+
+    async def _on_record(self) -> None:
+        shown: Shown = "true" if self.shown.value == "true" else "imagined"
+        made: list[str] = []
+        self.recorded.set_text("recording ...")
+        done = await self._work(lambda: made.append(str(record(self.session, self.studio.out, shown))))
+        self.recorded.set_text(f"written: {made[0]}" if done else "")

@@ -1,0 +1,146 @@
+"""What the page shows, as bytes: frames, masks over them, the strip of slots, small animations, the error's curve.
+
+Shapes: T frames, n slots that are there, H W image height and width. Frames are uint8 [0, 255].
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from PIL import Image
+from PIL.ImageColor import getrgb
+
+from playslot_rl.play.session import Look, PlaySession
+from playslot_rl.play.timeline import Frame, SceneMoment
+from playslot_rl.visualization.charts import OKABE_ITO
+from playslot_rl.visualization.grid import side_by_side
+
+EDGE: Final = 0.75
+TINT: Final = 0.35
+ANIMATION_FPS: Final = 6.0
+CURVE: Final = (300, 110)
+"""Width and height of the error's curve, pixels."""
+
+
+def colour_of(slot: int) -> str:
+    """A slot's colour, the same everywhere: `#rrggbb`."""
+    return OKABE_ITO[slot % len(OKABE_ITO)]
+
+
+def encode(frame: Frame, scale: int = 1) -> bytes:
+    """PNG of a frame (H, W, 3), enlarged without interpolation."""
+    picture = Image.fromarray(frame)
+    if scale > 1:
+        picture = picture.resize((picture.width * scale, picture.height * scale), Image.Resampling.NEAREST)
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG", compress_level=1)
+    return buffer.getvalue()
+
+
+def with_masks(look: Look, chosen: int | None = None) -> Frame:
+    """The frame tinted by the slot that owns each pixel, with the borders drawn; the chosen slot the strongest.
+
+    Returns:
+        uint8 (H, W, 3).
+    """
+    owner = look.owner
+    colours = np.array([getrgb(colour_of(slot)) for slot in range(int(owner.max()) + 1)], np.float32)
+    border = np.zeros(owner.shape, bool)
+    border[:, :-1] |= owner[:, :-1] != owner[:, 1:]
+    border[:-1] |= owner[:-1] != owner[1:]
+    share = np.full(owner.shape, TINT, np.float32)
+    if chosen is not None:
+        share[owner == chosen] = 0.6
+    share[border] = EDGE
+    mixed = share[..., None] * colours[owner] + (1 - share[..., None]) * look.frame
+    out: Frame = np.clip(mixed, 0, 255).astype(np.uint8)
+    return out
+
+
+def strip(look: Look, session: PlaySession, chosen: int | None, gap: int) -> Frame:
+    """What each slot draws, side by side in the order of their numbers; an empty place where one was removed.
+
+    A bar above says its colour, one below that it is frozen; the chosen one has a frame.
+
+    Returns:
+        uint8 (H, N * W + (N - 1) * gap, 3).
+    """
+    n = session.world_model.slot_shape[0]
+    height, width = look.frame.shape[:2]
+    picture = np.full((height, n * width + (n - 1) * gap, 3), 255, np.uint8)
+    for number in range(n):
+        cell = picture[:, number * (width + gap) : number * (width + gap) + width]
+        if number not in session.now.present:
+            cell[:] = 232
+            continue
+        cell[:] = look.objects[session.now.present.index(number)]
+        colour = getrgb(colour_of(number))
+        cell[:3] = colour
+        if number in session.now.frozen:
+            cell[-3:] = (30, 120, 255)
+        if number == chosen:
+            cell[:, :2] = cell[:, -2:] = cell[-2:] = colour
+    return picture
+
+
+def animated(frames: Frame, fps: float = ANIMATION_FPS, scale: int = 1, last_s: float = 0.6) -> bytes:
+    """Endless GIF of frames (T, H, W, 3), whose last one stays a little longer."""
+    pictures = [Image.fromarray(frame) for frame in frames]
+    size = (pictures[0].width * scale, pictures[0].height * scale)
+    large = [picture.resize(size, Image.Resampling.NEAREST) for picture in pictures]
+    times = [round(1000 / fps)] * (len(large) - 1) + [round(1000 * last_s)]
+    buffer = io.BytesIO()
+    large[0].save(buffer, format="GIF", save_all=True, append_images=large[1:], duration=times, loop=0)
+    return buffer.getvalue()
+
+
+def session_animation(path: Sequence[SceneMoment], fps: float) -> bytes:
+    """The moments of a path as an endless GIF: imagined, and beside it what is true where there is a simulator."""
+    both = all(moment.true is not None for moment in path)
+    clips = [np.stack([moment.frame for moment in path])]
+    if both:
+        clips.append(np.stack([moment.true for moment in path if moment.true is not None]))
+    columns = ["imagined", "simulator"][: len(clips)]
+    pictures = side_by_side(np.stack(clips)[None], columns, [], scale=3)
+    whites = []
+    for picture in pictures:
+        ground = Image.new("RGBA", picture.size, (255, 255, 255, 255))
+        ground.alpha_composite(picture)
+        whites.append(np.asarray(ground.convert("RGB")))
+    return animated(np.stack(whites), fps)
+
+
+def error_curve(errors: Sequence[float | None], at: int) -> str:
+    """The error over the steps as an SVG.
+
+    Args:
+        errors: root mean squared difference of each moment, of [0, 1]; None leaves a gap.
+        at: which of them is the present one.
+    """
+    width, height = CURVE
+    left, bottom, top = 34, height - 18, 8
+    known = [error for error in errors if error is not None]
+    most = max([0.05, *known])
+    steps = max(1, len(errors) - 1)
+
+    def place(step: int, error: float) -> tuple[float, float]:
+        return left + (width - left - 6) * step / steps, bottom - (bottom - top) * error / most
+
+    points = [place(step, error) for step, error in enumerate(errors) if error is not None]
+    line = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+    error_here = errors[at] if at < len(errors) else None
+    here = None if error_here is None else place(at, error_here)
+    dot = f'<circle cx="{here[0]:.1f}" cy="{here[1]:.1f}" r="4" fill="#D55E00"/>' if here else ""
+    text = 'font-size="10" font-family="sans-serif" fill="#767676"'
+    return (
+        f'<svg width="{width}" height="{height}" xmlns="http://www.w3.org/2000/svg">'
+        f'<line x1="{left}" y1="{bottom}" x2="{width - 6}" y2="{bottom}" stroke="#d8dbe0"/>'
+        f'<line x1="{left}" y1="{top}" x2="{left}" y2="{bottom}" stroke="#d8dbe0"/>'
+        f'<text x="2" y="{top + 8}" {text}>{most:.2f}</text><text x="14" y="{bottom}" {text}>0</text>'
+        f'<text x="{left}" y="{height - 4}" {text}>0</text>'
+        f'<text x="{width - 6}" y="{height - 4}" text-anchor="end" {text}>step {steps}</text>'
+        f'<polyline points="{line}" fill="none" stroke="#0072B2" stroke-width="2"/>{dot}</svg>'
+    )

@@ -1,0 +1,143 @@
+"""A session written down: an animation, and a LeRobot v3.0 data set of one episode.
+
+Shapes: T steps, N slots, Z latent-action width, A action width, H W image height and width.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl import keys
+from playslot_rl.collectors.image_set import ImageSetWriter
+from playslot_rl.collectors.journal import png
+from playslot_rl.errors import DataError
+from playslot_rl.play.pictures import session_animation
+from playslot_rl.play.session import PlaySession
+from playslot_rl.play.timeline import SceneMoment
+from playslot_rl.progress import quiet_datasets
+from playslot_rl.storage.atomic import write_bytes, write_json
+from playslot_rl.storage.folders import new_folder
+
+Shown = Literal["imagined", "true"]
+
+ANIMATION: Final = "session.gif"
+DATA_SET: Final = "dataset"
+ABOUT: Final = "session.json"
+REPO: Final = "playslot_rl/played"
+
+
+def record(session: PlaySession, parent: Path, shown: Shown = "imagined") -> Path:
+    """Write the path from the session's start to its present moment.
+
+    Args:
+        session: with at least one step on that path.
+        parent: the recording becomes a folder `recording-NNN` in it, whole or not there.
+        shown: the data set's frames: imagined, or those of the simulator.
+
+    Returns:
+        The folder: `session.gif`, `session.json` and the data set in `dataset`.
+
+    Raises:
+        DataError: there is no step yet, or there are no true frames.
+        OutputError: the folder cannot be written.
+    """
+    path = session.timeline.path()
+    if not any(moment.latent is not None for moment in path):
+        raise DataError("record: got no step yet, expected at least one: press a prototype first")
+    if shown == "true" and any(moment.true is None for moment in path):
+        raise DataError("record: got a session without a simulator, expected one: record the imagined frames")
+    final = _free(parent)
+    with new_folder(final) as folder:
+        write_bytes(folder / ANIMATION, session_animation(path, session.start.fps))
+        _write_set(folder / DATA_SET, session, path, shown)
+        about = {
+            "start": session.start.title,
+            "frames": shown,
+            "moments": [{"label": moment.label, "error": moment.error} for moment in path],
+        }
+        write_json(folder / ABOUT, about)
+    return final
+
+
+def _free(parent: Path) -> Path:
+    """The next recording's folder."""
+    taken = [int(found.name[10:]) for found in parent.glob("recording-*") if found.name[10:].isdigit()]
+    return parent / f"recording-{max([0, *taken]) + 1:03d}"
+
+
+def columns(session: PlaySession, path: Sequence[SceneMoment], shown: Shown) -> dict[str, npt.NDArray[Any]]:
+    """LeRobot features of a path with T steps, (T + 1, ...): row t is a frame and the actions that followed it.
+
+    A touch makes no row: the frame before the next step is the touched one. The last row's actions are padding.
+    """
+    steps = [moment for moment in path if moment.latent is not None]
+    moments = session.timeline.moments
+    seen = [moments[moment.parent] for moment in steps if moment.parent is not None] + [path[-1]]
+    frames = [moment.frame if shown == "imagined" else moment.true for moment in seen]
+    index, n = np.arange(len(steps) + 1), session.world_model.slot_shape[0]
+    latents, codes = [], []
+    for moment in steps:
+        assert moment.latent is not None
+        assert moment.code is not None
+        latent, code = moment.latent.cpu().numpy().copy(), moment.code.cpu().numpy().reshape(-1).copy()
+        if session.per_slot:
+            gone = [slot for slot in range(n) if slot not in moment.present]
+            latent[gone], code[gone] = 0.0, -1
+        latents.append(latent.reshape(-1))
+        codes.append(code)
+    found = {
+        keys.FEATURE_IMAGE: np.stack([frame for frame in frames if frame is not None]),
+        keys.FEATURE_LATENT: _padded(np.stack(latents).astype(np.float32)),
+        keys.FEATURE_CODE: _padded(np.stack(codes).astype(np.int64)),
+        keys.FEATURE_DONE: (index >= len(steps) - 1)[:, None],
+        keys.FEATURE_LAST: (index == len(steps))[:, None],
+    }
+    actions = [moment.action for moment in steps if moment.action is not None]
+    if actions:
+        found[keys.FEATURE_ACTION] = _padded(np.stack(actions))
+    return found
+
+
+def _padded(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return np.concatenate([rows, np.zeros_like(rows[:1])])
+
+
+def _features(values: dict[str, npt.NDArray[Any]]) -> dict[str, dict[str, Any]]:
+    image = {"dtype": "image", "shape": values[keys.FEATURE_IMAGE].shape[1:], "names": ["height", "width", "channels"]}
+    found: dict[str, dict[str, Any]] = {keys.FEATURE_IMAGE: image}
+    for name, column in values.items():
+        if name != keys.FEATURE_IMAGE:
+            found[name] = {"dtype": str(column.dtype), "shape": column.shape[1:], "names": None}
+    return found
+
+
+def _write_set(root: Path, session: PlaySession, path: Sequence[SceneMoment], shown: Shown) -> None:
+    """A data set of one episode at `root`."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    values = columns(session, path, shown)
+    with quiet_datasets():
+        dataset = LeRobotDataset.create(
+            REPO,
+            fps=max(1, round(session.start.fps)),
+            features=_features(values),
+            root=root,
+            robot_type=session.world_model.env.name,
+            use_videos=False,
+            video_backend="pyav",
+        )
+        frames = values.pop(keys.FEATURE_IMAGE)
+        try:
+            with contextlib.closing(ImageSetWriter(dataset.meta, dataset.root, session.start.task)) as writer:
+                writer.add(values, frames, [png(frame) for frame in frames])
+            dataset.finalize()
+        except BaseException:
+            # LeRobot's destructors would finish the files later, in a folder that has been removed.
+            dataset.writer._finalized = dataset.meta._finalized = True
+            raise

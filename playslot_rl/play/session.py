@@ -1,0 +1,338 @@
+"""One player's session: steps, touches, time travel; no browser is needed.
+
+Shapes: N slots of the world model, n of them still there, K prototypes, P imagined frames, D slot width,
+Z latent-action width, A action width, H W image height and width. "[N,]" is there with one latent action per slot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from playslot_rl import keys
+from playslot_rl.acting.imagination import ImaginationSession
+from playslot_rl.frames import to_uint8
+from playslot_rl.play.starts import Start
+from playslot_rl.play.steering import Driver, PolicyDriver, require_prototypes, variability_directions
+from playslot_rl.play.timeline import Frame, SceneMoment, Timeline
+from playslot_rl.world_model import Agent, WorldModel
+
+PREVIEW: Final = 6
+"""Frames of a prototype's small animation."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """The present moment, drawn.
+
+    Attributes:
+        frame: uint8 (H, W, 3).
+        owner: number of the slot that each pixel belongs to, int64 (H, W).
+        objects: what each slot draws, its colours weighted by its mask on white, uint8 (n, H, W, 3).
+    """
+
+    frame: Frame
+    owner: npt.NDArray[np.int64]
+    objects: Frame
+
+
+class PlaySession:
+    """An imagined future under a user's hand.
+
+    Not for several threads at once: a page hands every call to one worker.
+
+    Args:
+        world_model: put into evaluation mode; with prototypes.
+        agent: of that world model, for the policy and the decoded actions; None has neither.
+        directions: (K, Z), see `variability_directions`; None takes the codebook's.
+
+    Attributes:
+        start: where the session began.
+        timeline: its moments.
+        drivers: who may take over, by name.
+
+    Raises:
+        CheckpointError: the world model has no prototypes.
+    """
+
+    start: Start
+    timeline: Timeline
+
+    def __init__(self, world_model: WorldModel, agent: Agent | None = None, directions: Tensor | None = None) -> None:
+        self.world_model, self.agent = world_model.eval(), agent
+        self.prototypes = require_prototypes(world_model)
+        self.directions = variability_directions(world_model, None) if directions is None else directions
+        self.drivers: dict[str, Driver] = {} if agent is None else {"policy": PolicyDriver(agent.policy)}
+        self._imagination = ImaginationSession(world_model)
+        self._look: tuple[int, Look] | None = None
+
+    @property
+    def per_slot(self) -> bool:
+        """Whether each slot has a latent action of its own (InvDyn_M)."""
+        return self.world_model.inverse_dynamics.per_slot
+
+    @property
+    def varies(self) -> bool:
+        """Whether variability means anything: in mode `discrete` the predictor sees the prototype alone."""
+        return self.world_model.config.inverse_dynamics.mode == "hybrid"
+
+    @property
+    def now(self) -> SceneMoment:
+        """The present moment."""
+        return self.timeline.now
+
+    @property
+    def slots(self) -> Tensor:
+        """Present slots (n, D)."""
+        out: Tensor = self.now.state[keys.SLOTS][0].clone()
+        return out
+
+    # --- begin -----------------------------------------------------------------------------------------------------
+
+    def begin(self, start: Start) -> None:
+        """Start a new timeline; the simulator of the one before is closed."""
+        before = getattr(self, "start", None)
+        if before is not None and before.twin is not None and before.twin is not start.twin:
+            before.twin.close()
+        self._imagination.reset(slots=start.slots)
+        state = self._imagination.state
+        present = tuple(range(self.world_model.slot_shape[0]))
+        true = None if start.twin is None or self.agent is None else start.twin.first
+        self.start = start
+        frame = self._draw(state, present)
+        self.timeline = Timeline(SceneMoment(0, None, 0, state, present, frozenset(), frame, true=true))
+
+    def close(self) -> None:
+        """Free the simulator."""
+        start = getattr(self, "start", None)
+        if start is not None and start.twin is not None:
+            start.twin.close()
+
+    # --- steps -----------------------------------------------------------------------------------------------------
+
+    def latent(self, prototype: int, variability: float = 0.0, slot: int | None = None) -> Tensor:
+        """The latent action of a key press: z = p + s * d (see `playslot_rl.play.steering`).
+
+        Args:
+            prototype: its number.
+            variability: s, in standard deviations.
+            slot: number of the slot that it goes to, the others staying as they are; None goes to all. Only with one
+                latent action per slot.
+
+        Returns:
+            ([N,] Z).
+
+        Raises:
+            ValueError: no such prototype, or a slot that is not there.
+        """
+        if not 0 <= prototype < len(self.prototypes):
+            raise ValueError(f"prototype: got {prototype}, expected 0 to {len(self.prototypes) - 1}")
+        z = self.prototypes[prototype] + variability * self.directions[prototype]
+        if not self.per_slot:
+            return z
+        if slot is not None:
+            self._row(slot)
+        out = z.new_zeros(self.world_model.latent_shape)
+        out[slice(None) if slot is None else slot] = z
+        return out
+
+    def press(self, prototype: int, variability: float = 0.0, slot: int | None = None) -> SceneMoment:
+        """One step by a prototype; arguments of `latent`."""
+        amount = f" {variability:+.1f}" if variability else ""
+        where = f", slot {slot + 1}" if self.per_slot and slot is not None else ""
+        return self.step(self.latent(prototype, variability, slot), f"prototype {prototype}{amount}{where}")
+
+    def drive(self, name: str) -> SceneMoment:
+        """One step by who has taken over.
+
+        Raises:
+            ValueError: nobody has this name.
+        """
+        if name not in self.drivers:
+            raise ValueError(f"driver: got {name!r}, expected one of {', '.join(self.drivers) or 'none'}")
+        driver = self.drivers[name]
+        return self.step(driver.choose(self), driver.title)
+
+    @torch.no_grad()
+    def step(self, latent: Tensor, label: str = "latent action") -> SceneMoment:
+        """One imagined step, and the decoded action in the simulator where there is one.
+
+        Args:
+            latent: ([N,] Z); rows of slots that were removed are not read.
+            label: for the timeline.
+
+        Raises:
+            ValueError: another shape, or the timeline is full.
+        """
+        now = self.now
+        if self.timeline.full:
+            raise ValueError("step: got a full timeline, expected room: record it and start anew")
+        if latent.shape != self.world_model.latent_shape:
+            raise ValueError(f"step: got a latent of {tuple(latent.shape)}, expected {self.world_model.latent_shape}")
+        rows = list(now.present)
+        self._imagination.restore(now.state)
+        after = self._imagination.step((latent[rows] if self.per_slot else latent)[None])
+        held = [row for row, number in enumerate(rows) if number in now.frozen]
+        if held:
+            after[:, held] = now.state[keys.SLOTS][:, held]
+            self._imagination.put(after)
+        action, true = self._act(latent)
+        code = self.world_model.inverse_dynamics.quantizer(latent)[1]
+        return self._land(label, latent=latent.clone(), code=code.clone(), action=action, true=true)
+
+    def _act(self, latent: Tensor) -> tuple[npt.NDArray[np.float32] | None, Frame | None]:
+        """The decoded action, and what the simulator shows after it.
+
+        As in imagination the latent is decoded alone: a decoder that reads slots learned from parsed ones.
+        """
+        if self.agent is None:
+            return None, None
+        decoded = self.agent.action_decoder(latent[None])[0].clamp(-1, 1)
+        action: npt.NDArray[np.float32] = decoded.cpu().numpy().astype(np.float32)
+        if self.start.twin is None:
+            return action, None
+        past = [moment.action for moment in self.timeline.path() if moment.action is not None]
+        return action, self.start.twin.follow([*past, action])
+
+    def _land(self, label: str, **found: Any) -> SceneMoment:
+        """Add the imagination's present state to the timeline."""
+        now, state = self.now, self._imagination.state
+        whole = {"present": now.present, "frozen": now.frozen, "true": now.true, **found}
+        moment = SceneMoment(
+            number=len(self.timeline.moments),
+            parent=now.number,
+            depth=now.depth + 1,
+            state=state,
+            frame=self._draw(state, whole["present"], len(self.timeline.moments)),
+            label=label,
+            **whole,
+        )
+        self.timeline.add(moment)
+        return moment
+
+    # --- time ------------------------------------------------------------------------------------------------------
+
+    def undo(self) -> bool:
+        """Back by one moment; False at the start. What was undone stays in the timeline, as a branch."""
+        return self.timeline.back()
+
+    def go(self, number: int) -> None:
+        """To any moment; the next step makes a branch there."""
+        self.timeline.go(number)
+
+    def reset(self) -> None:
+        """To the start."""
+        self.timeline.go(0)
+
+    # --- touch -----------------------------------------------------------------------------------------------------
+
+    def _row(self, slot: int) -> int:
+        if slot not in self.now.present:
+            there = ", ".join(str(number) for number in self.now.present)
+            raise ValueError(f"slot: got {slot}, expected one that is there: {there}")
+        return self.now.present.index(slot)
+
+    def freeze(self, slot: int, frozen: bool = True) -> SceneMoment:
+        """Hold a slot as it is from here on, or let it go; the others see it.
+
+        Raises:
+            ValueError: it is not there.
+        """
+        self._row(slot)
+        self._imagination.restore(self.now.state)
+        held = self.now.frozen | {slot} if frozen else self.now.frozen - {slot}
+        return self._land(f"slot {slot + 1} {'frozen' if frozen else 'let go'}", frozen=held)
+
+    def remove(self, slot: int) -> SceneMoment:
+        """Go on without a slot, as if it had never been there.
+
+        Raises:
+            ValueError: it is not there, or it is the last one.
+        """
+        row, present = self._row(slot), self.now.present
+        if len(present) == 1:
+            raise ValueError("remove: got the last slot, expected another one to stay: undo, or reset")
+        self._imagination.restore(self.now.state)
+        self._imagination.keep([r for r in range(len(present)) if r != row])
+        rest = tuple(number for number in present if number != slot)
+        return self._land(f"slot {slot + 1} removed", present=rest, frozen=self.now.frozen - {slot})
+
+    def swap(self, slot: int, other: Tensor, name: str = "another scene") -> SceneMoment:
+        """Put another slot in a slot's place; what came before is forgotten, since the new one was not in it.
+
+        Args:
+            slot: which one.
+            other: (D,), such as the same slot of another start.
+            name: where it is from, for the timeline.
+
+        Raises:
+            ValueError: it is not there, or `other` has another width.
+        """
+        row, slots = self._row(slot), self.slots
+        if other.shape != slots[row].shape:
+            raise ValueError(f"swap: got a slot of shape {tuple(other.shape)}, expected {tuple(slots[row].shape)}")
+        slots[row] = other
+        self._imagination.restore(self.now.state)
+        self._imagination.put(slots[None], forget=True)
+        return self._land(f"slot {slot + 1} swapped with that of {name}")
+
+    # --- pictures --------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def _draw(self, state: Any, present: Sequence[int], number: int = 0) -> Frame:
+        """The frame of a state, which becomes the present moment's look."""
+        decoded = self.world_model.savi.decode(state[keys.SLOTS][0])
+        frame: Frame = to_uint8(decoded.frames)
+        owner = np.asarray(present)[decoded.masks[:, 0].argmax(0).cpu().numpy()]
+        objects = decoded.rgb.clamp(0, 1) * decoded.masks + (1 - decoded.masks)
+        self._look = (number, Look(frame, owner, to_uint8(objects)))
+        return frame
+
+    def look(self) -> Look:
+        """The present moment, drawn."""
+        now = self.now
+        if self._look is None or self._look[0] != now.number:
+            self._draw(now.state, now.present, now.number)
+        assert self._look is not None
+        return self._look[1]
+
+    @torch.no_grad()
+    def preview(
+        self,
+        prototypes: Sequence[int] | None = None,
+        variability: float = 0.0,
+        slot: int | None = None,
+        steps: int = PREVIEW,
+    ) -> Frame:
+        """What holding some prototypes would do here; the session is left as it is.
+
+        Args:
+            prototypes: their numbers, K' of them; None takes all.
+            variability, slot: see `latent`.
+            steps: P.
+
+        Returns:
+            uint8 (K', P + 1, H, W, 3), the present frame first.
+        """
+        numbers = range(len(self.prototypes)) if prototypes is None else prototypes
+        now, k = self.now, len(numbers)
+        ahead = ImaginationSession(self.world_model)
+        ahead.restore(now.state)
+        ahead.branch(k)
+        rows = list(now.present)
+        latents = torch.stack([self.latent(number, variability, slot) for number in numbers])
+        held = [row for row, number in enumerate(rows) if number in now.frozen]
+        frames = [np.broadcast_to(now.frame, (k, *now.frame.shape))]
+        for _ in range(steps):
+            after = ahead.step(latents[:, rows] if self.per_slot else latents)
+            if held:
+                after[:, held] = now.state[keys.SLOTS][:, held]
+                ahead.put(after)
+            frames.append(to_uint8(self.world_model.savi.decode(after).frames))
+        return np.stack(frames, 1)

@@ -1,0 +1,238 @@
+"""Where playing starts: a frame of a data set, a fresh episode of the simulator, or an uploaded picture.
+
+Shapes: N slots, D slot width, E episodes, T frames, H W image height and width.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from playslot_rl.acting.episodes import Task
+from playslot_rl.config import EnvConfig, RenderConfig
+from playslot_rl.data.frames import resize_frames
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.episode_seeds import redraw_stride
+from playslot_rl.errors import DataError
+from playslot_rl.frames import to_float
+from playslot_rl.play.twin import Twin
+from playslot_rl.world_model import WorldModel, module_device
+
+Frame = npt.NDArray[np.uint8]
+
+SAME: Final = 2.0
+"""Mean difference, of 255, up to which a re-run episode shows the recorded frame."""
+CLIPS: Final = 24
+CLIP_FRAMES: Final = 16
+SIMULATED_CLIPS: Final = 4
+MAX_PIXELS: Final = 64 * 2**20
+
+
+@dataclass(frozen=True)
+class Start:
+    """A first frame, parsed.
+
+    Attributes:
+        title: in words.
+        frame: uint8 (H, W, 3), as it was seen.
+        slots: (1, N, D).
+        fps: agent steps a second.
+        task: the task in words.
+        twin: the simulator in the same state; None where there is none.
+    """
+
+    title: str
+    frame: Frame
+    slots: Tensor
+    fps: float = 10.0
+    task: str = "playing in imagination"
+    twin: Twin | None = None
+
+
+@torch.no_grad()
+def parse_last(model: WorldModel, frames: Frame, seed: int) -> Tensor:
+    """Slots (1, N, D) of the last of some consecutive frames uint8 (T, H, W, 3), the first of which starts an episode.
+
+    Earlier frames matter: SAVi goes on from them, as it did in training.
+    """
+    device = module_device(model)
+    slots, _ = model.savi(to_float(frames, device)[None], generator=torch.Generator(device).manual_seed(seed))
+    out: Tensor = slots[:, -1].clone()
+    return out
+
+
+class RecordedStarts:
+    """Frames of a data set.
+
+    Args:
+        model: parses them.
+        source: of the model's frame size.
+        make_task: makes the simulator of the data set's episodes; None where there is none.
+        seed: of sampled initial slots.
+    """
+
+    def __init__(
+        self, model: WorldModel, source: EpisodeFrames, make_task: Callable[[], Task] | None = None, seed: int = 0
+    ) -> None:
+        self.model, self.source, self.make_task, self.seed = model, source, make_task, seed
+        actions = source.actions
+        usable = source.seeds is not None and actions is not None and actions.shape[1] == model.env.action_dim
+        self._simulated = make_task is not None and usable
+
+    @property
+    def episodes(self) -> int:
+        """E."""
+        return self.source.episodes
+
+    def length(self, episode: int) -> int:
+        """Frames of an episode."""
+        return int(self.source.lengths[episode])
+
+    def start(self, episode: int, step: int) -> Start:
+        """Start at a frame of an episode; with the simulator where it runs the recorded episode again.
+
+        Raises:
+            ValueError: there is no such frame.
+        """
+        if not 0 <= episode < self.episodes or not 0 <= step < self.length(episode):
+            raise ValueError(
+                f"start: got frame {step} of episode {episode}, expected one of {self.episodes} episodes, and one of "
+                "its frames"
+            )
+        rows = self.source.episode_rows(episode)[: step + 1]
+        frames = np.asarray(self.source.frames[rows])
+        title = f"episode {episode}, frame {step} of {self.length(episode)}"
+        slots = parse_last(self.model, frames, self.seed)
+        task = self.source.task or "playing in imagination"
+        return Start(title, frames[-1].copy(), slots, self.source.fps, task, self._twin(episode, rows, frames[-1]))
+
+    def _twin(self, episode: int, rows: npt.NDArray[np.int64], seen: Frame) -> Twin | None:
+        """The episode run again to this frame, if what it shows is what was recorded."""
+        if not self._simulated or self.make_task is None:
+            return None
+        assert self.source.seeds is not None
+        assert self.source.actions is not None
+        task = self.make_task()
+        twin = Twin(task, int(self.source.seeds[episode]), list(self.source.actions[rows[:-1]]))
+        if twin.first.shape != seen.shape or np.abs(twin.first.astype(float) - seen).mean() > SAME:
+            twin.close()
+            return None
+        return twin
+
+    def clips(self) -> Frame | None:
+        """Some clips of the data set, uint8 (n, T, H, W, 3), evenly over its episodes; None where all are too short."""
+        long = np.flatnonzero(self.source.lengths >= 2)
+        if not len(long):
+            return None
+        frames = min(CLIP_FRAMES, int(self.source.lengths[long].max()))
+        fit = long[self.source.lengths[long] >= frames]
+        chosen = fit[np.unique(np.linspace(0, len(fit) - 1, min(CLIPS, len(fit))).round().astype(int))]
+        rows = self.source.starts[chosen][:, None] + np.arange(frames)
+        clips: Frame = np.asarray(self.source.frames[rows])
+        return clips
+
+
+class SimulatedStarts:
+    """Fresh episodes of the simulator.
+
+    Args:
+        model: parses their first frames.
+        make_task: makes the simulator.
+        fps: agent steps a second.
+        task: in words.
+        first_seed: of the first episode; others follow.
+    """
+
+    def __init__(
+        self,
+        model: WorldModel,
+        make_task: Callable[[], Task],
+        fps: float = 10.0,
+        task: str = "",
+        first_seed: int = 0,
+    ) -> None:
+        self.model, self.make_task, self.fps, self.task, self.first_seed = model, make_task, fps, task, first_seed
+
+    def start(self, number: int) -> Start:
+        """Start episode `number`, from 0 on.
+
+        Raises:
+            RenderError: there is no GL backend.
+        """
+        seed = self.first_seed + number
+        twin = Twin(self.make_task(), seed, stride=redraw_stride(seed))
+        slots = parse_last(self.model, twin.first[None], seed)
+        title = f"fresh episode {number}"
+        return Start(title, twin.first, slots, self.fps, self.task or "playing in imagination", twin)
+
+    def clips(self) -> Frame:
+        """A few episodes of random actions, uint8 (n, T, H, W, 3)."""
+        task, clips = self.make_task(), []
+        rng = np.random.default_rng(self.first_seed)
+        width = self.model.env.action_dim
+        try:
+            task.draw_steps = True
+            for number in range(SIMULATED_CLIPS):
+                observation, _ = task.reset(seed=self.first_seed + number)
+                frames = [observation["pixels"]]
+                for _ in range(CLIP_FRAMES - 1):
+                    frames.append(task.step(rng.uniform(-1, 1, width).astype(np.float32))[0]["pixels"])
+                clips.append(np.stack(frames))
+        finally:
+            task.close()
+        return np.stack(clips)
+
+
+def task_maker(env: EnvConfig, render: RenderConfig) -> Callable[[], Task]:
+    """Makes environments of a task."""
+
+    def make() -> Task:
+        from playslot_rl.envs import make_env
+
+        task: Any = make_env(env, render).unwrapped
+        return task  # type: ignore[no-any-return]
+
+    return make
+
+
+def picture_start(model: WorldModel, content: bytes, name: str = "picture", seed: int = 0) -> Start:
+    """Start from a picture of any size: its largest centred square, resized by area averaging as in training.
+
+    Args:
+        model: parses it.
+        content: of a PNG, JPEG or other picture file.
+        name: for messages.
+        seed: of sampled initial slots.
+
+    Raises:
+        DataError: it is no picture, or too large.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    side = model.env.image_size
+    try:
+        with Image.open(io.BytesIO(content)) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise DataError(
+                    f"{name}: got {image.width}x{image.height} pixels, expected at most {MAX_PIXELS // 2**20} million: "
+                    "make it smaller"
+                )
+            pixels = np.asarray(image.convert("RGB"))
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(
+            f"{name}: got no picture that can be read, expected a PNG or JPEG file: choose another"
+        ) from error
+    height, width = pixels.shape[:2]
+    cut = min(height, width)
+    top, left = (height - cut) // 2, (width - cut) // 2
+    frame = resize_frames(pixels[None, top : top + cut, left : left + cut], side)[0]
+    return Start(name, frame, parse_last(model, frame[None], seed))

@@ -1,0 +1,114 @@
+"""What all pages share: one model, one worker, the places to start from.
+
+Models, simulators and their renderers belong to one thread, so every call that touches them goes through the worker,
+one after the other: several pages at once take turns, and the server's own thread stays free for clicks.
+
+Shapes: K prototypes, N slots, D slot width, Z latent-action width.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from playslot_rl.errors import DataError
+from playslot_rl.play.session import PlaySession
+from playslot_rl.play.starts import RecordedStarts, SimulatedStarts, Start, parse_last
+from playslot_rl.play.steering import Driver, variability_directions
+from playslot_rl.world_model import Agent, WorldModel
+
+
+class Studio:
+    """A model to play with.
+
+    Args:
+        world_model: with prototypes.
+        agent: for the policy and the simulator beside; None has neither.
+        recorded: frames of data sets; None has none.
+        simulated: fresh episodes; None has none.
+        out: folder that recordings go to.
+        title: of the model, for the page.
+        fps: of free play, at first.
+        drivers: further ones that may take over, such as planners, by name.
+
+    Attributes:
+        directions: (K, Z), see `variability_directions`.
+        donors: (n, N, D), slots of other scenes for swapping; None where there are none.
+
+    Raises:
+        CheckpointError: the world model has no prototypes.
+    """
+
+    def __init__(
+        self,
+        world_model: WorldModel,
+        agent: Agent | None = None,
+        recorded: RecordedStarts | None = None,
+        simulated: SimulatedStarts | None = None,
+        out: Path = Path("runs/play"),
+        title: str = "world model",
+        fps: float = 8.0,
+        drivers: dict[str, Driver] | None = None,
+    ) -> None:
+        self.world_model, self.agent, self.out, self.title, self.fps = world_model.eval(), agent, out, title, fps
+        self.recorded, self.simulated, self.drivers = recorded, simulated, dict(drivers or {})
+        self._worker = ThreadPoolExecutor(1, "play")
+        clips_of = recorded or simulated
+        clips = None if clips_of is None else self.call(clips_of.clips).result()
+        self.directions = self.call(lambda: variability_directions(world_model, clips)).result()
+        self.donors: Tensor | None = None
+        if clips is not None:
+            self.donors = self.call(
+                lambda: torch.cat([parse_last(world_model, clip[:1], 0) for clip in clips])
+            ).result()
+
+    def call[Result](self, work: Callable[[], Result]) -> Future[Result]:
+        """Hand work to the worker."""
+        return self._worker.submit(work)
+
+    async def do[Result](self, work: Callable[[], Result]) -> Result:
+        """The result of work, without standing in the way of other pages' clicks."""
+        return await asyncio.wrap_future(self.call(work))
+
+    def session(self) -> PlaySession:
+        """A new player's session, not begun yet."""
+        session = PlaySession(self.world_model, self.agent, self.directions)
+        session.drivers.update(self.drivers)
+        return session
+
+    def start(self, source: str, number: int = 0, step: int = 0) -> Start:
+        """A start by its source.
+
+        Args:
+            source: `recorded` or `simulated`.
+            number: of the episode.
+            step: of the frame in a recorded episode.
+
+        Raises:
+            DataError: there is no such source.
+            ValueError: no such frame.
+        """
+        if source == "recorded" and self.recorded is not None:
+            return self.recorded.start(number, step)
+        if source == "simulated" and self.simulated is not None:
+            return self.simulated.start(number)
+        raise DataError(f"start: got {source}, expected one of {', '.join(self.sources) or 'none'}: upload a picture")
+
+    @property
+    def sources(self) -> dict[str, str]:
+        """Titles of the sources that are there, by name; the first is where a page starts."""
+        found = {}
+        if self.recorded is not None:
+            found["recorded"] = f"data set ({self.recorded.episodes} episodes)"
+        if self.simulated is not None:
+            found["simulated"] = "fresh simulator episode"
+        return found
+
+    def close(self) -> None:
+        """End the worker when it has finished what it does."""
+        self._worker.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,97 @@
+"""`playslot play run=RUN|pretrained [data.root=SET] [port=]`: an imagined future to play with, in the browser."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.compose import shipped
+from playslot_rl.errors import ConfigError, DataError
+from playslot_rl.recipes.run import open_device, parent_run
+
+if TYPE_CHECKING:
+    from playslot_rl.play.starts import RecordedStarts, SimulatedStarts
+    from playslot_rl.play.studio import Studio
+    from playslot_rl.world_model import Agent, WorldModel
+
+
+def main(config: ExperimentConfig) -> None:
+    """Serve the page until Ctrl-C.
+
+    Args:
+        config: `run`, `port`, `out`, `data`, `play`, `env`, `render`, `seed`, `device`.
+
+    Raises:
+        ConfigError: no run, a port that is taken, another frame size than the run's, or NiceGUI is not installed.
+        CheckpointError: there is no such run, or it has no prototypes.
+        DataError: a data set that cannot be read, or whose frames have another size.
+        RenderError: there is no GL backend.
+    """
+    if importlib.util.find_spec("nicegui") is None:
+        raise ConfigError("play: got no NiceGUI, expected the extra `play`: make setup, or pip install nicegui==3.18.0")
+    from playslot_rl.play.server import HOST, choose_port, serve
+
+    port = choose_port(config.port)  # before the model is loaded
+    studio = open_studio(config)
+    address = f"http://{HOST}:{port}"
+    print(f"{studio.title}: {address}  (Ctrl-C ends it; recordings go to {studio.out})", flush=True)
+    serve(studio, port, config.play.show)
+    print("stopped", flush=True)
+
+
+def open_studio(config: ExperimentConfig) -> Studio:
+    """The model of `config.run` and the places to start from."""
+    from playslot_rl.api import load
+    from playslot_rl.play.studio import Studio
+
+    if not config.run:
+        raise ConfigError("run: got nothing, expected a run or a shipped model, such as run=pretrained")
+    model = load(parent_run(config, Path()), str(open_device(config)), config.seed)
+    world, agent = model.world_model, model.agent
+    recorded, simulated = recorded_starts(config, world, agent), simulated_starts(config, world)
+    if recorded is None and simulated is None:
+        print("no data set and no simulator to start from: upload a picture, or give data.root=", flush=True)
+    out = Path(config.out or "runs") / "play"
+    return Studio(world, agent, recorded, simulated, out, config.run, config.play.fps)
+
+
+def simulated_starts(config: ExperimentConfig, world: WorldModel) -> SimulatedStarts | None:
+    """Fresh episodes of the run's task, where it has a simulator."""
+    from playslot_rl.envs import ENVIRONMENTS, task_metadata
+    from playslot_rl.evaluation.seeds import first_seed
+    from playslot_rl.play.starts import SimulatedStarts, task_maker
+    from playslot_rl.recipes.evaluate import check_environment
+
+    if config.env.name not in ENVIRONMENTS:
+        return None
+    check_environment(config, world.env.image_size, world.env.action_dim)
+    metadata = task_metadata(config.env)
+    fps = metadata["control_hz"] / config.env.frame_skip
+    maker = task_maker(config.env, config.render)
+    return SimulatedStarts(world, maker, fps, metadata["task"], first_seed(config, config.seed))
+
+
+def recorded_starts(config: ExperimentConfig, world: WorldModel, agent: Agent | None) -> RecordedStarts | None:
+    """Frames of `data.root`, or of the data sets that the run names and that are on this machine."""
+    from playslot_rl.data.source import open_sources
+    from playslot_rl.envs import ENVIRONMENTS
+    from playslot_rl.evaluation.seeds import data_folders
+    from playslot_rl.play.starts import RecordedStarts, task_maker
+
+    known = shipped(config.run)
+    named = data_folders(config, None if known else Path(config.run))
+    found = [root for root in named if (root / "meta" / "info.json").is_file()]
+    if named and not found:
+        # A shipped model names no data set, so the user did.
+        if known or config.env.name not in ENVIRONMENTS:
+            raise DataError(f"data.root={named[0]}: got no data set, expected a LeRobot v3.0 one: check data.root=")
+        print(f"the run's data sets are not on this machine ({named[0]}): the simulator makes the starts", flush=True)
+    if not found:
+        return None
+    size, data = world.env.image_size, config.data
+    source = open_sources(found, data.camera, data.cache, image_size=size, resize=data.resize)
+    simulator = agent is not None and config.env.name in ENVIRONMENTS
+    maker = task_maker(config.env, config.render) if simulator else None
+    return RecordedStarts(world, source, maker, config.seed)

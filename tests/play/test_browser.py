@@ -1,0 +1,138 @@
+"""The page in headless Chromium, as a user has it: `make test-browser`."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from playslot_rl.datasets.verify import verify
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt-get install --no-install-recommends chromium"),
+]
+
+
+def free_port() -> int:
+    """A port that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path, subprocess.Popen[str]]]:
+    """`playslot play` with the shipped model; its address, and the folder it runs in."""
+    folder, port = tmp_path_factory.mktemp("play"), free_port()
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    command = [sys.executable, "-m", "playslot_rl", "play", "run=pretrained/block_push_easy", f"port={port}"]
+    process = subprocess.Popen(
+        [*command, "device=cpu"], cwd=folder, env=environment, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    address = f"http://127.0.0.1:{port}"
+    try:
+        for _ in range(240):
+            try:
+                urllib.request.urlopen(address, timeout=5).close()
+                break
+            except OSError:
+                assert process.poll() is None, process.communicate()[1]
+                time.sleep(0.5)
+        yield address, folder, process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """A headless browser."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="no Playwright: make test-browser installs it")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+def open_page(browser: Any, address: str) -> tuple[Any, set[str]]:
+    """A page that has begun, and the hosts that it asks."""
+    page, hosts = browser.new_page(viewport={"width": 1500, "height": 820}), set[str]()
+    page.on("request", lambda request: hosts.add(request.url.split("/")[2]) if "//" in request.url else None)
+    page.goto(address)
+    wait(page, lambda: moment(page) == 0)
+    return page, hosts
+
+
+def wait(page: Any, true: Callable[[], bool]) -> None:
+    """Wait for something to become true, a minute at most: other jobs may have the cores."""
+    for _ in range(600):
+        if true():
+            return
+        page.wait_for_timeout(100)
+    raise AssertionError(f"nothing happened for a minute; the page says: {page.inner_text('body')[:500]}")
+
+
+def moment(page: Any) -> int:
+    """The depth of the moment that the page shows."""
+    found = re.search(r"; moment (\d+)", page.inner_text("body"))
+    return -1 if found is None else int(found[1])
+
+
+def picture(page: Any) -> bytes:
+    """What the imagined scene looks like on the screen."""
+    content: bytes = page.locator(".pixels").first.screenshot()
+    return content
+
+
+def test_a_user_plays_records_and_leaves(server: tuple[str, Path, subprocess.Popen[str]]) -> None:
+    address, folder, process = server
+    with chromium() as browser:
+        page, hosts = open_page(browser, address)
+        other, _ = open_page(browser, address)
+        before = picture(page)
+        for number, key in enumerate("1123", 1):
+            page.keyboard.press(key)
+            wait(page, lambda: moment(page) == number)  # noqa: B023
+        assert picture(page) != before
+        plain = picture(page)
+        page.keyboard.press("m")
+        wait(page, lambda: picture(page) != plain)
+        page.keyboard.press("u")
+        wait(page, lambda: moment(page) == 3)
+        page.get_by_text("latent policy", exact=True).click()
+        wait(page, lambda: moment(page) >= 5)
+        page.get_by_text("I steer", exact=True).click()
+        assert moment(other) == 0
+        other.keyboard.press("2")
+        wait(other, lambda: moment(other) == 1)
+        other.close()
+        page.get_by_text("Record", exact=True).click()
+        wait(page, lambda: "written: " in page.inner_text("body"))
+        assert hosts == {address.removeprefix("http://")}, "nothing from outside"
+    recording = folder / "runs" / "play" / "recording-001"
+    result = verify(recording / "dataset")
+    assert result.ok, result.lines()
+    assert result.frames >= 6
+    assert (recording / "session.gif").is_file()
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert "Traceback" not in err
+    assert out.splitlines()[-1] == "stopped"
+    assert [path.name for path in (folder / "runs" / "play").iterdir()] == ["recording-001"]

@@ -1,0 +1,225 @@
+"""The page without a browser: what is clicked and pressed does what it says; pages come and go; a taken port."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("nicegui", reason="the extra `play` is not installed")
+
+from nicegui import ui
+from nicegui.testing import User, user_simulation
+from scene import DotTask
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.errors import ConfigError, DataError
+from playslot_rl.play.gallery import Gallery
+from playslot_rl.play.page import PlayPage
+from playslot_rl.play.server import choose_port, serve_pictures
+from playslot_rl.play.starts import RecordedStarts, SimulatedStarts
+from playslot_rl.play.studio import Studio
+from playslot_rl.recipes import play
+from playslot_rl.world_model import Agent, WorldModel
+
+
+@pytest.fixture
+def studio(agent: Agent, recorded: RecordedStarts, simulated: SimulatedStarts, tmp_path: Path) -> Iterator[Studio]:
+    made = Studio(agent.world_model, agent, recorded, simulated, tmp_path / "play", "tiny")
+    yield made
+    made.close()
+
+
+def simulate(studio: Studio, script: Callable[[User, list[PlayPage]], Awaitable[None]]) -> list[PlayPage]:
+    """Open the page and follow a script; the pages that were built."""
+    pages: list[PlayPage] = []
+
+    def root() -> None:
+        serve_pictures()
+        pages.append(PlayPage(studio, Gallery()))
+        pages[-1].build()
+
+    async def run() -> None:
+        async with user_simulation(root) as user:
+            await user.open("/")
+            await until(lambda: pages[0].begun)
+            await script(user, pages)
+            for page in pages:
+                page.close()
+
+    asyncio.run(run())
+    return pages
+
+
+async def until(true: Callable[[], bool]) -> None:
+    """Wait for something to become true, five seconds at most."""
+    for _ in range(500):
+        if true():
+            return
+        await asyncio.sleep(0.01)
+    raise AssertionError("nothing happened for five seconds")
+
+
+def press(user: User, key: str, down: bool = True) -> None:
+    """Press or let go a key."""
+    code = f"Digit{key}" if key.isdigit() else f"Key{key.upper()}"
+    event = {"action": "keydown" if down else "keyup", "repeat": False, "key": key, "code": code, "location": 0}
+    flags = dict.fromkeys(("altKey", "ctrlKey", "shiftKey", "metaKey"), False)
+    user.find(ui.keyboard).trigger("key", {**event, **flags})
+
+
+def test_keys_step_undo_and_reset_and_the_buttons_touch_and_record(studio: Studio) -> None:
+    async def script(user: User, pages: list[PlayPage]) -> None:
+        page = pages[0]
+        session = page.session
+        await user.should_see("moment 0, start")
+        for number, key in enumerate("21", 1):
+            press(user, key)
+            await until(lambda: session.now.depth == number)  # noqa: B023
+            press(user, key, down=False)
+        assert session.now.label == "prototype 1"
+        press(user, "u")
+        await until(lambda: session.now.depth == 1)
+        user.find(marker="scene").trigger(
+            "mouse", {"mouse_event_type": "mousedown", "image_x": 20, "image_y": 30, **MOUSE}
+        )
+        await until(lambda: page.chosen is not None)
+        user.find(marker="freeze").click()
+        await until(lambda: bool(session.now.frozen))
+        user.find(marker="remove").click()
+        await until(lambda: len(session.now.present) == 3)
+        await until(lambda: page.chosen is None)
+        user.find(marker="record").click()
+        await until(lambda: "recording-001" in page.recorded.text)
+        picture = await user.http_client.get(page.scene.source)
+        assert picture.content.startswith(b"\x89PNG")
+        assert picture.headers["cache-control"] == "no-store"
+        press(user, "r")
+        await until(lambda: session.now.number == 0)
+
+    simulate(studio, script)
+    assert (studio.out / "recording-001" / "dataset" / "meta" / "info.json").is_file()
+
+
+MOUSE: dict[str, Any] = {
+    "button": 0, "buttons": 1, "altKey": False, "ctrlKey": False, "metaKey": False, "shiftKey": False,
+}  # fmt: skip
+
+
+def test_the_policy_takes_over_until_a_key_takes_back(studio: Studio) -> None:
+    async def script(user: User, pages: list[PlayPage]) -> None:
+        page = pages[0]
+        page.fps = 15
+        page.hand.set_value("policy")
+        await until(lambda: page.session.now.depth >= 2)
+        assert page.session.now.label == "latent policy"
+        press(user, "3")
+        await until(lambda: page.session.now.label == "prototype 3")
+        assert page.driver == "me"
+        page.free_switch.set_value(False)
+        await asyncio.sleep(0.2)
+        depth = page.session.now.depth
+        await asyncio.sleep(0.2)
+        assert page.session.now.depth == depth
+
+    simulate(studio, script)
+
+
+def test_two_pages_play_apart_and_a_closed_one_ends(studio: Studio) -> None:
+    open_before = DotTask.open_tasks
+
+    async def script(user: User, pages: list[PlayPage]) -> None:
+        await user.open("/")
+        await until(lambda: len(pages) == 2 and pages[1].begun)
+        pages[0].hand.set_value("policy")
+        await until(lambda: pages[0].session.now.depth >= 2)
+        assert pages[1].session.now.depth == 0
+        pages[0].close()
+        depth = pages[0].session.now.depth
+        await pages[1]._on_down(1)
+        assert pages[1].session.now.depth == 1
+        assert pages[0].session.now.depth <= depth + 1
+        assert pages[0].gallery.key not in Gallery.open
+
+    pages = simulate(studio, script)
+    studio.close()
+    assert all(page.closed for page in pages)
+    assert DotTask.open_tasks == open_before
+
+
+def test_without_a_policy_the_button_says_so(agent: Agent, recorded: RecordedStarts, tmp_path: Path) -> None:
+    studio = Studio(agent.world_model, None, recorded, None, tmp_path)
+
+    async def script(user: User, pages: list[PlayPage]) -> None:
+        await user.should_see("this model has no policy: playslot train-policy makes one")
+        await pages[0]._on_down(0)
+        assert pages[0].session.now.true is None
+
+    simulate(studio, script)
+    studio.close()
+
+
+def test_actions_go_to_the_slot_under_the_mouse_where_each_has_its_own(
+    many: WorldModel, recorded: RecordedStarts, tmp_path: Path
+) -> None:
+    studio = Studio(many, None, RecordedStarts(many, recorded.source), None, tmp_path)
+
+    async def script(user: User, pages: list[PlayPage]) -> None:
+        page, owner = pages[0], pages[0].session.look().owner
+        for slot in sorted(set(owner.flatten().tolist()))[:2]:
+            y, x = np.argwhere(owner == slot)[0].tolist()
+            place = {"image_x": x + 0.5, "image_y": y + 0.5, **MOUSE}
+            user.find(marker="scene").trigger("mouse", {"mouse_event_type": "mousemove", **place})
+            await until(lambda: page.under == slot)  # noqa: B023
+            await page._on_down(1)
+            assert page.session.now.label == f"prototype 1, slot {slot + 1}"
+            await page._on_undo()
+
+    simulate(studio, script)
+    studio.close()
+
+
+def test_an_upload_starts_anew_and_a_bad_one_is_told(studio: Studio) -> None:
+    async def script(user: User, pages: list[PlayPage]) -> None:
+        page = pages[0]
+        await page._on_down(1)
+        await page._work(lambda: page.session.begin(play_picture(page, b"nothing")), begins=True)
+        assert page.session.now.depth == 1, "what was there goes on"
+        assert any("got no picture that can be read" in str(message) for message in user.notify.messages)
+
+    simulate(studio, script)
+
+
+def play_picture(page: PlayPage, content: bytes) -> Any:
+    """The start of an upload."""
+    from playslot_rl.play.starts import picture_start
+
+    return picture_start(page.studio.world_model, content, "upload.png")
+
+
+def test_a_taken_port_is_refused_in_one_line_and_nothing_takes_the_next_free_one() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError, match=f"^port={port}: got one that is taken, expected a free one"):
+            choose_port(port)
+        with pytest.raises(ConfigError, match=f"^port={port}: got one that is taken"):
+            play.main(ExperimentConfig(run="pretrained", port=port))
+    assert choose_port(0) >= 8080
+
+
+def test_play_wants_a_run_and_a_data_set_that_is_there(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    with pytest.raises(ConfigError, match="run: got nothing, expected a run or a shipped model"):
+        play.open_studio(ExperimentConfig())
+    config = ExperimentConfig(run="pretrained", device="cpu")
+    config = replace(config, data=replace(config.data, root=str(tmp_path / "no")))
+    with pytest.raises(DataError, match="no: got no data set, expected a LeRobot"):
+        play.open_studio(config)
