@@ -10,7 +10,7 @@ from playslot_rl.config import SAViConfig
 
 SINGLE: Final = 1.5
 """Slots in use, below which one holds everything."""
-SHARED: Final = 0.8
+SHARED: Final = 0.95
 """Entropy of the masks, as a share of log N, above which no slot has a pixel for itself."""
 FLICKER: Final = 0.1
 """Exchanges of slots a transition, above which slots do not keep their things."""
