@@ -97,9 +97,9 @@ COMMANDS: Final[dict[str, Command]] = {
     ),
     "inspect": Command(
         "report card of a world model: are its slots and latent actions any good?",
-        "Measures a run's world model on held-out episodes of a LeRobot data set, and says of each number what is good and "
-        "what is bad: codes and directions in use, the real action recovered by probes with controls, transfer between "
-        "episodes, constancy of the prototypes, sensitivity to the latent, health of the slots. Writes "
+        "Measures a run's world model on held-out episodes of a LeRobot data set, and says of each number what is good "
+        "and what is bad: codes and directions in use, the real action recovered by probes with controls, transfer "
+        "between episodes, constancy of the prototypes, sensitivity to the latent, health of the slots. Writes "
         "RUN/inspect/inspect.json and a page; episodes= is how many episodes are looked at (200).",
         (
             "playslot inspect run=runs/mine data.root=data/random",

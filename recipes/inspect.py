@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import shipped
-from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.errors import CheckpointError, ConfigError, DataError
 from playslot_rl.recipes.evaluate import take_shipped
 from playslot_rl.recipes.run import open_device, open_run, parent_run, stored_result
 
@@ -117,13 +117,18 @@ def facts(config: ExperimentConfig, run: str) -> dict[str, Any]:
 
 
 def main_if_needed(config: ExperimentConfig) -> None:
-    """As `main`, unless this world model was inspected on this set before."""
+    """As `main`, unless this world model was inspected on these videos before; where they cannot measure it (nothing
+    moves) that is said, and the rest of a pipeline goes on.
+    """
     from playslot_rl.evaluation.card import RESULT
 
     if stored_result(Path(config.run) / RESULT, facts(config, config.run)) is not None:
         print("inspect: made before, skipped", flush=True)
         return
-    main(config)
+    try:
+        main(config)
+    except DataError as error:
+        print(f"inspect: not made, {error}", flush=True)
 
 
 def describe(result: Mapping[str, Any]) -> str:

@@ -134,7 +134,7 @@ def effect_lines(
     moved = displacements(start.labels, true.labels, n)
     lines, details = _transfer(shown, moved, n)
     constancy, held, table = _constancy(model, windows, used)
-    sensitivity, region = _sensitivity(shown, moved)
+    sensitivity, region = _sensitivity(shown, details["moving_slots"])
     details |= {"prototypes": table, "steps": windows.latents.shape[1], "windows": len(first)}
     shown = Replayed(windows, start, true, own, taken, swapped, region, held, tuple(used))
     return [*lines, constancy, *sensitivity], details, shown
@@ -148,7 +148,7 @@ def _transfer(shown: Replayed, moved: npt.NDArray[np.float64], n: int) -> tuple[
     what = f"{count} windows of {steps} steps"
     own = agreement(moved, displacements(shown.start.labels, shown.own.labels, n))
     lines = [line("replay", own, what if own is not None else STILL)]
-    details: dict[str, Any] = {"moving_slots": moving_slots(moved).tolist()}
+    details: dict[str, Any] = {"moving_slots": moving_slots(shown.start.labels, shown.true.labels, n).tolist()}
     if shown.taken is None:
         keys = ("transfer", "transfer_shuffled", "same_slot")
         return [*lines, *(line(key, None, SINGLE_EPISODE) for key in keys)], details
@@ -191,7 +191,7 @@ def _constancy(
     return line("constancy", share, why), np.stack(pictures), table
 
 
-def _sensitivity(shown: Replayed, moved: npt.NDArray[np.float64]) -> tuple[list[Line], npt.NDArray[np.bool_] | None]:
+def _sensitivity(shown: Replayed, movers: list[int]) -> tuple[list[Line], npt.NDArray[np.bool_] | None]:
     """Both lines, and the region of the slots that move."""
     if shown.swapped is None:
         return [line(key, None, SINGLE_EPISODE) for key in ("sensitivity", "locality")], None
@@ -199,8 +199,7 @@ def _sensitivity(shown: Replayed, moved: npt.NDArray[np.float64]) -> tuple[list[
     real = float(squared_change(shown.start.frames, shown.true.frames).sum())
     size = float(np.sqrt(change.sum() / real)) if real > 0 else None
     lines = [line("sensitivity", size, "the latents of a window of another episode" if size is not None else STILL)]
-    movers = moving_slots(moved)
-    if not len(movers):
+    if not movers:
         return [*lines, line("locality", None, STILL)], None
     drawn = (shown.start, shown.own, shown.swapped)
     region: npt.NDArray[np.bool_] = np.logical_or.reduce([np.isin(one.labels, movers) for one in drawn])

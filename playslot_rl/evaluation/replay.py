@@ -24,6 +24,8 @@ AT_ONCE = 32
 """Frames decoded at a time: bounds the memory."""
 MOVES = 1.0
 """Pixels over L steps, from which on a slot counts as moving."""
+TURNOVER = 0.2
+"""Share of the pixels held before or after L steps that are held only once, from which on a slot counts as moving."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,14 @@ def squared_change(one: npt.NDArray[np.uint8], other: npt.NDArray[np.uint8]) -> 
     return changed
 
 
-def moving_slots(moved: Floats) -> npt.NDArray[np.int64]:
-    """Slots whose displacement (W, N, 2) is `MOVES` pixels or more in the root mean square."""
-    size = np.sqrt((moved**2).sum(-1).mean(0))
-    return np.flatnonzero(size >= MOVES).astype(np.int64)
+def moving_slots(before: npt.NDArray[np.int64], after: npt.NDArray[np.int64], n_slots: int) -> npt.NDArray[np.int64]:
+    """Slots that move from some frames to others (W, H, W): by `MOVES` pixels in the root mean square, and
+    so that `TURNOVER` of what they hold is elsewhere. What an arm only uncovers, a ground, is not among them.
+    """
+    moved = displacements(before, after, n_slots)
+    far = np.sqrt((moved**2).sum(-1).mean(0)) >= MOVES
+    slots = np.arange(n_slots)[:, None]
+    held, then = (labels.reshape(1, -1) == slots for labels in (before, after))
+    either = (held | then).sum(1)
+    turnover = 1.0 - (held & then).sum(1) / np.maximum(either, 1)
+    return np.flatnonzero(far & (turnover >= TURNOVER)).astype(np.int64)

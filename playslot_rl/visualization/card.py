@@ -61,8 +61,8 @@ def card_document(result: Mapping[str, Any], card: Card, model: WorldModel) -> D
     pictures = _pictures(card, model)
     sections = [Section(group, [table, *pictures.get(group, [])]) for group, table in card_tables(result["lines"])]
     lead = (
-        f"World model of `{result['run']}`: {verdict_text(result['lines'])}. {told_text(result)} A verdict is a rule of "
-        "thumb; the borders are in the columns `good` and `bad`, what lies between is fair."
+        f"World model of `{result['run']}`: {verdict_text(result['lines'])}. {told_text(result)} A verdict is a rule "
+        "of thumb; the borders are in the columns `good` and `bad`, what lies between is fair."
     )
     return Document("PlaySlot report card", lead, sections)
 
