@@ -50,7 +50,8 @@ def _counts(flat: Tensor, values: int) -> Tensor:
 
 def mask_entropy(masks: Tensor) -> Tensor:
     """Entropy over the slots, in nats, mean over the pixels: masks (B, ..., N, 1, H, W) to (B,)."""
-    return torch.special.entr(masks).sum(-4).flatten(1).mean(1)
+    entropy: Tensor = torch.special.entr(masks).sum(-4)
+    return entropy.flatten(1).mean(1)
 
 
 def exchanges(labels: Tensor, n_slots: int) -> Tensor:
