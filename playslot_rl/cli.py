@@ -95,6 +95,17 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot evaluate run=runs/shapes episodes=100",
         ),
     ),
+    "inspect": Command(
+        "report card of a world model: are its slots and latent actions any good?",
+        "Measures a run's world model on held-out episodes of a LeRobot data set, and says of each number what is good "
+        "and what is bad: codes and directions in use, the real action recovered by probes with controls, transfer "
+        "between episodes, constancy of the prototypes, sensitivity to the latent, health of the slots. Writes "
+        "RUN/inspect/inspect.json and a page; episodes= is how many episodes are looked at (200).",
+        (
+            "playslot inspect run=runs/mine data.root=data/random",
+            "playslot inspect run=pretrained/block_push_easy data.root=data/expert out=runs/check",
+        ),
+    ),
     "export": Command(
         "a trained policy as a folder that LeRobot loads, with a model card; also to the Hub",
         "Writes config.json, model.safetensors (world model, policy and action decoder), LeRobot's processors and a "

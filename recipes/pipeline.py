@@ -8,7 +8,7 @@ from pathlib import Path
 
 from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.envs import PROCEDURAL, gym_id
-from playslot_rl.recipes import evaluate, slots, train_dynamics, train_policy, train_slots
+from playslot_rl.recipes import evaluate, inspect, slots, train_dynamics, train_policy, train_slots
 from playslot_rl.recipes.run import open_run
 
 
@@ -34,6 +34,7 @@ def main(config: ExperimentConfig) -> None:
         since = time.monotonic()
         stage.main(config)
         print(f"{stage.__name__.rsplit('.', 1)[-1]}: {time.monotonic() - since:.0f} s", flush=True)
+    inspect.main_if_needed(replace(config, run=name, out="", episodes=None))
     if behaves:
         slots.main_if_needed(config, folder)
     evaluate.main_if_needed(replace(config, run=name, out=""))

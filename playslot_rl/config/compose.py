@@ -24,7 +24,7 @@ from playslot_rl.errors import ConfigError
 
 CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
-CONTINUES: Final = frozenset({"evaluate", "export", "play", "train-dynamics", "train-policy"})
+CONTINUES: Final = frozenset({"evaluate", "export", "inspect", "play", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
 COMPARISONS: Final = {
     "compare": ("methods", "demos", "labels", "seeds"),

@@ -86,25 +86,38 @@ def _hold_out(groups: Ints, fraction: float, seed: int, what: str) -> tuple[npt.
     return np.isin(groups, held), len(held)
 
 
-def probe_actions(z: Floats, actions: Floats, episodes: Ints, codes: Ints | None = None) -> dict[str, Any]:
+def probe_actions(
+    z: Floats,
+    actions: Floats,
+    episodes: Ints,
+    codes: Ints | None = None,
+    tested: npt.NDArray[np.bool_] | None = None,
+) -> dict[str, Any]:
     """How much of the real action can be read from the latent, on episodes the probe has not seen.
 
     Args:
         z: (M, Z) latents.
         actions: (M, A) real actions in [-1, 1].
-        episodes: (M,) episode of each transition; a quarter of the episodes is held out, whole.
+        episodes: (M,) episode of each transition.
         codes: (M, C) codes; adds the probe `code`, which sees their one-hot form only.
+        tested: (M,) transitions that the probes are tested on, whole episodes of them; None holds out a quarter of the
+            episodes, drawn by a fixed seed.
 
     Returns:
         `linear` (ridge), `mlp` (two layers of 64) and, with codes, `code`: each `r2` (A values; None where the held-out
         action does not vary) and `mean_r2`; `train` and `test` count transitions, `test_episodes` episodes.
 
     Raises:
-        ValueError: sizes differ, or there are fewer than two episodes.
+        ValueError: sizes differ, there are fewer than two episodes, or an episode is on both sides.
     """
     if not len(z) == len(actions) == len(episodes):
         raise ValueError(f"probe_actions: got {len(z)}, {len(actions)} and {len(episodes)} rows, expected as many each")
-    test, test_episodes = _hold_out(episodes, 0.25, 0, "probe_actions: episode")
+    if tested is None:
+        test, test_episodes = _hold_out(episodes, 0.25, 0, "probe_actions: episode")
+    else:
+        test, test_episodes = tested, len(np.unique(episodes[tested]))
+        if not test.any() or test.all() or np.isin(episodes[~test], episodes[test]).any():
+            raise ValueError("probe_actions: got no two sets of whole episodes, expected some to fit and some to test")
     result: dict[str, Any] = {"train": int((~test).sum()), "test": int(test.sum()), "test_episodes": test_episodes}
     for name in ("linear", "mlp"):
         result[name] = _score(name, z[~test], actions[~test], z[test], actions[test])
@@ -231,3 +244,27 @@ def code_table(codes: Ints, actions: Floats, n_prototypes: int) -> list[dict[str
             }
         )
     return rows
+
+
+def participation_ratio(z: Floats) -> float | None:
+    """Effective number of directions in which latents vary: (sum l)^2 / sum l^2 of their covariance's eigenvalues l.
+
+    Args:
+        z: (M, Z).
+
+    Returns:
+        From 1 (a line) to Z (the same variance in every direction); None where nothing varies.
+    """
+    centred = z.astype(np.float64) - z.mean(0, dtype=np.float64)
+    # Of the covariance C, without its eigenvalues: (tr C)^2 / tr C^2.
+    covariance = centred.T @ centred / max(1, len(z))
+    trace, square = float(np.trace(covariance)), float((covariance**2).sum())
+    return trace**2 / square if square > 1e-24 else None
+
+
+def repaired(rows: Ints, sides: npt.NDArray[np.bool_], seed: int) -> Ints:
+    """Row numbers (M,) in an order drawn by a seed, each within its side (fitted or tested): wrong pairs on both."""
+    generator, order = np.random.default_rng(seed), rows.copy()
+    for side in (sides, ~sides):
+        order[side] = generator.permutation(rows[side])
+    return order

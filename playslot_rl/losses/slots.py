@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.objectives import LossModule
 
 from playslot_rl import keys
 from playslot_rl.frames import normalise
 from playslot_rl.losses.common import psnr
-from playslot_rl.modules.savi import SAVi
+from playslot_rl.modules.savi import Decoded, SAVi
 
 
 class SlotsLoss(LossModule):
@@ -71,7 +72,14 @@ class SlotsLoss(LossModule):
             tensordict: PIXELS (B, T, 3, H, W).
             generator: of sampled initial slots.
         """
+        frames, decoded = self.reconstruct(tensordict, generator)
+        mse = (decoded.frames - frames).square().mean()
+        return TensorDict({"loss_reconstruction": mse, "psnr": psnr(mse)}, [])
+
+    def reconstruct(
+        self, tensordict: TensorDictBase, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Decoded]:
+        """Frames (B, T, 3, H, W) in [0, 1] and what SAVi makes of them; arguments as of `forward`."""
         frames = normalise(tensordict.get(self.tensor_keys.pixels))
         slots, _ = self.savi(frames, generator=generator)
-        mse = (self.savi.decode(slots).frames - frames).square().mean()
-        return TensorDict({"loss_reconstruction": mse, "psnr": psnr(mse)}, [])
+        return frames, self.savi.decode(slots)

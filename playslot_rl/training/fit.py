@@ -11,8 +11,10 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -37,6 +39,17 @@ class Stage(Protocol):
 
     def validate(self, step: int) -> Mapping[str, float]:
         """Numbers on held-out data after `step` steps; called without gradients, modules in eval mode."""
+
+
+@runtime_checkable
+class WatchedStage(Protocol):
+    """A `Stage` whose validations can also be looked at. Nothing of this changes what is learned."""
+
+    def warnings(self, step: int, values: Mapping[str, float]) -> Mapping[str, str]:
+        """What the numbers of the validation after `step` steps say is wrong, by kind: one line each, with a cure."""
+
+    def pictures(self, step: int) -> Mapping[str, npt.NDArray[np.uint8]]:
+        """Pictures (H, W, 3) of held-out data, by name; called like `validate`, where a logger shows pictures."""
 
 
 @dataclass(frozen=True)
@@ -149,6 +162,7 @@ class _Run:
         if done % config.validate_every == 0 or last:
             self.state = replace(self.state, metrics=self._validate(done))
             self._log("validation", done, self.state.metrics)
+            self._look(done)
             self._judge()
         if done % config.checkpoint_every == 0 or self.ended:
             self.watch.require_finite(self.stage.modules, f"step {done}")
@@ -181,6 +195,18 @@ class _Run:
         if values and not kept:
             raise self.watch.not_finite("validation", next(iter(values)) + " not finite", f"step {done}")
         return kept
+
+    def _look(self, done: int) -> None:
+        if not isinstance(self.stage, WatchedStage):
+            return
+        self.watch.warn(done, self.stage.warnings(done, self.state.metrics))
+        if not self.watch.shows_pictures:
+            return
+        self._train_mode(False)
+        with torch.no_grad(), global_seed(self.seed, done, "validation"):
+            pictures = self.stage.pictures(done)
+        self._train_mode(True)
+        self.watch.show(done, pictures)
 
     def _judge(self) -> None:
         if self.patience is None:

@@ -14,6 +14,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from torch import nn
 
 from playslot_rl.config import LoggingConfig
@@ -67,6 +69,10 @@ class _TensorBoardLogger:
         for name, value in values.items():
             self._writer.add_scalar(name, value, step)
 
+    def show(self, pictures: Mapping[str, npt.NDArray[np.uint8]], step: int) -> None:
+        for name, picture in pictures.items():
+            self._writer.add_image(name, picture, step, dataformats="HWC")
+
     def close(self) -> None:
         self._writer.close()
 
@@ -80,6 +86,9 @@ class _RunLogger:
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         self._module.log(dict(values), step=step)
+
+    def show(self, pictures: Mapping[str, npt.NDArray[np.uint8]], step: int) -> None:
+        self._module.log({name: self._module.Image(picture) for name, picture in pictures.items()}, step=step)
 
     def close(self) -> None:
         self._module.finish()
@@ -135,6 +144,24 @@ class Watch:
         self.name, self.folder, self.checkpoints, self.cure = name, folder, checkpoints, cure
         self.history = History(folder / "metrics.jsonl")
         self._logger: _TensorBoardLogger | _RunLogger | None = None
+        self._warned: frozenset[str] = frozenset()
+
+    @property
+    def shows_pictures(self) -> bool:
+        """Whether there is a backend."""
+        return self._logger is not None
+
+    def warn(self, step: int, warnings: Mapping[str, str]) -> None:
+        """Print warnings, by kind, to standard output: each when it comes up, and again once it had gone away."""
+        for kind, text in warnings.items():
+            if kind not in self._warned:
+                print(f"{self.name}: warning at step {step}: {text}", flush=True)
+        self._warned = frozenset(warnings)
+
+    def show(self, step: int, pictures: Mapping[str, npt.NDArray[np.uint8]]) -> None:
+        """Hand pictures (H, W, 3), by name, to the backend."""
+        if self._logger is not None:
+            self._logger.show({f"{self.name}/validation/{name}": picture for name, picture in pictures.items()}, step)
 
     @contextlib.contextmanager
     def running(self, logging: LoggingConfig, start: int) -> Iterator[None]:

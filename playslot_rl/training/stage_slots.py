@@ -5,17 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
 from playslot_rl import keys
+from playslot_rl.colours import segmentation
 from playslot_rl.config import SlotsStageConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.errors import CheckpointError
+from playslot_rl.frames import to_uint8
 from playslot_rl.losses.slots import SlotsLoss
-from playslot_rl.modules.savi import SAVi
+from playslot_rl.modules.savi import Decoded, SAVi
+from playslot_rl.modules.savi.health import SlotHealth
 from playslot_rl.seeding import StepGenerators, step_generator
+from playslot_rl.training.slot_warnings import slot_warnings
 from playslot_rl.world_model import module_device
 
 INITIAL_SLOTS = "initializer.mean"
@@ -47,14 +52,32 @@ class SlotsStage:
         return {"loss": out["loss_reconstruction"], "psnr": out["psnr"]}
 
     def validate(self, step: int) -> Mapping[str, float]:
-        """PSNR (dB) on held-out clips, in fp32."""
+        """PSNR (dB) and the slots' health (`playslot_rl.modules.savi.health`) on held-out clips, in fp32."""
         self.savi.precision = "fp32"
-        errors = []
+        errors, health = [], SlotHealth(self.savi.config.n_slots)
         for rows in self.clips.validation_batches():
-            out = self.criterion(self._batch(rows), generator=step_generator(0, step, "validation", self.device))
-            errors.append(float(out["loss_reconstruction"]))
+            frames, decoded = self._parse(rows, step)
+            errors.append(float((decoded.frames - frames).square().mean()))
+            health.add(frames, decoded.frames, decoded.masks)
         mse = float(np.mean(errors))
-        return {"mse": mse, "psnr": -10.0 * float(np.log10(max(mse, 1e-12)))}
+        return {"mse": mse, "psnr": -10.0 * float(np.log10(max(mse, 1e-12))), **health.values()}
+
+    def warnings(self, step: int, values: Mapping[str, float]) -> Mapping[str, str]:
+        """What the last validation says is wrong with the slots, and the known cure; nothing in the first quarter, in
+        which slots have not taken the scene apart yet.
+        """
+        return slot_warnings(values, self.savi.config) if 4 * step >= self.config.steps else {}
+
+    def pictures(self, step: int) -> Mapping[str, npt.NDArray[np.uint8]]:
+        """The first held-out clip, (3 H, T W, 3): frames, reconstructions, segmentation."""
+        self.savi.precision = "fp32"
+        frames, decoded = self._parse(self.clips.held_out[:1], step)
+        drawn = to_uint8(decoded.frames[0])
+        rows = [to_uint8(frames[0]), drawn, segmentation(drawn, decoded.masks[0].cpu().numpy())]
+        return {"slots": np.concatenate([np.concatenate(list(row), 1) for row in rows])}
+
+    def _parse(self, rows: IntArray, step: int) -> tuple[Tensor, Decoded]:
+        return self.criterion.reconstruct(self._batch(rows), step_generator(0, step, "validation", self.device))
 
     def _batch(self, rows: IntArray) -> TensorDict:
         return TensorDict({keys.PIXELS: self.clips.source.pixels(rows).to(self.device)}, [len(rows)])

@@ -10,6 +10,9 @@ import base64
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
+
+from playslot_rl.storage.atomic import write_bytes, write_text
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,21 @@ def to_markdown(document: Document) -> str:
     for section in document.sections:
         parts += [f"## {section.title}", *map(_markdown_block, section.blocks)]
     return "\n\n".join(parts) + "\n"
+
+
+def write_document(document: Document, folder: Path, name: str) -> Path:
+    """Write `FOLDER/NAME.md`, `FOLDER/NAME.html` and `FOLDER/figures/*.png`; returns the path of the HTML file.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    for section in document.sections:
+        for block in section.blocks:
+            if isinstance(block, Picture):
+                write_bytes(folder / "figures" / f"{block.name}.png", block.light)
+    write_text(folder / f"{name}.md", to_markdown(document))
+    write_text(folder / f"{name}.html", to_html(document))
+    return folder / f"{name}.html"
 
 
 def table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -21,9 +21,9 @@ from playslot_rl.evaluation.objects import RESULT, parse_clips, seed_frames
 from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.frames import to_uint8
-from playslot_rl.storage.atomic import write_bytes, write_text
 from playslot_rl.storage.checkpoints import checkpoint_folder
 from playslot_rl.training.runs import world_model_folder
+from playslot_rl.visualization.card import card_section
 from playslot_rl.visualization.document import (
     Block,
     Document,
@@ -32,8 +32,7 @@ from playslot_rl.visualization.document import (
     Section,
     Table,
     Text,
-    to_html,
-    to_markdown,
+    write_document,
 )
 from playslot_rl.visualization.grid import film_strip, png
 from playslot_rl.visualization.latents import latent_section
@@ -87,15 +86,7 @@ def write_report(
         shown = relative if not relative.startswith("..") else run.name
         given = ReportInput(run, config, model, agent, used, shown, read_metas(run))
         document = build_objects(given) if config.env.name in PROCEDURAL else build(given)
-    figures = run / "figures"
-    figures.mkdir(parents=True, exist_ok=True)
-    for section in document.sections:
-        for block in section.blocks:
-            if isinstance(block, Picture):
-                write_bytes(figures / f"{block.name}.png", block.light)
-    write_text(run / "report.md", to_markdown(document))
-    write_text(run / "report.html", to_html(document))
-    return run / "report.html"
+    return write_document(document, run, "report")
 
 
 def stored_config(run: Path) -> ExperimentConfig:
@@ -135,6 +126,7 @@ def build(given: ReportInput) -> Document:
         slots_section(given, clip),
         prototype_section(given, clip),
         latent_section(given),
+        card_section(given),
         training_section(given),
         settings_section(given),
     ]
@@ -243,6 +235,7 @@ def build_objects(given: ReportInput) -> Document:
         slots_section(given, lambda: clips.frames[0], "The first evaluated clip."),
         prototype_section(given, lambda: clips.frames[0]),
         code_section(result),
+        card_section(given),
         training_section(given, ("slots", "dynamics")),
         object_settings(given, result),
     ]

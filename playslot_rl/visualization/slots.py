@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from PIL import Image
-from PIL.ImageColor import getrgb
 
+from playslot_rl.colours import segmentation
 from playslot_rl.frames import to_float, to_uint8
-from playslot_rl.visualization.charts import OKABE_ITO
 from playslot_rl.visualization.grid import film_strip, image_grid
 from playslot_rl.world_model import WorldModel
 
@@ -38,20 +37,6 @@ def slot_cells(model: WorldModel, frames: Frames) -> Frames:
     rows = [frames, to_uint8(decoded.frames), segmentation(to_uint8(decoded.frames), decoded.masks.cpu().numpy())]
     rows += [to_uint8(objects[:, n]) for n in range(objects.shape[1])]
     return np.stack(rows)
-
-
-def segmentation(frames: Frames, masks: npt.NDArray[np.float32]) -> Frames:
-    """Colour each pixel by the slot with the largest mask, over the faded frame.
-
-    Args:
-        frames: (T, H, W, 3) uint8.
-        masks: (T, N, 1, H, W), sum to one over N.
-    """
-    colours = np.array([getrgb(OKABE_ITO[n % len(OKABE_ITO)]) for n in range(masks.shape[1])], np.float32)
-    colour = colours[masks[:, :, 0].argmax(1)]
-    grey = frames.astype(np.float32).mean(-1, keepdims=True)
-    mixed: Frames = np.clip(0.6 * colour + 0.4 * grey, 0, 255).astype(np.uint8)
-    return mixed
 
 
 def draw_slots(model: WorldModel, frames: Frames, columns: int = 6) -> Image.Image:

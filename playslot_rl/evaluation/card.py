@@ -1,0 +1,185 @@
+"""The report card of a world model on one data set: `inspect.json`."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from playslot_rl.config import DataConfig
+from playslot_rl.data.slot_cache import parse_episodes
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.windows import spread_windows
+from playslot_rl.errors import DataError
+from playslot_rl.evaluation.card_lines import Line, line
+from playslot_rl.evaluation.effect_lines import Replayed, effect_lines
+from playslot_rl.evaluation.held_out import HeldOut, hold_out
+from playslot_rl.evaluation.latent_lines import Parsed, action_lines, usage_lines
+from playslot_rl.evaluation.probes import infer_latents
+from playslot_rl.evaluation.success import hardware
+from playslot_rl.frames import normalise
+from playslot_rl.modules.savi.health import MOVING, SlotHealth
+from playslot_rl.seeding import global_seed
+from playslot_rl.storage.atomic import write_json
+from playslot_rl.world_model import WorldModel, module_device
+
+FORMAT: Final = "playslot_rl.inspect/1"
+FOLDER: Final = "inspect"
+"""Of the card, below the run's."""
+RESULT: Final = Path(FOLDER) / "inspect.json"
+DEFAULT_EPISODES: Final = 200
+HEALTH_CLIPS: Final = 32
+HEALTH_FRAMES: Final = 8
+CLIPS_AT_ONCE: Final = 8
+
+
+@dataclass(frozen=True)
+class Card:
+    """What was measured.
+
+    Attributes:
+        lines: in the order of the page.
+        details: plain values behind them.
+        held_out: the episodes.
+        replayed: for the pictures.
+        parsed: for the pictures.
+    """
+
+    lines: list[Line]
+    details: dict[str, Any]
+    held_out: HeldOut
+    replayed: Replayed
+    parsed: Parsed
+
+
+def make_card(
+    model: WorldModel,
+    source: EpisodeFrames,
+    metas: Mapping[str, Mapping[str, Any]],
+    data: DataConfig,
+    most: int = DEFAULT_EPISODES,
+    seed: int = 0,
+) -> Card:
+    """Measure everything.
+
+    Args:
+        model: in evaluation mode.
+        source: frames of the model's size; actions or none.
+        metas: stage -> `meta.json`, for what was trained on (`hold_out`).
+        data: `validation` and `held_out`.
+        most: episodes that are looked at.
+        seed: of wrong pairs, noise and partners.
+
+    Raises:
+        DataError: no episode of two frames, nothing that moves, or actions of the wrong width for mode `ground_truth`.
+    """
+    held = hold_out(source, metas, data, most)
+    chosen, tested = held.subset(source)
+    require_motion(chosen, tested)
+    if model.config.inverse_dynamics.mode == "ground_truth":
+        chosen.require_actions(model.env.action_dim)
+    with global_seed(seed, 0, "inspect"):  # for latents that are sampled, and for nothing else
+        parsed = parse(model, chosen, tested)
+        usage, details = usage_lines(model, parsed)
+        actions, probes = action_lines(model, parsed, seed)
+        used = [code for code, count in enumerate(details.get("code_counts", [])) if count]
+        effects, replays, replayed = effect_lines(model, parsed, seed, used)
+        health, values = health_lines(model, parsed)
+    lines = [*usage, *actions, *effects, *health]
+    return Card(lines, details | probes | replays | {"slots": values}, held, replayed, parsed)
+
+
+def require_motion(source: EpisodeFrames, tested: Any) -> None:
+    """Refuse videos in which nothing moves.
+
+    Raises:
+        DataError: no pixel of a tested episode changes by `MOVING` between frames that follow each other.
+    """
+    largest = 0
+    for start, length in zip(source.starts[tested], source.lengths[tested], strict=True):
+        frames = np.asarray(source.frames[start : start + length]).astype(np.int16)
+        largest = max(largest, int(np.abs(np.diff(frames, axis=0)).max()))
+    if largest < 255 * MOVING:
+        raise DataError(
+            f"data.root: got frames that never change (by {largest} of 255 at most), expected videos in which "
+            f"something moves by {math.ceil(255 * MOVING)} or more: use other videos, or every few frames of them"
+        )
+
+
+def parse(model: WorldModel, source: EpisodeFrames, tested: Any) -> Parsed:
+    """Slots and latents of episodes, parsed from their first frames on."""
+    device = module_device(model)
+    slots = np.concatenate(list(parse_episodes(source, model.savi, device)))
+    lengths = source.lengths
+    starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
+    frames = np.concatenate([s + np.arange(n) for s, n in zip(source.starts, lengths, strict=True)])
+    real = None if source.actions is None else np.asarray(source.actions[frames])
+    latents, codes, episodes = infer_latents(model.inverse_dynamics, slots, starts, lengths, real)
+    rows = np.concatenate([s + np.arange(n - 1) for s, n in zip(starts, lengths, strict=True)])
+    actions = None if real is None else real[rows]
+    return Parsed(source, slots, starts, tested, latents, codes, rows, frames[rows], episodes, actions)
+
+
+@torch.no_grad()
+def health_lines(model: WorldModel, parsed: Parsed) -> tuple[list[Line], dict[str, float]]:
+    """Slots in use, flicker, entropy and motion explained, on clips of the tested episodes."""
+    tested = np.flatnonzero(parsed.tested_episodes)
+    lengths, device, n = parsed.source.lengths, module_device(model), model.slot_shape[0]
+    frames = min(HEALTH_FRAMES, int(lengths[tested].max()))
+    rows = spread_windows(parsed.starts, lengths, frames, HEALTH_CLIPS, tested)
+    of = np.searchsorted(parsed.starts, rows[:, 0], side="right") - 1
+    pixels = rows + (parsed.source.starts - parsed.starts)[of][:, None]
+    health = SlotHealth(n)
+    for some in np.array_split(np.arange(len(rows)), -(-len(rows) // CLIPS_AT_ONCE)):
+        decoded = model.savi.decode(torch.from_numpy(parsed.slots[rows[some]]).to(device))
+        health.add(normalise(parsed.source.pixels(pixels[some]).to(device)), decoded.frames, decoded.masks)
+    values = health.values()
+    clips, explained = f"{len(rows)} clips of {frames} frames", values.get("moving_explained")
+    one = n == 1
+    return [
+        line("slots_in_use", values["slots_in_use"] / n, f"{values['slots_in_use']:.1f} of {n}, {clips}"),
+        line("flicker", None if one else values["flicker"], "a single slot" if one else clips),
+        line("mask_entropy", None if one else values["mask_entropy"] / math.log(n), "a single slot" if one else clips),
+        line("moving_explained", explained, clips if explained is not None else "nothing moves in these clips"),
+    ], values
+
+
+def card_json(card: Card, source: EpisodeFrames, facts: Mapping[str, Any], began: float) -> dict[str, Any]:
+    """The card as JSON holds it.
+
+    Args:
+        card: what was measured.
+        source: the data set.
+        facts: further plain values: run, data set, seed, fingerprints.
+        began: of `time.perf_counter`.
+    """
+    held = card.held_out
+    return {
+        "format": FORMAT,
+        **facts,
+        "data_fingerprint": source.fingerprint,
+        "camera": source.camera,
+        "episodes_tested": held.tested.tolist(),
+        "episodes_fitted": len(held.fitted),
+        "held_out": held.told_by,
+        "held_out_known": held.known,
+        "lines": [one.plain() for one in card.lines],
+        "details": card.details,
+        "wall_seconds": round(time.perf_counter() - began, 2),
+        "hardware": hardware(),
+    }
+
+
+def write_card(out: Path, result: Mapping[str, Any]) -> None:
+    """Write `OUT/inspect/inspect.json`.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_json(out / RESULT, result)

@@ -1,0 +1,108 @@
+"""Which episodes of a data set measure a world model: those that it was not trained on, as far as that can be told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.config import DataConfig
+from playslot_rl.data.demonstrations import split_demonstrations
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.windows import split_episodes
+from playslot_rl.errors import DataError
+
+Ints = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Episodes to measure on, and others that probes are fitted on.
+
+    Attributes:
+        fitted, tested: sorted episode numbers, int64; `fitted` may be empty.
+        told_by: why the tested ones are held out, or that it cannot be told, as part of a sentence.
+        known: whether it can be told that no stage was trained on the tested ones.
+    """
+
+    fitted: Ints
+    tested: Ints
+    told_by: str
+    known: bool
+
+    def subset(self, source: EpisodeFrames) -> tuple[EpisodeFrames, npt.NDArray[np.bool_]]:
+        """The fitted episodes, then the tested ones, as a source of their own; which of its episodes are tested (E,).
+
+        Its frames are still those of the whole data set: rows are `starts` and on, no longer one after the other.
+        """
+        chosen = np.concatenate([self.fitted, self.tested])
+        tested = np.arange(len(chosen)) >= len(self.fitted)
+        return replace(source, starts=source.starts[chosen], lengths=source.lengths[chosen]), tested
+
+
+def hold_out(source: EpisodeFrames, metas: Mapping[str, Mapping[str, Any]], config: DataConfig, most: int) -> HeldOut:
+    """Choose at most `most` episodes of two frames or more, a quarter of them at most to test on.
+
+    Of the world model's own videos those are tested that its validation held out; of the policy's demonstrations the
+    last ones, as many as were held out; of any other set the last `data.held_out`, or else its last quarter.
+
+    Args:
+        source: the data set.
+        metas: stage -> `meta.json` of the checkpoint, for the fingerprints of what was trained on.
+        config: `validation` and `held_out`.
+        most: episodes in all, at least 1.
+
+    Raises:
+        DataError: no episode has two frames.
+    """
+    usable = np.flatnonzero(source.lengths >= 2).astype(np.int64)
+    if len(usable) == 0:
+        raise DataError(
+            f"data.root: got {source.episodes} episodes of one frame, expected some of two frames or more: "
+            "a latent action lies between two frames"
+        )
+    candidates, told_by, known = _candidates(source, metas, config, usable)
+    tested = _spread(candidates, max(1, min(len(candidates), most // 4)))
+    fitted = _spread(np.setdiff1d(usable, candidates), max(0, most - len(tested)))
+    return HeldOut(fitted, tested, told_by, known)
+
+
+def _candidates(
+    source: EpisodeFrames, metas: Mapping[str, Mapping[str, Any]], config: DataConfig, usable: Ints
+) -> tuple[Ints, str, bool]:
+    trained = [str(metas.get(stage, {}).get("data", {}).get("train", "")) for stage in ("slots", "dynamics")]
+    if source.fingerprint in trained:
+        # Both stages split alike: by the seed they were trained with.
+        seed = int(metas["dynamics"].get("seed", 0))
+        held = split_episodes(source.episodes, config.validation, seed)[1]
+        if config.validation > 0 and len(chosen := np.intersect1d(held, usable)):
+            return chosen, "the world model's own videos, the episodes that its validation held out", True
+        return usable[-max(1, len(usable) // 4) :], "the world model's own videos, none of which were held out", False
+    last = _policy_held_out(source, metas.get("policy", {}), config) or config.held_out
+    if last:
+        chosen = usable[usable >= source.episodes - last]
+        if len(chosen):
+            return chosen, f"the last {last} episodes, which are held out from training", True
+    what = "the last quarter of the episodes; the checkpoints do not say whether the world model was trained on them"
+    return usable[-max(1, len(usable) // 4) :], what, False
+
+
+def _policy_held_out(source: EpisodeFrames, policy: Mapping[str, Any], config: DataConfig) -> int:
+    """How many of the last episodes the policy's training held out, if this is the set it was trained on; else 0."""
+    held, demos = int(policy.get("held_out_demos", 0)), int(policy.get("demos", 0))
+    if not held or not 0 < demos <= source.episodes - held:
+        return 0
+    # Its checkpoint names the demonstrations it was trained on, which a draw may have chosen.
+    draws = {None, config.draw, int(policy.get("seed", 0))}
+    prints = {split_demonstrations(source, demos, held, held, draw).trained.fingerprint for draw in draws}
+    return held if policy.get("data", {}).get("demos") in prints else 0
+
+
+def _spread(episodes: Ints, count: int) -> Ints:
+    """At most `count` of some episodes, spread evenly over them."""
+    if len(episodes) <= count:
+        return episodes
+    return episodes[np.linspace(0, len(episodes) - 1, count).round().astype(np.int64)] if count else episodes[:0]

@@ -1,0 +1,165 @@
+"""The card's lines on latents: how many kinds and directions, how much of the real action they carry, with controls.
+
+Shapes: M transitions, Z latent-action width (N * Z with one latent per slot), A action width, N slots, D slot width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.evaluation.card_lines import ACTIONS, MEASURES, Line, line
+from playslot_rl.evaluation.probes import codebook_usage, participation_ratio, probe_actions, repaired
+from playslot_rl.frames import normalise
+from playslot_rl.seeding import derived_seed, step_generator
+from playslot_rl.world_model import WorldModel, module_device
+
+NOISE = 0.02
+"""Standard deviation of the camera noise, of the range [0, 1] of a pixel: five of 255."""
+PAIRS_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class Parsed:
+    """Episodes as a world model sees them, transition by transition; whole episodes are tested.
+
+    Attributes:
+        source: the episodes; an episode's rows are `starts` and on.
+        slots: (F, N, D) of all their frames, in order.
+        starts: row of `slots` of each episode's first frame, int64 (E,).
+        tested_episodes: bool (E,).
+        latents: (M, Z) or (M, N * Z).
+        codes: (M, 1) or (M, N), -1 without a codebook.
+        rows: row of `slots` that a transition starts from, int64 (M,).
+        pixels: row of the source's frames, likewise.
+        episodes: episode of each transition, int64 (M,).
+        actions: (M, A), or None.
+    """
+
+    source: EpisodeFrames
+    slots: npt.NDArray[np.float32]
+    starts: npt.NDArray[np.int64]
+    tested_episodes: npt.NDArray[np.bool_]
+    latents: npt.NDArray[np.float32]
+    codes: npt.NDArray[np.int64]
+    rows: npt.NDArray[np.int64]
+    pixels: npt.NDArray[np.int64]
+    episodes: npt.NDArray[np.int64]
+    actions: npt.NDArray[np.float32] | None
+
+    @property
+    def tested(self) -> npt.NDArray[np.bool_]:
+        """Transitions that are tested (M,)."""
+        return self.tested_episodes[self.episodes]
+
+
+def usage_lines(model: WorldModel, parsed: Parsed) -> tuple[list[Line], dict[str, Any]]:
+    """Codes in use, perplexity, directions; and for the page, the counts of the codes."""
+    k, tested = model.inverse_dynamics.n_prototypes, parsed.tested
+    width = model.inverse_dynamics.latent_dim
+    latents = parsed.latents[tested].reshape(-1, width) if width else parsed.latents[tested]
+    ratio = participation_ratio(latents) if width else None
+    within = f"of {width}, over {len(latents)} latents" if width else NO_LATENTS
+    directions = line("directions", ratio, within if ratio is not None or not width else "the latents do not vary")
+    if not k:
+        why = f"mode {model.config.inverse_dynamics.mode} has no prototypes"
+        return [line("codes_in_use", None, why), line("perplexity", None, why), directions], {}
+    usage = codebook_usage(parsed.codes[tested], k)
+    return [
+        line("codes_in_use", usage["used"] / k, f"{usage['used']} of {k}"),
+        line("perplexity", usage["perplexity"] / k, f"{usage['perplexity']:.1f} of {k}"),
+        directions,
+    ], {"code_counts": usage["counts"]}
+
+
+NO_LATENTS = "this world model has no latent actions (mode none)"
+
+
+def action_lines(model: WorldModel, parsed: Parsed, seed: int) -> tuple[list[Line], dict[str, Any]]:
+    """Probes of the real action with their controls; all `not measured` where that cannot be.
+
+    Args:
+        model: in evaluation mode.
+        parsed: the episodes.
+        seed: of the wrong pairs and of the camera noise.
+    """
+    fitted = parsed.tested_episodes.size - int(parsed.tested_episodes.sum())
+    missing = ""
+    if not model.inverse_dynamics.latent_dim:
+        missing = NO_LATENTS
+    elif model.config.inverse_dynamics.mode == "ground_truth":
+        missing = "latents are the real actions (mode ground_truth)"
+    noisy = None if missing else noise_latents(model, parsed, seed)
+    lines = {"noise_size": line("noise_size", None, missing)}
+    if noisy is not None:
+        lines["noise_size"] = _noise_size(noisy[parsed.tested], parsed.latents[parsed.tested])
+    if not missing and parsed.actions is None:
+        missing = "no actions"
+    elif not missing and fitted == 0:
+        missing = "no other episodes to fit a probe on"
+    scores: dict[str, Any] = {}
+    if not missing:
+        assert noisy is not None
+        scores = _scores(parsed, noisy, seed)
+        if scores["latent"]["linear"]["mean_r2"] is None:
+            missing, scores = "the actions do not vary", {}
+    if scores:
+        lines |= _probe_lines(scores)
+    keys = [key for key, measure in MEASURES.items() if measure.group == ACTIONS]
+    return [lines.get(key) or line(key, None, missing) for key in keys], {"probes": scores}
+
+
+def _scores(parsed: Parsed, noisy: npt.NDArray[np.float32], seed: int) -> dict[str, Any]:
+    """What is seen -> result of `probe_actions`."""
+    assert parsed.actions is not None
+    wrong = repaired(np.arange(len(parsed.rows)), parsed.tested, derived_seed(seed, 0, "wrong pairs"))
+    seen = {
+        "latent": parsed.latents,
+        "shuffled": parsed.latents[wrong],
+        "frame": parsed.slots[parsed.rows].reshape(len(parsed.rows), -1),
+        "noise": noisy,
+    }
+    return {name: probe_actions(x, parsed.actions, parsed.episodes, tested=parsed.tested) for name, x in seen.items()}
+
+
+def _probe_lines(scores: dict[str, Any]) -> dict[str, Line]:
+    best = {name: max(score["linear"]["mean_r2"], score["mlp"]["mean_r2"]) for name, score in scores.items()}
+    own = scores["latent"]
+    held = f"{own['test']} transitions of {own['test_episodes']} held-out episodes, fitted on {own['train']} others"
+    return {
+        "linear_probe": line("linear_probe", own["linear"]["mean_r2"], held),
+        "mlp_probe": line("mlp_probe", own["mlp"]["mean_r2"], held),
+        "above_frame": line("above_frame", best["latent"] - best["frame"], f"the frame alone: {best['frame']:.2f}"),
+        "shuffled_probe": line("shuffled_probe", best["shuffled"], "the better of both probes"),
+        "noise_probe": line("noise_probe", best["noise"], "the better of both probes"),
+    }
+
+
+def _noise_size(noisy: npt.NDArray[np.float32], real: npt.NDArray[np.float32]) -> Line:
+    size = float(np.sqrt(np.square(real, dtype=np.float64).mean()))
+    if size < 1e-9:
+        return line("noise_size", None, "the latents are all zero")
+    ratio = float(np.sqrt(np.square(noisy, dtype=np.float64).mean())) / size
+    return line("noise_size", ratio, f"noise of {NOISE:.0%} of a pixel's range, {len(noisy)} frames")
+
+
+@torch.no_grad()
+def noise_latents(model: WorldModel, parsed: Parsed, seed: int) -> npt.NDArray[np.float32]:
+    """The latent (M, Z) between each transition's first frame and the same frame with camera noise, parsed after it."""
+    device, savi = module_device(model), model.savi
+    found = []
+    for first in range(0, len(parsed.rows), PAIRS_AT_ONCE):
+        some = slice(first, first + PAIRS_AT_ONCE)
+        frames = normalise(parsed.source.pixels(parsed.pixels[some]).to(device))
+        generator = step_generator(seed, first, "camera noise", device)
+        noise = NOISE * torch.randn(frames.shape, generator=generator, device=device)
+        before = torch.from_numpy(parsed.slots[parsed.rows[some]]).to(device)
+        after, _ = savi((frames + noise).clamp(0, 1)[:, None], savi.transition(before), generator)
+        latent = model.inverse_dynamics(torch.stack([before, after[:, 0]], 1)).mean[:, 0]
+        found.append(latent.flatten(1).cpu().numpy())
+    return np.concatenate(found)

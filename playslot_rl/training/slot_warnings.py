@@ -1,0 +1,65 @@
+"""What a validation of SAVi says is wrong with its slots, in words that name the cure that is known for it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Final
+
+from playslot_rl.config import SAViConfig
+
+SINGLE: Final = 1.5
+"""Slots in use, below which one holds everything."""
+SHARED: Final = 0.95
+"""Entropy of the masks, as a share of log N, above which no slot has a pixel for itself."""
+FLICKER: Final = 0.1
+"""Exchanges of slots a transition, above which slots do not keep their things."""
+UNSEEN: Final = 0.3
+"""Share of the moving pixels' change that is explained, below which what moves is not drawn."""
+
+
+def slot_warnings(values: Mapping[str, float], savi: SAViConfig) -> dict[str, str]:
+    """Kind -> one line, for each thing that is wrong.
+
+    Args:
+        values: of `playslot_rl.modules.savi.health.SlotHealth`; what is not among them is not judged.
+        savi: sizes and settings, so that no cure is named that is in use already.
+    """
+    found: dict[str, str] = {}
+    slots, entropy = savi.n_slots, values.get("mask_entropy", 0.0)
+    if slots == 1:
+        return found
+    shared = entropy > SHARED * math.log(slots)
+    if shared:
+        found["shared"] = (
+            f"all slots share all pixels (mask entropy {entropy:.2f} of at most {math.log(slots):.2f}): the scene is "
+            f"not taken apart yet; {_leave_plateau(savi)}"
+        )
+    elif values.get("slots_in_use", slots) < SINGLE:
+        found["single"] = (
+            f"one slot holds everything ({values['slots_in_use']:.1f} of {slots} slots in use): it can draw whole "
+            f"frames alone; give it less room by a smaller model.savi.slot_dim (now {savi.slot_dim}) and fewer "
+            f"model.savi.decoder_channels (now {list(savi.decoder_channels)}), or {_leave_plateau(savi)}"
+        )
+    if values.get("flicker", 0.0) > FLICKER and not shared:
+        cure = "train for longer (slots.steps)" if savi.transition_start == "identity" else _IDENTITY
+        found["flicker"] = f"slots change places ({values['flicker']:.2f} exchanges a transition): {cure}"
+    if values.get("moving_explained", 1.0) < UNSEEN:
+        found["unseen"] = (
+            f"what moves is hardly drawn ({100 * values['moving_explained']:.0f} % of the moving pixels' change "
+            f"explained): {_leave_plateau(savi)}"
+        )
+    return found
+
+
+_IDENTITY: Final = "start the transition as identity, model.savi.transition_start=identity"
+
+
+def _leave_plateau(savi: SAViConfig) -> str:
+    learned = "" if savi.decoder_position == "learned" or savi.decoder != "pixel_shuffle" else _LEARNED
+    return (
+        f"{learned}train for longer (slots.steps), or start from one that can do it (slots.start_from=pretrained/ENV)"
+    )
+
+
+_LEARNED: Final = "let the decoder learn its position map (model.savi.decoder_position=learned), "

@@ -1,0 +1,187 @@
+"""The report card as a page of its own, and as a section of a run's report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from playslot_rl.evaluation.card import RESULT, Card
+from playslot_rl.evaluation.effect_lines import Replayed
+from playslot_rl.visualization.charts import usage_chart
+from playslot_rl.visualization.document import Block, Document, Missing, Picture, Section, Table, Text
+from playslot_rl.visualization.grid import image_grid, png
+from playslot_rl.visualization.sections import ReportInput, chart
+from playslot_rl.visualization.slots import change_map, draw_slots
+from playslot_rl.world_model import WorldModel
+
+ROWS = 4
+"""Windows shown."""
+VERDICTS = {"good": "good", "fair": "fair", "bad": "BAD", "not measured": "not measured"}
+
+
+def card_tables(lines: Sequence[Mapping[str, Any]]) -> list[tuple[str, Table]]:
+    """One table a group of lines (`Line.plain`), with the group's name."""
+    headers = ["measure", "value", "verdict", "good", "bad", "measured on"]
+    groups = dict.fromkeys(str(one["group"]) for one in lines)
+    return [(group, Table(headers, [_row(one) for one in lines if one["group"] == group])) for group in groups]
+
+
+def _row(one: Mapping[str, Any]) -> list[str]:
+    value = "–" if one["value"] is None else f"{round(one['value'], 2) + 0.0:.2f}"
+    note = f"not measured: {one['note']}" if one["value"] is None else str(one["note"])
+    return [one["measure"], value, VERDICTS[one["verdict"]], one["good"], one["bad"], note]
+
+
+def verdict_text(lines: Sequence[Mapping[str, Any]]) -> str:
+    """`12 good, 5 fair, 2 bad (perplexity of the codes; ...)`."""
+    counts = {v: sum(one["verdict"] == v for one in lines) for v in VERDICTS}
+    return ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+
+
+def told_text(result: Mapping[str, Any]) -> str:
+    """Which episodes were measured, as sentences."""
+    known = "" if result["held_out_known"] else " It is not known whether the world model has seen them."
+    return (
+        f"Measured on {len(result['episodes_tested'])} episodes of `{result['data']}`: {result['held_out']}.{known} "
+        f"Probes are fitted on {result['episodes_fitted']} others."
+    )
+
+
+def card_document(result: Mapping[str, Any], card: Card, model: WorldModel) -> Document:
+    """The page of `inspect`.
+
+    Args:
+        result: as stored (`card_json`).
+        card: what was measured.
+        model: the world model.
+    """
+    pictures = _pictures(card, model)
+    sections = [Section(group, [table, *pictures.get(group, [])]) for group, table in card_tables(result["lines"])]
+    lead = (
+        f"World model of `{result['run']}`: {verdict_text(result['lines'])}. {told_text(result)} A verdict is a rule "
+        "of thumb; the borders are in the columns `good` and `bad`, what lies between is fair."
+    )
+    return Document("PlaySlot report card", lead, sections)
+
+
+def _pictures(card: Card, model: WorldModel) -> dict[str, list[Block]]:
+    """Pictures by the group that they belong to."""
+    from playslot_rl.evaluation.card_lines import EFFECTS, LATENTS, SLOTS
+
+    found: dict[str, list[Block]] = {LATENTS: [], EFFECTS: [], SLOTS: []}
+    counts = card.details.get("code_counts")
+    if counts:
+        alt = f"Share of transitions by code: {', '.join(map(str, counts))}."
+        found[LATENTS].append(
+            chart(
+                "codebook",
+                lambda theme: usage_chart({"held out": counts}, theme),
+                alt,
+                "Codes of the held-out episodes.",
+            )
+        )
+    if model.inverse_dynamics.latent_dim:
+        found[EFFECTS] += _replay_pictures(card.replayed)
+        found[EFFECTS] += _prototype_table(card.details.get("prototypes", []))
+    source, first = card.parsed.source, int(np.flatnonzero(card.parsed.tested_episodes)[0])
+    clip = np.asarray(source.frames[source.episode_rows(first)])
+    alt = "Rows: frames, their reconstructions, the segmentation by slot, and the part of the frame each slot holds."
+    found[SLOTS].append(Picture("slots", png(draw_slots(model, clip)), alt, "The first held-out episode, not chosen."))
+    return found
+
+
+def _replay_pictures(shown: Replayed) -> list[Block]:
+    windows, steps = shown.windows, shown.windows.latents.shape[1]
+    rows = np.unique(np.linspace(0, len(windows.frames) - 1, min(ROWS, len(windows.frames))).round().astype(int))
+    labels = [f"window {row + 1}" for row in rows]
+    blocks: list[Block] = []
+    if shown.taken is not None:
+        others = windows.others[rows]
+        columns = [windows.frames[rows, 0], windows.frames[rows, -1], shown.own.frames[rows]]
+        columns += [windows.frames[others, 0], shown.taken.frames[rows]]
+        names = ["frame", f"true, t = {steps}", "imagined", "elsewhere", "same latents"]
+        blocks.append(
+            Picture(
+                "transfer",
+                png(image_grid(np.stack(columns, 1), labels, names)),
+                "Rows are windows: frame, true and imagined frames later, a frame of another episode, and what the "
+                "same latents make of it.",
+                f"Latents of {steps} steps in their own episode, and replayed from a frame of another. Windows are "
+                "spread evenly, not chosen.",
+            )
+        )
+    if shown.swapped is not None:
+        own, swapped = shown.own.frames[rows], shown.swapped.frames[rows]
+        columns, names = (
+            [windows.frames[rows, 0], own, swapped, change_map(own, swapped)],
+            [
+                "frame",
+                "own latents",
+                "others'",
+                "difference",
+            ],
+        )
+        if shown.region is not None:
+            where = np.where(shown.region[rows][..., None], own, (own * 0.15).astype(np.uint8))
+            columns, names = [*columns, where], [*names, "moving slots"]
+        blocks.append(
+            Picture(
+                "sensitivity",
+                png(image_grid(np.stack(columns, 1), labels, names)),
+                "Rows are windows: frame, imagined under its own latents and under another window's, the difference, "
+                "and where the slots that move are.",
+                f"What exchanging the latents changes after {steps} steps: orange where the others make it brighter, "
+                "blue where darker.",
+            )
+        )
+    return [*blocks, *_held_picture(shown)]
+
+
+def _held_picture(shown: Replayed) -> list[Block]:
+    if shown.held is None:
+        return []
+    steps, cells = shown.windows.latents.shape[1], []
+    for place, window in enumerate((0, len(shown.start.frames) - 1)):
+        before = np.broadcast_to(shown.start.frames[window], shown.held[:, place].shape)
+        cells += [before, shown.held[:, place], change_map(before, shown.held[:, place])]
+    names = ["first place", f"t = {steps}", "change", "last place", f"t = {steps}", "change"]
+    drawn = image_grid(np.stack(cells, 1), [f"code {code}" for code in shown.codes], names)
+    alt = "Rows are prototypes: a frame, the frame imagined while the prototype is held, the change; from two places."
+    return [
+        Picture("held", png(drawn), alt, f"Each prototype in use, held for {steps} steps from two held-out frames.")
+    ]
+
+
+def _prototype_table(table: Sequence[Mapping[str, Any]]) -> list[Block]:
+    if not table:
+        return []
+    rows = [
+        [
+            f"code {row['code']}",
+            f"slot {row['slot'] + 1}",
+            f"{row['pixels'][0]:+.1f} right, {row['pixels'][1]:+.1f} down",
+            f"{row['spread']:.1f}",
+        ]
+        for row in table
+    ]
+    caption = "The slot that a held prototype moves most on average, how far (pixels), and how far places differ."
+    return [Table(["prototype", "moves most", "mean displacement", "standard deviation"], rows, caption)]
+
+
+def card_section(given: ReportInput) -> Section:
+    """The stored card; a note where there is none, or that of another world model."""
+    title, path = "Report card", given.run / RESULT
+    command = given.command("inspect", "data.root=SET")
+    if not path.is_file():
+        return Section(title, [Missing("There is no report card of the world model yet.", command)])
+    result = json.loads(path.read_text())
+    prints = {stage: given.metas.get(stage, {}).get("fingerprint") for stage in ("slots", "dynamics")}
+    if result["fingerprints"] != prints:
+        return Section(title, [Missing("The report card is that of another world model.", command)])
+    blocks: list[Block] = [Text(f"{verdict_text(result['lines'])}. {told_text(result)}")]
+    for group, table in card_tables(result["lines"]):
+        blocks.append(Table([group, *table.headers[1:]], table.rows))
+    return Section(title, [*blocks, Text("With pictures: `inspect/inspect.html`.")])

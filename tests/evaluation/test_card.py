@@ -1,0 +1,206 @@
+"""The report card: held-out episodes, lines on latents whose content is known, and repeatable numbers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from playslot_rl.config import DataConfig
+from playslot_rl.data.demonstrations import split_demonstrations
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.windows import split_episodes
+from playslot_rl.errors import DataError
+from playslot_rl.evaluation.card import Card, make_card
+from playslot_rl.evaluation.card_lines import ACTIONS, EFFECTS, MEASURES, Line
+from playslot_rl.evaluation.held_out import hold_out
+from playslot_rl.evaluation.latent_lines import action_lines
+from playslot_rl.evaluation.probes import participation_ratio, probe_actions, repaired
+from playslot_rl.testing import tiny_agent, tiny_config
+from playslot_rl.world_model import WorldModel
+
+EPISODES, LENGTH = 12, 7
+
+
+def videos(episodes: int = EPISODES, length: int = LENGTH, moving: bool = True) -> EpisodeFrames:
+    """A square that is moved by the actions, in frames of 64x64."""
+    generator = np.random.default_rng(0)
+    frames = np.full((episodes * length, 64, 64, 3), 90, np.uint8)
+    actions = generator.uniform(-1, 1, (len(frames), 4)).astype(np.float32)
+    for episode in range(episodes):
+        at = generator.uniform(20, 36, 2)
+        for row in range(episode * length, (episode + 1) * length):
+            x, y = at.astype(int)
+            frames[row, y : y + 8, x : x + 8] = (220, 40, 40) if moving else (90, 90, 90)
+            at = np.clip(at + 4 * actions[row, :2], 0, 56)
+    starts = np.arange(episodes, dtype=np.int64) * length
+    lengths = np.full(episodes, length, np.int64)
+    return EpisodeFrames(frames, starts, lengths, actions, None, None, "print", 10.0, "", "camera")
+
+
+@pytest.fixture(scope="module")
+def model() -> WorldModel:
+    return tiny_agent().world_model
+
+
+@pytest.fixture(scope="module")
+def card(model: WorldModel) -> Card:
+    return make_card(model, videos(), {}, DataConfig())
+
+
+def by_key(lines: list[Line]) -> dict[str, Line]:
+    return {one.key: one for one in lines}
+
+
+def test_every_line_says_what_is_good_and_what_is_bad_and_json_holds_it(card: Card) -> None:
+    assert [one.key for one in card.lines] == list(MEASURES)
+    assert all(one.good and one.bad and one.measure and one.note for one in card.lines)
+    assert json.loads(json.dumps([one.plain() for one in card.lines], allow_nan=False))
+    assert {one.verdict for one in card.lines} <= {"good", "fair", "bad", "not measured"}
+    assert all((one.value is None) == (one.verdict == "not measured") for one in card.lines)
+
+
+def test_a_card_repeats_to_the_last_bit_and_leaves_the_global_generator_alone(model: WorldModel, card: Card) -> None:
+    import torch
+
+    state = torch.get_rng_state()
+    again = make_card(model, videos(), {}, DataConfig())
+    assert torch.equal(state, torch.get_rng_state())
+    assert again.lines == card.lines
+    assert again.details == card.details
+
+
+def test_latents_that_are_the_action_are_recovered_and_wrong_pairs_are_not(model: WorldModel, card: Card) -> None:
+    parsed = card.parsed
+    assert parsed.actions is not None
+    mixed = parsed.actions @ np.random.default_rng(0).normal(size=(4, 8)).astype(np.float32)
+    lines = by_key(action_lines(model, replace(parsed, latents=mixed), 0)[0])
+    assert lines["linear_probe"].value == pytest.approx(1.0, abs=0.02)
+    assert lines["linear_probe"].verdict == "good"
+    assert lines["shuffled_probe"].value is not None
+    assert lines["shuffled_probe"].value < 0.1
+    assert lines["above_frame"].verdict == "good"
+
+
+def test_latents_of_noise_recover_nothing(model: WorldModel, card: Card) -> None:
+    noise = np.random.default_rng(1).normal(size=card.parsed.latents.shape).astype(np.float32)
+    lines = by_key(action_lines(model, replace(card.parsed, latents=noise), 0)[0])
+    assert lines["linear_probe"].verdict == lines["mlp_probe"].verdict == "bad"
+    assert lines["above_frame"].verdict != "good"
+
+
+def test_probes_refuse_an_episode_on_both_sides() -> None:
+    z, episodes = np.zeros((6, 2), np.float32), np.repeat(np.arange(2), 3)
+    for tested in (np.array([1, 0, 0, 0, 0, 0], bool), np.ones(6, bool), np.zeros(6, bool)):
+        with pytest.raises(ValueError, match="two sets of whole episodes"):
+            probe_actions(z, z, episodes, tested=tested)
+
+
+def test_wrong_pairs_stay_on_their_side() -> None:
+    sides = np.arange(100) < 30
+    order = repaired(np.arange(100), sides, 5)
+    assert sorted(order) == list(range(100))
+    assert (np.isin(order[sides], np.arange(30))).all()
+    assert (order != np.arange(100)).mean() > 0.9
+
+
+def test_participation_ratio_counts_directions_of_equal_variance() -> None:
+    axes = np.concatenate([np.eye(6), -np.eye(6)]).astype(np.float32)
+    assert participation_ratio(axes) == pytest.approx(6.0)
+    assert participation_ratio(axes * np.array([1, 1, 0, 0, 0, 0], np.float32)) == pytest.approx(2.0)
+    assert participation_ratio(axes * np.array([3, 0, 0, 0, 0, 0], np.float32) + 7) == pytest.approx(1.0)
+    weights = np.array([2.0, 1.0, 0, 0, 0, 0], np.float32)  # variances 4 and 1: 25 / 17
+    assert participation_ratio(axes * weights) == pytest.approx(25 / 17)
+    assert participation_ratio(np.ones((5, 3), np.float32)) is None
+
+
+def test_without_actions_their_lines_are_not_measured(model: WorldModel) -> None:
+    found = by_key(make_card(model, replace(videos(), actions=None), {}, DataConfig()).lines)
+    for key, measure in MEASURES.items():
+        if measure.group == ACTIONS and key != "noise_size":
+            assert (found[key].value, found[key].note) == (None, "no actions"), key
+    assert found["noise_size"].value is not None
+
+
+def test_one_episode_says_what_it_cannot_tell(model: WorldModel) -> None:
+    found = by_key(make_card(model, videos(1), {}, DataConfig()).lines)
+    assert found["linear_probe"].note == "no other episodes to fit a probe on"
+    assert found["transfer"].note == found["sensitivity"].note == "a single held-out episode"
+    assert found["slots_in_use"].value is not None
+
+
+@pytest.mark.parametrize("mode", ["continuous", "ground_truth", "none"])
+def test_models_without_prototypes_or_latents_say_so(mode: Any) -> None:
+    config = tiny_config(mode=mode)
+    if mode == "none":
+        config = replace(
+            config, model=replace(config.model, predictor=replace(config.model.predictor, kind="ocvp_seq"))
+        )
+    other = WorldModel(config.model, config.env).eval()
+    found = by_key(make_card(other, videos(4), {}, DataConfig()).lines)
+    assert found["codes_in_use"].note == f"mode {mode} has no prototypes"
+    assert (found["linear_probe"].value is None) == (mode != "continuous")
+    assert (found["replay"].note == "this world model has no latent actions (mode none)") == (mode == "none")
+
+
+def test_one_latent_a_slot_is_measured_too() -> None:
+    found = by_key(make_card(tiny_agent_multi(), videos(4), {}, DataConfig()).lines)
+    assert found["directions"].note == "of 8, over 24 latents"  # one held-out episode of six transitions, four slots
+    assert found["linear_probe"].value is not None
+
+
+def tiny_agent_multi() -> WorldModel:
+    import torch
+
+    config = tiny_config(multi=True)
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        torch.manual_seed(0)
+        model = WorldModel(config.model, config.env)
+        model.inverse_dynamics.split(torch.randn(64, model.inverse_dynamics.latent_dim))
+        return model.eval()
+
+
+def test_videos_without_motion_or_of_single_frames_are_refused(model: WorldModel) -> None:
+    with pytest.raises(DataError, match="frames that never change"):
+        make_card(model, videos(moving=False), {}, DataConfig())
+    with pytest.raises(DataError, match="12 episodes of one frame"):
+        make_card(model, videos(length=1), {}, DataConfig())
+
+
+def test_the_world_models_own_videos_are_measured_where_its_validation_was(model: WorldModel) -> None:
+    metas = {"dynamics": {"data": {"train": "print"}, "seed": 4}}
+    found = hold_out(videos(), metas, DataConfig(validation=0.25), 100)
+    assert found.tested.tolist() == split_episodes(EPISODES, 0.25, 4)[1].tolist()
+    assert found.known
+    assert not np.intersect1d(found.tested, found.fitted).size
+    none = hold_out(videos(), metas, DataConfig(validation=0.0), 100)
+    assert not none.known
+
+
+def test_the_policys_demonstrations_are_measured_on_those_it_held_out() -> None:
+    source = videos()
+    trained = split_demonstrations(source, 8, 3, 3, 0).trained.fingerprint
+    policy = {"data": {"demos": trained}, "demos": 8, "held_out_demos": 3, "seed": 0}
+    found = hold_out(source, {"policy": policy}, DataConfig(), 100)
+    assert (found.tested.tolist(), found.known) == ([9, 10, 11], True)
+    assert hold_out(source, {"policy": policy | {"demos": 7}}, DataConfig(), 100).known is False
+    assert hold_out(source, {}, DataConfig(held_out=2), 100).tested.tolist() == [10, 11]
+
+
+def test_at_most_so_many_episodes_are_taken_and_short_ones_left_out() -> None:
+    source = videos()
+    lengths = source.lengths.copy()
+    lengths[[0, 11]] = 1
+    found = hold_out(replace(source, lengths=lengths), {}, DataConfig(), 8)
+    assert found.tested.tolist() == [9, 10]
+    assert len(found.fitted) == 6
+    assert not {0, 11} & {*found.tested.tolist(), *found.fitted.tolist()}
+
+
+def test_effects_are_measured_over_as_many_steps_as_there_are(model: WorldModel) -> None:
+    card = make_card(model, videos(length=3), {}, DataConfig())
+    assert card.details["steps"] == 2
+    assert {one.key for one in card.lines if one.group == EFFECTS} >= {"transfer", "constancy", "locality"}
