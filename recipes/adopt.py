@@ -17,7 +17,7 @@ from typing import Any, Final
 from playslot_rl.config import ExperimentConfig, SAViConfig, to_dict
 from playslot_rl.data.survey import Choice, Survey, choose_size, choose_stride, survey
 from playslot_rl.errors import ConfigError, DataError
-from playslot_rl.recipes import train_dynamics, train_slots
+from playslot_rl.recipes import inspect, train_dynamics, train_slots
 from playslot_rl.recipes.adopt_trials import (
     choose_prototypes,
     choose_slots,
@@ -94,6 +94,7 @@ def main(config: ExperimentConfig) -> None:
     train_slots.main(config)
     config = _chosen_prototypes(config, run, decide, budget)
     train_dynamics.main(config)
+    inspect.main_if_needed(replace(config, run=str(run), out=""))
     print(f"play it: playslot play run={run} data.root={config.data.root}")
 
 

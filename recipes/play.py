@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,7 +76,7 @@ def simulated_starts(config: ExperimentConfig, world: WorldModel) -> SimulatedSt
 
 def recorded_starts(config: ExperimentConfig, world: WorldModel, agent: Agent | None) -> RecordedStarts | None:
     """Frames of `data.root`, or of the data sets that the run names and that are on this machine."""
-    from playslot_rl.data.source import open_sources
+    from playslot_rl.data.opening import open_configured
     from playslot_rl.envs import ENVIRONMENTS
     from playslot_rl.evaluation.seeds import data_folders
     from playslot_rl.play.starts import RecordedStarts, task_maker
@@ -90,8 +91,8 @@ def recorded_starts(config: ExperimentConfig, world: WorldModel, agent: Agent | 
         print(f"the run's data sets are not on this machine ({named[0]}): the simulator makes the starts", flush=True)
     if not found:
         return None
-    size, data = world.env.image_size, config.data
-    source = open_sources(found, data.camera, data.cache, image_size=size, resize=data.resize)
+    env = replace(config.env, image_size=world.env.image_size)
+    source = open_configured(replace(config, env=env), found)
     simulator = agent is not None and config.env.name in ENVIRONMENTS
     maker = task_maker(config.env, config.render) if simulator else None
     return RecordedStarts(world, source, maker, config.seed)

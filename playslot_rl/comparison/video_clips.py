@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.demonstrations import split_tested
-from playslot_rl.data.source import EpisodeFrames, open_sources
-from playslot_rl.data.stride import every
+from playslot_rl.data.opening import open_configured
+from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray, spread_windows
 from playslot_rl.errors import DataError
 
@@ -68,9 +68,8 @@ def open_clips(config: ExperimentConfig, test: str, frames: int, count: int) -> 
     Raises:
         DataError: too few episodes, none so long, fewer than two clips, or a data set that cannot be read.
     """
-    data, size = config.data, config.env.image_size
-    source = open_sources(test or data.root, data.camera, data.cache, image_size=size, resize=data.resize)
-    source = every(source, data.stride)
+    data = config.data
+    source = open_configured(config, test or data.root)
     tested = source if test else split_tested(source, data.tested)[1]
     rows = spread_windows(tested.starts, tested.lengths, frames, count, range(tested.episodes))
     if len(rows) < 2:

@@ -14,8 +14,8 @@ from torch import nn
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.roles import fixed_keys
 from playslot_rl.data.demonstrations import DemonstrationSplit, episode_range, split_demonstrations, split_tested
-from playslot_rl.data.source import EpisodeFrames, concatenate, open_sources
-from playslot_rl.data.stride import every
+from playslot_rl.data.opening import open_configured
+from playslot_rl.data.source import EpisodeFrames, concatenate
 from playslot_rl.data.windows import Clips
 from playslot_rl.errors import CheckpointError, DataError
 from playslot_rl.storage.checkpoints import (
@@ -39,19 +39,14 @@ def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrame
         DataError: none is named, or one cannot be read.
     """
 
-    def opened(root: str) -> EpisodeFrames:
-        size, resize = config.env.image_size, config.data.resize
-        found = open_sources(root, config.data.camera, config.data.cache, image_size=size, resize=resize)
-        return every(found, config.data.stride)
-
     if not roots:
         raise DataError(f"{what}: got no data set, expected data.root=DIR; record one by `playslot collect`")
     names = [name.strip() for name in roots.split(",")]
     if config.data.tested:
-        return split_tested(opened(roots), config.data.tested)[0]
+        return split_tested(open_configured(config, roots), config.data.tested)[0]
     if not config.data.held_out or config.data.demos not in names or len(names) == 1:
-        return opened(roots)
-    parts = {name: opened(name) for name in names}
+        return open_configured(config, roots)
+    parts = {name: open_configured(config, name) for name in names}
     demos = parts[config.data.demos]
     parts[config.data.demos] = episode_range(demos, 0, demos.episodes - config.data.held_out)
     return concatenate([parts[name] for name in names])

@@ -42,14 +42,11 @@ def data_roots(given: ReportInput) -> list[Path]:
 
 def read_latents(model: WorldModel, root: Path, given: ReportInput, most_episodes: int = 200) -> LatentData:
     """Latent actions of up to `most_episodes` episodes of a data set, with the probe where it has actions."""
+    from playslot_rl.data.opening import open_configured
     from playslot_rl.data.slot_cache import slot_cache
-    from playslot_rl.data.source import open_sources
-    from playslot_rl.data.stride import every
 
     data = given.config.data
-    size = given.config.env.image_size
-    source = open_sources([root], data.camera, data.cache, image_size=size, resize=data.resize)
-    source = every(source, data.stride)
+    source = open_configured(given.config, [root])
     prints = str(given.metas.get("slots", {}).get("fingerprint", ""))
     slots = slot_cache(source, model.savi, prints, data.cache, module_device(model))
     starts, lengths = source.starts[:most_episodes], source.lengths[:most_episodes]

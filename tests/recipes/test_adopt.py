@@ -53,6 +53,7 @@ def test_a_set_that_nobody_prepared_becomes_a_world_model(any_set: Path, tmp_pat
     assert made["prototypes"]["value"] == 4
     assert all(f"{name}: {choice['value']} (" in done.out for name, choice in made.items())
     assert f"playslot play run={run} data.root={any_set}" in done.out
+    assert json.loads((run / "inspect" / "inspect.json").read_text())["lines"]
     model = playslot_rl.load(run, device="cpu")
     assert model.world_model.slot_shape[0] == made["slots"]["value"]
     assert json.loads((run / "config.json").read_text())["data"]["stride"] == made["stride"]["value"]
