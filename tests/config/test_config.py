@@ -175,6 +175,11 @@ def test_a_config_stored_before_the_collector_had_settings_loads(tmp_path: Path)
     assert compose([f"run={tmp_path}"], "evaluate").collector == ExperimentConfig().collector
 
 
+@pytest.mark.parametrize(("typed", "port"), [("port=", 0), ("port=0", 0), ("port=8090", 8090)])
+def test_an_empty_port_is_any_port(typed: str, port: int) -> None:
+    assert compose(["run=pretrained", typed], "play").port == port
+
+
 def test_equal_configs_have_equal_fingerprints() -> None:
     assert fingerprint(compose(["preset=smoke"])) == fingerprint(compose(["preset=smoke"]))
     assert fingerprint(compose(["preset=smoke"])) != fingerprint(compose(["preset=smoke", "seed=1"]))
@@ -192,19 +197,8 @@ def test_roles_say_what_each_key_counts_for() -> None:
     assert keys_of(DreamerConfig, "free") == {"minutes", "replay_on_disk", "evaluate_every"} | looking - {
         "validate_every"
     }
-    call = {
-        "out",
-        "run",
-        "episodes",
-        "policy",
-        "protocol",
-        "workers",
-        "collector",
-        "device",
-        "export",
-        "adopt",
-        "minutes",
-    }
+    call = {"out", "run", "episodes", "policy", "protocol", "workers", "collector", "device", "export"}
+    call |= {"adopt", "minutes", "play", "port"}
     assert keys_of(ExperimentConfig, "call") == call
     machine = {
         "device",
@@ -220,6 +214,8 @@ def test_roles_say_what_each_key_counts_for() -> None:
         "preset",
         "out",
         "run",
+        "play",
+        "port",
     }
     named = {"data.root", "data.demos", "data.cache", "behaviour.policy_from"}
     named |= {f"baselines.{method}.world" for method in ("lapo", "caddy_policy", "caddy_oracle")}

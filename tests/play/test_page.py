@@ -57,12 +57,12 @@ def simulate(studio: Studio, script: Callable[[User, list[PlayPage]], Awaitable[
 
 
 async def until(true: Callable[[], bool]) -> None:
-    """Wait for something to become true, five seconds at most."""
-    for _ in range(500):
+    """Wait for something to become true, half a minute at most: other jobs may have the cores."""
+    for _ in range(3000):
         if true():
             return
         await asyncio.sleep(0.01)
-    raise AssertionError("nothing happened for five seconds")
+    raise AssertionError("nothing happened for half a minute")
 
 
 def press(user: User, key: str, down: bool = True) -> None:
