@@ -13,9 +13,9 @@ import numpy as np
 from PIL import Image
 from PIL.ImageColor import getrgb
 
+from playslot_rl.colours import OKABE_ITO
 from playslot_rl.play.session import Look, PlaySession
 from playslot_rl.play.timeline import Frame, SceneMoment
-from playslot_rl.visualization.charts import OKABE_ITO
 from playslot_rl.visualization.grid import side_by_side
 
 EDGE: Final = 0.75
