@@ -5,6 +5,8 @@ Each is a run of its own below `OUT/trials`, finished or carried on like any oth
 
 from __future__ import annotations
 
+import contextlib
+import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -19,6 +21,11 @@ CARRIED: Final = 0.95
 """Share of the transitions that the prototypes in use have to carry."""
 FEWEST: Final = 4
 """Prototypes at least."""
+
+
+def _quietly() -> contextlib.AbstractContextManager[Any]:
+    """What a trial says of its slots, after a few steps, would mislead: its outcome is the reason of a choice."""
+    return contextlib.redirect_stdout(io.StringIO())
 
 
 def steps_within(seconds: float, seconds_a_step: float) -> int:
@@ -57,7 +64,8 @@ def seconds_a_step(config: ExperimentConfig, stage: str, out: Path) -> float:
     timed = scheduled(config, stage, TIMED_STEPS)
     if stage == "dynamics":  # steps with a teacher are much cheaper than rollouts
         timed = replace(timed, dynamics=replace(timed.dynamics, teacher_steps=0))
-    (train_slots if stage == "slots" else train_dynamics).main(replace(timed, out=str(out)))
+    with _quietly():
+        (train_slots if stage == "slots" else train_dynamics).main(replace(timed, out=str(out)))
     return float(read_stage(checkpoint_folder(out, stage), stage).meta["seconds"]) / TIMED_STEPS
 
 
@@ -75,7 +83,8 @@ def choose_slots(config: ExperimentConfig, out: Path, steps: int) -> Choice:
     errors = {}
     for slots in sorted(config.adopt.slots):
         folder = out / f"slots_{slots}"
-        train_slots.main(scheduled(replace(with_slots(config, slots), out=str(folder)), "slots", steps))
+        with _quietly():
+            train_slots.main(scheduled(replace(with_slots(config, slots), out=str(folder)), "slots", steps))
         errors[slots] = float(read_stage(checkpoint_folder(folder, "slots"), "slots").meta["metrics"]["mse"])
     enough = min(errors.values()) * (1 + config.adopt.tolerance)
     slots = min(slots for slots, error in errors.items() if error <= enough)
@@ -103,7 +112,8 @@ def choose_prototypes(config: ExperimentConfig, run: Path, out: Path, steps: int
 
     many = config.adopt.prototypes
     trial = scheduled(with_prototypes(config, many), "dynamics", steps)
-    train_dynamics.main(replace(trial, run=str(run), out=str(out)))
+    with _quietly():
+        train_dynamics.main(replace(trial, run=str(run), out=str(out)))
     model = load_world_model(out, config.device or "cpu")
     source = open_videos(config, config.data.root, "adopt")
     slots = slot_cache(
