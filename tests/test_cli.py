@@ -24,6 +24,7 @@ COMMANDS = [
     "train-policy",
     "train-baseline",
     "evaluate",
+    "plan",
     "export",
     "pipeline",
     "compare",

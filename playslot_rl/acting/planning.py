@@ -167,7 +167,7 @@ class PlanningActor(Actor):
         if config.cost == "image":
             return ImageDistance(model.savi, image)
         if config.cost == "dynamics":
-            return DynamicsDistance(model.inverse_dynamics, self.whitening, goal)
+            return DynamicsDistance(model.inverse_dynamics, self.agent.policy.whitening or self.whitening, goal)
         free = model.config.savi.initial == "gaussian" if config.match is None else config.match
         return SlotDistance(goal, free)
 

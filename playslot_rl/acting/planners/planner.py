@@ -14,6 +14,7 @@ Shapes: M candidates, H horizon, Z latent-action width. "[N,]" is there with one
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from playslot_rl.modules.whitening import Whitening
+from playslot_rl.modules.whitening import FADE, Whitening
 from playslot_rl.world_model import Agent
 
 Cost = Callable[[Tensor], Tensor]
@@ -148,13 +149,35 @@ def shifted(plan: Tensor, steps: int, fill: Tensor) -> Tensor:
     return torch.cat([rest, fill.expand(len(plan) - len(rest), *plan.shape[1:])])
 
 
+@torch.no_grad()
+def unfaded(whitening: Whitening) -> Whitening:
+    """The same mean and directions with the data's own deviations, at least a thousandth of the first one's.
+
+    Examples:
+        >>> z = torch.randn(1000, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.01])
+        >>> whitening = Whitening(2)
+        >>> whitening.fit(z)
+        >>> [round(float(s), 2) for s in unfaded(whitening)(z).std(dim=0)]
+        [1.0, 1.0]
+    """
+    plain = copy.deepcopy(whitening)
+    squares = whitening.scale.double().square()
+    first = squares[0] / (1 + FADE)
+    plain.scale.copy_((squares - FADE * first).clamp(min=1e-6 * first).sqrt())
+    return plain
+
+
 def latent_statistics(agent: Agent) -> Whitening:
-    """Mean, directions and scales of the latent actions that an agent was trained on: its policy's whitening (the
+    """Mean, directions and deviations of the latent actions that an agent was trained on: by its policy's whitening (the
     demonstrations' inferred latents), else its action decoder's whitening, else that one's mean and scale.
+
+    Note: networks take coordinates in which directions of next to no variance fade out. A search must draw in these
+    directions what the data have there, next to nothing, or most of a plan is noise that the model has never seen; so
+    the fading is taken back.
     """
     found = agent.policy.whitening or agent.action_decoder.whitening
     if found is not None:
-        return found
+        return unfaded(found)
     decoder = agent.action_decoder
     plain = Whitening(decoder.mean.shape[-1]).to(decoder.mean.device)
     plain.mean.copy_(decoder.mean)
