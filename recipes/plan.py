@@ -15,7 +15,7 @@ from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import shipped
 from playslot_rl.config.planning import GoalName, search_size
 from playslot_rl.envs import gym_id
-from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.errors import CheckpointError
 from playslot_rl.recipes.evaluate import check_environment, check_run, take_shipped
 
 if TYPE_CHECKING:
@@ -112,9 +112,7 @@ def _measure(
     return {**part, "cost_along_solution": solution}
 
 
-def _actors(
-    config: ExperimentConfig, agent: Agent, goals: GoalName, episodes: list[GoalEpisode]
-) -> dict[str, Actor]:
+def _actors(config: ExperimentConfig, agent: Agent, goals: GoalName, episodes: list[GoalEpisode]) -> dict[str, Actor]:
     """Ways of acting, by the name of their row."""
     import torch
 

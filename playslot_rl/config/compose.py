@@ -19,7 +19,7 @@ from typing import Any, Final
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.methods import MethodName, canonical_method
 from playslot_rl.config.plain import flatten
-from playslot_rl.config.planning import PLANNERS, PROPOSALS
+from playslot_rl.config.planning import GOALS, PLANNERS, PROPOSALS
 from playslot_rl.config.roles import keys_of
 from playslot_rl.errors import ConfigError
 
@@ -32,7 +32,7 @@ COMPARISONS: Final = {
     "compare-video": ("methods", "seeds", "vary", "values", "objects"),
 }
 """Commands with a group of their own in the config, and its keys that go without its name."""
-NAMES: Final = {"plan": {"planner": PLANNERS, "proposal": PROPOSALS}}
+NAMES: Final = {"plan": {"planner": PLANNERS, "proposal": PROPOSALS, "goals": GOALS}}
 """Commands with keys of their group that go without its name, and take one name, several with commas, or `all`."""
 SHIPPED: Final = "pretrained"
 """`run=pretrained` names the task's shipped world model, `run=pretrained/ENV` one of them: no run folders."""

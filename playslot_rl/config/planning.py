@@ -13,6 +13,7 @@ ProposalName = Literal["none", "policy"]
 GoalName = Literal["solved", "ahead"]
 PLANNERS: Final[tuple[PlannerName, ...]] = get_args(PlannerName)
 PROPOSALS: Final[tuple[ProposalName, ...]] = get_args(ProposalName)
+GOALS: Final[tuple[GoalName, ...]] = get_args(GoalName)
 
 _POSITIVE = within(lambda value: value > 0, "a number above 0")
 
@@ -89,7 +90,9 @@ class PlanConfig(Checked):
             check(len(values) > 0, name, values, "at least one")
             check(len(set(values)) == len(values), name, values, "each one once")
         if self.elites is not None and self.candidates is not None:
-            check(self.elites <= self.candidates, "plan.elites", self.elites, f"at most the {self.candidates} candidates")
+            check(
+                self.elites <= self.candidates, "plan.elites", self.elites, f"at most the {self.candidates} candidates"
+            )
         if self.every is not None and self.horizon is not None:
             check(self.every <= self.horizon, "plan.every", self.every, f"at most plan.horizon={self.horizon}")
 

@@ -59,7 +59,9 @@ class GoalTask:
         self._note(observation["pixels"])
         return observation, info
 
-    def step(self, action: npt.NDArray[np.float32]) -> tuple[dict[str, npt.NDArray[Any]], Any, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: npt.NDArray[np.float32]
+    ) -> tuple[dict[str, npt.NDArray[Any]], Any, bool, bool, dict[str, Any]]:
         """One agent step."""
         self._task.draw_steps = self.draw_steps
         observation, reward, terminated, truncated, info = self._task.step(action)

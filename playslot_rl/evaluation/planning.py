@@ -5,6 +5,7 @@ Shapes: T agent steps, H horizon, P things with a place, N slots, D slot width.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Sequence
@@ -56,7 +57,13 @@ class Played:
 
 
 def play(
-    pool: GoalPool, actor: Actor, goals: Sequence[GoalEpisode], protocol: GoalName, max_steps: int, every: int, draw: bool
+    pool: GoalPool,
+    actor: Actor,
+    goals: Sequence[GoalEpisode],
+    protocol: GoalName,
+    max_steps: int,
+    every: int,
+    draw: bool,
 ) -> Played:
     """Run one actor towards each goal.
 
@@ -112,7 +119,12 @@ def results(played: Played, goals: Sequence[GoalEpisode], near: float) -> dict[s
     ways = [[goal.distance(p) for p in trace.places] for goal, trace in zip(goals, played.traces, strict=True)]
     reached = sum(min(way) < near for way in ways)
     episodes = [
-        {**asdict(outcome), "start": goal.start, "expert_steps": len(goal.frames) - 1, "state_distance": round(way[-1], 4)}
+        {
+            **asdict(outcome),
+            "start": goal.start,
+            "expert_steps": len(goal.frames) - 1,
+            "state_distance": round(way[-1], 4),
+        }
         | {"state_closest": round(min(way), 4)}
         for outcome, goal, way in zip(played.outcomes, goals, ways, strict=True)
     ]
@@ -173,7 +185,9 @@ def cost_along_solution(
         there = parse_goal(model.savi, state, goal.image[None].to(device), looks)[0]
         distances = {
             "slots": SlotDistance(there, free),
-            "dynamics": DynamicsDistance(model.inverse_dynamics, agent.policy.whitening or latent_statistics(agent), there),
+            "dynamics": DynamicsDistance(
+                model.inverse_dynamics, agent.policy.whitening or latent_statistics(agent), there
+            ),
             "image": ImageDistance(model.savi, goal.image.to(device)),
         }
         for name, to_goal in distances.items():
@@ -188,7 +202,7 @@ def cost_along_solution(
 
 def _shape(ways: list[list[float]]) -> dict[str, Any]:
     """What curves from start to goal look like."""
-    steps = [after < before for way in ways for before, after in zip(way, way[1:], strict=False)]
+    steps = [after < before for way in ways for before, after in itertools.pairwise(way)]
     return {
         "goal_is_minimum": float(np.mean([min(way) == way[-1] for way in ways])),
         "downhill": float(np.mean(steps)),

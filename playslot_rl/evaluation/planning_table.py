@@ -32,7 +32,12 @@ def table(report: Mapping[str, Any]) -> str:
     for name, part in report["goals"].items():
         goal = GOALS[name].format(**report["settings"])
         size = ", ".join(f"{key} {value}" for key, value in part["size"].items())
-        lines += [f"## Goals: {goal}", "", f"{part['episodes']} episodes of {part['max_steps']} agent steps. {size}.", ""]
+        lines += [
+            f"## Goals: {goal}",
+            "",
+            f"{part['episodes']} episodes of {part['max_steps']} agent steps. {size}.",
+            "",
+        ]
         lines += [*rows(part["rows"]), "", *_solution(part["cost_along_solution"]), ""]
     return "\n".join(lines)
 
@@ -40,7 +45,7 @@ def table(report: Mapping[str, Any]) -> str:
 def rows(results: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """The lines of one table."""
     lines = [
-        "| | success | by state | furthest thing from its place at the end, m | planned cost, of the proposal | s a decision |",
+        "| | success | by state | off its place at the end, m | planned cost, of the proposal | s a decision |",
         "|---|---|---|---|---|---|",
     ]
     for name, row in results.items():

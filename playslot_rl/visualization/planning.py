@@ -53,7 +53,9 @@ def solution_chart(found: Mapping[str, Any], theme: Theme) -> bytes:
         ways = [np.array(way) / max(way[0], 1e-12) for way in found[name]["curves"]]
         for number, way in enumerate(ways):
             label = "one episode" if number == 0 else None
-            axes.plot(np.arange(len(way)) - len(way) + 1, way, color=theme.series[-1], linewidth=0.8, alpha=0.6, label=label)
+            axes.plot(
+                np.arange(len(way)) - len(way) + 1, way, color=theme.series[-1], linewidth=0.8, alpha=0.6, label=label
+            )
         longest = max(map(len, ways))
         padded = np.full((len(ways), longest), np.nan)
         for row, way in zip(padded, ways, strict=True):

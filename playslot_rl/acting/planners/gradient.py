@@ -49,7 +49,9 @@ class GradientPlanner:
                 finite = best.offer(latents, costs).isfinite()
                 best.note()
                 optimiser.zero_grad()
-                costs[finite].sum().backward()  # type: ignore[no-untyped-call]
+                # The gradient of the logarithm: Adam's steps then depend on no unit, and huge costs do not overflow.
+                relative = costs[finite] / costs[finite].detach().abs().clamp(min=1e-30)
+                relative.sum().backward()  # type: ignore[no-untyped-call]
                 optimiser.step()
                 with torch.no_grad():
                     point.clamp_(-search.bound, search.bound)

@@ -105,13 +105,12 @@ class Best:
 
     def __init__(self, search: Search) -> None:
         self.search, self.costs = search, list[float]()
-        self.latents, self.cost = torch.empty(0), float("inf")
+        self.latents, self.cost = search.whitening.mean.expand(search.shape), float("inf")
 
     @torch.no_grad()
     def begin(self) -> Tensor:
         """Try the mean latent action held and the given plans; returns the better one's latents (H, [N,] Z)."""
-        mean = self.search.whitening.mean.expand(1, *self.search.shape)
-        tried = torch.cat([mean, self.search.starts])
+        tried = torch.cat([self.latents[None], self.search.starts])
         self.offer(tried, self.search.cost(tried))
         return self.latents
 

@@ -12,11 +12,10 @@ Shapes: M candidates, H horizon, N slots, D slot width, Z latent-action width.
 
 from __future__ import annotations
 
-import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Composite
 from torchrl.envs import Compose, ObservationNorm, Transform, TransformedEnv
 
 from playslot_rl import keys
