@@ -105,7 +105,7 @@ class PixelTask(gym.Env[Observation, Action]):
 
     @abstractmethod
     def places(self) -> dict[str, npt.NDArray[np.float64]]:
-        """Where the arm's hand and the movable things are: name -> (3,), metres; as many in every step of an episode."""
+        """Where the arm's hand and the movable things are: name -> (3,) metres; as many in each step of an episode."""
 
     def segment(self) -> npt.NDArray[np.int64]:
         """Which object each pixel shows: int64 (H, W), o + 1 for `objects()[o]`, 0 for the ground."""

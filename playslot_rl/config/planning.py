@@ -111,8 +111,8 @@ class SearchSize:
 def search_size(plan: PlanConfig, goals: GoalName, frame_skip: int) -> SearchSize:
     """The size of a search: what was typed, else the goals' own.
 
-    stable-worldmodel plans 5 blocks of 5 environment steps, all of them executed before the next plan, with 300 samples,
-    30 iterations and 30 elites. Our agent step is a block of `frame_skip` environment steps.
+    stable-worldmodel plans 5 blocks of 5 environment steps, all of them executed before the next plan, with 300
+    samples, 30 iterations and 30 elites. Our agent step is a block of `frame_skip` environment steps.
 
     Raises:
         ValueError: more elites than candidates, or more steps executed than planned.

@@ -1,5 +1,5 @@
-"""Goal images that can be reached: frames of the scripted expert's own episodes, held-out ones, and the episodes in which
-others are to reach them.
+"""Goal images that can be reached: frames of the scripted expert's own episodes, held-out ones, and the episodes in
+which others are to reach them.
 
 An episode is a function of its seed, so the expert's goal and whoever plans towards it share one layout.
 

@@ -167,8 +167,8 @@ def unfaded(whitening: Whitening) -> Whitening:
 
 
 def latent_statistics(agent: Agent) -> Whitening:
-    """Mean, directions and deviations of the latent actions that an agent was trained on: by its policy's whitening (the
-    demonstrations' inferred latents), else its action decoder's whitening, else that one's mean and scale.
+    """Mean, directions and deviations of the latent actions that an agent was trained on: by its policy's whitening
+    (the demonstrations' inferred latents), else its action decoder's whitening, else that one's mean and scale.
 
     Note: networks take coordinates in which directions of next to no variance fade out. A search must draw in these
     directions what the data have there, next to nothing, or most of a plan is noise that the model has never seen; so
