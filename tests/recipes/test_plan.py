@@ -99,6 +99,13 @@ def test_a_run_without_a_policy_is_refused(world: Path) -> None:
     assert contents(world) == before
 
 
+def test_an_environment_without_a_simulator_is_refused(run: Path) -> None:
+    config = json.loads((run / "config.json").read_text())
+    config["env"]["name"] = "grid_shapes"
+    (run / "config.json").write_text(json.dumps(config))
+    refused("plan", f"run={run}", message="env=grid_shapes: got an environment without a simulator, expected one of")
+
+
 def test_nothing_to_plan_in_is_refused(tmp_path: Path) -> None:
     refused("plan", message="run: got nothing, expected")
     refused("plan", f"run={tmp_path / 'no'}", message="got no .*config.json", code=2)
