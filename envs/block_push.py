@@ -220,6 +220,11 @@ class BlockEnv(PixelTask):
         things = (f"{kind}{i}" for i in range(self._simulation.count))
         return ("robot0:base_link",), ("target0",), *((name,) for name in things)
 
+    def places(self) -> dict[str, npt.NDArray[np.float64]]:
+        """The grip and each object."""
+        scene = self.scene
+        return {"grip": np.array(scene.grip), **{f"object{i}": np.array(p) for i, p in enumerate(scene.places)}}
+
     def _advance(self, action: Action) -> tuple[float, bool]:
         self._simulation.advance(action)
         scene, d = self.scene, self.distance

@@ -89,6 +89,10 @@ class ButtonPressEnv(PixelTask):
         """The arm, and the box with its button."""
         return ("base", "hand"), ("box",)
 
+    def places(self) -> dict[str, npt.NDArray[np.float64]]:
+        """The hand and the button."""
+        return {"hand": self._full[:3].copy(), "button": self._full[4:7].copy()}
+
     def _advance(self, action: Action) -> tuple[float, bool]:
         self._full, reward, _, _, info = self._simulation.step(action)
         return float(reward), bool(info["success"])

@@ -103,6 +103,10 @@ class PixelTask(gym.Env[Observation, Action]):
     def objects(self) -> Sequence[Sequence[str]]:
         """What a viewer calls one thing: for each, the names of its root bodies, or of sites of the world."""
 
+    @abstractmethod
+    def places(self) -> dict[str, npt.NDArray[np.float64]]:
+        """Where the arm's hand and the movable things are: name -> (3,) metres; as many in each step of an episode."""
+
     def segment(self) -> npt.NDArray[np.int64]:
         """Which object each pixel shows: int64 (H, W), o + 1 for `objects()[o]`, 0 for the ground."""
         model, found = self._simulation.model, self._renderer.parts(self._simulation.data)

@@ -106,6 +106,18 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot inspect run=pretrained/block_push_easy data.root=data/expert out=runs/check",
         ),
     ),
+    "plan": Command(
+        "reach goal images by searching over latent actions, beside random actions and the latent policy",
+        "Model-predictive control in imagination, executed in the simulator by the action decoder. planner= is cem, "
+        "mppi, gradient, prototypes or all; proposal= is none, policy (begin with the latent policy's rollout) or all. "
+        "Goals are frames of the expert's held-out episodes: the solved one (plan.goals=solved) and the one 25 "
+        "environment steps ahead (plan.goals=ahead, stable-worldmodel's protocol); both by default. Writes "
+        "RUN/planning/GOALS/METHOD/eval_info.json with pictures, and the table RUN/planning/planning.md.",
+        (
+            "playslot plan run=runs/mine planner=cem proposal=policy episodes=20",
+            "playslot plan run=pretrained planner=all proposal=all plan.seconds=1 episodes=20 out=runs/plan",
+        ),
+    ),
     "export": Command(
         "a trained policy as a folder that LeRobot loads, with a model card; also to the Hub",
         "Writes config.json, model.safetensors (world model, policy and action decoder), LeRobot's processors and a "

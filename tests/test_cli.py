@@ -25,6 +25,7 @@ COMMANDS = [
     "train-baseline",
     "evaluate",
     "inspect",
+    "plan",
     "export",
     "play",
     "pipeline",

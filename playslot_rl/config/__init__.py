@@ -32,6 +32,7 @@ from playslot_rl.config.model import SAViConfig as SAViConfig
 from playslot_rl.config.plain import fingerprint as fingerprint
 from playslot_rl.config.plain import from_dict as from_dict
 from playslot_rl.config.plain import to_dict as to_dict
+from playslot_rl.config.planning import PlanConfig as PlanConfig
 from playslot_rl.config.stages import BehaviourStageConfig as BehaviourStageConfig
 from playslot_rl.config.stages import DynamicsStageConfig as DynamicsStageConfig
 from playslot_rl.config.stages import OptimConfig as OptimConfig

@@ -19,18 +19,21 @@ from typing import Any, Final
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.methods import MethodName, canonical_method
 from playslot_rl.config.plain import flatten
+from playslot_rl.config.planning import GOALS, PLANNERS, PROPOSALS
 from playslot_rl.config.roles import keys_of
 from playslot_rl.errors import ConfigError
 
 CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
-CONTINUES: Final = frozenset({"evaluate", "export", "inspect", "play", "train-dynamics", "train-policy"})
+CONTINUES: Final = frozenset({"evaluate", "export", "inspect", "plan", "play", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
 COMPARISONS: Final = {
     "compare": ("methods", "demos", "labels", "seeds"),
     "compare-video": ("methods", "seeds", "vary", "values", "objects"),
 }
 """Commands with a group of their own in the config, and its keys that go without its name."""
+NAMES: Final = {"plan": {"planner": PLANNERS, "proposal": PROPOSALS, "goals": GOALS}}
+"""Commands with keys of their group that go without its name, and take one name, several with commas, or `all`."""
 SHIPPED: Final = "pretrained"
 """`run=pretrained` names the task's shipped world model, `run=pretrained/ENV` one of them: no run folders."""
 
@@ -60,7 +63,11 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         ConfigError: an argument that is not `key=value`, an unknown environment, preset or key, a value outside its
             range, or a run folder without a usable `config.json`.
     """
-    pairs = _parse(_compare_keys(overrides, command) if command in COMPARISONS else overrides)
+    if command in COMPARISONS:
+        overrides = _compare_keys(overrides, command)
+    elif command in NAMES:
+        overrides = _named_keys(overrides, command)
+    pairs = _parse(overrides)
     for group in GROUPS:
         if group in pairs:
             _check_choice(group, pairs[group])
@@ -145,6 +152,20 @@ def _compare_keys(overrides: Sequence[str], command: str) -> list[str]:
             kept.append(argument)
     quoted = ",".join(_quote(argument) for argument in hydra)
     return [*kept, f"{group}.hydra=[{quoted}]"] if hydra else kept
+
+
+def _named_keys(overrides: Sequence[str], command: str) -> list[str]:
+    """`planner=cem,mppi` as `plan.planner=[cem,mppi]`, and `all` as all there are."""
+    kept = []
+    for argument in overrides:
+        key, equals, value = argument.partition("=")
+        name = key.strip().removeprefix("+").removeprefix(f"{command}.")
+        if equals and name in NAMES[command]:
+            inside = _unquote(value.strip()).removeprefix("[").removesuffix("]")
+            inside = ",".join(NAMES[command][name]) if inside == "all" else inside
+            argument = f"{command}.{name}=[{inside}]"
+        kept.append(argument)
+    return kept
 
 
 def _quote(text: str) -> str:

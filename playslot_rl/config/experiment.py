@@ -12,6 +12,7 @@ from playslot_rl.config.compare_video import CompareVideoConfig
 from playslot_rl.config.env import EnvConfig, RenderConfig
 from playslot_rl.config.methods import MethodName
 from playslot_rl.config.model import ModelConfig
+from playslot_rl.config.planning import PlanConfig
 from playslot_rl.config.roles import SEED, Checked, at_least, between, role, within
 from playslot_rl.config.stages import BehaviourStageConfig, DynamicsStageConfig, SlotsStageConfig
 from playslot_rl.episode_seeds import EVALUATION
@@ -210,6 +211,7 @@ class ExperimentConfig(Checked):
     baselines: BaselinesConfig = field(default_factory=BaselinesConfig)
     compare: CompareConfig = field(default_factory=CompareConfig, metadata=role("machine"))
     compare_video: CompareVideoConfig = field(default_factory=CompareVideoConfig, metadata=role("machine"))
+    plan: PlanConfig = field(default_factory=PlanConfig, metadata=role("call"))
     metrics: MetricsConfig = field(default_factory=MetricsConfig, metadata=role("machine"))
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     logging: LoggingConfig = field(default_factory=LoggingConfig, metadata=role("machine"))

@@ -1,0 +1,176 @@
+"""What a plan costs: how far the imagined future is from a goal image, in slots or in pixels.
+
+    J(z_{1:H}) = (1 - a) d(S^_H, G) + a / H sum_t d(S^_t, G),   d(S, G) = min_pi 1/ND sum_n |S_n - G_pi(n)|^2
+
+with the weight a of the way (`along`): 0 asks where the plan ends, 1 also how soon it is there. The futures come from
+the cached rollout, all candidates at once; what was seen before the plan begins may be given as seed frames.
+
+Shapes: M candidates, H horizon, S seed frames, N slots, D slot width, Z latent-action width, W H image size. "[N,]" is
+there with one latent action per slot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from playslot_rl.frames import normalise
+from playslot_rl.modules.inverse_dynamics import InverseDynamics
+from playslot_rl.modules.savi import SAVi
+from playslot_rl.modules.whitening import Whitening
+from playslot_rl.world_model import WorldModel
+
+Distance = Callable[[Tensor], Tensor]
+"""Slots (..., N, D) to how far each frame is from the goal (...)."""
+
+
+class SlotDistance:
+    """Mean squared difference of slots to the goal's.
+
+    Args:
+        goal: (N, D).
+        match: whether the order of the slots is free: each frame is then matched with the goal by the Hungarian
+            algorithm. Learned initial slots keep their order, and matching only lets things change places.
+
+    Examples:
+        >>> goal = torch.tensor([[0.0, 1.0], [2.0, 3.0]])
+        >>> float(SlotDistance(goal)(goal.flip(0))), float(SlotDistance(goal, match=True)(goal.flip(0)))
+        (4.0, 0.0)
+    """
+
+    def __init__(self, goal: Tensor, match: bool = False) -> None:
+        self.goal, self.match = goal, match
+
+    def __call__(self, slots: Tensor) -> Tensor:
+        """Slots (..., N, D) to distances (...), differentiable."""
+        if not self.match:
+            return (slots - self.goal).square().mean((-2, -1))
+        flat = slots.reshape(-1, *self.goal.shape)
+        pairs = (flat[:, :, None] - self.goal).square().mean(-1)  # (M, N, N): predicted slot, goal slot
+        return pairs.gather(2, assignment(pairs)[..., None]).mean((1, 2)).reshape(slots.shape[:-2])
+
+
+@torch.no_grad()
+def assignment(pairs: Tensor) -> Tensor:
+    """Which goal slot (M, N) each slot is matched with, so that the sum of the pairs' costs (M, N, N) is least."""
+    from scipy.optimize import linear_sum_assignment
+
+    costs = np.nan_to_num(pairs.double().cpu().numpy(), nan=1e300, posinf=1e300)
+    return torch.from_numpy(np.stack([linear_sum_assignment(cost)[1] for cost in costs])).to(pairs.device)
+
+
+class DynamicsDistance:
+    """Mean squared difference of the scene dynamics, in whitened coordinates of the latent actions.
+
+        d(S, G) = 1/Z |W^-1 (mu(S) - mu(G))|^2
+
+    A latent action is a difference of InvDyn's means, z_t = mu_{t+1} - mu_t, so mu(G) - mu(S) is the sum of the latent
+    actions that lead from S to G, and W^-1 counts it in steps of a typical motion. Slots saturate: once an object is
+    out of the place where the goal has it, they no longer say how far (docs/planning.md).
+
+    Args:
+        inverse_dynamics: in evaluation mode, of a mode that infers latent actions.
+        whitening: of its latent actions.
+        goal: (N, D).
+
+    Raises:
+        ValueError: it has no encoder (modes `ground_truth` and `none`).
+    """
+
+    def __init__(self, inverse_dynamics: InverseDynamics, whitening: Whitening, goal: Tensor) -> None:
+        mode = inverse_dynamics.config.mode
+        if mode in ("ground_truth", "none"):
+            raise ValueError(f"cost dynamics: got mode {mode}, expected one that infers latents: use plan.cost=slots")
+        self.inverse_dynamics, self.whitening = inverse_dynamics, whitening
+        self.goal = inverse_dynamics.scene_dynamics(goal)[0]
+
+    def __call__(self, slots: Tensor) -> Tensor:
+        """Slots (..., N, D) to distances (...), differentiable."""
+        here = self.inverse_dynamics.scene_dynamics(slots)[0]
+        squares = self.whitening.turn(here - self.goal).square()
+        return squares.flatten(slots.ndim - 2).mean(-1)
+
+
+class ImageDistance:
+    """Mean squared difference of decoded frames to the goal image: dearer, and blind to what is hidden.
+
+    Args:
+        savi: decodes slots.
+        goal: (3, H, W), uint8 [0, 255] or float [0, 1].
+    """
+
+    def __init__(self, savi: SAVi, goal: Tensor) -> None:
+        self.savi, self.goal = savi, normalise(goal)
+
+    def __call__(self, slots: Tensor) -> Tensor:
+        """Slots (..., N, D) to distances (...), differentiable."""
+        frames: Tensor = self.savi.decode(slots).frames
+        return (frames - self.goal).square().mean((-3, -2, -1))
+
+
+class GoalCost:
+    """Cost of latent actions from where an episode stands.
+
+    Args:
+        world_model: in evaluation mode.
+        slots: (S, N, D) of the frames seen so far, the present one last; at most the predictor's context.
+        past: (S - 1, [N,] Z), the latent actions between them.
+        distance: to the goal.
+        along: a, 0 to 1.
+        rows: candidates imagined at once, for the memory.
+    """
+
+    def __init__(
+        self,
+        world_model: WorldModel,
+        slots: Tensor,
+        past: Tensor,
+        distance: Distance,
+        along: float = 0.5,
+        rows: int = 512,
+    ) -> None:
+        self.world_model, self.slots, self.past = world_model, slots, past
+        self.distance, self.along, self.rows = distance, along, rows
+
+    def imagine(self, latents: Tensor) -> Tensor:
+        """Slots (M, H, N, D) that follow the present frame under latent actions (M, H, [N,] Z)."""
+        m = len(latents)
+        z = torch.cat([self.past.expand(m, *self.past.shape), latents], 1)
+        p, v = self.world_model.inverse_dynamics.split(z)
+        seed = self.slots.expand(m, *self.slots.shape)
+        future: Tensor = self.world_model.predictor.rollout(seed, p, v)
+        return future[:, len(self.past) :]
+
+    def __call__(self, latents: Tensor) -> Tensor:
+        """Latent actions (M, H, [N,] Z) to costs (M,)."""
+        return torch.cat([self._cost(some) for some in latents.split(self.rows)])
+
+    def _cost(self, latents: Tensor) -> Tensor:
+        future = self.imagine(latents)
+        last = self.distance(future[:, -1])
+        if self.along == 0:
+            return last
+        return (1 - self.along) * last + self.along * self.distance(future).mean(1)
+
+
+@torch.no_grad()
+def parse_goal(savi: SAVi, state: Tensor, goal: Tensor, looks: int = 1) -> Tensor:
+    """Slots of a goal image as SAVi would track them there: parsed as the frame after the first one, not as a first.
+
+    Parsed as a first frame the slots of the same picture lie five times as far from the tracked ones.
+
+    Args:
+        savi: in evaluation mode.
+        state: (n, N, D), SAVi's state after the first frame of the episodes.
+        goal: (n, 3, H, W), uint8 [0, 255] or float [0, 1].
+        looks: how many times the image is shown; a far goal may take the slots more than one correction to reach.
+
+    Returns:
+        (n, N, D).
+    """
+    clip = normalise(goal)[:, None].expand(-1, looks, -1, -1, -1)
+    slots: Tensor = savi(clip, state)[0]
+    return slots[:, -1]

@@ -1,0 +1,184 @@
+"""What a planner is: a search for the latent actions whose imagined future costs least.
+
+    z*_{1:H} = argmin_z  cost(rollout(S, z_{1:H}))
+
+It sees a `Search` alone: what a plan costs, and how latent actions are distributed. So the same planner serves the
+world model, a toy cost in a test, and any other model.
+
+All planners but the categorical one search in whitened coordinates c of the latents (`playslot_rl.modules.whitening`),
+where the training latents have unit scale: a standard deviation of 1 in the latents themselves, where theirs is a
+tenth, draws futures that the model has never seen.
+
+Shapes: M candidates, H horizon, Z latent-action width. "[N,]" is there with one latent action per slot.
+"""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from playslot_rl.modules.whitening import FADE, Whitening
+from playslot_rl.world_model import Agent
+
+Cost = Callable[[Tensor], Tensor]
+"""Latent actions (M, H, [N,] Z) to what each plan costs (M,), lower is better."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """A problem to be planned in.
+
+    Attributes:
+        cost: of candidates; differentiable for the gradient planner.
+        shape: (H, [N,] Z) of a plan.
+        whitening: mean and scale of the latent actions.
+        starts: plans (S, H, [N,] Z) to begin with, such as the shifted last plan or a policy's; S may be 0.
+        bound: the search stays where every whitened coordinate is in [-bound, bound]; beyond, the model is guessing.
+        seconds: of wall clock that the search may take, at least one iteration; 0: the planner's iterations decide,
+            and the plan is a function of its inputs.
+    """
+
+    cost: Cost
+    shape: tuple[int, ...]
+    whitening: Whitening
+    starts: Tensor
+    bound: float = 3.0
+    seconds: float = 0.0
+
+    def rounds(self, iterations: int) -> Iterator[int]:
+        """Number the iterations: so many, or as many as begin within the time."""
+        begin, done = time.perf_counter(), 0
+        while done == 0 or (time.perf_counter() - begin < self.seconds if self.seconds else done < iterations):
+            yield done
+            done += 1
+
+    def latents(self, coordinates: Tensor) -> Tensor:
+        """Whitened coordinates (..., Z) to latent actions."""
+        return self.whitening.inverse(coordinates)
+
+    def coordinates(self, latents: Tensor) -> Tensor:
+        """Latent actions (..., Z) to whitened coordinates, inside the bound."""
+        return self.whitening(latents).clamp(-self.bound, self.bound)
+
+    def normal(self, count: int, generator: torch.Generator) -> Tensor:
+        """Standard normal numbers (count, H, [N,] Z)."""
+        return torch.randn(count, *self.shape, generator=generator, device=generator.device)
+
+
+class Plan(NamedTuple):
+    """What was found.
+
+    Attributes:
+        latents: (H, [N,] Z), the best of all candidates whose cost was computed.
+        cost: its cost.
+        costs: the best cost known after each iteration; never rises.
+    """
+
+    latents: Tensor
+    cost: float
+    costs: list[float]
+
+
+class Planner(Protocol):
+    """A way of searching."""
+
+    def __call__(self, search: Search, generator: torch.Generator) -> Plan:
+        """Search.
+
+        Args:
+            search: the problem.
+            generator: draws all candidates, on the device of the search.
+
+        Raises:
+            ValueError: the search has no finite cost at all.
+        """
+
+
+class Best:
+    """The best plan so far. Plans to begin with are tried first, so that nothing worse than they are is returned."""
+
+    def __init__(self, search: Search) -> None:
+        self.search, self.costs = search, list[float]()
+        self.latents, self.cost = search.whitening.mean.expand(search.shape), float("inf")
+
+    @torch.no_grad()
+    def begin(self) -> Tensor:
+        """Try the mean latent action held and the given plans; returns the better one's latents (H, [N,] Z)."""
+        tried = torch.cat([self.latents[None], self.search.starts])
+        self.offer(tried, self.search.cost(tried))
+        return self.latents
+
+    def offer(self, latents: Tensor, costs: Tensor) -> Tensor:
+        """Take the best of some candidates if it is better; returns their costs (M,), infinite where not finite."""
+        costs = torch.where(costs.isfinite(), costs, torch.inf).detach()
+        index = int(costs.argmin())
+        if float(costs[index]) < self.cost:
+            self.latents, self.cost = latents[index].detach().clone(), float(costs[index])
+        return costs
+
+    def note(self) -> None:
+        """An iteration is over."""
+        self.costs.append(self.cost)
+
+    def plan(self) -> Plan:
+        """The result.
+
+        Raises:
+            ValueError: no candidate had a finite cost.
+        """
+        if self.cost == float("inf"):
+            raise ValueError("plan: got no finite cost, expected one: look at the goal and at the model's predictions")
+        return Plan(self.latents, self.cost, self.costs)
+
+
+def shifted(plan: Tensor, steps: int, fill: Tensor) -> Tensor:
+    """A plan (H, [N,] Z) after `steps` of it were executed: the rest, then `fill` ([N,] Z) to the horizon.
+
+    Examples:
+        >>> shifted(torch.tensor([[1.0], [2.0], [3.0]]), 2, torch.zeros(1)).flatten().tolist()
+        [3.0, 0.0, 0.0]
+    """
+    rest = plan[steps:]
+    return torch.cat([rest, fill.expand(len(plan) - len(rest), *plan.shape[1:])])
+
+
+@torch.no_grad()
+def unfaded(whitening: Whitening) -> Whitening:
+    """The same mean and directions with the data's own deviations, at least a thousandth of the first one's.
+
+    Examples:
+        >>> z = torch.randn(1000, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.01])
+        >>> whitening = Whitening(2)
+        >>> whitening.fit(z)
+        >>> [round(float(s), 2) for s in unfaded(whitening)(z).std(dim=0)]
+        [1.0, 1.0]
+    """
+    plain = copy.deepcopy(whitening)
+    squares = whitening.scale.double().square()
+    first = squares[0] / (1 + FADE)
+    plain.scale.copy_((squares - FADE * first).clamp(min=1e-6 * first).sqrt())
+    return plain
+
+
+def latent_statistics(agent: Agent) -> Whitening:
+    """Mean, directions and deviations of the latent actions that an agent was trained on: by its policy's whitening
+    (the demonstrations' inferred latents), else its action decoder's whitening, else that one's mean and scale.
+
+    Note: networks take coordinates in which directions of next to no variance fade out. A search must draw in these
+    directions what the data have there, next to nothing, or most of a plan is noise that the model has never seen; so
+    the fading is taken back.
+    """
+    found = agent.policy.whitening or agent.action_decoder.whitening
+    if found is not None:
+        return unfaded(found)
+    decoder = agent.action_decoder
+    plain = Whitening(decoder.mean.shape[-1]).to(decoder.mean.device)
+    plain.mean.copy_(decoder.mean)
+    plain.scale.copy_(decoder.scale)
+    return plain

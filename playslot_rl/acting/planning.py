@@ -1,0 +1,179 @@
+"""Acting by planning: parse, search for latent actions, execute the first few through the action decoder, plan again.
+
+Shapes: n episodes side by side, H horizon, C frames of history, N slots, D slot width, Z latent-action width, A action
+width, H W image height and width.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from playslot_rl import keys
+from playslot_rl.acting.actor import Actor
+from playslot_rl.acting.agent import imagine
+from playslot_rl.acting.planners import Planner, Search, latent_statistics, shifted
+from playslot_rl.acting.planners.costs import (
+    Distance,
+    DynamicsDistance,
+    GoalCost,
+    ImageDistance,
+    SlotDistance,
+    parse_goal,
+)
+from playslot_rl.config.planning import PlanConfig, SearchSize
+from playslot_rl.seeding import step_generator
+from playslot_rl.world_model import Agent, action_decoder_module, frame_parser_module
+
+Goals = Callable[[Sequence[int]], Tensor]
+"""Seeds of n episodes to their goal images (n, 3, H, W) uint8 [0, 255]."""
+
+_MEMORY = (
+    keys.SLOT_STATE,
+    keys.SLOT_AGE,
+    keys.SLOT_HISTORY,
+    keys.STEP_COUNT,
+    keys.EPISODE_SEED,
+    keys.GOAL_PIXELS,
+    keys.GOAL_SLOTS,
+    keys.PLANNED_LATENTS,
+    keys.PREDICTED_SLOTS,
+    keys.PLAN_COST,
+    keys.PROPOSAL_COST,
+    keys.PLAN_SECONDS,
+)
+
+
+class PlanningActor(Actor):
+    """Plans every few steps towards a goal image, and executes the plan's latent actions by the action decoder.
+
+    A plan begins where the last one ends: shifted by what was executed, the mean latent action at its end. With
+    `policy` the latent policy's imagined rollout from the present slots is a plan to begin with too, so that what is
+    found costs no more in imagination than what the policy would do.
+
+    The plan, its imagined slots PREDICTED_SLOTS (n, H + 1, N, D), its cost and the seconds it took stay in the memory,
+    for who looks on. Candidates are drawn by the episode's seed and the step, so that episodes side by side do not
+    touch each other.
+
+    Args:
+        agent: in evaluation mode.
+        planner: the search.
+        plan: cost, history and bounds.
+        size: horizon, and how much of it is executed.
+        goals: images to reach.
+        policy: begin with the latent policy's rollout.
+        seed: of the candidates, beside that of the episode.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        planner: Planner,
+        plan: PlanConfig,
+        size: SearchSize,
+        goals: Goals,
+        policy: bool = False,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(_MEMORY)
+        self.agent, self.planner, self.config, self.size = agent, planner, plan, size
+        self.goals, self.policy, self.seed = goals, policy, seed
+        self.whitening = latent_statistics(agent)
+        self.parser = frame_parser_module(agent.world_model.savi)
+        self.decoder = action_decoder_module(agent.action_decoder)
+        self.frames_seen = min(plan.history, agent.world_model.config.predictor.context)
+
+    def reset(self, seeds: Sequence[int]) -> TensorDict:
+        """Nothing seen and nothing planned; the goals are there."""
+        memory, n = super().reset(seeds), len(seeds)
+        model, h = self.agent.world_model, self.size.horizon
+        self.parser.module.generator = torch.Generator(self.device).manual_seed(seeds[0])
+        memory[keys.SLOT_STATE] = torch.zeros(n, *model.slot_shape)
+        memory[keys.SLOT_AGE] = torch.zeros(n, 1, dtype=torch.long)
+        memory[keys.SLOT_HISTORY] = torch.zeros(n, self.frames_seen, *model.slot_shape)
+        memory[keys.STEP_COUNT] = torch.zeros(n, 1, dtype=torch.long)
+        memory[keys.EPISODE_SEED] = torch.tensor(seeds)[:, None]
+        memory[keys.GOAL_PIXELS] = self.goals(seeds)
+        memory[keys.GOAL_SLOTS] = torch.zeros(n, *model.slot_shape)
+        memory[keys.PLANNED_LATENTS] = torch.zeros(n, h, *model.latent_shape)
+        memory[keys.PREDICTED_SLOTS] = torch.zeros(n, h + 1, *model.slot_shape)
+        for key in (keys.PLAN_COST, keys.PROPOSAL_COST, keys.PLAN_SECONDS):
+            memory[key] = torch.zeros(n, 1)
+        return memory
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Parse, plan where a plan is due, and take the plan's present step."""
+        self.parser(tensordict)
+        slots, step = tensordict.get(keys.SLOTS), tensordict.get(keys.STEP_COUNT)
+        history = torch.cat([tensordict.get(keys.SLOT_HISTORY)[:, 1:], slots[:, None]], 1)
+        tensordict.set(keys.SLOT_HISTORY, history)
+        fresh = step.squeeze(-1) == 0
+        if bool(fresh.any()):
+            state, goal = tensordict.get(keys.SLOT_STATE), tensordict.get(keys.GOAL_PIXELS)
+            goal_slots = tensordict.get(keys.GOAL_SLOTS).clone()
+            goal_slots[fresh] = parse_goal(self.agent.world_model.savi, state[fresh], goal[fresh], self.config.looks)
+            tensordict.set(keys.GOAL_SLOTS, goal_slots)
+        for row in range(len(step)):
+            if int(step[row]) % self.size.every == 0:
+                self._plan(tensordict, row)
+        now = (step.squeeze(-1) % self.size.every).clamp(max=self.size.horizon - 1)
+        rows = torch.arange(len(step), device=step.device)
+        tensordict.set(keys.LATENT_ACTION, tensordict.get(keys.PLANNED_LATENTS)[rows, now])
+        return self.decoder(tensordict).set(keys.STEP_COUNT, step + 1)
+
+    def _plan(self, tensordict: TensorDictBase, row: int) -> None:
+        """Renew the plan of one episode in the tensordict."""
+        begin = time.perf_counter()
+        step, seed = int(tensordict.get(keys.STEP_COUNT)[row]), int(tensordict.get(keys.EPISODE_SEED)[row])
+        cost = self._cost(tensordict, row, step)
+        proposal = self._proposal(cost.slots[-1])
+        starts = proposal
+        if step:
+            last = tensordict.get(keys.PLANNED_LATENTS)[row]
+            starts = torch.cat([proposal, shifted(last, self.size.every, self.whitening.mean)[None]])
+        shape = (self.size.horizon, *self.agent.world_model.latent_shape)
+        search = Search(cost, shape, self.whitening, starts, self.config.bound, self.config.seconds)
+        plan = self.planner(search, step_generator(seed, step, f"plan-{self.seed}", self.device))
+        future = torch.cat([cost.slots[-1:], cost.imagine(plan.latents[None])[0]])
+        offered = float(cost(proposal)[0]) if len(proposal) else float("nan")
+        found = {
+            keys.PLANNED_LATENTS: plan.latents,
+            keys.PREDICTED_SLOTS: future,
+            keys.PLAN_COST: torch.tensor([plan.cost]),
+            keys.PROPOSAL_COST: torch.tensor([offered]),
+            keys.PLAN_SECONDS: torch.tensor([time.perf_counter() - begin]),
+        }
+        for key, value in found.items():
+            whole = tensordict.get(key).clone()  # the memory's tensors are others' too
+            whole[row] = value.to(whole.device)
+            tensordict.set(key, whole)
+
+    def _cost(self, tensordict: TensorDictBase, row: int, step: int) -> GoalCost:
+        """The cost of plans from where an episode stands."""
+        model = self.agent.world_model
+        seen = tensordict.get(keys.SLOT_HISTORY)[row, -min(step + 1, self.frames_seen) :]
+        past = model.inverse_dynamics(seen[None]).z[0] if len(seen) > 1 else seen.new_empty(0, *model.latent_shape)
+        distance = self.distance(tensordict.get(keys.GOAL_SLOTS)[row], tensordict.get(keys.GOAL_PIXELS)[row])
+        return GoalCost(model, seen, past, distance, self.config.along)
+
+    def distance(self, goal: Tensor, image: Tensor) -> Distance:
+        """Distance to a goal, of slots (N, D) and image (3, H, W), by the config's `cost`."""
+        model, config = self.agent.world_model, self.config
+        if config.cost == "image":
+            return ImageDistance(model.savi, image)
+        if config.cost == "dynamics":
+            return DynamicsDistance(model.inverse_dynamics, self.agent.policy.whitening or self.whitening, goal)
+        free = model.config.savi.initial == "gaussian" if config.match is None else config.match
+        return SlotDistance(goal, free)
+
+    def _proposal(self, slots: Tensor) -> Tensor:
+        """The latent policy's imagined rollout from slots (N, D): latent actions (1, H, Z), or none (0, H, Z)."""
+        h = self.size.horizon
+        if not self.policy:
+            return slots.new_empty(0, h, *self.agent.world_model.latent_shape)
+        return imagine(self.agent, TensorDict({keys.SLOTS: slots[None]}, [1]), h).latents

@@ -1,0 +1,157 @@
+"""`playslot plan run=DIR planner=NAME proposal=none|policy episodes=N seed=S`: goal images reached by planning.
+
+Writes `RUN/planning/GOALS/METHOD/eval_info.json`, `plan.png` beside it, `GOALS/cost.png`, and the table
+`RUN/planning/planning.md` and `.json` (docs/planning.md).
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config.compose import shipped
+from playslot_rl.config.planning import GoalName, search_size
+from playslot_rl.envs import gym_id
+from playslot_rl.errors import CheckpointError
+from playslot_rl.recipes.evaluate import check_environment, check_run, take_shipped
+
+if TYPE_CHECKING:
+    from playslot_rl.acting.actor import Actor
+    from playslot_rl.evaluation.goals import GoalEpisode, GoalPool
+    from playslot_rl.world_model import Agent
+
+EPISODES = 20
+
+
+def main(config: ExperimentConfig) -> None:
+    """Plan towards both kinds of goals, beside random actions and the latent policy, and print the table.
+
+    Raises:
+        ConfigError: no run, an environment without a simulator, or settings that do not fit together.
+        CheckpointError: the run has no trained policy, whose action decoder executes plans.
+        OutputError: the results cannot be written.
+    """
+    run = check_run(config)
+    gym_id(config.env.name)  # refuses what has no simulator
+    frame_skip = config.env.frame_skip
+    sizes = {goals: search_size(config.plan, goals, frame_skip) for goals in config.plan.goals}
+    if config.method != "playslot":
+        raise CheckpointError(f"run={config.run}: got a run of method={config.method}, expected one of playslot's own")
+    if shipped(config.run):
+        run = take_shipped(config)
+    from playslot_rl.evaluation.goals import GoalPool
+    from playslot_rl.evaluation.planning_table import table
+    from playslot_rl.evaluation.success import run_facts
+    from playslot_rl.recipes.run import open_device
+    from playslot_rl.storage.atomic import write_json, write_text
+    from playslot_rl.training.runs import load_agent
+
+    facts = run_facts(run)
+    agent = load_agent(run, open_device(config))
+    check_environment(config, agent.world_model.env.image_size, agent.world_model.env.action_dim)
+    folder, parts = run / "planning", {}
+    for goals, size in sizes.items():
+        with GoalPool(config.env, config.render) as pool:
+            common = {"demos": facts.demos, "labelled_demos": facts.labelled_demos, **_facts(config, run)}
+            common |= {"fingerprints": facts.fingerprints, "commit": facts.commit, "size": asdict(size)}
+            parts[goals] = _measure(config, agent, pool, goals, folder / goals, common)
+    report = {"run": config.run, "command": "playslot " + " ".join(sys.argv[1:]), "settings": to_dict(config.plan)}
+    report |= {"goals": parts, **_facts(config, run)}
+    write_json(folder / "planning.json", report)
+    write_text(folder / "planning.md", table(report))
+    print(table(report) + f"\nwritten to {folder / 'planning.md'}", flush=True)
+
+
+def _facts(config: ExperimentConfig, run: Path) -> dict[str, Any]:
+    """What every result of this command says alike."""
+    from playslot_rl.evaluation.success import hardware, task_facts
+
+    return {"seed": config.seed, **task_facts(config, config.seed), "hardware": hardware(), "folder": str(run)}
+
+
+def _measure(
+    config: ExperimentConfig, agent: Agent, pool: GoalPool, goals: GoalName, folder: Path, common: dict[str, Any]
+) -> dict[str, Any]:
+    """All ways of acting towards one kind of goal: a part of the report."""
+    from playslot_rl.evaluation.goals import make_goals
+    from playslot_rl.evaluation.planning import cost_along_solution, play, results
+    from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
+    from playslot_rl.storage.atomic import write_bytes, write_json
+    from playslot_rl.visualization.charts import LIGHT
+    from playslot_rl.visualization.planning import solution_chart
+
+    plan, first, whole = config.plan, first_seed(config, config.seed), config.env.max_steps
+    episodes = make_goals(pool, range(first, first + (config.episodes or EPISODES)), goals, plan, config.seed)
+    check_disjoint([episode.seed for episode in episodes], training_seeds(config, Path(common["folder"])))
+    solution = cost_along_solution(agent, episodes, plan.looks, plan.match)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_bytes(folder / "cost.png", solution_chart(solution, LIGHT))
+    steps = whole if goals == "solved" else max(2, round(plan.budget / config.env.frame_skip))
+    every, found = common["size"]["every"], {}
+    for name, actor in _actors(config, agent, goals, episodes).items():
+        played = play(pool, actor, episodes, goals, steps, every, draw=False)
+        found[name] = {
+            "method": name,
+            "protocol": f"planning, goals {goals}",
+            "episodes": len(episodes),
+            "seeds": [episode.seed for episode in episodes],
+            "max_steps": steps,
+            "planning": to_dict(plan),
+            **results(played, episodes, plan.near),
+            **common,
+        }
+        print(f"{goals}: {name}: {100 * found[name]['success_rate']:.0f} %, {played.wall:.0f} s", flush=True)
+        (folder / name).mkdir(exist_ok=True)
+        write_json(folder / name / "eval_info.json", found[name])
+        if played.plans and plan.pictures:
+            _draw(agent, episodes[: plan.pictures], played, folder / name)
+    part = {"episodes": len(episodes), "max_steps": steps, "size": common["size"], "rows": found}
+    return {**part, "cost_along_solution": solution}
+
+
+def _actors(config: ExperimentConfig, agent: Agent, goals: GoalName, episodes: list[GoalEpisode]) -> dict[str, Actor]:
+    """Ways of acting, by the name of their row."""
+    import torch
+
+    from playslot_rl.acting.actor import RandomActor
+    from playslot_rl.acting.agent import playslot_actor
+    from playslot_rl.acting.planners import build_planner
+    from playslot_rl.acting.planning import PlanningActor
+
+    plan, size = config.plan, search_size(config.plan, goals, config.env.frame_skip)
+    images = {episode.seed: episode.image for episode in episodes}
+    actors: dict[str, Actor] = {}
+    if config.evaluation.references:
+        actors["random"] = RandomActor(config.env.max_steps, config.env.action_dim)
+        actors["policy"] = playslot_actor(agent)
+    for name in plan.planner:
+        planner = build_planner(name, plan, size, agent.world_model)
+        for proposal in plan.proposal:
+            row = name if proposal == "none" else f"{name}-{proposal}"
+            actors[row] = PlanningActor(
+                agent,
+                planner,
+                plan,
+                size,
+                lambda seeds: torch.stack([images[seed] for seed in seeds]),
+                policy=proposal == "policy",
+                seed=config.seed,
+            )
+    return {name: actor.eval() for name, actor in actors.items()}
+
+
+def _draw(agent: Agent, episodes: list[GoalEpisode], played: Any, folder: Path) -> None:
+    """The first plans, and what came of them."""
+    import numpy as np
+
+    from playslot_rl.evaluation.planning import decoded_plan
+    from playslot_rl.storage.atomic import write_bytes
+    from playslot_rl.visualization.grid import png
+    from playslot_rl.visualization.planning import plan_sheet
+
+    plans = [decoded_plan(agent, slots) for slots in played.plans[: len(episodes)]]
+    executed = [np.stack(trace.frames) for trace in played.traces[: len(episodes)]]
+    write_bytes(folder / "plan.png", png(plan_sheet([e.frames for e in episodes], plans, executed)))
