@@ -24,6 +24,7 @@ from playslot_rl.recipes.adopt_trials import (
     scheduled,
     seconds_a_step,
     steps_within,
+    too_short,
     with_prototypes,
     with_slots,
 )
@@ -138,10 +139,18 @@ def _chosen_slots(config: ExperimentConfig, run: Path, decide: Decisions, budget
     )
     if len(tried) > 1:
         steps = steps_within(budget["slots_trials"] / len(tried), milliseconds / 1000)
-        slots = decide("slots", lambda: choose_slots(config, trials, steps))
+        few = too_short(steps, "the scene is not taken apart", config.model.savi.n_slots)
+        slots = decide("slots", lambda: few or choose_slots(config, trials, steps))
     else:
         slots = decide("slots", lambda: Choice(tried[0], "as asked for"))
     steps = steps_within(budget["slots"], milliseconds / 1000)
+    if steps < config.slots.steps / 2:
+        enough = math.ceil(config.minutes * config.slots.steps / steps)
+        print(
+            f"note: minutes={config.minutes:g} are {steps} steps of SAVi on this machine; the preset's "
+            f"{config.slots.steps} would take minutes={enough}",
+            flush=True,
+        )
     return scheduled(with_slots(config, slots), "slots", steps, config.adopt.patience)
 
 
@@ -152,7 +161,8 @@ def _chosen_prototypes(
     trials, child = run / "trials", replace(config, run=str(run))
     milliseconds = decide("milliseconds a step of the dynamics", lambda: _timed(child, "dynamics", trials))
     steps = steps_within(budget["dynamics_trial"], milliseconds / 1000)
-    prototypes = decide("prototypes", lambda: choose_prototypes(config, run, trials / "prototypes", steps))
+    few = too_short(steps, "one prototype holds all", config.model.inverse_dynamics.n_prototypes)
+    prototypes = decide("prototypes", lambda: few or choose_prototypes(config, run, trials / "prototypes", steps))
     steps = steps_within(budget["dynamics"], milliseconds / 1000)
     return scheduled(with_prototypes(config, prototypes), "dynamics", steps, config.adopt.patience)
 

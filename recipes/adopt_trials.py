@@ -21,6 +21,8 @@ CARRIED: Final = 0.95
 """Share of the transitions that the prototypes in use have to carry."""
 FEWEST: Final = 4
 """Prototypes at least."""
+TELLING: Final = 150
+"""Steps from which on a trial says something: before that slots are not taken apart and one prototype holds all."""
 
 
 def _quietly() -> contextlib.AbstractContextManager[Any]:
@@ -67,6 +69,13 @@ def seconds_a_step(config: ExperimentConfig, stage: str, out: Path) -> float:
     with _quietly():
         (train_slots if stage == "slots" else train_dynamics).main(replace(timed, out=str(out)))
     return float(read_stage(checkpoint_folder(out, stage), stage).meta["seconds"]) / TIMED_STEPS
+
+
+def too_short(steps: int, what: str, preset: int) -> Choice | None:
+    """The preset's number where the time allows no trial that would say anything."""
+    if steps >= TELLING:
+        return None
+    return Choice(preset, f"the preset's: the time is enough for {steps} steps of a trial, and below {TELLING} {what}")
 
 
 def choose_slots(config: ExperimentConfig, out: Path, steps: int) -> Choice:

@@ -14,8 +14,9 @@ from commands import refused, smoke
 
 from playslot_rl.config.compose import compose
 from playslot_rl.modules.savi import SAVi
+from playslot_rl.recipes import adopt_trials
 from playslot_rl.recipes.adopt import savi_for
-from playslot_rl.recipes.adopt_trials import SHORTEST, scheduled, steps_within
+from playslot_rl.recipes.adopt_trials import SHORTEST, scheduled, steps_within, too_short
 
 QUICK = ("minutes=0.02", "adopt.slots=[2,3]", "adopt.prototypes=4")
 
@@ -42,9 +43,12 @@ def any_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_set(tmp_path_factory.mktemp("any") / "set", (24, 30, 26, 24, 28), speed=2)
 
 
-def test_a_set_that_nobody_prepared_becomes_a_world_model(any_set: Path, tmp_path: Path) -> None:
+def test_a_set_that_nobody_prepared_becomes_a_world_model(
+    any_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import playslot_rl
 
+    monkeypatch.setattr(adopt_trials, "TELLING", SHORTEST)  # trials although there is no time
     run = tmp_path / "run"
     done = smoke("adopt", f"data.root={any_set}", f"out={run}", *QUICK)
     made = json.loads((run / "adopt.json").read_text())["choices"]
@@ -93,6 +97,14 @@ def test_every_preset_has_a_savi_for_every_frame_size(preset: str, size: int) ->
     sizes = savi_for(compose([f"preset={preset}"], "adopt").model.savi, size)
     savi = SAVi(replace(sizes, decoder_channels=tuple(4 for _ in sizes.decoder_channels)), size)
     assert savi.decode(torch.zeros(1, sizes.n_slots, sizes.slot_dim)).frames.shape == (1, 3, size, size)
+
+
+def test_a_trial_that_is_too_short_chooses_nothing() -> None:
+    few = too_short(20, "nothing is seen", preset=4)
+    assert few is not None
+    assert few.value == 4
+    assert "20 steps" in few.reason
+    assert too_short(adopt_trials.TELLING, "nothing is seen", preset=4) is None
 
 
 def test_schedules_shrink_with_the_time_that_there_is() -> None:
