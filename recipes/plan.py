@@ -15,11 +15,10 @@ from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import shipped
 from playslot_rl.config.planning import GoalName, search_size
 from playslot_rl.envs import gym_id
-from playslot_rl.errors import CheckpointError
+from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes.evaluate import check_environment, check_run, take_shipped
 
 if TYPE_CHECKING:
-    from playslot_rl.acting.actor import Actor
     from playslot_rl.evaluation.goals import GoalEpisode, GoalPool
     from playslot_rl.world_model import Agent
 
@@ -37,7 +36,10 @@ def main(config: ExperimentConfig) -> None:
     run = check_run(config)
     gym_id(config.env.name)  # refuses what has no simulator
     frame_skip = config.env.frame_skip
-    sizes = {goals: search_size(config.plan, goals, frame_skip) for goals in config.plan.goals}
+    try:
+        sizes = {goals: search_size(config.plan, goals, frame_skip) for goals in config.plan.goals}
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
     if config.method != "playslot":
         raise CheckpointError(f"run={config.run}: got a run of method={config.method}, expected one of playslot's own")
     if shipped(config.run):
@@ -77,7 +79,7 @@ def _measure(
 ) -> dict[str, Any]:
     """All ways of acting towards one kind of goal: a part of the report."""
     from playslot_rl.evaluation.goals import make_goals
-    from playslot_rl.evaluation.planning import cost_along_solution, play, results
+    from playslot_rl.evaluation.planning import cost_along_solution, play, results, ways_of_acting
     from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
     from playslot_rl.storage.atomic import write_bytes, write_json
     from playslot_rl.visualization.charts import LIGHT
@@ -91,7 +93,7 @@ def _measure(
     write_bytes(folder / "cost.png", solution_chart(solution, LIGHT))
     steps = whole if goals == "solved" else max(2, round(plan.budget / config.env.frame_skip))
     every, found = common["size"]["every"], {}
-    for name, actor in _actors(config, agent, goals, episodes).items():
+    for name, actor in ways_of_acting(config, agent, goals, episodes).items():
         played = play(pool, actor, episodes, goals, steps, every, draw=False)
         found[name] = {
             "method": name,
@@ -110,37 +112,6 @@ def _measure(
             _draw(agent, episodes[: plan.pictures], played, folder / name)
     part = {"episodes": len(episodes), "max_steps": steps, "size": common["size"], "rows": found}
     return {**part, "cost_along_solution": solution}
-
-
-def _actors(config: ExperimentConfig, agent: Agent, goals: GoalName, episodes: list[GoalEpisode]) -> dict[str, Actor]:
-    """Ways of acting, by the name of their row."""
-    import torch
-
-    from playslot_rl.acting.actor import RandomActor
-    from playslot_rl.acting.agent import playslot_actor
-    from playslot_rl.acting.planners import build_planner
-    from playslot_rl.acting.planning import PlanningActor
-
-    plan, size = config.plan, search_size(config.plan, goals, config.env.frame_skip)
-    images = {episode.seed: episode.image for episode in episodes}
-    actors: dict[str, Actor] = {}
-    if config.evaluation.references:
-        actors["random"] = RandomActor(config.env.max_steps, config.env.action_dim)
-        actors["policy"] = playslot_actor(agent)
-    for name in plan.planner:
-        planner = build_planner(name, plan, size, agent.world_model)
-        for proposal in plan.proposal:
-            row = name if proposal == "none" else f"{name}-{proposal}"
-            actors[row] = PlanningActor(
-                agent,
-                planner,
-                plan,
-                size,
-                lambda seeds: torch.stack([images[seed] for seed in seeds]),
-                policy=proposal == "policy",
-                seed=config.seed,
-            )
-    return {name: actor.eval() for name, actor in actors.items()}
 
 
 def _draw(agent: Agent, episodes: list[GoalEpisode], played: Any, folder: Path) -> None:

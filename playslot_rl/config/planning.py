@@ -62,7 +62,7 @@ class PlanConfig(Checked):
     goals: tuple[GoalName, ...] = ("solved", "ahead")
     cost: Literal["slots", "dynamics", "image"] = "dynamics"
     match: bool | None = None
-    along: float = field(default=0.5, metadata=between(0, 1, "0 to 1"))
+    along: float = field(default=0.1, metadata=between(0, 1, "0 to 1"))
     horizon: int | None = field(default=None, metadata=at_least(1, "at least 1 agent step"))
     every: int | None = field(default=None, metadata=at_least(1, "at least 1 agent step"))
     candidates: int | None = field(default=None, metadata=at_least(2, "at least 2"))
@@ -71,7 +71,7 @@ class PlanConfig(Checked):
     descents: int = field(default=4, metadata=at_least(1, "at least 1"))
     seconds: float = field(default=0.0, metadata=at_least(0, "0 (iterations decide) or more"))
     spread: float = field(default=1.0, metadata=_POSITIVE)
-    start_spread: float = field(default=0.5, metadata=_POSITIVE)
+    start_spread: float = field(default=0.2, metadata=_POSITIVE)
     floor: float = field(default=0.05, metadata=_POSITIVE)
     bound: float = field(default=3.0, metadata=_POSITIVE)
     correlation: float = field(default=0.5, metadata=within(lambda value: 0 <= value < 1, "0 to under 1"))
@@ -118,7 +118,7 @@ def search_size(plan: PlanConfig, goals: GoalName, frame_skip: int) -> SearchSiz
         ValueError: more elites than candidates, or more steps executed than planned.
     """
     blocks = max(1, round(25 / frame_skip))
-    own = SearchSize(10, 2, 64, 8, 8) if goals == "solved" else SearchSize(blocks, blocks, 300, 30, 30)
+    own = SearchSize(16, 2, 64, 8, 8) if goals == "solved" else SearchSize(blocks, blocks, 300, 30, 30)
     horizon = plan.horizon or own.horizon
     candidates = plan.candidates or own.candidates
     every, elites = plan.every or min(own.every, horizon), plan.elites or min(own.elites, candidates)

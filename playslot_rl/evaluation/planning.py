@@ -17,16 +17,26 @@ import torch
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import Actor
+from playslot_rl.acting.actor import Actor, RandomActor
+from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.episodes import Moment, Outcome, run_episodes
-from playslot_rl.acting.planners import latent_statistics
-from playslot_rl.acting.planners.costs import DynamicsDistance, GoalCost, ImageDistance, SlotDistance, parse_goal
-from playslot_rl.config.planning import GoalName
+from playslot_rl.acting.planners import build_planner, latent_statistics
+from playslot_rl.acting.planners.costs import (
+    Distance,
+    DynamicsDistance,
+    GoalCost,
+    ImageDistance,
+    SlotDistance,
+    parse_goal,
+)
+from playslot_rl.acting.planning import PlanningActor
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.planning import GoalName, search_size
 from playslot_rl.evaluation.goals import Frames, GoalEpisode, GoalPool, Trace
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.success import summary
-from playslot_rl.frames import normalise
-from playslot_rl.world_model import Agent
+from playslot_rl.frames import normalise, to_uint8
+from playslot_rl.world_model import Agent, module_device
 
 STRIDE: Final = 1
 """Episodes with a goal never start solved, so none is drawn anew."""
@@ -54,6 +64,33 @@ class Played:
     first_costs: list[float] = field(default_factory=list)
     first_proposals: list[float] = field(default_factory=list)
     wall: float = 0.0
+
+
+def ways_of_acting(
+    config: ExperimentConfig, agent: Agent, protocol: GoalName, goals: Sequence[GoalEpisode]
+) -> dict[str, Actor]:
+    """The rows of a table: random actions and the latent policy (unless `evaluation.references` is false), then each
+    planner with each proposal.
+
+    Raises:
+        ConfigError: a planner that the world model cannot serve.
+    """
+    plan, size = config.plan, search_size(config.plan, protocol, config.env.frame_skip)
+    images = {goal.seed: goal.image for goal in goals}
+
+    def image_of(seeds: Sequence[int]) -> Tensor:
+        return torch.stack([images[seed] for seed in seeds]).to(module_device(agent.world_model))
+
+    actors: dict[str, Actor] = {}
+    if config.evaluation.references:
+        actors["random"] = RandomActor(config.env.max_steps, config.env.action_dim)
+        actors["policy"] = playslot_actor(agent)
+    for name in plan.planner:
+        planner = build_planner(name, plan, size, agent.world_model)
+        for proposal in plan.proposal:
+            row, policy = (name, False) if proposal == "none" else (f"{name}-{proposal}", True)
+            actors[row] = PlanningActor(agent, planner, plan, size, image_of, policy, config.seed)
+    return {name: actor.eval() for name, actor in actors.items()}
 
 
 def play(
@@ -172,7 +209,7 @@ def cost_along_solution(
         `model_error`: mean squared slot error after the whole way, imagined under the latents that InvDyn infers on
         it; `moved`: that of standing still.
     """
-    model, device = agent.world_model, agent.world_model.inverse_dynamics.parameters().__next__().device
+    model, device = agent.world_model, module_device(agent.world_model)
     curves: dict[str, list[list[float]]] = {"slots": [], "dynamics": [], "image": []}
     errors, moved = [], []
     free = model.config.savi.initial == "gaussian" if match is None else match
@@ -183,7 +220,7 @@ def cost_along_solution(
         generator.manual_seed(goal.seed)
         state = model.savi(frames[None, :1], generator=generator)[1]
         there = parse_goal(model.savi, state, goal.image[None].to(device), looks)[0]
-        distances = {
+        distances: dict[str, Distance] = {
             "slots": SlotDistance(there, free),
             "dynamics": DynamicsDistance(
                 model.inverse_dynamics, agent.policy.whitening or latent_statistics(agent), there
@@ -213,7 +250,5 @@ def _shape(ways: list[list[float]]) -> dict[str, Any]:
 
 def decoded_plan(agent: Agent, slots: Tensor) -> Frames:
     """The frames (H + 1, H, W, 3) that a plan's slots (H + 1, N, D) show."""
-    from playslot_rl.frames import to_uint8
-
-    device = agent.world_model.inverse_dynamics.parameters().__next__().device
+    device = module_device(agent.world_model)
     return to_uint8(agent.world_model.savi.decode(slots.to(device)).frames.detach())

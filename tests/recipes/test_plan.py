@@ -14,6 +14,7 @@ from playslot_rl.config.planning import PLANNERS, PROPOSALS
 from playslot_rl.errors import ConfigError
 
 SMALL = (
+    "env.max_steps=20",  # smoke's are too few for the expert
     "plan.horizon=3",
     "plan.candidates=4",
     "plan.iterations=1",
@@ -26,7 +27,7 @@ SMALL = (
 def test_a_table_of_everything_and_what_stands_behind_it(run: Path) -> None:
     shutil.rmtree(run / "evaluation")
     before = contents(run)
-    done = smoke("plan", f"run={run}", "planner=cem,gradient", "proposal=all", "episodes=1", *SMALL)
+    done = smoke("plan", f"run={run}", "planner=cem", "proposal=all", "episodes=1", *SMALL)
     after = contents(run)
     assert {path: after[path] for path in before} == before
     assert {path.split("/")[0] for path in after.keys() - before.keys()} == {"planning"}
@@ -35,10 +36,10 @@ def test_a_table_of_everything_and_what_stands_behind_it(run: Path) -> None:
     report = json.loads((run / "planning" / "planning.json").read_text())
     for goals in ("solved", "ahead"):
         part = report["goals"][goals]
-        assert list(part["rows"]) == ["random", "policy", "cem", "cem-policy", "gradient", "gradient-policy"]
+        assert list(part["rows"]) == ["random", "policy", "cem", "cem-policy"]
         assert part["cost_along_solution"].keys() >= {"slots", "dynamics", "image", "model_error"}
         assert (run / "planning" / goals / "cost.png").read_bytes().startswith(b"\x89PNG")
-        for name in ("cem", "gradient-policy"):
+        for name in ("cem", "cem-policy"):
             info = json.loads((run / "planning" / goals / name / "eval_info.json").read_text())
             assert info == part["rows"][name]
             assert info["seconds_per_decision"] > 0
@@ -110,8 +111,6 @@ def test_nothing_to_plan_in_is_refused(tmp_path: Path) -> None:
     refused("plan", message="run: got nothing, expected")
     refused("plan", f"run={tmp_path / 'no'}", message="got no .*config.json", code=2)
     out = f"out={tmp_path / 'new'}"
-    refused(
-        "plan", "run=pretrained/grid_shapes", out, message="got an environment without a simulator|without a policy"
-    )
+    refused("plan", "run=pretrained/grid_shapes", out, message="no pretrained world model for env=grid_shapes")
     refused("plan", "run=pretrained", message="out: got nothing with run=pretrained")
     assert list(tmp_path.iterdir()) == []

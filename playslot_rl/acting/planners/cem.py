@@ -44,7 +44,7 @@ class CEMPlanner:
     iterations: int = 10
     elites: int = 8
     spread: float = 1.0
-    start_spread: float = 0.5
+    start_spread: float = 0.2
     floor: float = 0.05
     correlation: float = 0.5
 

@@ -30,7 +30,7 @@ class GradientPlanner:
     iterations: int = 30
     learning_rate: float = 0.1
     spread: float = 1.0
-    start_spread: float = 0.5
+    start_spread: float = 0.2
     correlation: float = 0.5
 
     def __call__(self, search: Search, generator: torch.Generator) -> Plan:
@@ -51,7 +51,7 @@ class GradientPlanner:
                 optimiser.zero_grad()
                 # The gradient of the logarithm: Adam's steps then depend on no unit, and huge costs do not overflow.
                 relative = costs[finite] / costs[finite].detach().abs().clamp(min=1e-30)
-                relative.sum().backward()  # type: ignore[no-untyped-call]
+                relative.sum().backward()
                 optimiser.step()
                 with torch.no_grad():
                     point.clamp_(-search.bound, search.bound)

@@ -37,7 +37,7 @@ class MPPIPlanner:
     iterations: int = 10
     temperature: float = 0.2
     spread: float = 1.0
-    start_spread: float = 0.5
+    start_spread: float = 0.2
     floor: float = 0.05
     decay: float = 0.8
     correlation: float = 0.5

@@ -60,11 +60,13 @@ class Search:
 
     def latents(self, coordinates: Tensor) -> Tensor:
         """Whitened coordinates (..., Z) to latent actions."""
-        return self.whitening.inverse(coordinates)
+        latents: Tensor = self.whitening.inverse(coordinates)
+        return latents
 
     def coordinates(self, latents: Tensor) -> Tensor:
         """Latent actions (..., Z) to whitened coordinates, inside the bound."""
-        return self.whitening(latents).clamp(-self.bound, self.bound)
+        coordinates: Tensor = self.whitening(latents).clamp(-self.bound, self.bound)
+        return coordinates
 
     def normal(self, count: int, generator: torch.Generator) -> Tensor:
         """Standard normal numbers (count, H, [N,] Z)."""
