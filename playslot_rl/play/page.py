@@ -144,6 +144,8 @@ class PlayPage:
             if "policy" not in names:
                 ui.button("latent policy").props("dense no-caps disable").mark("no-policy")
                 ui.label("this model has no policy: playslot train-policy makes one").classes("text-sm text-gray-500")
+            if self.session.planner is not None:
+                ui.button("Goal", on_click=self._on_goal).props("dense no-caps").mark("goal")
             self.free_switch = ui.switch("free play", on_change=self._on_free).mark("free")
             ui.slider(min=1, max=15, step=1, value=self.fps).props("label").classes("w-32").bind_value(self, "fps")
             ui.label("frames a second").classes("text-sm")
@@ -357,6 +359,11 @@ class PlayPage:
         self.pressed = None
         self.free_switch.set_value(self.driver != ME)  # who gives back stops
         self._run()
+
+    async def _on_goal(self) -> None:
+        session, planner = self.session, self.session.planner
+        if planner is not None and await self._work(lambda: planner.aim(session)):
+            ui.notify(f"goal: moment {session.now.number}; go back, then let the planner steer")
 
     async def _on_masks(self) -> None:
         await self._work(lambda: None)

@@ -18,6 +18,7 @@ from torch import Tensor
 from playslot_rl import keys
 from playslot_rl.acting.imagination import ImaginationSession
 from playslot_rl.frames import to_uint8
+from playslot_rl.play.planner_driver import PlannerDriver
 from playslot_rl.play.starts import Start
 from playslot_rl.play.steering import Driver, PolicyDriver, require_prototypes, variability_directions
 from playslot_rl.play.timeline import Frame, SceneMoment, Timeline
@@ -56,6 +57,7 @@ class PlaySession:
         start: where the session began.
         timeline: its moments.
         drivers: who may take over, by name.
+        planner: the one among them that has a goal; None without an agent.
 
     Raises:
         CheckpointError: the world model has no prototypes.
@@ -68,7 +70,11 @@ class PlaySession:
         self.world_model, self.agent = world_model.eval(), agent
         self.prototypes = require_prototypes(world_model)
         self.directions = variability_directions(world_model, None) if directions is None else directions
-        self.drivers: dict[str, Driver] = {} if agent is None else {"policy": PolicyDriver(agent.policy)}
+        self.drivers: dict[str, Driver] = {}
+        self.planner: PlannerDriver | None = None
+        if agent is not None:
+            self.planner = PlannerDriver(agent)
+            self.drivers = {"policy": PolicyDriver(agent.policy), "planner": self.planner}
         self._imagination = ImaginationSession(world_model)
         self._look: tuple[int, Look] | None = None
 

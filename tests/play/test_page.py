@@ -111,6 +111,26 @@ MOUSE: dict[str, Any] = {
 }  # fmt: skip
 
 
+def test_the_planner_steers_to_the_moment_that_goal_was_pressed_at(studio: Studio) -> None:
+    async def script(user: User, pages: list[PlayPage]) -> None:
+        page = pages[0]
+        page.hand.set_value("planner")
+        await until(lambda: not page.free)  # no goal yet: it says so and stops
+        assert page.session.now.depth == 0
+        page.hand.set_value("me")
+        press(user, "2")
+        await until(lambda: page.session.now.depth == 1)
+        user.find(marker="goal").click()
+        await until(lambda: page.session.planner is not None and page.session.planner.goal is not None)
+        press(user, "r")
+        await until(lambda: page.session.now.depth == 0)
+        page.hand.set_value("planner")
+        await until(lambda: page.session.now.label == "planner")
+        page.free_switch.set_value(False)
+
+    simulate(studio, script)
+
+
 def test_the_policy_takes_over_until_a_key_takes_back(studio: Studio) -> None:
     async def script(user: User, pages: list[PlayPage]) -> None:
         page = pages[0]

@@ -184,6 +184,27 @@ def test_previews_are_what_the_presses_would_do(session: PlaySession) -> None:
     assert np.array_equal(session.preview([2, 4])[:, 0], np.stack([session.now.frame] * 2))
 
 
+def test_the_planner_steers_to_the_moment_that_is_marked(session: PlaySession) -> None:
+    assert session.planner is not None
+    with pytest.raises(ValueError, match="planner: got no goal, expected a marked moment"):
+        session.drive("planner")
+    start = session.slots
+    for number in (2, 2, 4):
+        session.press(number)
+    goal = session.slots
+    session.planner.aim(session)
+    session.reset()
+    for _ in range(6):
+        session.drive("planner")
+    assert session.now.label == "planner"
+    mean = session.world_model.inverse_dynamics.scene_dynamics
+    far, near = ((mean(slots)[0] - mean(goal)[0]).square().mean() for slots in (start, session.slots))
+    assert float(near) < float(far)
+    session.remove(0)
+    with pytest.raises(ValueError, match=r"planner: got \d slots, expected all"):
+        session.drive("planner")
+
+
 def test_a_planner_may_take_over_by_one_method(session: PlaySession) -> None:
     class Still:
         title = "still"
@@ -193,7 +214,7 @@ def test_a_planner_may_take_over_by_one_method(session: PlaySession) -> None:
 
     session.drivers["still"] = Still()
     assert session.drive("still").label == "still"
-    with pytest.raises(ValueError, match="driver: got 'nobody', expected one of policy, still"):
+    with pytest.raises(ValueError, match="driver: got 'nobody', expected one of policy, planner, still"):
         session.drive("nobody")
 
 
