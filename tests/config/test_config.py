@@ -192,7 +192,7 @@ def test_roles_say_what_each_key_counts_for() -> None:
     assert keys_of(DreamerConfig, "free") == {"minutes", "replay_on_disk", "evaluate_every"} | looking - {
         "validate_every"
     }
-    call = {"out", "run", "episodes", "policy", "protocol", "workers", "collector", "device", "export"}
+    call = {"out", "run", "episodes", "policy", "protocol", "workers", "collector", "device", "export", "plan"}
     assert keys_of(ExperimentConfig, "call") == call
     machine = {
         "device",
@@ -203,6 +203,7 @@ def test_roles_say_what_each_key_counts_for() -> None:
         "compare",
         "compare_video",
         "metrics",
+        "plan",
         "preset",
         "out",
         "run",
