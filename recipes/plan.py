@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import shipped
-from playslot_rl.config.planning import GoalName, search_size
+from playslot_rl.config.planning import GoalName
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes.evaluate import check_environment, check_run, take_shipped
@@ -33,6 +33,8 @@ def main(config: ExperimentConfig) -> None:
         CheckpointError: the run has no trained policy, whose action decoder executes plans.
         OutputError: the results cannot be written.
     """
+    from playslot_rl.acting.planners.size import search_size
+
     run = check_run(config)
     gym_id(config.env.name)  # refuses what has no simulator
     frame_skip = config.env.frame_skip

@@ -25,7 +25,8 @@ from playslot_rl.acting.planners.costs import (
     SlotDistance,
     parse_goal,
 )
-from playslot_rl.config.planning import PlanConfig, SearchSize
+from playslot_rl.acting.planners.size import SearchSize
+from playslot_rl.config.planning import PlanConfig
 from playslot_rl.seeding import step_generator
 from playslot_rl.world_model import Agent, action_decoder_module, frame_parser_module
 

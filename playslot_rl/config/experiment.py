@@ -211,7 +211,7 @@ class ExperimentConfig(Checked):
     baselines: BaselinesConfig = field(default_factory=BaselinesConfig)
     compare: CompareConfig = field(default_factory=CompareConfig, metadata=role("machine"))
     compare_video: CompareVideoConfig = field(default_factory=CompareVideoConfig, metadata=role("machine"))
-    plan: PlanConfig = field(default_factory=PlanConfig, metadata=role("call"))
+    plan: PlanConfig = field(default_factory=PlanConfig, metadata=role("call", "machine"))
     metrics: MetricsConfig = field(default_factory=MetricsConfig, metadata=role("machine"))
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     logging: LoggingConfig = field(default_factory=LoggingConfig, metadata=role("machine"))

@@ -23,7 +23,8 @@ class PlanConfig(Checked):
     """How `playslot plan` plans. On its command line `planner=` and `proposal=` go without the group's name, and take
     one name, several with commas, or `all`.
 
-    Where a key is None the goals decide: `solved` and `ahead` each have their own setting (`with_defaults`).
+    Where a key is None the goals decide: `solved` and `ahead` each have their own setting
+    (`playslot_rl.acting.planners.size`).
 
     Attributes:
         planner: `cem`, `mppi`, `gradient` (through the differentiable rollout), `prototypes` (categorical CEM); a row
@@ -95,33 +96,3 @@ class PlanConfig(Checked):
             )
         if self.every is not None and self.horizon is not None:
             check(self.every <= self.horizon, "plan.every", self.every, f"at most plan.horizon={self.horizon}")
-
-
-@dataclass(frozen=True)
-class SearchSize:
-    """The five keys that the goals decide, with nothing left open; as in `PlanConfig`."""
-
-    horizon: int
-    every: int
-    candidates: int
-    iterations: int
-    elites: int
-
-
-def search_size(plan: PlanConfig, goals: GoalName, frame_skip: int) -> SearchSize:
-    """The size of a search: what was typed, else the goals' own.
-
-    stable-worldmodel plans 5 blocks of 5 environment steps, all of them executed before the next plan, with 300
-    samples, 30 iterations and 30 elites. Our agent step is a block of `frame_skip` environment steps.
-
-    Raises:
-        ValueError: more elites than candidates, or more steps executed than planned.
-    """
-    blocks = max(1, round(25 / frame_skip))
-    own = SearchSize(16, 2, 64, 8, 8) if goals == "solved" else SearchSize(blocks, blocks, 300, 30, 30)
-    horizon = plan.horizon or own.horizon
-    candidates = plan.candidates or own.candidates
-    every, elites = plan.every or min(own.every, horizon), plan.elites or min(own.elites, candidates)
-    check(every <= horizon, "plan.every", every, f"at most plan.horizon={horizon}")
-    check(elites <= candidates, "plan.elites", elites, f"at most the {candidates} candidates")
-    return SearchSize(horizon, every, candidates, plan.iterations or own.iterations, elites)

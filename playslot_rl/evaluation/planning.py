@@ -29,9 +29,10 @@ from playslot_rl.acting.planners.costs import (
     SlotDistance,
     parse_goal,
 )
+from playslot_rl.acting.planners.size import search_size
 from playslot_rl.acting.planning import PlanningActor
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.planning import GoalName, search_size
+from playslot_rl.config.planning import GoalName
 from playslot_rl.evaluation.goals import Frames, GoalEpisode, GoalPool, Trace
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.success import summary

@@ -13,9 +13,10 @@ from playslot_rl import keys
 from playslot_rl.acting.agent import imagine
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.acting.planners import build_planner, shifted
+from playslot_rl.acting.planners.size import search_size
 from playslot_rl.acting.planning import PlanningActor
 from playslot_rl.config import PlanConfig
-from playslot_rl.config.planning import PLANNERS, search_size
+from playslot_rl.config.planning import PLANNERS
 from playslot_rl.errors import ConfigError
 from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.world_model import Agent

@@ -198,7 +198,7 @@ def test_roles_say_what_each_key_counts_for() -> None:
         "validate_every"
     }
     call = {"out", "run", "episodes", "policy", "protocol", "workers", "collector", "device", "export"}
-    call |= {"adopt", "minutes", "play", "port"}
+    call |= {"adopt", "minutes", "plan", "play", "port"}
     assert keys_of(ExperimentConfig, "call") == call
     machine = {
         "device",
@@ -211,6 +211,7 @@ def test_roles_say_what_each_key_counts_for() -> None:
         "compare_video",
         "metrics",
         "minutes",
+        "plan",
         "preset",
         "out",
         "run",

@@ -10,7 +10,8 @@ from playslot_rl.acting.planners.gradient import GradientPlanner
 from playslot_rl.acting.planners.mppi import MPPIPlanner
 from playslot_rl.acting.planners.planner import Plan, Planner, Search, latent_statistics, shifted
 from playslot_rl.acting.planners.prototypes import PrototypePlanner
-from playslot_rl.config.planning import PlanConfig, PlannerName, SearchSize
+from playslot_rl.acting.planners.size import SearchSize
+from playslot_rl.config.planning import PlanConfig, PlannerName
 from playslot_rl.errors import ConfigError
 from playslot_rl.world_model import WorldModel
 
