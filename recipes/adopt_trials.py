@@ -14,7 +14,7 @@ from typing import Any, Final
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.survey import Choice
 
-TIMED_STEPS: Final = 8
+TIMED_STEPS: Final = 24
 SHORTEST: Final = 20
 """Steps of a training at least, however little time there is."""
 CARRIED: Final = 0.95
