@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.collectors.image_set import ImageSetWriter
+from playslot_rl.collectors.image_set import ImageSetWriter, finalising
 from playslot_rl.collectors.journal import Journal, RecordedEpisode
 from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.envs import PROCEDURAL, task_metadata
@@ -106,7 +106,7 @@ def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str,
     )
     write = _write_video if video else _write_images
     records = []
-    try:
+    with finalising(dataset):
         for episode in write(dataset, journal, metadata["task"]):
             solved = bool(episode.success.any())
             records.append(
@@ -117,11 +117,6 @@ def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str,
                     "redrawn": episode.redrawn,
                 }
             )
-        dataset.finalize()
-    except BaseException:
-        # LeRobot's destructors would finish the files later, in a folder that has been removed or made anew.
-        dataset.writer._finalized = dataset.meta._finalized = True
-        raise
     return records
 
 

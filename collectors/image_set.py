@@ -7,6 +7,8 @@ This writer makes the same files with LeRobot's own schema, metadata and statist
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,6 +19,19 @@ from playslot_rl import keys
 
 EPISODES_AT_ONCE: Final = 32
 """Episodes in a row group."""
+
+
+@contextlib.contextmanager
+def finalising(dataset: Any) -> Iterator[None]:
+    """Finish a `LeRobotDataset` after the block. After an error nothing of it is finished: LeRobot's destructors would
+    write the files later, in a folder that has been removed or made anew.
+    """
+    try:
+        yield
+        dataset.finalize()
+    except BaseException:
+        dataset.writer._finalized = dataset.meta._finalized = True
+        raise
 
 
 class ImageSetWriter:

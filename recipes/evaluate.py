@@ -16,7 +16,7 @@ from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes import objects, slots
-from playslot_rl.recipes.run import open_run, parent_run, stored_result
+from playslot_rl.recipes.run import existing_run, open_run, parent_run, stored_result
 
 PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")
 
@@ -128,8 +128,8 @@ def measured(run: Path, protocol: str, facts: dict[str, Any]) -> bool:
     return True
 
 
-def check_run(config: ExperimentConfig) -> Path:
-    """The run folder.
+def check_run(config: ExperimentConfig, command: str = "evaluate") -> Path:
+    """The run folder of a command that needs a policy.
 
     Raises:
         ConfigError: none was named, or `out` names another folder.
@@ -145,14 +145,7 @@ def check_run(config: ExperimentConfig) -> Path:
         if config.protocol != "slots" and not (checkpoint_folder(folder, "policy") / "meta.json").is_file():
             raise CheckpointError(f"run={config.run} is a world model without a policy; run `playslot train-policy`")
         return folder
-    run = Path(config.run)
-    if not run.is_dir():
-        raise CheckpointError(f"run={config.run}: no such folder, expected a run; make one by `playslot demo`")
-    if config.out and Path(config.out).resolve() != run.resolve():
-        raise ConfigError(
-            f"out: got {config.out}, expected nothing: evaluate writes into run={config.run}; leave it out"
-        )
-    return run
+    return existing_run(config, command, "make one by `playslot demo`")
 
 
 def take_shipped(config: ExperimentConfig) -> Path:

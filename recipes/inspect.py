@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import shipped
-from playslot_rl.errors import CheckpointError, ConfigError, DataError
+from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.recipes.evaluate import take_shipped
-from playslot_rl.recipes.run import open_device, open_run, parent_run, stored_result
+from playslot_rl.recipes.run import existing_run, open_device, open_run, parent_run, stored_result
 
 if TYPE_CHECKING:
     from playslot_rl.data.source import EpisodeFrames
@@ -66,12 +66,7 @@ def check_run(config: ExperimentConfig) -> str:
     if shipped(config.run):
         open_run(config)  # refused now, not after minutes
         return parent_run(config, Path())
-    if not Path(config.run).is_dir():
-        raise CheckpointError(f"run={config.run}: no such folder, expected a run; train one by `playslot pipeline`")
-    if config.out and Path(config.out).resolve() != Path(config.run).resolve():
-        raise ConfigError(
-            f"out: got {config.out}, expected nothing: inspect writes into run={config.run}; leave it out"
-        )
+    existing_run(config, "inspect", "train one by `playslot pipeline`")
     return config.run
 
 

@@ -35,7 +35,7 @@ def main(config: ExperimentConfig) -> None:
     """
     from playslot_rl.acting.planners.size import search_size
 
-    run = check_run(config)
+    run = check_run(config, "plan")
     gym_id(config.env.name)  # refuses what has no simulator
     frame_skip = config.env.frame_skip
     try:

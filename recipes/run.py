@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import SHIPPED, shipped
-from playslot_rl.errors import ConfigError, OutputError
+from playslot_rl.errors import CheckpointError, ConfigError, OutputError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,6 +39,28 @@ def stored_result(path: Path, facts: Mapping[str, Any]) -> dict[str, Any] | None
     """What an evaluation wrote before, if `facts` (parts of its result) are the same; None otherwise."""
     stored: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
     return stored if stored and {key: stored.get(key) for key in facts} == facts else None
+
+
+def existing_run(config: ExperimentConfig, command: str, cure: str) -> Path:
+    """The folder of `run`, into which a command writes its results.
+
+    Args:
+        config: `run` and `out`.
+        command: for the message.
+        cure: how a run is made, for the message.
+
+    Raises:
+        CheckpointError: there is no such folder.
+        ConfigError: `out` names another one.
+    """
+    run = Path(config.run)
+    if not run.is_dir():
+        raise CheckpointError(f"run={config.run}: no such folder, expected a run; {cure}")
+    if config.out and Path(config.out).resolve() != run.resolve():
+        raise ConfigError(
+            f"out: got {config.out}, expected nothing: {command} writes into run={config.run}; leave it out"
+        )
+    return run
 
 
 def open_run(config: ExperimentConfig) -> Path:

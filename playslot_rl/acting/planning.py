@@ -17,14 +17,7 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
 from playslot_rl.acting.agent import imagine
 from playslot_rl.acting.planners import Planner, Search, latent_statistics, shifted
-from playslot_rl.acting.planners.costs import (
-    Distance,
-    DynamicsDistance,
-    GoalCost,
-    ImageDistance,
-    SlotDistance,
-    parse_goal,
-)
+from playslot_rl.acting.planners.costs import GoalCost, goal_distance, parse_goal
 from playslot_rl.acting.planners.size import SearchSize
 from playslot_rl.config.planning import PlanConfig
 from playslot_rl.seeding import step_generator
@@ -159,22 +152,18 @@ class PlanningActor(Actor):
         model = self.agent.world_model
         seen = tensordict.get(keys.SLOT_HISTORY)[row, -min(step + 1, self.frames_seen) :]
         past = model.inverse_dynamics(seen[None]).z[0] if len(seen) > 1 else seen.new_empty(0, *model.latent_shape)
-        distance = self.distance(tensordict.get(keys.GOAL_SLOTS)[row], tensordict.get(keys.GOAL_PIXELS)[row])
+        goal, image = tensordict.get(keys.GOAL_SLOTS)[row], tensordict.get(keys.GOAL_PIXELS)[row]
+        distance = goal_distance(self.agent, self.config.cost, goal, image, self.config.match)
         return GoalCost(model, seen, past, distance, self.config.along)
 
-    def distance(self, goal: Tensor, image: Tensor) -> Distance:
-        """Distance to a goal, of slots (N, D) and image (3, H, W), by the config's `cost`."""
-        model, config = self.agent.world_model, self.config
-        if config.cost == "image":
-            return ImageDistance(model.savi, image)
-        if config.cost == "dynamics":
-            return DynamicsDistance(model.inverse_dynamics, self.agent.policy.whitening or self.whitening, goal)
-        free = model.config.savi.initial == "gaussian" if config.match is None else config.match
-        return SlotDistance(goal, free)
-
     def _proposal(self, slots: Tensor) -> Tensor:
-        """The latent policy's imagined rollout from slots (N, D): latent actions (1, H, Z), or none (0, H, Z)."""
+        """The policy's plan from slots (N, D): latent actions (1, H, Z), or none (0, H, Z)."""
         h = self.size.horizon
         if not self.policy:
             return slots.new_empty(0, h, *self.agent.world_model.latent_shape)
-        return imagine(self.agent, TensorDict({keys.SLOTS: slots[None]}, [1]), h).latents
+        return policy_plan(self.agent, slots, h)
+
+
+def policy_plan(agent: Agent, slots: Tensor, horizon: int) -> Tensor:
+    """What the latent policy would do from slots (N, D), imagined: latent actions (1, H, Z)."""
+    return imagine(agent, TensorDict({keys.SLOTS: slots[None]}, [1]), horizon).latents

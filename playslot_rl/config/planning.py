@@ -10,6 +10,7 @@ from playslot_rl.config.roles import Checked, at_least, between, within
 
 PlannerName = Literal["cem", "mppi", "gradient", "prototypes"]
 ProposalName = Literal["none", "policy"]
+CostName = Literal["slots", "dynamics", "image"]
 GoalName = Literal["solved", "ahead"]
 PLANNERS: Final[tuple[PlannerName, ...]] = get_args(PlannerName)
 PROPOSALS: Final[tuple[ProposalName, ...]] = get_args(ProposalName)
@@ -61,7 +62,7 @@ class PlanConfig(Checked):
     planner: tuple[PlannerName, ...] = ("cem",)
     proposal: tuple[ProposalName, ...] = ("none",)
     goals: tuple[GoalName, ...] = ("solved", "ahead")
-    cost: Literal["slots", "dynamics", "image"] = "dynamics"
+    cost: CostName = "dynamics"
     match: bool | None = None
     along: float = field(default=0.1, metadata=between(0, 1, "0 to 1"))
     horizon: int | None = field(default=None, metadata=at_least(1, "at least 1 agent step"))

@@ -71,6 +71,13 @@ def spread_windows(
     return windows[:: max(1, len(windows) // count)][:count]
 
 
+def spread_evenly(items: IntArray, count: int) -> IntArray:
+    """At most `count` of some items, spread evenly over them."""
+    if len(items) <= count:
+        return items
+    return items[np.linspace(0, len(items) - 1, count).round().astype(np.int64)] if count else items[:0]
+
+
 def _valid_starts(
     starts: npt.ArrayLike, lengths: npt.ArrayLike, window: int, episodes: Sequence[int] | IntArray | None
 ) -> tuple[IntArray, IntArray]:

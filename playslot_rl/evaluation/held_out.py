@@ -12,7 +12,7 @@ import numpy.typing as npt
 from playslot_rl.config import DataConfig
 from playslot_rl.data.demonstrations import split_demonstrations
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import split_episodes
+from playslot_rl.data.windows import split_episodes, spread_evenly
 from playslot_rl.errors import DataError
 
 Ints = npt.NDArray[np.int64]
@@ -65,8 +65,8 @@ def hold_out(source: EpisodeFrames, metas: Mapping[str, Mapping[str, Any]], conf
             "a latent action lies between two frames"
         )
     candidates, told_by, known = _candidates(source, metas, config, usable)
-    tested = _spread(candidates, max(1, min(len(candidates), most // 4)))
-    fitted = _spread(np.setdiff1d(usable, candidates), max(0, most - len(tested)))
+    tested = spread_evenly(candidates, max(1, min(len(candidates), most // 4)))
+    fitted = spread_evenly(np.setdiff1d(usable, candidates), max(0, most - len(tested)))
     return HeldOut(fitted, tested, told_by, known)
 
 
@@ -99,10 +99,3 @@ def _policy_held_out(source: EpisodeFrames, policy: Mapping[str, Any], config: D
     draws = {None, config.draw, int(policy.get("seed", 0))}
     prints = {split_demonstrations(source, demos, held, held, draw).trained.fingerprint for draw in draws}
     return held if policy.get("data", {}).get("demos") in prints else 0
-
-
-def _spread(episodes: Ints, count: int) -> Ints:
-    """At most `count` of some episodes, spread evenly over them."""
-    if len(episodes) <= count:
-        return episodes
-    return episodes[np.linspace(0, len(episodes) - 1, count).round().astype(np.int64)] if count else episodes[:0]

@@ -20,19 +20,12 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import Actor, RandomActor
 from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.episodes import Moment, Outcome, run_episodes
-from playslot_rl.acting.planners import build_planner, latent_statistics
-from playslot_rl.acting.planners.costs import (
-    Distance,
-    DynamicsDistance,
-    GoalCost,
-    ImageDistance,
-    SlotDistance,
-    parse_goal,
-)
+from playslot_rl.acting.planners import build_planner
+from playslot_rl.acting.planners.costs import GoalCost, goal_distance, parse_goal
 from playslot_rl.acting.planners.size import search_size
 from playslot_rl.acting.planning import PlanningActor
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.planning import GoalName
+from playslot_rl.config.planning import CostName, GoalName
 from playslot_rl.evaluation.goals import Frames, GoalEpisode, GoalPool, Trace
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.success import summary
@@ -211,9 +204,8 @@ def cost_along_solution(
         it; `moved`: that of standing still.
     """
     model, device = agent.world_model, module_device(agent.world_model)
-    curves: dict[str, list[list[float]]] = {"slots": [], "dynamics": [], "image": []}
+    curves: dict[CostName, list[list[float]]] = {"slots": [], "dynamics": [], "image": []}
     errors, moved = [], []
-    free = model.config.savi.initial == "gaussian" if match is None else match
     for goal in goals:
         frames = normalise(torch.from_numpy(goal.frames).movedim(-1, -3).to(device))
         generator = torch.Generator(device).manual_seed(goal.seed)
@@ -221,13 +213,7 @@ def cost_along_solution(
         generator.manual_seed(goal.seed)
         state = model.savi(frames[None, :1], generator=generator)[1]
         there = parse_goal(model.savi, state, goal.image[None].to(device), looks)[0]
-        distances: dict[str, Distance] = {
-            "slots": SlotDistance(there, free),
-            "dynamics": DynamicsDistance(
-                model.inverse_dynamics, agent.policy.whitening or latent_statistics(agent), there
-            ),
-            "image": ImageDistance(model.savi, goal.image.to(device)),
-        }
+        distances = {kind: goal_distance(agent, kind, there, goal.image.to(device), match) for kind in curves}
         for name, to_goal in distances.items():
             curves[name].append([round(value, 6) for value in to_goal(slots).tolist()])
         z = model.inverse_dynamics(slots[None]).z

@@ -113,7 +113,7 @@ class PlayPage:
             ui.button("Start here", on_click=self._on_start).props("dense no-caps").mark("start")
             ui.button("Next episode", on_click=self._on_next).props("dense no-caps flat").mark("next")
             ui.upload(
-                label="or a picture", auto_upload=True, on_upload=self._on_upload, max_file_size=50_000_000
+                label="or a picture", auto_upload=True, on_upload=self._on_upload, max_file_size=MOST_BYTES
             ).props("accept=image/* dense flat bordered").classes("w-44").style("max-height: 56px; min-height: 0").mark(
                 "upload"
             )
@@ -182,8 +182,9 @@ class PlayPage:
             try:
                 await self.studio.do(work)
                 if begins:
-                    self.begun, self.chosen = True, None
+                    self.chosen = None
                 drawn = await self.studio.do(self._paint)
+                self.begun = True  # only now: the mouse needs to know what it points at
             except (PlaySlotError, ValueError) as error:
                 self._halt()
                 ui.notify(explain(error) if isinstance(error, PlaySlotError) else str(error), type="warning")

@@ -11,13 +11,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
-from playslot_rl import keys
-from playslot_rl.acting.agent import imagine
 from playslot_rl.acting.planners import CEMPlanner, Search, latent_statistics, shifted
 from playslot_rl.acting.planners.costs import DynamicsDistance, GoalCost
+from playslot_rl.acting.planning import policy_plan
 from playslot_rl.config.planning import PlanConfig
 from playslot_rl.seeding import step_generator
 from playslot_rl.world_model import Agent
@@ -75,7 +73,7 @@ class PlannerDriver:
         distance = DynamicsDistance(model.inverse_dynamics, self.agent.policy.whitening or self._whitening, self.goal)
         past = slots.new_empty(0, *model.latent_shape)
         cost = GoalCost(model, slots[None], past, distance, self._along)
-        starts = imagine(self.agent, TensorDict({keys.SLOTS: slots[None]}, [1]), HORIZON).latents
+        starts = policy_plan(self.agent, slots, HORIZON)
         now = session.now
         if self._last is not None and self._last[0] == now.parent:
             starts = torch.cat([starts, shifted(self._last[1], 1, self._whitening.mean)[None]])

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.collectors.image_set import ImageSetWriter
+from playslot_rl.collectors.image_set import ImageSetWriter, finalising
 from playslot_rl.collectors.journal import png
 from playslot_rl.errors import DataError
 from playslot_rl.play.pictures import session_animation
@@ -133,11 +133,8 @@ def _write_set(root: Path, session: PlaySession, path: Sequence[SceneMoment], sh
             video_backend="pyav",
         )
         frames = values.pop(keys.FEATURE_IMAGE)
-        try:
-            with contextlib.closing(ImageSetWriter(dataset.meta, dataset.root, session.start.task)) as writer:
-                writer.add(values, frames, [png(frame) for frame in frames])
-            dataset.finalize()
-        except BaseException:
-            # LeRobot's destructors would finish the files later, in a folder that has been removed.
-            dataset.writer._finalized = dataset.meta._finalized = True
-            raise
+        with (
+            finalising(dataset),
+            contextlib.closing(ImageSetWriter(dataset.meta, dataset.root, session.start.task)) as writer,
+        ):
+            writer.add(values, frames, [png(frame) for frame in frames])

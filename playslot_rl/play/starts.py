@@ -19,6 +19,7 @@ from playslot_rl.acting.episodes import Task
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.data.frames import resize_frames
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.windows import spread_evenly
 from playslot_rl.episode_seeds import redraw_stride
 from playslot_rl.errors import DataError
 from playslot_rl.frames import to_float
@@ -133,7 +134,7 @@ class RecordedStarts:
             return None
         frames = min(CLIP_FRAMES, int(self.source.lengths[long].max()))
         fit = long[self.source.lengths[long] >= frames]
-        chosen = fit[np.unique(np.linspace(0, len(fit) - 1, min(CLIPS, len(fit))).round().astype(int))]
+        chosen = spread_evenly(fit, CLIPS)
         rows = self.source.starts[chosen][:, None] + np.arange(frames)
         clips: Frame = np.asarray(self.source.frames[rows])
         return clips

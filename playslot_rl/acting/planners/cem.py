@@ -53,7 +53,7 @@ class CEMPlanner:
         """See `Planner`."""
         best = Best(search)
         mean = search.coordinates(best.begin())
-        std = torch.full_like(mean, self.start_spread if len(search.starts) else self.spread)
+        std = torch.full_like(mean, search.first_spread(self.spread, self.start_spread))
         kept = mean.new_empty(0, *search.shape)
         for _ in search.rounds(self.iterations):
             mean, std, kept = self._improve(search, best, mean, std, kept, generator)
@@ -64,18 +64,9 @@ class CEMPlanner:
         self, search: Search, best: Best, mean: Tensor, std: Tensor, kept: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor]:
         """One iteration: mean and deviation (H, [N,] Z) and elites (K, H, [N,] Z), in whitened coordinates."""
-        noise = correlated(search.normal(self.candidates, generator), self.correlation)
-        drawn = (mean + std * noise).clamp(-search.bound, search.bound)
+        drawn = search.around(mean, std, self.candidates, self.correlation, generator)
         tried = torch.cat([drawn, mean[None], kept])  # at first the mean is the best plan to begin with
         latents = search.latents(tried)
         costs = best.offer(latents, search.cost(latents))
         elites = tried[costs.topk(min(self.elites, len(tried)), largest=False).indices]
         return elites.mean(0), elites.std(0, unbiased=False).clamp(min=self.floor), elites
-
-
-def correlated(noise: Tensor, correlation: float) -> Tensor:
-    """White noise (M, H, ...) to noise of the same variance whose neighbouring steps correlate (an AR(1) process)."""
-    steps = [noise[:, 0]]
-    for t in range(1, noise.shape[1]):
-        steps.append(correlation * steps[-1] + (1 - correlation**2) ** 0.5 * noise[:, t])
-    return torch.stack(steps, 1)

@@ -17,11 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from playslot_rl.acting.planners.planner import latent_statistics
+from playslot_rl.config.planning import CostName
 from playslot_rl.frames import normalise
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.modules.whitening import Whitening
-from playslot_rl.world_model import WorldModel
+from playslot_rl.world_model import Agent, WorldModel
 
 Distance = Callable[[Tensor], Tensor]
 """Slots (..., N, D) to how far each frame is from the goal (...)."""
@@ -109,6 +111,25 @@ class ImageDistance:
         """Slots (..., N, D) to distances (...), differentiable."""
         frames: Tensor = self.savi.decode(slots).frames
         return (frames - self.goal).square().mean((-3, -2, -1))
+
+
+def goal_distance(agent: Agent, kind: CostName, goal: Tensor, image: Tensor, match: bool | None = None) -> Distance:
+    """The distance to a goal by its name.
+
+    Args:
+        agent: whose world model and latent actions.
+        kind: `slots`, `dynamics` or `image`.
+        goal: slots (N, D).
+        image: (3, H, W), uint8 [0, 255] or float [0, 1]; read by `image` alone.
+        match: whether the order of the slots is free; None says so where SAVi's initial slots are sampled.
+    """
+    model = agent.world_model
+    if kind == "image":
+        return ImageDistance(model.savi, image)
+    if kind == "dynamics":
+        whitening = agent.policy.whitening or latent_statistics(agent)
+        return DynamicsDistance(model.inverse_dynamics, whitening, goal)
+    return SlotDistance(goal, model.config.savi.initial == "gaussian" if match is None else match)
 
 
 class GoalCost:

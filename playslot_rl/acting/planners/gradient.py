@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import torch
 
-from playslot_rl.acting.planners.cem import correlated
 from playslot_rl.acting.planners.planner import Best, Plan, Search
 
 
@@ -37,11 +36,11 @@ class GradientPlanner:
         """See `Planner`."""
         best = Best(search)
         first = search.coordinates(best.begin())
-        std = self.start_spread if len(search.starts) else self.spread
-        noise = correlated(search.normal(self.candidates, generator), self.correlation)
-        noise[0] = 0
+        std = search.first_spread(self.spread, self.start_spread)
+        drawn = search.around(first, std, self.candidates, self.correlation, generator)
+        drawn[0] = first
         with torch.enable_grad():  # a planner is called where actors are: without gradients
-            point = (first + std * noise).clamp(-search.bound, search.bound).requires_grad_()
+            point = drawn.requires_grad_()
             optimiser = torch.optim.Adam([point], lr=self.learning_rate)
             for _ in search.rounds(self.iterations):
                 latents = search.latents(point)

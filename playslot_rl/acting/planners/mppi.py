@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from playslot_rl.acting.planners.cem import correlated
 from playslot_rl.acting.planners.planner import Best, Plan, Search
 
 
@@ -47,10 +46,9 @@ class MPPIPlanner:
         """See `Planner`."""
         best = Best(search)
         mean = search.coordinates(best.begin())
-        std = self.start_spread if len(search.starts) else self.spread
+        std = search.first_spread(self.spread, self.start_spread)
         for _ in search.rounds(self.iterations):
-            noise = correlated(search.normal(self.candidates, generator), self.correlation)
-            drawn = (mean + std * noise).clamp(-search.bound, search.bound)
+            drawn = search.around(mean, std, self.candidates, self.correlation, generator)
             tried = torch.cat([drawn, mean[None], search.coordinates(best.latents)[None]])
             latents = search.latents(tried)
             weights = path_weights(best.offer(latents, search.cost(latents)), self.temperature)

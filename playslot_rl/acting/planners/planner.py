@@ -68,9 +68,17 @@ class Search:
         coordinates: Tensor = self.whitening(latents).clamp(-self.bound, self.bound)
         return coordinates
 
-    def normal(self, count: int, generator: torch.Generator) -> Tensor:
-        """Standard normal numbers (count, H, [N,] Z)."""
-        return torch.randn(count, *self.shape, generator=generator, device=generator.device)
+    def first_spread(self, spread: float, start_spread: float) -> float:
+        """The first standard deviation: narrower where there are plans to begin with."""
+        return start_spread if len(self.starts) else spread
+
+    def around(
+        self, mean: Tensor, std: Tensor | float, count: int, correlation: float, generator: torch.Generator
+    ) -> Tensor:
+        """Coordinates (count, H, [N,] Z) drawn round a plan's (H, [N,] Z), inside the bound; the noise of neighbouring
+        steps correlates."""
+        white = torch.randn(count, *self.shape, generator=generator, device=generator.device)
+        return (mean + std * correlated(white, correlation)).clamp(-self.bound, self.bound)
 
 
 class Plan(NamedTuple):
@@ -137,6 +145,14 @@ class Best:
         if self.cost == float("inf"):
             raise ValueError("plan: got no finite cost, expected one: look at the goal and at the model's predictions")
         return Plan(self.latents, self.cost, self.costs)
+
+
+def correlated(noise: Tensor, correlation: float) -> Tensor:
+    """White noise (M, H, ...) to noise of the same variance whose neighbouring steps correlate (an AR(1) process)."""
+    steps = [noise[:, 0]]
+    for t in range(1, noise.shape[1]):
+        steps.append(correlation * steps[-1] + (1 - correlation**2) ** 0.5 * noise[:, t])
+    return torch.stack(steps, 1)
 
 
 def shifted(plan: Tensor, steps: int, fill: Tensor) -> Tensor:
