@@ -52,12 +52,14 @@ def compare(config: ExperimentConfig) -> None:
     data = replace(config.data, tested=own.tested if config.data.root and not own.test else 0.0)
     config = replace(config, run=run, data=data, demos=None)
     lpips = open_lpips(config.metrics.lpips_weights)  # a wrong file is refused before anything is computed
-    if config.data.root:
+    recorded = bool(config.data.root)
+    if recorded:
         _check_clips(config)
     open_comparison(out)
     with comparison_lock(out):
         config = _prepare(config, out)
-        _check_clips(config)
+        if not recorded:
+            _check_clips(config)
         parents, jobs = _parents(config), {}
         for job in video_jobs(config, out):
             jobs[job] = video_job_record(job, video_job_config(config, job, config.run), parents)
