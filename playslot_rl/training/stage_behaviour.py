@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Final
 
 import torch
 from torch import Tensor, nn
@@ -27,6 +28,11 @@ from playslot_rl.training.stage_regression import (
     TensorInputs,
     apply_rows,
 )
+
+VALIDATED: Final = 2048
+"""So many rows of each kind are looked at in a validation, evenly spread: all rows of thousands of demonstrations, four
+times over, would cost more than the training between two validations.
+"""
 
 
 def cloning_settings(config: BehaviourStageConfig) -> BehaviourStageConfig:
@@ -110,6 +116,7 @@ class CloneStage:
                 demos.latents[seen.rows],
                 config.batch_size,
                 checks=_checks(demos) | ({} if held_out is None else _checks(held_out, HELD_OUT)),
+                validated=VALIDATED,
                 precision=config.precision,
             )
         }
@@ -239,6 +246,7 @@ class DecoderStage(RegressionStage):
             actions,
             config.batch_size,
             held_out=None if acted is None else examples(acted, 0.0)[1],
+            validated=VALIDATED,
             stream="decoder",
             precision=config.precision,
         )
@@ -288,8 +296,9 @@ class FinetuneStage:
             criterion = BehaviourLoss(network, config.loss)
             criterion.set_keys(action=keys.ACTION)
             return RegressionStage(
-                "finetune", criterion, *labelled, config.batch_size, held_out=measured, precision=config.precision
-            )
+                "finetune", criterion, *labelled, config.batch_size, held_out=measured, validated=VALIDATED,
+                precision=config.precision,
+            )  # fmt: skip
 
         self.acting = [acting(network) for network in networks]
 
@@ -339,5 +348,6 @@ def oracle_stage(
         actions,
         config.batch_size,
         held_out=held_out and (TensorInputs(held_out[0]), held_out[1]),
+        validated=VALIDATED,
         precision=config.precision,
     )
