@@ -162,14 +162,14 @@ def copied(tensors: Sequence[Tensor]) -> None:
     """
     if _here.world == 1:
         return
+    import torch
     import torch.distributed as dist
 
     for tensor in tensors:
-        whole = tensor.contiguous()
+        whole = tensor.detach().clone(memory_format=torch.contiguous_format)
         with _exchange():
             dist.broadcast(whole, src=0)
-        if whole is not tensor:
-            tensor.copy_(whole)
+        tensor.detach().copy_(whole)
 
 
 @contextlib.contextmanager
