@@ -140,7 +140,7 @@ class GlobalBatchNorm(nn.modules.batchnorm._BatchNorm):
         """(b, C, ...) to the same shape."""
         if not self.training or _share.get() is _WHOLE or processes.here().world == 1:
             return super().forward(x)
-        values = x.float()
+        values = x.float() if x.element_size() < 4 else x
         var, mean = torch.var_mean(values, [i for i in range(x.ndim) if i != 1], unbiased=False)
         means, variances = all_rows(torch.stack((mean, var))[None]).unbind(1)
         mean = means.mean(0)

@@ -80,7 +80,7 @@ class GlobalBatches:
         for own in () if begins else self._shares():
             with global_seed(seed, step):
                 numbers.append(self._share(step, generators, own))
-        means = {key: torch.stack([part[key] for part in numbers]).mean() for key in numbers[0]}
+        means = {key: torch.stack([part[key].float() for part in numbers]).mean() for key in numbers[0]}
         return self._averaged(means) if here().world > 1 else means
 
     def _shares(self) -> Iterator[Share]:
@@ -92,7 +92,7 @@ class GlobalBatches:
         with sharing(own):
             losses = self.stage.loss(step, generators)
             (losses["loss"] / self.micros).backward()
-        return {key: value.detach().float() for key, value in losses.items()}
+        return {key: value.detach() for key, value in losses.items()}
 
     @torch.no_grad()
     def _rehearse(self, step: int, generators: StepGenerators) -> None:
@@ -104,7 +104,8 @@ class GlobalBatches:
     def _averaged(self, numbers: Mapping[str, Tensor]) -> dict[str, Tensor]:
         parameters = list(self.parameters.values())
         parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-        flat = torch.cat([*(part.flatten() for part in parts), torch.stack(list(numbers.values())).to(parts[0])])
+        scalars = torch.stack([value.to(parts[0].dtype) for value in numbers.values()])
+        flat = torch.cat([*(part.flatten() for part in parts), scalars])
         flat = summed(flat) / here().world
         *grads, scalars = flat.split([*(part.numel() for part in parts), len(numbers)])
         for parameter, grad in zip(parameters, grads, strict=True):
