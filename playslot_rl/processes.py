@@ -16,6 +16,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl.errors import PeerError
@@ -84,7 +85,7 @@ def start(device: str = "") -> None:
     engine = Accelerator(cpu=on_cpu, kwargs_handlers=[InitProcessGroupKwargs(timeout=TIMEOUT)])
     _here = Processes(engine.process_index, engine.num_processes)
     if not _here.first:
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+        sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
 
 
 def stop() -> None:
@@ -117,7 +118,7 @@ def own_device(device: torch.device) -> torch.device:
     """`cuda` as the GPU of this process; any other device as it is."""
     import torch
 
-    if _here.world == 1 or device.type != "cuda" or device.index is not None:
+    if _here.world == 1 or str(device) != "cuda":
         return device
     return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
 
@@ -142,10 +143,9 @@ def stacked(values: Tensor) -> Tensor:
     Raises:
         PeerError: one of them ended.
     """
-    import torch
-
     if _here.world == 1:
         return values
+    import torch
     import torch.distributed as dist
 
     parts = [torch.empty_like(values, memory_format=torch.contiguous_format) for _ in range(_here.world)]

@@ -97,7 +97,7 @@ def all_rows(own: Tensor) -> Tensor:
     """
     if _share.get() is _WHOLE or processes.here().world == 1:
         return own
-    rows: Tensor = _AllRows.apply(own)
+    rows: Tensor = _AllRows.apply(own)  # type: ignore[no-untyped-call]
     return rows
 
 

@@ -112,4 +112,3 @@ class GlobalBatches:
             if parameter.grad is not None:
                 parameter.grad.copy_(grad.view_as(parameter))
         return dict(zip(numbers, scalars.unbind(), strict=True))
-

@@ -179,9 +179,7 @@ class _Run:
         if done % config.checkpoint_every == 0 or self.ended:
             self.watch.require_finite(self.stage.modules, f"step {done}")
             if here().first:
-                self.checkpoints.save(
-                    self.state, self.stage.modules, self.optimizer, self.parameters, self._averaged
-                )
+                self.checkpoints.save(self.state, self.stage.modules, self.optimizer, self.parameters, self._averaged)
 
     def _step(self, step: int) -> dict[str, Tensor | float]:
         rate = learning_rate(self.config.optim, step, self.config.steps)

@@ -117,9 +117,7 @@ class FrameInputs:
         if self.shift == 0:
             return self.plain(rows)
         generator = generators.torch("shift", "cpu")
-        offsets = own_noise(
-            (len(rows), 2), lambda shape: torch.randint(2 * self.shift + 1, shape, generator=generator)
-        )
+        offsets = own_noise((len(rows), 2), lambda shape: torch.randint(2 * self.shift + 1, shape, generator=generator))
         frames = self.source.frames[self.rows[rows.cpu().numpy()]]
         moved = shift_frames(frames, offsets.numpy() - self.shift)
         return torch.from_numpy(moved).movedim(-1, 1).to(self.device)

@@ -127,9 +127,7 @@ def assert_equal(one: Path, other: Path) -> None:
 LONG = ("slots.steps=400", "slots.checkpoint_every=4", "slots.validate_every=200")
 
 
-def test_a_command_gives_the_run_of_one_process(
-    launch: Callable[..., Launched], tmp_path: Path, videos: Path
-) -> None:
+def test_a_command_gives_the_run_of_one_process(launch: Callable[..., Launched], tmp_path: Path, videos: Path) -> None:
     done = launch(*slots(tmp_path / "two", videos))
     assert done.end() == 0, done.log.read_text()
     smoke(*slots(tmp_path / "one", videos))

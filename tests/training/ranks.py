@@ -54,7 +54,7 @@ def _rank(rank: int, world: int, port: int, work: Callable[..., None], arguments
         processes.start("cpu")
         work(*arguments)
         processes.stop()
-    except BaseException:
+    except BaseException:  # noqa: BLE001
         traceback.print_exc(file=sys.__stderr__)
         os._exit(1)
     os._exit(0)

@@ -1,4 +1,4 @@
-"""Every stage that `fit` trains, tiny, on a square that moves: six rows a batch, which one, two and three ranks divide."""
+"""Every stage that `fit` trains, tiny, on a square that moves: six rows a batch, for one, two and three ranks."""
 
 from __future__ import annotations
 

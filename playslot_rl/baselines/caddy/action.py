@@ -145,8 +145,9 @@ class ActionNetwork(nn.Module):
 
     @torch.no_grad()
     def update_centroids(self, p: Tensor, d: Tensor) -> None:
-        """Move the centroids towards the p-weighted means of directions (..., Z) of the global batch; p is (..., K). Training
-        mode only.
+        """Move the centroids towards the p-weighted means of directions (..., Z); p is (..., K). Training mode only.
+
+        The means are those of the global batch.
         """
         if not self.training:
             return
