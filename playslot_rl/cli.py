@@ -11,13 +11,14 @@ import importlib
 import os
 import sys
 import textwrap
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NoReturn
 
 from playslot_rl import __version__
-from playslot_rl.errors import DEBUG, ConfigError, explain
+from playslot_rl.errors import DEBUG, ConfigError, PeerError, explain
 
 
 @dataclass(frozen=True)
@@ -208,6 +209,12 @@ COMMANDS: Final[dict[str, Command]] = {
     ),
 }
 
+SEVERAL: Final = ("train-slots", "train-dynamics", "train-policy", "train-baseline")
+"""Commands that torchrun and accelerate launch may start on several processes."""
+INTERRUPTED: Final = 130
+PEER_PATIENCE_S: Final = 5.0
+"""How long a process that lost another one waits for that one's own error to be printed."""
+
 GROUPS: Final = {"dataset": "data sets: info, verify, repair, merge, split, viz, push, pull"}
 """Commands with actions and options of their own instead of `key=value`."""
 
@@ -310,14 +317,23 @@ def _run(name: str, options: argparse.Namespace) -> int:
         from playslot_rl import doctor
 
         return doctor.main(config)
+    from playslot_rl import processes
     from playslot_rl.envs.rendering import import_mujoco
 
+    if processes.launched().world > 1:
+        if name not in SEVERAL:
+            raise ConfigError(
+                f"got {processes.launched().world} processes, expected one: only {', '.join(SEVERAL)} run on several; "
+                "start this command without torchrun or accelerate launch"
+            )
+        processes.start(config.device)
     import_mujoco()  # torchrl imports it too, and would fail without our cure
     recipe = importlib.import_module(f"playslot_rl.recipes.{name.replace('-', '_')}")
     if name == "bench":
         recipe.main(config, json_path=options.json)
     else:
         recipe.main(config)
+    processes.stop()
     return 0
 
 
@@ -327,7 +343,11 @@ def _guarded(name: str, run: Callable[[], int]) -> int:
         return run()
     except KeyboardInterrupt as error:
         where = str(error) or "interrupted; the same command carries on from the last checkpoint or episode"
-        return _fail(name, where, 130)
+        return _fail(name, where, INTERRUPTED)
+    except PeerError as error:
+        if _debugging():
+            raise
+        return _fail(name, explain(error), 1, patience_s=PEER_PATIENCE_S)
     except Exception as error:
         if _debugging():
             raise
@@ -338,6 +358,18 @@ def _debugging() -> bool:
     return os.environ.get(DEBUG, "") not in ("", "0")
 
 
-def _fail(name: str, message: str, code: int) -> int:
-    print(f"playslot {name}: error: {message}", file=sys.stderr)
+def _fail(name: str, message: str, code: int, patience_s: float = 1.0) -> int:
+    """Print one line. Of several processes the first one with an error of its own does: what all of them got is said by
+    rank 0, and the others are ended by the launcher while they wait.
+    """
+    from playslot_rl.processes import launched
+
+    rank = launched().rank
+    if rank:
+        if code == INTERRUPTED:
+            return code
+        name = f"{name} (rank {rank})"
+    if launched().world > 1 and (rank or patience_s > 1):
+        time.sleep(patience_s)
+    print(f"playslot {name}: error: {message}", file=sys.stderr, flush=True)
     return code

@@ -33,6 +33,10 @@ class TrainingError(PlaySlotError, RuntimeError):
     """Training cannot go on: the loss is not finite."""
 
 
+class PeerError(TrainingError):
+    """Another process of the same training ended; its own error says why."""
+
+
 class OutputError(PlaySlotError, OSError):
     """The output folder holds something else, or cannot be written (full disk)."""
 

@@ -103,12 +103,14 @@ def open_device(config: ExperimentConfig) -> torch.device:
     import torch
 
     from playslot_rl.allocator import tune_allocator
+    from playslot_rl.processes import own_device
     from playslot_rl.threads import set_threads
 
     tune_allocator()
     set_threads(config.threads)
     try:
         device = torch.device(config.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        device = own_device(device)
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:
         raise ConfigError(f"device={config.device}: {str(error).splitlines()[0]}; use device=cpu") from error
@@ -144,11 +146,14 @@ def demonstration_views(
 
 def adopt_policy(config: ExperimentConfig, record: StageRecord, steps: int) -> None:
     """Take over the finished policy training of the run `behaviour.policy_from` names, if it is the same one."""
+    from playslot_rl.processes import here, wait
     from playslot_rl.training.runs import adopt_training
 
     if config.behaviour.policy_from:
         record.begin()
-        adopt_training(config.behaviour.policy_from, record.run, record.name, steps)
+        if here().first:
+            adopt_training(config.behaviour.policy_from, record.run, record.name, steps)
+        wait()
 
 
 def held_out_text(demos: DemonstrationSplit) -> str:

@@ -23,8 +23,9 @@ from playslot_rl.recipes.run import (
 )
 
 if TYPE_CHECKING:
-    from playslot_rl.training.fit import Part, Stage
+    from playslot_rl.training.fit import Part
     from playslot_rl.training.record import StageRecord, Training
+    from playslot_rl.training.stage import Stage
 
 
 def main(config: ExperimentConfig) -> None:

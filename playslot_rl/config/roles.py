@@ -18,7 +18,8 @@ Role = Literal["call", "machine", "free", "folder"]
 """`call`: what one invocation does; a stored run does not hand it on.
 
 `machine`: where, how loudly and of which names a job of a comparison is made, not what comes out.
-`free`: how often and how long we look; may differ when a stage is resumed or found finished.
+`free`: how often and how long we look, and how a batch is computed where that only rounds otherwise; may differ when a
+stage is resumed or found finished.
 `folder`: one or several paths, in which a leading `~` is expanded.
 """
 

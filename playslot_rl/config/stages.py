@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from playslot_rl.config.roles import Checked, at_least, between, role
+from playslot_rl.config.roles import Checked, at_least, between, role, within
 
 Precision = Literal["fp32", "bf16"]
 
 
 @dataclass(frozen=True)
-class OptimConfig:
+class OptimConfig(Checked):
     """Adam and its schedule.
 
     Attributes:
@@ -19,12 +19,20 @@ class OptimConfig:
         warmup_steps: linear warm-up.
         schedule: `cosine` to zero over the stage's steps after warm-up, or `constant`.
         grad_clip: maximum gradient norm; 0 switches clipping off.
+        accumulate: micro-batches that a process computes one after the other, for want of memory; the result is the
+            same but for rounding. It and the number of processes divide the batch.
+        ema: decay of a moving average of the weights, which is validated and kept in their place; 0 keeps the last
+            weights (paper).
     """
+
+    group = "optim."
 
     lr: float = 1e-4
     warmup_steps: int = 0
     schedule: Literal["cosine", "constant"] = "cosine"
     grad_clip: float = 0.05
+    accumulate: int = field(default=1, metadata=role("free") | at_least(1))
+    ema: float = field(default=0.0, metadata=within(lambda value: 0 <= value < 1, "0 (none) to below 1"))
 
 
 @dataclass(frozen=True)
@@ -39,6 +47,7 @@ class StageConfig(Checked):
         checkpoint_every: steps between checkpoints.
         validate_every: steps between validations.
         log_every: steps between log lines.
+        compile: make kernels of the networks' parts by torch.compile; needs a C++ compiler, and a minute at the start.
     """
 
     steps: int = field(default=200_000, metadata=at_least(1))
@@ -48,6 +57,7 @@ class StageConfig(Checked):
     checkpoint_every: int = field(default=1000, metadata=role("free") | at_least(1))
     validate_every: int = field(default=1000, metadata=role("free"))
     log_every: int = field(default=50, metadata=role("free"))
+    compile: bool = field(default=False, metadata=role("free"))
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from playslot_rl import keys
+from playslot_rl.shares import averaged
 
 
 class _CloningLoss(LossModule):
@@ -100,7 +101,7 @@ class _CloningLoss(LossModule):
         mask = mask.reshape(target.shape[:-1])
         # The target is replaced, not the error multiplied: it may be NaN, and 0 * NaN is NaN in the gradient.
         error = self._distance(predicted - torch.where(mask[..., None], target, predicted.detach())).mean(-1)
-        return error.sum() / mask.sum().clamp(min=1)
+        return error.sum() / averaged(mask.sum().float()).clamp(min=1)
 
     def _distance(self, difference: Tensor) -> Tensor:
         whitening = getattr(self.network, "whitening", None)

@@ -8,6 +8,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from playslot_rl.shares import averaged
+
 
 def total_loss(losses: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
     """Sum of the entries named `loss_*` (scalars, weights included).
@@ -22,5 +24,5 @@ def total_loss(losses: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
 
 
 def psnr(mse: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio in dB of a mean squared error on frames in [0, 1]."""
-    return -10 * mse.detach().clamp(min=1e-12).log10()
+    """Peak signal-to-noise ratio in dB of a mean squared error on frames in [0, 1]; that of the global batch."""
+    return -10 * averaged(mse.detach()).clamp(min=1e-12).log10()

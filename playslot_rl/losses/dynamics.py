@@ -23,6 +23,7 @@ from playslot_rl.modules.inverse_dynamics import InverseDynamics, LatentActions
 from playslot_rl.modules.predictors import Predictor
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.modules.savi import SAVi
+from playslot_rl.shares import own_noise
 
 
 class DynamicsLoss(LossModule):
@@ -142,7 +143,8 @@ class DynamicsLoss(LossModule):
         count = self.config.decoded_frames
         if 0 < count < steps:
             device = predicted.device if generator is None else generator.device
-            order = torch.rand(batch, steps, generator=generator, device=device).argsort(dim=1)
+            drawn = own_noise((batch, steps), lambda shape: torch.rand(shape, generator=generator, device=device))
+            order = drawn.argsort(dim=1)
             chosen = order[:, :count].to(predicted.device)
             rows = torch.arange(batch, device=predicted.device)[:, None]
             predicted, pixels = predicted[rows, chosen], pixels[rows.to(pixels.device), chosen.to(pixels.device)]

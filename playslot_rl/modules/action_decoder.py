@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from playslot_rl.config import ActionDecoderConfig
 from playslot_rl.modules.transformer import SlotTokenEncoder
 from playslot_rl.modules.whitening import Whitening
+from playslot_rl.shares import own_noise
 
 SAME = 1e-6
 """Standard deviation up to which numbers count as the same."""
@@ -93,7 +94,8 @@ class ActionDecoder(nn.Module):
             return torch.tanh(self.layers(inputs))
         state = self.encoder(slots)
         if self.training and self.dropout:
-            state = state * (torch.rand(*state.shape[:-1], 1, device=state.device) >= self.dropout)
+            drawn = own_noise((*state.shape[:-1], 1), lambda shape: torch.rand(shape, device=state.device))
+            state = state * (drawn >= self.dropout)
         return torch.tanh(self.seeing(torch.cat((inputs, state), dim=-1)))
 
 

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from playslot_rl.config import InverseDynamicsConfig
 from playslot_rl.modules.quantizer import ActionQuantizer
 from playslot_rl.modules.transformer import SlotTokenEncoder
+from playslot_rl.shares import own_noise
 
 
 class LatentActions(NamedTuple):
@@ -130,7 +131,9 @@ class InverseDynamics(nn.Module):
         mean, variance = mu[:, 1:] - mu[:, :-1], var[:, 1:] + var[:, :-1]
         z = mean
         if self.training or self.config.sample:
-            noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
+            noise = own_noise(
+                mean.shape, lambda s: torch.randn(s, generator=generator, device=mean.device, dtype=mean.dtype)
+            )
             z = mean + variance.sqrt() * noise
         return self._compose(z, mean)
 

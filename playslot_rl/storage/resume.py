@@ -23,7 +23,7 @@ from playslot_rl.config.plain import flatten
 from playslot_rl.errors import CheckpointError, OutputError
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.folders import new_folder
-from playslot_rl.storage.tensors import load_modules, load_tensors, module_tensors, save_tensors
+from playslot_rl.storage.tensors import load_into, load_modules, load_tensors, module_tensors, save_tensors
 
 FORMAT = "playslot_rl.training/1"
 KEPT = 2
@@ -69,6 +69,7 @@ ADDED: Final[Mapping[str, Any]] = {
     "reads_slots": False,
     "patience": 0,
     "project_out": True,
+    "ema": 0.0,
 }
 """Settings that came after the first checkpoints, and what those were trained with."""
 
@@ -111,19 +112,25 @@ class TrainingCheckpoints:
         modules: Mapping[str, nn.Module],
         optimizer: torch.optim.Optimizer,
         parameters: Mapping[str, nn.Parameter],
+        average: Mapping[str, Tensor] | None = None,
     ) -> Path:
-        """Write a checkpoint and remove all but the newest two.
+        """Write a checkpoint, with an average of the weights if there is one, and remove all but the newest two.
 
         Raises:
             OutputError: full disk; the earlier checkpoints stay.
         """
         tensors = {"modules": module_tensors(modules), "optimizer": optimizer_tensors(optimizer, list(parameters))}
-        return self._write(state.step, tensors, asdict(state))
+        return self._write(state.step, tensors | ({"average": average} if average else {}), asdict(state))
 
     def resume(
-        self, modules: Mapping[str, nn.Module], optimizer: torch.optim.Optimizer, parameters: Mapping[str, nn.Parameter]
+        self,
+        modules: Mapping[str, nn.Module],
+        optimizer: torch.optim.Optimizer,
+        parameters: Mapping[str, nn.Parameter],
+        average: Mapping[str, Tensor] | None = None,
     ) -> TrainingState:
-        """Load the newest checkpoint into the modules and the optimiser; a fresh `TrainingState` if there is none.
+        """Load the newest checkpoint into the modules, the optimiser and the average of the weights, if there is one; a
+        fresh `TrainingState` if there is no checkpoint.
 
         Raises:
             CheckpointError: the config differs from the stored one, or the checkpoint is damaged.
@@ -135,6 +142,8 @@ class TrainingCheckpoints:
         last, stored = newest
         load_modules(modules, load_tensors(last / "modules.safetensors"), str(last))
         restore_optimizer(optimizer, load_tensors(last / "optimizer.safetensors"), str(last), list(parameters))
+        if average:
+            load_into(average, load_tensors(last / "average.safetensors"), str(last))
         best, stale = stored.get("best", {}), stored.get("stale", 0)
         return TrainingState(stored["step"], stored["seconds"], stored["metrics"], best, stale)
 

@@ -57,7 +57,15 @@ def load_modules(modules: Mapping[str, nn.Module], tensors: Mapping[str, Tensor]
     Raises:
         CheckpointError: a tensor is missing, unexpected, or of another shape.
     """
-    expected = module_tensors(modules)
+    load_into(module_tensors(modules), tensors, where)
+
+
+def load_into(expected: Mapping[str, Tensor], tensors: Mapping[str, Tensor], where: str) -> None:
+    """Copy tensors into others of the same names and shapes; nothing is changed unless everything fits.
+
+    Raises:
+        CheckpointError: a tensor is missing, unexpected, or of another shape.
+    """
     missing, unexpected = sorted(set(expected) - set(tensors)), sorted(set(tensors) - set(expected))
     if missing or unexpected:
         kind, names = ("misses", missing) if missing else ("holds the unexpected", unexpected)

@@ -2,54 +2,34 @@
 
 A stage says what it trains and what its loss is; the loop steps Adam, schedules, clips, checks, logs, validates and
 checkpoints. Killed at any moment and started again, it ends with the same weights and buffers, bit for bit on a CPU.
+Of several processes (`playslot_rl.processes`) each computes its share of every batch, and the first one writes.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
 from playslot_rl.config import LoggingConfig, OptimConfig, StageConfig, to_dict
 from playslot_rl.config.roles import fixed_keys
+from playslot_rl.processes import here, spreading, wait
 from playslot_rl.progress import StageProgress
-from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.seeding import global_seed
 from playslot_rl.storage.resume import TrainingCheckpoints, TrainingState
+from playslot_rl.training.averages import WeightAverage
+from playslot_rl.training.batches import GlobalBatches
+from playslot_rl.training.compiling import compile_parts, release_parts
 from playslot_rl.training.logging import Watch, finite
 from playslot_rl.training.patience import Patience
-
-
-class Stage(Protocol):
-    """What a stage gives to `fit`. It keeps no state of its own between steps, except in its modules."""
-
-    @property
-    def modules(self) -> Mapping[str, nn.Module]:
-        """What is trained and stored, by name; parameters without `requires_grad` are stored, not trained."""
-
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
-        """Scalars of one step; `loss` is minimised, the others are logged. All randomness comes from `generators`."""
-
-    def validate(self, step: int) -> Mapping[str, float]:
-        """Numbers on held-out data after `step` steps; called without gradients, modules in eval mode."""
-
-
-@runtime_checkable
-class WatchedStage(Protocol):
-    """A `Stage` whose validations can also be looked at. Nothing of this changes what is learned."""
-
-    def warnings(self, step: int, values: Mapping[str, float]) -> Mapping[str, str]:
-        """What the numbers of the validation after `step` steps say is wrong, by kind: one line each, with a cure."""
-
-    def pictures(self, step: int) -> Mapping[str, npt.NDArray[np.uint8]]:
-        """Pictures (H, W, 3) of held-out data, by name; called like `validate`, where a logger shows pictures."""
+from playslot_rl.training.stage import Stage, WatchedStage
 
 
 @dataclass(frozen=True)
@@ -74,6 +54,11 @@ class Part:
     identity: Mapping[str, Any] = field(default_factory=dict)
     patience: Patience | None = None
 
+    @property
+    def key(self) -> str:
+        """Dotted config group, for messages."""
+        return self.lr_key.rpartition(".optim.")[0] or self.lr_key.partition(".")[0] or self.name
+
 
 def fit(
     part: Part,
@@ -87,7 +72,8 @@ def fit(
 ) -> tuple[TrainingState, int]:
     """Train to `part.config.steps` or the end of patience, carrying on from the newest checkpoint if there is one.
 
-    Writes `checkpoints/step_*`, `logs/` and `metrics.jsonl` in the part's folder, nothing else.
+    Writes `checkpoints/step_*`, `logs/` and `metrics.jsonl` in the part's folder, nothing else; with several processes,
+    all of which call this, the first one does.
 
     Args:
         part: what is trained.
@@ -102,22 +88,29 @@ def fit(
         Where it ended, and the step this process started at: the same if there was nothing left to do.
 
     Raises:
+        ConfigError: the processes do not divide the batch.
         TrainingError: a loss or gradient is not finite; the last good checkpoint stays.
         CheckpointError: the folder was begun with another config, or its checkpoint is damaged.
         OutputError: full disk; the last good checkpoint stays.
         KeyboardInterrupt: Ctrl-C; its message says where the same command carries on.
     """
-    logging, config = logging or LoggingConfig(backend="none", progress=False), part.config
+    silent = LoggingConfig(backend="none", progress=False)
+    logging, config = (logging or silent) if here().first else silent, part.config
     run = _Run(part, folder / part.folder, seed, device, identity or {})
-    if ready is not None:
-        ready()
     start = run.state.step
-    run.watch.history.rewind(start)
+    if here().first:
+        if ready is not None:
+            ready()
+        run.watch.history.rewind(start)
+    wait()  # until all have looked, and what is there is there for all
     if not run.ended:
+        run.batches.meet()
         progress = StageProgress(part.name, start, config.steps, logging.progress, config.log_every * 10)
-        with run.watch.running(logging, start), progress:
+        with run.watch.running(logging, start), run.compiled(), progress:
             while not run.ended:
                 run.advance(run.state.step, progress)
+    if run.average is not None:
+        run.average.settle()
     return run.state, start
 
 
@@ -127,17 +120,20 @@ class _Run:
     def __init__(
         self, part: Part, folder: Path, seed: int, device: torch.device | str, identity: Mapping[str, Any]
     ) -> None:
-        self.stage, self.config, self.seed, self.device = part.stage, part.config, seed, device
+        self.part, self.stage, self.config, self.seed, self.device = part, part.stage, part.config, seed, device
         self.folder, self.patience = folder, part.patience
         self.parameters = trainable_parameters(part.stage.modules)
+        self.batches = GlobalBatches(part.stage, part.config, self.parameters, part.key)
         self.optimizer = build_adam(self.parameters, part.config.optim)
+        ema = part.config.optim.ema
+        self.average = WeightAverage(self.parameters, ema) if ema else None
         own = {part.name: fixed_keys(to_dict(part.config)), "seed": seed}
         if part.patience is not None:  # when it looks decides where it ends
             own["validate_every"] = part.config.validate_every
         self.checkpoints = TrainingCheckpoints(folder / "checkpoints", {**own, **identity, **part.identity})
         cure = f"lower {part.lr_key or f'{part.name}.optim.lr'} or check the data"
         self.watch = Watch(part.name, folder, self.checkpoints, cure)
-        self.state = self.checkpoints.resume(part.stage.modules, self.optimizer, self.parameters)
+        self.state = self.checkpoints.resume(part.stage.modules, self.optimizer, self.parameters, self._averaged)
         self._began = time.monotonic() - self.state.seconds
         self._train_mode(True)
 
@@ -146,6 +142,22 @@ class _Run:
         """Whether there is nothing left to do."""
         patient = self.patience is None or not self.patience.ended(self.state)
         return self.state.step >= self.config.steps or not patient
+
+    @property
+    def _averaged(self) -> Mapping[str, Tensor] | None:
+        return None if self.average is None else self.average.tensors
+
+    @contextlib.contextmanager
+    def compiled(self) -> Iterator[None]:
+        """Inside the block the networks' parts are compiled, if the config says so."""
+        if not self.config.compile:
+            yield
+            return
+        compile_parts(self.stage.modules, f"{self.part.key}.compile")
+        try:
+            yield
+        finally:
+            release_parts(self.stage.modules)
 
     def advance(self, step: int, progress: StageProgress) -> None:
         """One step, and whatever is due after it."""
@@ -166,16 +178,15 @@ class _Run:
             self._judge()
         if done % config.checkpoint_every == 0 or self.ended:
             self.watch.require_finite(self.stage.modules, f"step {done}")
-            self.checkpoints.save(self.state, self.stage.modules, self.optimizer, self.parameters)
+            if here().first:
+                self.checkpoints.save(self.state, self.stage.modules, self.optimizer, self.parameters, self._averaged)
 
     def _step(self, step: int) -> dict[str, Tensor | float]:
         rate = learning_rate(self.config.optim, step, self.config.steps)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
-        with global_seed(self.seed, step):
-            losses = self.stage.loss(step, StepGenerators(self.seed, step, self.device))
-            losses["loss"].backward()
+        losses = self.batches.backward(step, self.seed, self.device)
         norm = clip_gradients(self.parameters, self.config.optim.grad_clip)
         # One transfer for both, so that a GPU is waited for once a step.
         loss, size = torch.stack([losses["loss"].detach().float(), norm.float()]).tolist()
@@ -183,12 +194,14 @@ class _Run:
             if not math.isfinite(got):
                 raise self.watch.not_finite(what, str(got), f"step {step + 1}")
         self.optimizer.step()
+        if self.average is not None:
+            self.average.update(step + 1)
         values: dict[str, Tensor | float] = {key: value.detach() for key, value in losses.items()}
         return values | {"loss": loss, "lr": rate, "grad_norm": size}
 
     def _validate(self, done: int) -> dict[str, float]:
         self._train_mode(False)
-        with torch.no_grad(), global_seed(self.seed, done, "validation"):
+        with self._shown(), spreading(), torch.no_grad(), global_seed(self.seed, done, "validation"):
             values = {key: float(value) for key, value in self.stage.validate(done).items()}
         self._train_mode(True)
         kept = finite(values)
@@ -203,7 +216,7 @@ class _Run:
         if not self.watch.shows_pictures:
             return
         self._train_mode(False)
-        with torch.no_grad(), global_seed(self.seed, done, "validation"):
+        with self._shown(), torch.no_grad(), global_seed(self.seed, done, "validation"):
             pictures = self.stage.pictures(done)
         self._train_mode(True)
         self.watch.show(done, pictures)
@@ -213,15 +226,24 @@ class _Run:
             return
         modules = self.stage.modules
         self.watch.require_finite(modules, f"step {self.state.step}")
-        self.state = self.patience.judge(self.state, modules, self.folder)
+        with self._shown():
+            self.state = self.patience.judge(self.state, modules, self.folder)
         if self.ended:
             self.state = self.patience.restore(self.state, modules, self.folder)
+            if self.average is not None:
+                self.average.restart()
+
+    def _shown(self) -> contextlib.AbstractContextManager[None]:
+        """The weights that count: their average, if there is one."""
+        return contextlib.nullcontext() if self.average is None else self.average.shown()
 
     def _train_mode(self, on: bool) -> None:
         for module in self.stage.modules.values():
             module.train(on)
 
     def _log(self, split: str, step: int, values: Mapping[str, float]) -> None:
+        if not here().first:
+            return
         self.watch.log(split, step, {**values, "seconds": round(self.state.seconds, 3)}, at=step)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from torch import nn
 
+from playslot_rl.processes import here, wait
 from playslot_rl.storage.resume import TrainingState
 from playslot_rl.storage.tensors import load_modules, load_tensors, module_tensors, save_tensors
 
@@ -41,7 +42,8 @@ class Patience:
         return state.stale >= self.checks
 
     def judge(self, state: TrainingState, modules: Mapping[str, nn.Module], folder: Path) -> TrainingState:
-        """The state after a validation; the weights are written to `FOLDER/best.safetensors` if it is the best one.
+        """The state after a validation; the weights are written to `FOLDER/best.safetensors` if it is the best one, by
+        the first of several processes.
 
         A training that is killed and carries on from an older checkpoint comes to the same weights, and writes them
         again.
@@ -52,11 +54,13 @@ class Patience:
         """
         if state.best and state.metrics[self.watched] >= state.best[self.watched]:
             return replace(state, stale=state.stale + 1)
-        folder.mkdir(parents=True, exist_ok=True)
-        save_tensors(folder / BEST, module_tensors(modules))
+        if here().first:
+            folder.mkdir(parents=True, exist_ok=True)
+            save_tensors(folder / BEST, module_tensors(modules))
         return replace(state, best=dict(state.metrics), stale=0)
 
     def restore(self, state: TrainingState, modules: Mapping[str, nn.Module], folder: Path) -> TrainingState:
         """Load the best weights; the state's metrics become theirs."""
+        wait()
         load_modules(modules, load_tensors(folder / BEST), str(folder / BEST))
         return replace(state, metrics=state.best)

@@ -18,6 +18,7 @@ from playslot_rl.data.opening import open_configured
 from playslot_rl.data.source import EpisodeFrames, concatenate
 from playslot_rl.data.windows import Clips
 from playslot_rl.errors import CheckpointError, DataError
+from playslot_rl.processes import here, wait
 from playslot_rl.storage.checkpoints import (
     StageCheckpoint,
     checkpoint_folder,
@@ -168,8 +169,9 @@ class StageRecord:
         Raises:
             OutputError: the folder cannot be written.
         """
-        store_config(self.config, self.run)
-        self.ready()
+        if here().first:
+            store_config(self.config, self.run)
+            self.ready()
 
     def save(
         self,
@@ -179,13 +181,17 @@ class StageRecord:
         seconds: float,
         extra: Mapping[str, Any],
     ) -> StageCheckpoint:
-        """Write the finished stage; `extra` goes to its `meta.json`.
+        """Write the finished stage; `extra` goes to its `meta.json`. The first of several processes does, all read it.
 
         Raises:
             OutputError: full disk, or a folder that cannot be written.
         """
-        return save_stage(
-            checkpoint_folder(self.run, self.name),
+        path = checkpoint_folder(self.run, self.name)
+        if not here().first:
+            wait()
+            return read_stage(path, self.name)
+        done = save_stage(
+            path,
             stage=self.name,
             modules=modules,
             config=self.stored,
@@ -196,6 +202,8 @@ class StageRecord:
             seconds=seconds,
             extra={"seed": self.config.seed, **extra},
         )
+        wait()
+        return done
 
     def _of_stored(self, *keys: str) -> dict[str, Any]:
         """The parts of `stored` that dotted keys name, nested as there."""
@@ -242,6 +250,7 @@ def run_stage(record: StageRecord, prepare: Callable[[], Training]) -> StageChec
         OutputError, TrainingError, KeyboardInterrupt: as `fit`.
     """
     done = record.finished()
+    wait()  # until all have looked
     if done is not None:
         return done
     training = prepare()

@@ -15,7 +15,9 @@ from playslot_rl.config import DynamicsStageConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.losses.common import total_loss
 from playslot_rl.losses.dynamics import DynamicsLoss
+from playslot_rl.processes import spread
 from playslot_rl.seeding import StepGenerators, step_generator
+from playslot_rl.shares import own_rows
 from playslot_rl.world_model import WorldModel, module_device
 
 
@@ -47,21 +49,24 @@ class DynamicsStage:
         """Image, slot and quantiser loss of one batch of clips."""
         self.model.savi.precision = self.config.precision
         teacher = step < self.config.teacher_steps
-        out = self.criterion(self._batch(self._sample(generators)), generators.torch("latent"), teacher)
+        out = self.criterion(self._batch(own_rows(self._sample(generators))), generators.torch("latent"), teacher)
         logged = {key: value for key, value in out.items() if not key.startswith("loss_")}
         return {"loss": total_loss(out), "loss_vq": out["loss_vq"], **logged}
 
     def validate(self, step: int) -> Mapping[str, float]:
         """Errors of autoregressive rollouts on held-out clips, with the latents' means, in fp32."""
         self.model.savi.precision = "fp32"
-        outs = [
-            self.criterion(self._batch(rows), step_generator(0, step, "validation", self.device))
-            for rows in self.clips.validation_batches()
-        ]
         names = ("mse_image", "mse_slot", "psnr", "usage", "perplexity")
-        return {name: float(np.mean([float(out[name]) for out in outs])) for name in names}
+
+        def look(_: int, rows: IntArray) -> list[float]:
+            out = self.criterion(self._batch(rows), step_generator(0, step, "validation", self.device))
+            return [float(out[name]) for name in names]
+
+        columns = zip(*spread(self.clips.validation_batches(), look), strict=True)
+        return {name: float(np.mean(column)) for name, column in zip(names, columns, strict=True)}
 
     def _sample(self, generators: StepGenerators) -> IntArray:
+        """Rows of the global batch."""
         config, numpy, clips = self.config, generators.numpy("windows"), self.clips
         rows = clips.sample(config.batch_size, numpy)
         if config.from_start > 0:

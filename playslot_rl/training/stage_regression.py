@@ -21,7 +21,9 @@ from playslot_rl.config import Precision
 from playslot_rl.data.demonstrations import Transitions, real_actions, shift_frames
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
+from playslot_rl.processes import spread
 from playslot_rl.seeding import StepGenerators
+from playslot_rl.shares import own_noise, own_rows
 
 Observed = Tensor | tuple[Tensor, ...]
 """What a network is called with: one tensor (b, ...), or several."""
@@ -61,7 +63,9 @@ class TensorInputs:
         if self.noise == 0:
             return values
         generator = generators.torch(self.stream, values.device)
-        return values + self.noise * torch.randn(values.shape, generator=generator, device=values.device)
+        return values + self.noise * own_noise(
+            values.shape, lambda shape: torch.randn(shape, generator=generator, device=values.device)
+        )
 
     def plain(self, rows: Tensor) -> Tensor:
         """Rows, without noise."""
@@ -112,7 +116,8 @@ class FrameInputs:
         """Frames of rows, each shifted by its own random offset."""
         if self.shift == 0:
             return self.plain(rows)
-        offsets = torch.randint(2 * self.shift + 1, (len(rows), 2), generator=generators.torch("shift", "cpu"))
+        generator = generators.torch("shift", "cpu")
+        offsets = own_noise((len(rows), 2), lambda shape: torch.randint(2 * self.shift + 1, shape, generator=generator))
         frames = self.source.frames[self.rows[rows.cpu().numpy()]]
         moved = shift_frames(frames, offsets.numpy() - self.shift)
         return torch.from_numpy(moved).movedim(-1, 1).to(self.device)
@@ -190,7 +195,7 @@ class RegressionStage:
         """Error of one batch."""
         device = self.targets.device
         drawn = torch.randint(len(self.targets), (self.batch_size,), generator=generators.torch(self.stream, "cpu"))
-        rows = drawn.to(device)
+        rows = own_rows(drawn).to(device)
         observed = dict(zip(self.criterion.observed, _several(self.inputs.draw(rows, generators)), strict=True))
         batch = {**observed, self.criterion.tensor_keys.action: self.targets[rows]}
         with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):
@@ -211,7 +216,8 @@ class RegressionStage:
 @torch.no_grad()
 def apply_rows(network: nn.Module, inputs: Inputs, rows: Tensor, batch: int = 1024) -> Tensor:
     """A network's outputs (b, ...) on rows of its inputs, in the mode it is in."""
-    return torch.cat([network(*_several(inputs.plain(part))) for part in rows.split(batch)])
+    parts = spread(rows.split(batch), lambda _, part: network(*_several(inputs.plain(part))))
+    return torch.cat(parts).to(rows.device)
 
 
 def _several(observed: Observed) -> tuple[Tensor, ...]:

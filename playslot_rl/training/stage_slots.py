@@ -19,7 +19,9 @@ from playslot_rl.frames import to_uint8
 from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.modules.savi import Decoded, SAVi
 from playslot_rl.modules.savi.health import SlotHealth
+from playslot_rl.processes import spread
 from playslot_rl.seeding import StepGenerators, step_generator
+from playslot_rl.shares import own_rows
 from playslot_rl.training.slot_warnings import slot_warnings
 from playslot_rl.world_model import module_device
 
@@ -46,7 +48,7 @@ class SlotsStage:
 
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         """Reconstruction error of one batch of clips."""
-        rows = self.clips.sample(self.config.batch_size, generators.numpy("windows"))
+        rows = own_rows(self.clips.sample(self.config.batch_size, generators.numpy("windows")))
         self.savi.precision = self.config.precision
         out = self.criterion(self._batch(rows), generator=generators.torch("slots"))
         return {"loss": out["loss_reconstruction"], "psnr": out["psnr"]}
@@ -54,11 +56,17 @@ class SlotsStage:
     def validate(self, step: int) -> Mapping[str, float]:
         """PSNR (dB) and the slots' health (`playslot_rl.modules.savi.health`) on held-out clips, in fp32."""
         self.savi.precision = "fp32"
-        errors, health = [], SlotHealth(self.savi.config.n_slots)
-        for rows in self.clips.validation_batches():
+
+        def look(_: int, rows: IntArray) -> tuple[float, SlotHealth]:
             frames, decoded = self._parse(rows, step)
-            errors.append(float((decoded.frames - frames).square().mean()))
+            health = SlotHealth(self.savi.config.n_slots)
             health.add(frames, decoded.frames, decoded.masks)
+            return float((decoded.frames - frames).square().mean()), health
+
+        errors, found = zip(*spread(self.clips.validation_batches(), look), strict=True)
+        health = SlotHealth(self.savi.config.n_slots)
+        for part in found:
+            health.join(part)
         mse = float(np.mean(errors))
         return {"mse": mse, "psnr": -10.0 * float(np.log10(max(mse, 1e-12))), **health.values()}
 

@@ -15,9 +15,10 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips
 from playslot_rl.seeding import step_generator
 from playslot_rl.testing import tiny_savi
-from playslot_rl.training.fit import Part, Stage, WatchedStage, fit
+from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.logging import History
 from playslot_rl.training.slot_warnings import slot_warnings
+from playslot_rl.training.stage import Stage, WatchedStage
 from playslot_rl.training.stage_slots import SlotsStage
 
 HEALTHY = {"slots_in_use": 4.0, "flicker": 0.0, "mask_entropy": 0.4, "moving_explained": 0.8}

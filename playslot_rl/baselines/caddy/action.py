@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from playslot_rl.baselines.caddy.blocks import Res
+from playslot_rl.shares import all_rows, own_noise
 
 VARIANCE = 1e-6
 """Added to the variances."""
@@ -133,7 +134,8 @@ class ActionNetwork(nn.Module):
         direction = difference(first, second)
         d = direction.mean
         if noise is not None:
-            d = d + direction.var.sqrt() * _on(d, torch.randn(d.shape, generator=noise, device=noise.device))
+            drawn = own_noise(d.shape, lambda shape: torch.randn(shape, generator=noise, device=noise.device))
+            d = d + direction.var.sqrt() * _on(d, drawn)
         return Moves(direction, d, self.to_logits(d).float())
 
     def variability(self, a: Tensor, d: Tensor) -> Tensor:
@@ -143,10 +145,13 @@ class ActionNetwork(nn.Module):
 
     @torch.no_grad()
     def update_centroids(self, p: Tensor, d: Tensor) -> None:
-        """Move the centroids towards the p-weighted means of directions (..., Z); p is (..., K). Training mode only."""
+        """Move the centroids towards the p-weighted means of directions (..., Z); p is (..., K). Training mode only.
+
+        The means are those of the global batch.
+        """
         if not self.training:
             return
-        p, d = p.float().flatten(0, -2), d.float().flatten(0, -2)
+        p, d = all_rows(p.float().flatten(0, -2)), all_rows(d.float().flatten(0, -2))
         means = (p.T @ d) / p.sum(dim=0).clamp(min=1e-8)[:, None]
         self.centroids.lerp_(means, 1 - self.decay)
 
@@ -170,7 +175,8 @@ def gumbel_softmax(logits: Tensor, temperature: float, noise: torch.Generator) -
         temperature: tau, positive; towards 0 the samples are one-hot.
         noise: source of the Gumbel noise.
     """
-    uniform = torch.rand(logits.shape, generator=noise, device=noise.device).clamp(min=1e-20)
+    drawn = own_noise(logits.shape, lambda shape: torch.rand(shape, generator=noise, device=noise.device))
+    uniform = drawn.clamp(min=1e-20)
     gumbel = -(-uniform.log()).log()
     return ((logits + _on(logits, gumbel)) / temperature).softmax(dim=-1)
 

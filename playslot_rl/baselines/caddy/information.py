@@ -14,16 +14,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from playslot_rl.shares import all_rows
+
 TINY = 1e-12
 
 
 def joint_distribution(real: Tensor, generated: Tensor) -> Tensor:
-    """Symmetric joint distribution (K, K) of the actions in real and generated frames.
+    """Symmetric joint distribution (K, K) of the actions in real and generated frames of the global batch.
 
     Args:
         real, generated: probabilities (..., K), at least one row.
     """
-    real, generated = real.float().flatten(0, -2), generated.float().flatten(0, -2)
+    real, generated = all_rows(real.float().flatten(0, -2)), all_rows(generated.float().flatten(0, -2))
     joint = real.T @ generated / len(real)
     return (joint + joint.T) / 2
 

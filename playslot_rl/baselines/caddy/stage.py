@@ -27,7 +27,9 @@ from playslot_rl.config.video import CADDYConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise
 from playslot_rl.modules.quantizer import usage
+from playslot_rl.processes import spread
 from playslot_rl.seeding import StepGenerators
+from playslot_rl.shares import own_rows
 from playslot_rl.world_model import module_device
 
 
@@ -61,8 +63,8 @@ class CADDYStage:
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         """Terms of one batch; `usage` and `perplexity` (1 to K) of its actions."""
         config = self.config
-        rows = self.clips.sample(config.batch_size, generators.numpy("clips"))[:, : clip_length(config, step)]
-        frames = self._frames(rows)
+        rows = own_rows(self.clips.sample(config.batch_size, generators.numpy("clips")))
+        frames = self._frames(rows[:, : clip_length(config, step)])
         wanted = self._wanted(frames.shape[1], generators)
         with torch.autocast(frames.device.type, torch.bfloat16, enabled=config.precision == "bf16"):
             rollout = self.model(
@@ -84,16 +86,11 @@ class CADDYStage:
         (1 to K) of the actions; `information` (nats, 0 to log K) between them and those in the predicted frames;
         `variability`, the part that v has in the mean square of d.
         """
-        seed, errors, real, again, squares = self.config.seed_frames, [], [], [], torch.zeros(2)
-        for rows in self.clips.validation_batches():
-            frames = self._frames(rows)
-            predicted = self.model.predict(frames, seed)
-            errors.append((predicted.clamp(0, 1) - frames[:, seed:]).square().mean(dim=(2, 3, 4)).flatten())
-            latents = self.model.infer(frames[:, seed - 1 :])
-            real.append(latents.p.flatten(0, 1))
-            again.append(self.model.infer(torch.cat((frames[:, seed - 1 : seed], predicted), dim=1)).p.flatten(0, 1))
-            d = latents.v + latents.a @ self.model.action.centroids
-            squares += torch.stack((latents.v.square().sum(), d.square().sum())).cpu()
+        looked = spread(self.clips.validation_batches(), lambda _, rows: self._look(rows))
+        errors, real, again, parts = zip(*looked, strict=True)
+        squares = torch.zeros(2)
+        for part in parts:
+            squares += part
         error, p = torch.cat(errors), torch.cat(real)
         used, perplexity = usage(p.argmax(dim=-1), self.config.actions)
         return {
@@ -104,6 +101,19 @@ class CADDYStage:
             "information": float(mutual_information(joint_distribution(p, torch.cat(again)))),
             "variability": float(squares[0] / squares[1].clamp(min=1e-12)),
         }
+
+    def _look(self, rows: IntArray) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Of held-out clips: errors of the frames, probabilities of actions in real and predicted ones, squares of v
+        and d.
+        """
+        frames, seed = self._frames(rows), self.config.seed_frames
+        predicted = self.model.predict(frames, seed)
+        error = (predicted.clamp(0, 1) - frames[:, seed:]).square().mean(dim=(2, 3, 4)).flatten()
+        latents = self.model.infer(frames[:, seed - 1 :])
+        again = self.model.infer(torch.cat((frames[:, seed - 1 : seed], predicted), dim=1)).p.flatten(0, 1)
+        d = latents.v + latents.a @ self.model.action.centroids
+        squares = torch.stack((latents.v.square().sum(), d.square().sum())).cpu()
+        return error, latents.p.flatten(0, 1), again, squares
 
     def _frames(self, rows: IntArray) -> Tensor:
         return normalise(self.clips.source.pixels(rows).to(module_device(self.model)))

@@ -24,7 +24,9 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise
 from playslot_rl.modules.quantizer import usage
+from playslot_rl.processes import spread
 from playslot_rl.seeding import StepGenerators
+from playslot_rl.shares import own_rows
 from playslot_rl.world_model import module_device
 
 BATCH = 64
@@ -51,7 +53,7 @@ class LAPOModelStage:
 
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         """Error of one batch of pairs."""
-        first, second = self._frames(self.clips.sample(self.config.batch_size, generators.numpy("pairs")))
+        first, second = self._frames(own_rows(self.clips.sample(self.config.batch_size, generators.numpy("pairs"))))
         with torch.autocast(first.device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
             inferred = self.inverse(first, second)
             predicted = self.forward(first, inferred.z)
@@ -67,13 +69,15 @@ class LAPOModelStage:
 
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
         """`unexplained`: error on held-out pairs over that of no change; `perplexity` of the codes (1 to K)."""
-        errors, stills, codes = [], [], []
-        for rows in np.array_split(self.clips.held_out, -(-len(self.clips.held_out) // BATCH)):
+
+        def look(_: int, rows: IntArray) -> tuple[float, float, Tensor]:
             first, second = self._frames(rows)
             inferred = self.inverse(first, second)
-            errors.append(float((self.forward(first, inferred.z) - second).square().sum()))
-            stills.append(float((first - second).square().sum()))
-            codes.append(inferred.code)
+            error = float((self.forward(first, inferred.z) - second).square().sum())
+            return error, float((first - second).square().sum()), inferred.code
+
+        batches = np.array_split(self.clips.held_out, -(-len(self.clips.held_out) // BATCH))
+        errors, stills, codes = zip(*spread(batches, look), strict=True)
         _, perplexity = usage(torch.cat(codes), self.inverse.config.codes)
         return {"unexplained": sum(errors) / max(1e-6, sum(stills)), "perplexity": float(perplexity)}
 

@@ -7,6 +7,7 @@ from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.envs import gym_id
 from playslot_rl.episode_seeds import EPISODES
 from playslot_rl.errors import ConfigError
+from playslot_rl.processes import here
 
 
 def require_online(config: ExperimentConfig, online: OnlineConfig, method: str) -> None:
@@ -14,8 +15,13 @@ def require_online(config: ExperimentConfig, online: OnlineConfig, method: str) 
 
     Raises:
         ConfigError: an environment without a simulator or without a dense reward, or more episodes than
-            a seed has.
+            a seed has; several processes.
     """
+    if here().world > 1:
+        raise ConfigError(
+            f"method={method}: got {here().world} processes, expected one: it learns by acting; start it without "
+            "torchrun or accelerate launch"
+        )
     gym_id(config.env.name)
     if config.env.name.startswith("block_") and config.env.blocks.reward != "dense":
         raise ConfigError(

@@ -16,6 +16,7 @@ from torch import Tensor
 from playslot_rl.baselines.svg.model import TeacherForced
 from playslot_rl.baselines.svg.recurrent import Gaussian
 from playslot_rl.frames import normalise
+from playslot_rl.shares import own_noise
 
 
 def gaussian_kl(posterior: Gaussian, prior: Gaussian) -> Tensor:
@@ -39,7 +40,8 @@ def draw_steps(batch: int, steps: int, count: int, generator: torch.Generator) -
     """
     if not 0 < count < steps:
         return None
-    return torch.rand(batch, steps, generator=generator, device=generator.device).argsort(dim=1)[:, :count]
+    drawn = own_noise((batch, steps), lambda shape: torch.rand(shape, generator=generator, device=generator.device))
+    return drawn.argsort(dim=1)[:, :count]
 
 
 def svg_objective(out: TeacherForced, frames: Tensor, kl_weight: float) -> dict[str, Tensor]:

@@ -14,6 +14,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from playslot_rl.shares import own_noise
+
 State = tuple[Tensor, Tensor]
 """Hidden and cell state of an LSTM (layers, B, hidden)."""
 
@@ -31,7 +33,10 @@ class Gaussian(NamedTuple):
 
     def sample(self, generator: torch.Generator) -> Tensor:
         """mu + sigma eps (..., Z), differentiable in both; eps is drawn on the generator's device."""
-        noise = torch.randn(self.mean.shape, generator=generator, device=generator.device, dtype=self.mean.dtype)
+        device, dtype = generator.device, self.mean.dtype
+        noise = own_noise(
+            self.mean.shape, lambda shape: torch.randn(shape, generator=generator, device=device, dtype=dtype)
+        )
         return self.mean + (0.5 * self.log_variance).exp() * noise.to(self.mean.device)
 
 

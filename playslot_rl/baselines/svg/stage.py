@@ -15,7 +15,9 @@ from playslot_rl.baselines.svg.model import SVG
 from playslot_rl.config.video import SVGConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise
+from playslot_rl.processes import spread
 from playslot_rl.seeding import StepGenerators, step_generator
+from playslot_rl.shares import own_rows
 from playslot_rl.world_model import module_device
 
 MSE_FLOOR = 1e-8
@@ -42,7 +44,7 @@ class SVGStage:
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         """Loss of one batch of clips (`svg_objective`); draws clips, latents and decoded steps."""
         config = self.config
-        frames = self._frames(self.clips.sample(config.batch_size, generators.numpy("clips")))
+        frames = self._frames(own_rows(self.clips.sample(config.batch_size, generators.numpy("clips"))))
         device = frames.device
         batch, count = frames.shape[:2]
         steps = draw_steps(batch, count - 1, config.decoded_frames, generators.torch("decoded", device))
@@ -57,13 +59,15 @@ class SVGStage:
             `psnr` (dB, mean over frames) and `mse` with latents from the true future; `psnr_prior` with latents that
             the prior draws: close to `psnr` where the latents are ignored; `kl`, nats a step on true frames.
         """
-        inferred, drawn, divergence = [], [], []
-        for number, rows in enumerate(self.clips.validation_batches()):
+
+        def look(number: int, rows: IntArray) -> tuple[Tensor, Tensor, Tensor]:
             frames, seed = self._frames(rows), self.config.seed_frames
             generator = step_generator(0, number, "validation", frames.device)
-            inferred.append(_errors(self.model.predict(frames, seed), frames))
-            drawn.append(_errors(self.model.sample(frames, seed, generator), frames))
-            divergence.append(gaussian_kl(*self.model.distributions(self.model.encode(frames))))
+            inferred = _errors(self.model.predict(frames, seed), frames)
+            drawn = _errors(self.model.sample(frames, seed, generator), frames)
+            return inferred, drawn, gaussian_kl(*self.model.distributions(self.model.encode(frames)))
+
+        inferred, drawn, divergence = zip(*spread(self.clips.validation_batches(), look), strict=True)
         mse = torch.cat(inferred)
         return {
             "psnr": _psnr(mse),

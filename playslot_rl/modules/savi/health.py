@@ -119,6 +119,11 @@ class SlotHealth:
         error, motion = change_errors(frames, reconstructed)
         self._error, self._motion = self._error + error, self._motion + motion
 
+    def join(self, other: SlotHealth) -> None:
+        """Some more clips, gathered elsewhere."""
+        self._clips += other._clips
+        self._error, self._motion = self._error + other._error, self._motion + other._motion
+
     def values(self) -> dict[str, float]:
         """Means over the clips: `slots_in_use` (0 to N), `largest_slot` (share of the pixels of the slot that holds the
         most), `flicker` (exchanges a transition), `mask_entropy` (nats), `moving_explained` (at most 1; it may be far

@@ -11,6 +11,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from playslot_rl.shares import own_noise
+
 
 class SlotInitializer(nn.Module):
     """Initial slots of an episode.
@@ -36,7 +38,8 @@ class SlotInitializer(nn.Module):
         mean = self.mean.expand(self.n_slots, -1).expand(batch, -1, -1)
         if self.mode == "learned":
             return mean
-        noise = torch.randn(
-            (batch, self.n_slots, self.slot_dim), generator=generator, device=mean.device, dtype=mean.dtype
+        noise = own_noise(
+            (batch, self.n_slots, self.slot_dim),
+            lambda shape: torch.randn(shape, generator=generator, device=mean.device, dtype=mean.dtype),
         )
         return mean + self.log_scale.exp() * noise

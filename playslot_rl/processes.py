@@ -1,0 +1,224 @@
+"""The processes of one training: started by `torchrun` or `accelerate launch`, each with its own slice of every batch.
+
+    g = 1/W sum_r g_r,   g_r the gradient of the mean over the rows of rank r
+
+Hugging Face accelerate opens the process group; what is exchanged is small (models of some million parameters, one flat
+vector a step). Without a launcher there is one process, and nothing of this does anything.
+
+Shapes: W processes ("world"), r rank of one of them, from 0.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from playslot_rl.errors import PeerError
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+TIMEOUT: Final = timedelta(minutes=10)
+"""How long a process waits for the others: longer than a validation's batch or a checkpoint takes, and not for ever. A
+process that dies is noticed at once, by its closed connection.
+"""
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Which of the processes this is.
+
+    Attributes:
+        rank: r, from 0.
+        world: W.
+    """
+
+    rank: int = 0
+    world: int = 1
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the one that writes and prints."""
+        return self.rank == 0
+
+
+_here = Processes()
+_spreading = False
+
+
+def here() -> Processes:
+    """This process among those of the training; the only one unless `start` was called."""
+    return _here
+
+
+def launched() -> Processes:
+    """What a launcher's environment says, whether or not `start` was called."""
+    return Processes(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
+
+
+def start(device: str = "") -> None:
+    """Meet the other processes. From then on only the first one prints to standard output.
+
+    Args:
+        device: `cpu` keeps off a GPU that there is, as the key of the same name; else each process of a machine has a
+            GPU of its own, where there are some.
+
+    Raises:
+        RuntimeError: they cannot be reached.
+    """
+    global _here
+    if launched().world == 1:
+        return
+    import torch
+    from accelerate import Accelerator
+    from accelerate.utils import InitProcessGroupKwargs
+
+    on_cpu = device == "cpu" or not torch.cuda.is_available()
+    # Without `cpu=True` accelerate takes every process on a CPU for the only one.
+    engine = Accelerator(cpu=on_cpu, kwargs_handlers=[InitProcessGroupKwargs(timeout=TIMEOUT)])
+    _here = Processes(engine.process_index, engine.num_processes)
+    if not _here.first:
+        sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115
+
+
+def stop() -> None:
+    """Part from the others, at the end of a command that went well."""
+    global _here
+    if _here.world > 1:
+        import torch.distributed as dist
+        from accelerate.state import AcceleratorState, PartialState
+
+        dist.destroy_process_group()
+        AcceleratorState._reset_state(reset_partial_state=True)
+        PartialState._reset_state()
+        _here = Processes()
+
+
+def wait() -> None:
+    """Until all are here.
+
+    Raises:
+        PeerError: one of them ended.
+    """
+    if _here.world > 1:
+        import torch.distributed as dist
+
+        with _exchange():
+            dist.barrier()
+
+
+def own_device(device: torch.device) -> torch.device:
+    """`cuda` as the GPU of this process; any other device as it is."""
+    import torch
+
+    if _here.world == 1 or str(device) != "cuda":
+        return device
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+
+
+def summed(values: Tensor) -> Tensor:
+    """Sum over the processes, in place; no gradient.
+
+    Raises:
+        PeerError: one of them ended.
+    """
+    if _here.world > 1:
+        import torch.distributed as dist
+
+        with _exchange():
+            dist.all_reduce(values)
+    return values
+
+
+def stacked(values: Tensor) -> Tensor:
+    """The tensors (b, ...) of all processes, rank by rank: (W b, ...); no gradient.
+
+    Raises:
+        PeerError: one of them ended.
+    """
+    if _here.world == 1:
+        return values
+    import torch
+    import torch.distributed as dist
+
+    parts = [torch.empty_like(values, memory_format=torch.contiguous_format) for _ in range(_here.world)]
+    with _exchange():
+        dist.all_gather(parts, values.contiguous())
+    return torch.cat(parts)
+
+
+def copied(tensors: Sequence[Tensor]) -> None:
+    """Give all processes the first one's tensors, in place.
+
+    Raises:
+        PeerError: one of them ended.
+    """
+    if _here.world == 1:
+        return
+    import torch
+    import torch.distributed as dist
+
+    for tensor in tensors:
+        whole = tensor.detach().clone(memory_format=torch.contiguous_format)
+        with _exchange():
+            dist.broadcast(whole, src=0)
+        tensor.detach().copy_(whole)
+
+
+@contextlib.contextmanager
+def spreading() -> Iterator[None]:
+    """Inside the block `spread` shares its items out."""
+    global _spreading
+    _spreading = _here.world > 1
+    try:
+        yield
+    finally:
+        _spreading = False
+
+
+def spread[Item, Result](items: Sequence[Item], compute: Callable[[int, Item], Result]) -> list[Result]:
+    """`compute(number, item)` of all items, in order: each is computed by one process, and all get all results.
+
+    Outside of `spreading`, and without other processes, this one computes them all. Every process must come here with
+    the same items. Tensors among shared results are on the CPU.
+
+    Raises:
+        PeerError: a process ended.
+    """
+    if not _spreading:
+        return [compute(number, item) for number, item in enumerate(items)]
+    import torch.distributed as dist
+
+    own = range(_here.rank, len(items), _here.world)
+    mine = {number: _on_cpu(compute(number, items[number])) for number in own}
+    gathered: list[Any] = [None] * _here.world
+    with _exchange():
+        dist.all_gather_object(gathered, mine)
+    found = {number: result for part in gathered for number, result in part.items()}
+    return [found[number] for number in range(len(items))]
+
+
+def _on_cpu(result: Any) -> Any:
+    import torch
+    from torch.utils._pytree import tree_map_only
+
+    return tree_map_only(torch.Tensor, lambda tensor: tensor.cpu(), result)
+
+
+@contextlib.contextmanager
+def _exchange() -> Iterator[None]:
+    """Say what a failed exchange means: gloo and NCCL give a page about sockets."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise PeerError(
+            f"rank {_here.rank} of {_here.world}: another process ended or did not answer within "
+            f"{TIMEOUT.seconds // 60} minutes; its own line says why; the same command carries on"
+        ) from error

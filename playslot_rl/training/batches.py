@@ -1,0 +1,114 @@
+"""The loss and the gradients of one global batch, whatever number of processes and micro-batches it is computed in.
+
+    L = 1/n sum_i L_i,   n = processes x `optim.accumulate`
+
+Each share of the rows is computed by itself (`playslot_rl.shares`); gradients and numbers of all processes are averaged
+by one flat sum, between the backward pass and the clipping. With one share nothing is added to the plain loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import torch
+from torch import Tensor, nn
+
+from playslot_rl.config import StageConfig
+from playslot_rl.errors import ConfigError
+from playslot_rl.modules.quantizer import ActionQuantizer
+from playslot_rl.processes import copied, here, summed
+from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.shares import Share, global_norms, sharing
+from playslot_rl.training.stage import Stage
+
+
+class GlobalBatches:
+    """One process's part in the batches of a stage.
+
+    Args:
+        stage: its BatchNorm layers are made global where there are other processes, its weights are made equal.
+        config: batch size and accumulation.
+        parameters: what is trained, by name.
+        key: dotted config group of the stage, for messages.
+
+    Raises:
+        ConfigError: the shares do not divide the batch, or the stage cannot accumulate.
+    """
+
+    def __init__(self, stage: Stage, config: StageConfig, parameters: Mapping[str, nn.Parameter], key: str) -> None:
+        self.stage, self.parameters, self.micros = stage, parameters, config.optim.accumulate
+        self.count = here().world * self.micros
+        if config.batch_size % self.count:
+            raise ConfigError(
+                f"{key}.batch_size: got {config.batch_size}, expected a multiple of {self.count} ({here().world} "
+                f"processes, {key}.optim.accumulate={self.micros}), so that every share has equally many rows"
+            )
+        modules = [part for module in stage.modules.values() for part in module.modules()]
+        if self.micros > 1 and any(isinstance(part, nn.modules.batchnorm._BatchNorm) for part in modules):
+            raise ConfigError(
+                f"{key}.optim.accumulate: got {self.micros}, expected 1: this network normalises by its whole batch "
+                "(BatchNorm), which micro-batches do not have; start more processes instead"
+            )
+        self._quantizers = [part for part in modules if isinstance(part, ActionQuantizer)]
+
+    def meet(self) -> None:
+        """Begin together: every process has the first one's weights and buffers."""
+        if here().world == 1:
+            return
+        for module in self.stage.modules.values():
+            global_norms(module)
+            copied([*module.parameters(), *module.buffers()])
+
+    def backward(self, step: int, seed: int, device: torch.device | str) -> dict[str, Tensor]:
+        """Gradients of the global batch into the parameters; its loss and the other numbers of it.
+
+        Raises:
+            PeerError: another process ended.
+        """
+        if self.count == 1:
+            with global_seed(seed, step):
+                losses = dict(self.stage.loss(step, StepGenerators(seed, step, device)))
+                losses["loss"].backward()
+            return losses
+        generators, numbers = StepGenerators(seed, step, device), []
+        with global_seed(seed, step):
+            begins = self.micros > 1 and any(quantizer.starts_from_a_batch for quantizer in self._quantizers)
+            if begins:
+                self._rehearse(step, generators)
+                numbers = [self._share(step, generators, own) for own in self._shares()]
+        # Every micro-batch draws the global batch's noise anew, so that all slice the same.
+        for own in () if begins else self._shares():
+            with global_seed(seed, step):
+                numbers.append(self._share(step, generators, own))
+        means = {key: torch.stack([part[key].float() for part in numbers]).mean() for key in numbers[0]}
+        return self._averaged(means) if here().world > 1 else means
+
+    def _shares(self) -> Iterator[Share]:
+        first = here().rank * self.micros
+        for micro in range(self.micros):
+            yield Share(first + micro, self.count, micro, self.micros)
+
+    def _share(self, step: int, generators: StepGenerators, own: Share) -> dict[str, Tensor]:
+        with sharing(own):
+            losses = self.stage.loss(step, generators)
+            (losses["loss"] / self.micros).backward()
+        return {key: value.detach() for key, value in losses.items()}
+
+    @torch.no_grad()
+    def _rehearse(self, step: int, generators: StepGenerators) -> None:
+        """Show the first global batch to codebooks that start from it, before its first micro-batch is quantised."""
+        for micro in range(self.micros):
+            with sharing(Share(here().rank * self.micros + micro, self.count, micro, self.micros, rehearsal=True)):
+                self.stage.loss(step, generators)
+
+    def _averaged(self, numbers: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        parameters = list(self.parameters.values())
+        parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+        scalars = torch.stack([value.to(parts[0].dtype) for value in numbers.values()])
+        flat = torch.cat([*(part.flatten() for part in parts), scalars])
+        flat = summed(flat) / here().world
+        *grads, scalars = flat.split([*(part.numel() for part in parts), len(numbers)])
+        for parameter, grad in zip(parameters, grads, strict=True):
+            if parameter.grad is not None:
+                parameter.grad.copy_(grad.view_as(parameter))
+        return dict(zip(numbers, scalars.unbind(), strict=True))

@@ -1,0 +1,45 @@
+"""`compile=true`: the parts of a stage's networks as kernels made by torch.compile."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping
+
+from torch import nn
+
+from playslot_rl.errors import ConfigError
+
+COMPILERS = ("g++", "gcc", "clang++", "clang")
+
+
+def compile_parts(modules: Mapping[str, nn.Module], key: str) -> None:
+    """Compile what the networks call step by step (SAVi's encoder, corrector, transition), in place; names stay.
+
+    Whole networks draw random numbers from generators, which torch.compile cannot trace; their parts do not.
+
+    Args:
+        modules: of the stage.
+        key: dotted name of the setting, for the error.
+
+    Raises:
+        ConfigError: there is no C++ compiler.
+    """
+    if not (os.environ.get("CXX") or any(map(shutil.which, COMPILERS))):
+        raise ConfigError(
+            f"{key}=true: got no C++ compiler, expected g++ or clang++ on the PATH: install one (Debian, Ubuntu: "
+            f"apt-get install g++), or leave {key} out"
+        )
+    for part in _parts(modules):
+        part.compile()
+
+
+def release_parts(modules: Mapping[str, nn.Module]) -> None:
+    """Have the networks run as they were written again."""
+    for part in _parts(modules):
+        part._compiled_call_impl = None
+
+
+def _parts(modules: Mapping[str, nn.Module]) -> list[nn.Module]:
+    children = [part for module in modules.values() for part in module.children()]
+    return [part for part in children if any(parameter.requires_grad for parameter in part.parameters())]

@@ -1,0 +1,68 @@
+"""Several ranks on this machine, forked from this process, which has paid for the imports."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import socket
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+TIMEOUT_S = 300
+
+
+def free_port() -> int:
+    """A port that nobody listens on."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+def run_ranks(world: int, work: Callable[..., None], *arguments: Any) -> list[int]:
+    """`work(*arguments)` on so many ranks with a gloo group; the exit codes, by rank."""
+    context, port = multiprocessing.get_context("fork"), free_port()
+    ranks = [context.Process(target=_rank, args=(rank, world, port, work, arguments)) for rank in range(world)]
+    for process in ranks:
+        process.start()
+    try:
+        for process in ranks:
+            process.join(TIMEOUT_S)
+    finally:
+        for process in ranks:
+            process.kill()
+    return [process.exitcode or 0 for process in ranks]
+
+
+def _rank(rank: int, world: int, port: int, work: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+    import torch
+
+    from playslot_rl import processes
+
+    torch.set_num_threads(1)
+    os.environ |= {
+        "RANK": str(rank),
+        "LOCAL_RANK": str(rank),
+        "WORLD_SIZE": str(world),
+        "LOCAL_WORLD_SIZE": str(world),
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+    }
+    try:
+        processes.start("cpu")
+        work(*arguments)
+        processes.stop()
+    except BaseException:  # noqa: BLE001
+        traceback.print_exc(file=sys.__stderr__)
+        os._exit(1)
+    os._exit(0)
+
+
+def log_of(folder: Path) -> list[dict[str, Any]]:
+    """What a training logged, less the times."""
+    from playslot_rl.training.logging import History
+
+    rows = History(folder / "metrics.jsonl").read()
+    return [{key: value for key, value in row.items() if key != "seconds"} for row in rows]

@@ -1,0 +1,100 @@
+"""Training on several processes: the result does not depend on their number."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from ranks import log_of, run_ranks
+from tiny_stages import DOUBLE, STAGES, in_double
+
+from playslot_rl.processes import here, wait
+from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
+from playslot_rl.training.fit import fit
+
+SEED = 3
+CURVE = 1e-5
+"""Largest relative difference of a number that is logged while training."""
+AT_ALL = 1e-6
+"""Absolute difference that is none: numbers that are zero but for rounding."""
+RESUMED = "dynamics"
+
+
+def train(name: str, folder: Path) -> None:
+    """One stage, to its end; each rank keeps what it ended with."""
+    with in_double(name in DOUBLE):
+        part = STAGES[name]()
+        fit(part, folder, seed=SEED)
+        save_tensors(folder / f"rank{here().rank}.safetensors", module_tensors(part.stage.modules))
+
+
+def interrupted(whole: Path, folder: Path) -> Path:
+    """A training as it was when a kill ended it after half its steps."""
+    shutil.copytree(whole, folder)
+    shutil.rmtree(folder / "checkpoints" / "step_00000020")
+    return folder
+
+
+def train_all(folder: Path) -> None:
+    """Every stage, one after the other, in one process group, and one of them once more from half its way on."""
+    for name in STAGES:
+        train(name, folder / name)
+    if here().first:
+        interrupted(folder / RESUMED, folder / "resumed")
+    wait()
+    train(RESUMED, folder / "resumed")
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of all stages trained by this process."""
+    folder = tmp_path_factory.mktemp("alone")
+    train_all(folder)
+    return folder
+
+
+@pytest.fixture(scope="module", params=[2, 3])
+def several(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same by so many ranks."""
+    folder: Path = tmp_path_factory.mktemp(f"ranks{request.param}")
+    assert run_ranks(request.param, train_all, folder) == [0] * request.param
+    return folder
+
+
+def difference(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> float:
+    assert one.keys() == other.keys()
+    return max(float((one[key].double() - other[key].double()).abs().max()) for key in one if one[key].numel())
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_the_curve_is_that_of_one_process(alone: Path, several: Path, name: str) -> None:
+    ones, shares = log_of(alone / name), log_of(several / name)
+    assert [(row["step"], row["split"]) for row in ones] == [(row["step"], row["split"]) for row in shares]
+    for one, shared in zip(ones, shares, strict=True):
+        tolerance = CURVE if one.pop("split") == "train" else 10 * CURVE
+        del shared["split"]
+        assert shared == pytest.approx(one, rel=tolerance, abs=AT_ALL)
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_all_ranks_end_with_the_same_weights(several: Path, name: str) -> None:
+    first, *others = [load_tensors(path) for path in sorted((several / name).glob("rank*.safetensors"))]
+    assert others
+    for other in others:
+        assert [key for key in first if not torch.equal(first[key], other[key])] == []
+
+
+def test_a_killed_training_resumes_bit_for_bit_on_as_many_ranks(several: Path) -> None:
+    whole, resumed = several / RESUMED, several / "resumed"
+    first, second = load_tensors(whole / "rank0.safetensors"), load_tensors(resumed / "rank0.safetensors")
+    assert difference(first, second) == 0
+    assert log_of(whole) == log_of(resumed)
+
+
+def test_a_training_of_several_ranks_is_carried_on_by_one(several: Path, tmp_path: Path) -> None:
+    folder = interrupted(several / RESUMED, tmp_path / "resumed")
+    train(RESUMED, folder)
+    whole, carried_on = (load_tensors(path / "rank0.safetensors") for path in (several / RESUMED, folder))
+    assert 0 < difference(whole, carried_on) < 1e-4

@@ -1,0 +1,240 @@
+"""Every stage that `fit` trains, tiny, on a square that moves: six rows a batch, for one, two and three ranks."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from playslot_rl import keys
+from playslot_rl.baselines.caddy.model import CADDY
+from playslot_rl.baselines.caddy.stage import CADDYStage
+from playslot_rl.baselines.lapo.model import ForwardModel, InverseModel
+from playslot_rl.baselines.lapo.stage import LAPOModelStage
+from playslot_rl.baselines.oracles.resnet import ResNetPolicy
+from playslot_rl.baselines.svg.model import SVG
+from playslot_rl.baselines.svg.stage import SVGStage
+from playslot_rl.config import (
+    ActionDecoderConfig,
+    BehaviourStageConfig,
+    DynamicsStageConfig,
+    EnvConfig,
+    InverseDynamicsConfig,
+    ModelConfig,
+    OptimConfig,
+    PolicyConfig,
+    PredictorConfig,
+    SAViConfig,
+    SlotsStageConfig,
+    StageConfig,
+)
+from playslot_rl.config.baselines import LAPOConfig
+from playslot_rl.config.video import CADDYConfig, SVGConfig
+from playslot_rl.data.demonstrations import Demonstrations
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.windows import Clips
+from playslot_rl.losses.behaviour import BehaviourLoss
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.seeding import global_seed
+from playslot_rl.testing import tiny_savi
+from playslot_rl.training.fit import Part
+from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage
+from playslot_rl.training.stage_dynamics import DynamicsStage
+from playslot_rl.training.stage_regression import FrameInputs, RegressionStage
+from playslot_rl.training.stage_slots import SlotsStage
+from playslot_rl.world_model import WorldModel
+
+STEPS = 20
+BATCH = 6
+CADDY_STEPS = 8
+"""It normalises a hundred times a step; 3 steps are its warm-up."""
+OPTIM = OptimConfig(lr=1e-3, warmup_steps=2, grad_clip=0.05)
+SETTINGS: dict[str, Any] = {
+    "steps": STEPS,
+    "batch_size": BATCH,
+    "optim": OPTIM,
+    "checkpoint_every": 10,
+    "validate_every": 10,
+    "log_every": 1,
+}
+SIZES = PolicyConfig(dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16)
+
+
+def videos(size: int) -> EpisodeFrames:
+    """Six episodes of seven frames: a square that moves, over noise."""
+    generator = np.random.default_rng(0)
+    frames = generator.integers(0, 60, (42, size, size, 3), dtype=np.uint8)
+    for t in range(42):
+        at = (3 * t) % (size - 6)
+        frames[t, at : at + 6, size // 4 : size // 4 + 6] = 200 - 20 * (t // 7)
+    starts, lengths = np.arange(0, 42, 7, dtype=np.int64), np.full(6, 7, np.int64)
+    actions = generator.uniform(-1, 1, (42, 2)).astype(np.float32)
+    return EpisodeFrames(frames, starts, lengths, actions, None, None, "f", 10.0, "", "camera")
+
+
+def clips(size: int, frames: int) -> Clips:
+    return Clips(videos(size), frames, 0.4, 0)
+
+
+def demonstrations() -> Demonstrations:
+    draw = torch.Generator().manual_seed(0)
+    slots, latents = torch.randn(30, 3, 16, generator=draw), torch.randn(30, 4, generator=draw)
+    episode, step = torch.arange(30) // 6, torch.arange(30) % 6
+    imagined, actions = slots + 0.1, torch.rand(30, 2, generator=draw) * 2 - 1
+    return Demonstrations(slots, imagined, latents, actions, episode, step, torch.ones(30), torch.full((5,), 6))
+
+
+def slots() -> Part:
+    savi = tiny_savi(initial="gaussian")
+    return Part("slots", SlotsStage(savi, clips(32, 4), SlotsStageConfig(**SETTINGS, clip_frames=4)), _plain())
+
+
+def dynamics(multi: bool = False, mode: Any = "hybrid", kind: Any = "cocvp", teacher: int = 5) -> Part:
+    savi = SAViConfig(**vars(tiny_savi().config))
+    inverse = InverseDynamicsConfig(
+        variant="multi" if multi else "single",
+        mode=mode,
+        latent_dim=4,
+        n_prototypes=4,
+        dim=16,
+        layers=1,
+        heads=2,
+        head_dim=8,
+        mlp_dim=16,
+        decay=0.8,
+        dead_threshold=1.5,
+    )
+    predictor = PredictorConfig(kind=kind, dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16)
+    model = ModelConfig(savi=savi, inverse_dynamics=inverse, predictor=predictor)
+    with global_seed(0, 0, "test"):
+        world = WorldModel(model, EnvConfig(image_size=32, action_dim=2))
+        cached = torch.randn(42, 3, 16).numpy()
+    own = DynamicsStageConfig(
+        **SETTINGS, seed_frames=2, predicted_frames=3, decoded_frames=2, from_start=0.3, teacher_steps=teacher
+    )
+    return Part("dynamics", DynamicsStage(world, clips(32, 5), cached, own), own)
+
+
+def _behaviour() -> tuple[LatentPolicy, LatentPolicy, ActionDecoder, BehaviourStageConfig]:
+    with global_seed(0, 0, "test"):
+        sizes = replace(SIZES, whiten=True)
+        policy, oracle = LatentPolicy(sizes, 16, 4), LatentPolicy(SIZES, 16, 2)
+        decoder = ActionDecoder(
+            ActionDecoderConfig(hidden_dim=8, reads_slots=True, state_dim=8, state_layers=1, state_heads=2), 4, 2, 16
+        )
+    return policy, oracle, decoder, BehaviourStageConfig(**SETTINGS, labelled_demos=4, slot_noise=0.1)
+
+
+def policy() -> Part:
+    network, oracle, _, config = _behaviour()
+    return Part("policy", CloneStage(network, oracle, demonstrations(), config, demonstrations()), config)
+
+
+def decoder() -> Part:
+    network, _, decoder, config = _behaviour()
+    return Part("decoder", DecoderStage(decoder, network.eval(), demonstrations(), config), config)
+
+
+def finetune() -> Part:
+    network, oracle, decoder, config = _behaviour()
+    clone = CloneStage(network, oracle, demonstrations(), config).stages["policy"]
+    return Part("finetune", FinetuneStage(clone, decoder, demonstrations(), config), config)
+
+
+def resnet() -> Part:
+    data, config = videos(32), replace(_plain(), steps=2, checkpoint_every=2, validate_every=2)
+    with global_seed(0, 0, "test"):
+        network = ResNetPolicy(SIZES, 32, 2)
+    criterion = BehaviourLoss(network)
+    criterion.set_keys(observation=keys.PIXELS, action=keys.ACTION)
+    rows = np.arange(42)
+    stage = RegressionStage(
+        "policy", criterion, FrameInputs(data, rows, "cpu", 2), torch.from_numpy(data.require_actions()).float(), BATCH
+    )
+    return Part("resnet", stage, config)
+
+
+def svg() -> Part:
+    config = SVGConfig(
+        **SETTINGS | {"optim": replace(OPTIM, grad_clip=0.0)},
+        channels=(4, 8),
+        convs=(1, 1),
+        features=6,
+        latent_dim=3,
+        hidden=8,
+        seed_frames=2,
+        predicted_frames=3,
+        decoded_frames=2,
+    )
+    with global_seed(0, 0, "test"):
+        model = SVG(config, 16)
+    return Part("svg", SVGStage(model, clips(16, 5), config), config)
+
+
+def caddy() -> Part:
+    config = CADDYConfig(
+        **SETTINGS | {"optim": replace(OPTIM, lr=4e-4, grad_clip=0.0), "steps": CADDY_STEPS, "validate_every": 4},
+        encoder=(4, 4, 4, 8),
+        dynamics=8,
+        generator=(8, 4, 4),
+        actions=3,
+        latent_dim=2,
+        seed_frames=2,
+        predicted_frames=2,
+        warmup_steps=3,
+        first_frames=3,
+        growth_steps=4,
+    )
+    with global_seed(0, 0, "test"):
+        model = CADDY(config, 16)
+    return Part("caddy", CADDYStage(model, clips(16, 4), config), config)
+
+
+def lapo() -> Part:
+    own = LAPOConfig(channels=(4, 8), hidden=16, groups=2, code_dim=4, codes=6, dead_threshold=1.5)
+    with global_seed(0, 0, "test"):
+        inverse, forward = InverseModel(own, 16), ForwardModel(own)
+    return Part("lapo", LAPOModelStage(inverse, forward, clips(16, 2), _plain()), _plain())
+
+
+@contextlib.contextmanager
+def in_double(wanted: bool) -> Iterator[None]:
+    """Compute everything in double precision, also what the library says is float32."""
+    as_float = torch.Tensor.float
+    if wanted:
+        torch.set_default_dtype(torch.float64)
+        torch.Tensor.float = torch.Tensor.double  # type: ignore[method-assign, assignment]
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
+        torch.Tensor.float = as_float  # type: ignore[method-assign]
+
+
+def _plain() -> StageConfig:
+    return StageConfig(**SETTINGS)
+
+
+DOUBLE = ("resnet", "svg", "caddy", "lapo")
+"""In double precision: BatchNorm divides by small spreads, Adam by small gradients, and together they turn the rounding
+of a batch's mean into another curve within a few steps, as another number of threads does.
+"""
+STAGES: dict[str, Callable[[], Part]] = {
+    "slots": slots,
+    "dynamics": dynamics,
+    "dynamics of many agents": lambda: dynamics(multi=True),
+    "slotformer": lambda: dynamics(mode="none", kind="slotformer"),
+    "ocvp_seq": lambda: dynamics(mode="none", kind="ocvp_seq"),
+    "policy": policy,
+    "decoder": decoder,
+    "finetune": finetune,
+    "resnet": resnet,
+    "svg": svg,
+    "caddy": caddy,
+    "lapo": lapo,
+}
