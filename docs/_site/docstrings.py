@@ -8,7 +8,7 @@ from typing import Any, Final
 from griffe import Extension, Object
 
 SHARED: Final = re.compile(r"^( +)(\w+(?:, \w+)+): (.*(?:\n\1 +\S.*)*)", re.MULTILINE)
-"""Two or more arguments with one description, `first, second: text`; each gets it, so that each is checked and typed."""
+"""Arguments with one description, `first, second: text`; each gets it, so that each is checked and typed."""
 OPTIONAL: Final = re.compile(r",\] \[")
 """Between optional dimensions, `([B,] [T,] N, D)`: a link in Markdown."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -49,7 +49,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for source, uri in PAGES.items():
         files.append(File.generated(config, uri, content=(ROOT / source).read_text()))
     for package, modules in packages().items():
-        own = "\n    options:\n      members: false" if package == PACKAGE else ""  # its names are those of the module `api`
+        # The names of the package itself are those of the module `api`.
+        own = "\n    options:\n      members: false" if package == PACKAGE else ""
         blocks = [f"::: {package}{own}", *(f"::: {module}\n    options:\n      heading_level: 2" for module in modules)]
         files.append(File.generated(config, f"api/{package}.md", content="\n\n".join(blocks) + "\n"))
     nicegui = find_spec("nicegui")  # of the extra `play`: its wheel holds the program that draws the diagrams
