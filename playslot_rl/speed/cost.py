@@ -129,6 +129,7 @@ def stage_cost(config: ExperimentConfig, stage: str) -> StageCost:
     """
     agent = fresh_agent(config)
     criterion, batch_of = _parts(config, stage, agent)
+    begin(criterion, batch_of(2))
     trained = [p for p in criterion.parameters() if p.requires_grad]
     frozen = sum(p.numel() for p in criterion.parameters()) - sum(p.numel() for p in trained)
     own = {"slots": config.slots, "dynamics": config.dynamics}.get(stage, config.behaviour)
@@ -186,6 +187,12 @@ class _Calls(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         self.number += not func.is_view
         return func(*args, **(kwargs or {}))
+
+
+def begin(criterion: nn.Module, batch: TensorDict) -> None:
+    """One step that is not counted: the codebook begins by k-means."""
+    with torch.no_grad():
+        criterion(batch)
 
 
 def _count(criterion: nn.Module, batch: TensorDict) -> Count:
