@@ -172,17 +172,15 @@ def _parts(config: ExperimentConfig, stage: str, agent: Agent) -> tuple[nn.Modul
     if stage == "policy":
         return BehaviourLoss(agent.policy), lambda n: batch(n, (keys.SLOTS, slots), (keys.LATENT_ACTION, latent))
     if stage == "decoder":
-        own = ((keys.SLOTS, slots), (keys.LATENT_ACTION, latent), (keys.ACTION, action))
-        return ActionDecoderLoss(agent.action_decoder), lambda n: batch(n, *own)
+        seen = ((keys.SLOTS, slots), (keys.LATENT_ACTION, latent), (keys.ACTION, action))
+        return ActionDecoderLoss(agent.action_decoder), lambda n: batch(n, *seen)
     raise ValueError(f"stage: got {stage}, expected one of {', '.join(STAGES)}")
 
 
 class _Calls(TorchDispatchMode):
     """Counts operators that compute something."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.number = 0
+    number = 0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         self.number += not func.is_view

@@ -59,7 +59,7 @@ def sweep(files: list[Path], launcher: str, *overrides: str) -> None:
     [
         ("joblib", "hydra.launcher.n_jobs=2"),
         ("submitit_local", "hydra.launcher.timeout_min=5"),
-        ("ray", "hydra.launcher.ray.init.num_cpus=2"),
+        ("ray", "+hydra.launcher.ray.init.num_cpus=2"),
     ],
 )
 def test_jobs_run_on_one_machine(jobs: list[Path], launcher: str, override: str) -> None:
@@ -77,8 +77,8 @@ def test_jobs_go_to_slurm_as_one_array_with_what_was_asked_for(
         (commands / name).chmod(stat.S_IRWXU)
     monkeypatch.setenv("PATH", f"{commands}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("SLURM_IMITATION", str(tmp_path))
-    asked = ("partition=gpu", "gpus_per_node=2", "cpus_per_task=8", "timeout_min=720", "array_parallelism=4")
+    asked = ("partition=gpu", "gpus_per_node=2", "cpus_per_task=8", "timeout_min=720", "array_parallelism=1")
     sweep(jobs, "submitit_slurm", *(f"hydra.launcher.{word}" for word in asked))
     submitted = (tmp_path / "submitted.sh").read_text()
-    for line in ("partition=gpu", "gpus-per-node=2", "cpus-per-task=8", "time=720", "array=0-1%4"):
+    for line in ("partition=gpu", "gpus-per-node=2", "cpus-per-task=8", "time=720", "array=0-1%1"):
         assert f"#SBATCH --{line}\n" in submitted
