@@ -204,7 +204,8 @@ def _count(criterion: nn.Module, batch: TensorDict) -> Count:
 
     criterion.zero_grad()  # a second gradient would be added to the first
     # Attention as plain products: not every fused kernel is known to the counter.
-    with sdpa_kernel(SDPBackend.MATH), _Calls() as calls, FlopCounterMode(display=False) as flops:
+    calls = _Calls()  # type: ignore[no-untyped-call]
+    with sdpa_kernel(SDPBackend.MATH), calls, FlopCounterMode(display=False) as flops:
         with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
             out = criterion(batch)
         total_loss(out).backward()
