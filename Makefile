@@ -38,13 +38,14 @@ exit 1
 endef
 export FIND_PYTHON
 
-.PHONY: help setup demo test test-all test-browser lint format typing lock clean FORCE
+.PHONY: help setup demo test test-all test-browser docs lint format typing lock clean FORCE
 
 help:
 	@echo "make demo      set up, then the main job: success in simulation and in imagination, in minutes"
 	@echo "make test      set up, then the quick tests"
 	@echo "make test-all  set up, then all tests"
 	@echo "make test-browser  the page of playslot play in headless Chromium (Debian, Ubuntu: apt-get install chromium)"
+	@echo "make docs      the site of README, docs/ and the API, in build/site"
 	@echo "make lint      ruff, format check, mypy strict"
 	@echo "make setup     .venv with the pinned packages and $(BIN)/playslot"
 	@echo "make format    format the code"
@@ -98,7 +99,13 @@ format: $(STAMP)
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 
-# mypy and editors do not know the mapped folders: links that look like the installed package.
+# Of the source alone: nothing is imported, nothing fetched. Not --quiet: --strict counts the warnings that it silences.
+docs: export NO_MKDOCS_2_WARNING := 1
+docs: $(STAMP) typing
+	@$(BIN)/mkdocs build --strict $(ARGS)
+	@echo "look at it: $(BIN)/python -m http.server --bind 127.0.0.1 --directory build/site 8000"
+
+# mypy, mkdocs and editors do not know the mapped folders: links that look like the installed package.
 typing:
 	@mkdir -p .typing/playslot_rl
 	@find .typing/playslot_rl -xtype l -delete

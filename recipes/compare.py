@@ -35,7 +35,9 @@ def main(config: ExperimentConfig) -> None:
     config = compare_data.check_data(config, out)
     with comparison_lock(out):
         config = compare_data.prepare(config, out)
-        plain = replace(config, compare=CompareConfig(evaluation_seed=config.compare.evaluation_seed))
+        plain = replace(
+            config, compare=CompareConfig(evaluation_seed=wanted.evaluation_seed, processes=wanted.processes)
+        )
         parents, records = compare_data.Parents(config, out), {}
         for job in jobs(config, out):
             own = job_config(plain, job, config.run)

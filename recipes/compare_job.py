@@ -51,11 +51,15 @@ def _run(job: dict[str, Any]) -> None:
 
         compare_video_job.run(job)
         return
+    from playslot_rl.comparison.several import train_on_several
     from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts, task_facts
     from playslot_rl.recipes import evaluate, train_baseline
 
-    config = from_dict(ExperimentConfig, job["config"])
-    train_baseline.main(config)
+    config, processes = from_dict(ExperimentConfig, job["config"]), int(job["processes"])
+    if processes > 1:
+        train_on_several("train-baseline", config, processes)
+    else:
+        train_baseline.main(config)
     run, seed = Path(config.out), int(job["evaluation_seed"])
     facts = {
         "episodes": config.episodes or DEFAULT_EPISODES,

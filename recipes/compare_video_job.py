@@ -27,14 +27,17 @@ def run(record: dict[str, Any]) -> None:
 
     job = VideoJob(record["method"], int(record["seed"]), Path(record["out"]), record["variant"])
     config = _chosen(job, from_dict(ExperimentConfig, record["config"]), record)
-    _train(job, config)
+    _train(job, config, int(record["processes"]))
     _score(job, config, record)
 
 
-def _train(job: VideoJob, config: ExperimentConfig) -> None:
+def _train(job: VideoJob, config: ExperimentConfig, processes: int) -> None:
+    from playslot_rl.comparison.several import train_on_several
     from playslot_rl.recipes import train_baseline, train_dynamics
 
-    if job.trained_as == "playslot":
+    if processes > 1:
+        train_on_several("train-dynamics" if job.trained_as == "playslot" else "train-baseline", config, processes)
+    elif job.trained_as == "playslot":
         train_dynamics.main(config)
     else:
         train_baseline.main(config)
@@ -50,7 +53,8 @@ def _chosen(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> 
     if stored.get("fingerprint") != record["fingerprint"]:
         tried = []
         if len(asked.rates) > 1 or asked.budget_minutes:
-            tried = [_trial(job, config, rate, asked.trial_steps) for rate in asked.rates]
+            processes = int(record["processes"])
+            tried = [_trial(job, config, rate, asked.trial_steps, processes) for rate in asked.rates]
         best = max(tried, key=lambda trial: float(trial["psnr"])) if tried else {"rate": asked.rates[0]}
         seconds = min((float(trial["seconds_a_step"]) for trial in tried), default=0.0)
         steps = max(1, round(60 * asked.budget_minutes / seconds)) if asked.budget_minutes and seconds else own.steps
@@ -61,7 +65,7 @@ def _chosen(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> 
     return with_training(config, job.method, steps=int(stored["steps"]), optim=optim)
 
 
-def _trial(job: VideoJob, config: ExperimentConfig, rate: float, steps: int) -> dict[str, float]:
+def _trial(job: VideoJob, config: ExperimentConfig, rate: float, steps: int, processes: int) -> dict[str, float]:
     """Validation PSNR after a short training with a factor of the learning rate, and what a step takes."""
     from playslot_rl.comparison.video_plan import training_of, with_training
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
@@ -70,7 +74,7 @@ def _trial(job: VideoJob, config: ExperimentConfig, rate: float, steps: int) -> 
     out = job.trials / f"rate_{rate:g}"
     optim = replace(own.optim, lr=own.optim.lr * rate, warmup_steps=min(own.optim.warmup_steps, steps // 4))
     changes: dict[str, Any] = {"steps": steps, "optim": optim, "checkpoint_every": steps, "validate_every": steps}
-    _train(job, replace(with_training(config, job.method, **changes), out=str(out)))
+    _train(job, replace(with_training(config, job.method, **changes), out=str(out)), processes)
     done = read_stage(checkpoint_folder(out, job.stage), job.stage)
     return {
         "rate": rate,

@@ -251,6 +251,7 @@ def job_record(job: Job, config: ExperimentConfig, parents: Mapping[str, str]) -
         "evaluation_seed": config.compare.evaluation_seed,
         "protocols": list(job.protocols),
         "stage": job.stage,
+        "processes": 1 if METHODS[job.method].online else config.compare.processes,
         "fingerprint": hashlib.sha256(identity.encode()).hexdigest()[:16],
         "config": values,
     }

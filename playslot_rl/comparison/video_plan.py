@@ -16,7 +16,7 @@ from playslot_rl.config.methods import MethodName
 from playslot_rl.config.roles import without
 from playslot_rl.errors import ConfigError
 
-NOT_OF_A_JOB = ("methods", "seeds", "vary", "values", "objects", "launcher", "hydra")
+NOT_OF_A_JOB = ("methods", "seeds", "vary", "values", "objects", "processes", "launcher", "hydra")
 """Settings of the whole comparison: another choice of them leaves a job as it is."""
 
 
@@ -233,6 +233,7 @@ def video_job_record(job: VideoJob, config: ExperimentConfig, parents: Mapping[s
         "variant": job.variant,
         "out": absolute(str(job.out)),
         "asked": asked,
+        "processes": config.compare_video.processes,
         "fingerprint": hashlib.sha256(identity.encode()).hexdigest()[:16],
         "config": to_dict(config),
     }

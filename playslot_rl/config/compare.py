@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from playslot_rl.config.methods import METHODS, MethodName
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import SEED, Checked, at_least
+from playslot_rl.config.roles import SEED, Checked, at_least, role
 
 LAUNCHERS: dict[str, str] = {
     "basic": "hydra",
@@ -21,7 +21,7 @@ LAUNCHERS: dict[str, str] = {
 @dataclass(frozen=True)
 class CompareConfig(Checked):
     """What is compared. On the command line of `playslot compare` the keys are `methods=`, `demos=`, `labels=`,
-    `seeds=` and `hydra.launcher=`, without the group's name.
+    `seeds=`, `processes=` and `hydra.launcher=`, without the group's name.
 
     Attributes:
         methods: names of `playslot_rl.config.methods`.
@@ -32,6 +32,7 @@ class CompareConfig(Checked):
         seeds: training seeds; each has its own draw of demonstrations.
         online_seeds: training seeds of the methods that act, which take the longest; empty means `seeds`.
         evaluation_seed: seed of the evaluation's episodes, the same for every method and training seed.
+        processes: that each training runs on, by torchrun; methods that act learn in one, and evaluation is in one.
         launcher: Hydra launcher that runs the jobs; empty runs them one after the other.
         hydra: further overrides for Hydra, such as `hydra.launcher.n_jobs=2`.
     """
@@ -43,6 +44,7 @@ class CompareConfig(Checked):
     seeds: tuple[int, ...] = field(default=(0, 1, 2), metadata=SEED)
     online_seeds: tuple[int, ...] = ()
     evaluation_seed: int = field(default=100, metadata=SEED)
+    processes: int = field(default=1, metadata=role("machine") | at_least(1))
     launcher: str = ""
     hydra: tuple[str, ...] = ()
 

@@ -26,8 +26,8 @@ ON_SLOTS: Final = ("slotformer", "ocvp_seq", "playslot", "playslot_m")
 
 @dataclass(frozen=True)
 class CompareVideoConfig(Checked):
-    """What is compared. On the command line the keys are `methods=`, `seeds=`, `vary=`, `values=`, `objects=` and
-    `hydra.launcher=`, without the group's name.
+    """What is compared. On the command line the keys are `methods=`, `seeds=`, `vary=`, `values=`, `objects=`,
+    `processes=` and `hydra.launcher=`, without the group's name.
 
     Attributes:
         methods: names of `VIDEO_METHODS`.
@@ -52,7 +52,7 @@ class CompareVideoConfig(Checked):
         rates: factors of the preset's learning rate, of which each method takes the one that is best on validation
             clips; one of them means no choice.
         trial_steps: steps of each trial.
-        launcher, hydra: as for `compare`.
+        processes, launcher, hydra: as for `compare`.
     """
 
     group = "compare_video."
@@ -74,6 +74,7 @@ class CompareVideoConfig(Checked):
     budget_minutes: float = field(default=0.0, metadata=at_least(0, "0 (the preset's steps) or more"))
     rates: tuple[float, ...] = field(default=(0.3, 1.0, 3.0), metadata=within(lambda rate: rate > 0, "above 0"))
     trial_steps: int = field(default=150, metadata=at_least(2))
+    processes: int = field(default=1, metadata=role("machine") | at_least(1))
     launcher: str = ""
     hydra: tuple[str, ...] = ()
 

@@ -30,8 +30,8 @@ GROUPS: Final = ("env", "preset")
 CONTINUES: Final = frozenset({"evaluate", "export", "inspect", "plan", "play", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
 COMPARISONS: Final = {
-    "compare": ("methods", "demos", "labels", "seeds"),
-    "compare-video": ("methods", "seeds", "vary", "values", "objects"),
+    "compare": ("methods", "demos", "labels", "seeds", "processes"),
+    "compare-video": ("methods", "seeds", "vary", "values", "objects", "processes"),
 }
 """Commands with a group of their own in the config, and its keys that go without its name."""
 NAMES: Final = {"plan": {"planner": PLANNERS, "proposal": PROPOSALS, "goals": GOALS}}
@@ -140,11 +140,11 @@ def _compare_keys(overrides: Sequence[str], command: str) -> list[str]:
         name = key.strip().lstrip("+")
         if equals and name in lists:
             inside = _unquote(value.strip()).removeprefix("[").removesuffix("]")
-            if name == "vary":  # one key, no list
+            if name in ("vary", "processes"):  # one value, no list
                 kept.append(f"{group}.{name}={inside}")
                 continue
             if name == "values":  # of whatever kind the setting is: text until then
-                inside = ",".join(_quote(_unquote(part.strip())) for part in inside.split(",") if part.strip())
+                inside = ",".join(quoted(_unquote(part.strip())) for part in inside.split(",") if part.strip())
             kept.append(f"{group}.{name}=[{inside}]")
         elif equals and name == "hydra.launcher":
             kept.append(f"{group}.launcher={value}")
@@ -152,8 +152,8 @@ def _compare_keys(overrides: Sequence[str], command: str) -> list[str]:
             hydra.append(argument.strip())
         else:
             kept.append(argument)
-    quoted = ",".join(_quote(argument) for argument in hydra)
-    return [*kept, f"{group}.hydra=[{quoted}]"] if hydra else kept
+    inside = ",".join(quoted(argument) for argument in hydra)
+    return [*kept, f"{group}.hydra=[{inside}]"] if hydra else kept
 
 
 def _named_keys(overrides: Sequence[str], command: str) -> list[str]:
@@ -170,7 +170,7 @@ def _named_keys(overrides: Sequence[str], command: str) -> list[str]:
     return kept
 
 
-def _quote(text: str) -> str:
+def quoted(text: str) -> str:
     """Text as Hydra reads it back unchanged."""
     text = text.replace("\\", "\\\\").replace("'", "\\'")
     return "'" + text.replace("${", "\\${") + "'"
@@ -228,7 +228,7 @@ def _assignments(pairs: Mapping[str, str]) -> list[str]:
             continue
         if _hint(key) is str and value != "null":
             text = _expand_home(_unquote(value)) if key in folders else _unquote(value)
-            value = _quote(text)
+            value = quoted(text)
         assignments.append(f"++{key}={value}")
     return assignments
 

@@ -16,16 +16,16 @@ from playslot_rl.errors import PlaySlotError, explain
 from playslot_rl.play import pictures
 from playslot_rl.play.gallery import Gallery
 from playslot_rl.play.recording import Shown, record
-from playslot_rl.play.starts import Start, picture_start
+from playslot_rl.play.start_panel import StartPanel
+from playslot_rl.play.starts import Start
 from playslot_rl.play.studio import Studio
+from playslot_rl.play.time_panel import TimePanel
 
 TICK_S: Final = 0.02
 REST_S: Final = 0.7
 """Seconds without a step after which the prototypes' animations are made anew."""
 ME: Final = "me"
 GAP: Final = 4
-MOST_BYTES: Final = 50_000_000
-"""Of an uploaded picture."""
 
 HELP: Final = (
     "Keys: 0-9 prototypes, U undo, R reset, space free play, M masks. Click a slot in the picture or in the strip to "
@@ -55,8 +55,9 @@ class PlayPage:
         self.donor = 0
         self._due = self._moved = 0.0
         self._lock = asyncio.Lock()
-        self._stale = self._showing = False
-        self._start_key: tuple[str, int, int] = (next(iter(studio.sources), ""), 0, 0)
+        self._stale = False
+        self.starts = StartPanel(studio, self._start, self._halt)
+        self.time = TimePanel(self.session, self._work, self._halt)
 
     # --- layout ----------------------------------------------------------------------------------------------------
 
@@ -68,9 +69,9 @@ class PlayPage:
             with ui.column().classes("gap-2"):
                 self._build_scene()
             with ui.column().classes("gap-3 grow"):
-                self._build_starts()
+                self.starts.build()
                 self._build_steering()
-                self._build_time()
+                self.time.build()
                 self._build_touch()
                 self._build_record()
         ui.keyboard(on_key=self._on_key, repeating=False)
@@ -103,21 +104,6 @@ class PlayPage:
             self.curve = ui.html("", sanitize=False).mark("curve")
         ui.label(HELP).classes("text-sm text-gray-500")
 
-    def _build_starts(self) -> None:
-        sources = self.studio.sources
-        with ui.row().classes("items-center gap-2"):
-            self.source = ui.select(sources or {"": "no data set, no simulator"}, value=next(iter(sources), ""))
-            self.source.props("dense").mark("source")
-            self.number = ui.number("episode", value=0, min=0, step=1, format="%d").props("dense").classes("w-20")
-            self.step = ui.number("frame", value=0, min=0, step=1, format="%d").props("dense").classes("w-20")
-            ui.button("Start here", on_click=self._on_start).props("dense no-caps").mark("start")
-            ui.button("Next episode", on_click=self._on_next).props("dense no-caps flat").mark("next")
-            ui.upload(
-                label="or a picture", auto_upload=True, on_upload=self._on_upload, max_file_size=MOST_BYTES
-            ).props("accept=image/* dense flat bordered").classes("w-44").style("max-height: 56px; min-height: 0").mark(
-                "upload"
-            )
-
     def _build_steering(self) -> None:
         self.protos: list[Any] = []
         with ui.row().classes("items-start gap-1"):
@@ -149,15 +135,6 @@ class PlayPage:
             self.free_switch = ui.switch("free play", on_change=self._on_free).mark("free")
             ui.slider(min=1, max=15, step=1, value=self.fps).props("label").classes("w-32").bind_value(self, "fps")
             ui.label("frames a second").classes("text-sm")
-
-    def _build_time(self) -> None:
-        with ui.row().classes("items-center gap-2 w-full"):
-            ui.button("Undo", on_click=self._on_undo).props("dense no-caps").mark("undo")
-            ui.button("Reset", on_click=self._on_reset).props("dense no-caps").mark("reset")
-            self.place = ui.slider(min=0, max=1, step=1, value=0, on_change=self._on_place).props("label")
-            self.place.classes("w-64").mark("place")
-            self.tips = ui.select({0: "start"}, value=0, on_change=self._on_tip, label="branch").props("dense")
-            self.tips.classes("w-48").mark("tips")
 
     def _build_touch(self) -> None:
         with ui.row().classes("items-center gap-2"):
@@ -217,7 +194,8 @@ class PlayPage:
         if "true" in drawn:
             self.true.set_source(self.gallery.put("true", drawn["true"]))
             self.curve.set_content(pictures.error_curve([moment.error for moment in branch], session.now.depth))
-        self._show_time(len(branch))
+        # The list of branches is long, and nobody reads it while it grows.
+        self.time.show(len(branch), branches=not self.ticker.active)
         now = session.now
         error = "" if now.error is None else f", error {now.error:.3f}"
         self.status.set_text(f"{session.start.title}; moment {now.depth}, {now.label}{error}")
@@ -227,16 +205,6 @@ class PlayPage:
             frozen = ", frozen" if self.chosen in now.frozen else ""
             self.which.set_text(f"slot {self.chosen + 1}{frozen}")
         self._stale, self._moved = True, time.monotonic()
-
-    def _show_time(self, moments: int) -> None:
-        """Timeline slider and list of branches, without setting off their own handlers."""
-        timeline, self._showing = self.session.timeline, True
-        self.place.props(f"max={max(1, moments - 1)}")
-        self.place.set_value(timeline.now.depth)
-        if not self.ticker.active:  # the list is long, and nobody reads it while it grows
-            tips = {tip.number: f"{tip.depth} moments, {tip.label}" for tip in timeline.tips()}
-            self.tips.set_options(tips, value=timeline.branch()[-1].number)
-        self._showing = False
 
     @property
     def target(self) -> int | None:
@@ -280,7 +248,7 @@ class PlayPage:
         if not self._stale or not paused or self.closed or not self.begun:
             return
         self._stale = False
-        self._show_time(len(self.session.timeline.branch()))
+        self.time.show(len(self.session.timeline.branch()), branches=True)
         for number in range(len(self.protos)):
             async with self._lock:
                 if self._stale or self.closed:
@@ -294,14 +262,12 @@ class PlayPage:
         return pictures.animated(self.session.preview([number], self.variability, self.target)[0])
 
     async def _begin(self) -> None:
-        if self._start_key[0]:
-            await self._start_at(self._start_key)
-        else:
+        if not await self.starts.first():
             self.status.set_text("nothing to start from: upload a picture, or give data.root=")
 
-    async def _start_at(self, key: tuple[str, int, int]) -> None:
-        if await self._work(lambda: self.session.begin(self.studio.start(*key)), begins=True):
-            self._start_key = key
+    async def _start(self, start: Callable[[], Start]) -> bool:
+        """Have the session begin at a start, which the worker makes."""
+        return await self._work(lambda: self.session.begin(start()), begins=True)
 
     def close(self) -> None:
         """The client is gone: no more steps; the simulator is freed by the worker."""
@@ -324,7 +290,7 @@ class PlayPage:
             await self._on_letter(str(event.key.name).lower())
 
     async def _on_letter(self, name: str) -> None:
-        actions: dict[str, Callable[[], Awaitable[None]]] = {"u": self._on_undo, "r": self._on_reset}
+        actions: dict[str, Callable[[], Awaitable[None]]] = {"u": self.time.undo, "r": self.time.reset}
         if name in actions:
             await actions[name]()
         elif name == "m":
@@ -371,42 +337,6 @@ class PlayPage:
 
     def _on_variability(self) -> None:
         self._stale, self._moved = True, time.monotonic()
-
-    async def _on_undo(self) -> None:
-        await self._work(self.session.undo)
-
-    async def _on_reset(self) -> None:
-        self._halt()
-        await self._work(self.session.reset)
-
-    def _on_place(self, event: events.ValueChangeEventArguments[float | None]) -> Awaitable[Any] | None:
-        if self._showing or not self.begun or event.value is None:
-            return None
-        branch = self.session.timeline.branch()
-        number = branch[min(int(event.value), len(branch) - 1)].number
-        return self._work(lambda: self.session.go(number))
-
-    def _on_tip(self, event: events.ValueChangeEventArguments[Any]) -> Awaitable[Any] | None:
-        if self._showing or not self.begun or event.value is None:
-            return None
-        return self._work(lambda: self.session.go(int(event.value)))
-
-    async def _on_start(self) -> None:
-        self._halt()
-        await self._start_at((str(self.source.value), int(self.number.value or 0), int(self.step.value or 0)))
-
-    async def _on_next(self) -> None:
-        self.number.set_value(int(self.number.value or 0) + 1)
-        await self._on_start()
-
-    async def _on_upload(self, event: events.UploadEventArguments) -> None:
-        content, name, model = await event.file.read(), event.file.name, self.studio.world_model
-
-        def start() -> Start:
-            return picture_start(model, content, name)
-
-        self._halt()
-        await self._work(lambda: self.session.begin(start()), begins=True)
 
     async def _on_scene(self, event: events.MouseEventArguments) -> None:
         if self._owner is None:

@@ -198,7 +198,7 @@ def test_actions_go_to_the_slot_under_the_mouse_where_each_has_its_own(
             await until(lambda: page.under == slot)  # noqa: B023
             await page._on_down(1)
             assert page.session.now.label == f"prototype 1, slot {slot + 1}"
-            await page._on_undo()
+            await page.time.undo()
 
     simulate(studio, script)
     studio.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import signal
@@ -254,3 +255,15 @@ def test_joblib_runs_the_jobs_side_by_side(shared_run: Path, tmp_path: Path) -> 
     assert (done.code, done.err) == (0, ""), (tmp_path / "out" / "jobs" / "launcher.log").read_text()
     assert [row["status"] for row in _result(tmp_path / "out")["rows"]] == ["done", "done"]
     assert "Joblib.Parallel" in (tmp_path / "out" / "jobs" / "launcher.log").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("playslot_rl.processes") is None, reason="needs training on processes")
+def test_joblib_runs_two_jobs_of_two_processes_each(shared_run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = _arguments(shared_run, out, "methods=slot_oracle", "demos=2,3", "processes=2")
+    done = playslot(*command, "hydra.launcher=joblib", "hydra.launcher.n_jobs=2")
+    assert (done.code, done.err) == (0, ""), (out / "jobs" / "launcher.log").read_text()
+    assert [row["status"] for row in _result(out)["rows"]] == ["done", "done"]
+    again = playslot(*(word for word in command if word != "processes=2"))
+    assert again.out.count("done before, skipped") == 2, "in one process they are the same jobs"

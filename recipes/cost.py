@@ -1,0 +1,78 @@
+"""What training takes, estimated before it is begun: `python -m playslot_rl.recipes.cost preset=paper`.
+
+Counts the operations of one step of each stage on this CPU, and prints them with the memory and time that they mean on
+1, 8 and 32 devices of which speed is *assumed* (`playslot_rl.speed.cost.Machine`). Nothing is written.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.compose import compose
+from playslot_rl.errors import PlaySlotError, explain
+
+if TYPE_CHECKING:
+    from playslot_rl.speed.cost import Machine, StageCost
+
+PROCESSES = (1, 8, 32)
+"""One device, one node of eight, four nodes."""
+
+
+def main(config: ExperimentConfig) -> str:
+    """The two tables, in Markdown; progress goes to standard error."""
+    from playslot_rl.allocator import tune_allocator
+    from playslot_rl.speed.cost import STAGES, Machine, stage_cost
+    from playslot_rl.threads import set_threads
+
+    tune_allocator()
+    set_threads(config.threads)
+    costs: list[StageCost] = []
+    for stage in STAGES:
+        print(f"{stage} ...", file=sys.stderr, flush=True)
+        costs.append(stage_cost(config, stage))
+    return f"{counted(costs)}\n\n{estimated(costs, Machine())}"
+
+
+def counted(costs: Sequence[StageCost]) -> str:
+    """What was counted, a row a stage."""
+    names = "parameters trained | batch | TFLOP a step | calls a step | kept for backward, fp32 | steps | PFLOP in all"
+    lines = [f"| counted | {names} |", "|---|---|---|---|---|---|---|---|"]
+    for cost in costs:
+        count = cost.at(cost.batch)
+        lines.append(
+            f"| {cost.stage} | {cost.parameters:,} | {cost.batch} | {count.flops / 1e12:.3g} | {count.calls:,.0f} | "
+            f"{count.kept / 2**30:.2f} GiB | {cost.steps:,} | {count.flops * cost.steps / 1e15:,.3g} |"
+        )
+    return "\n".join(lines)
+
+
+def estimated(costs: Sequence[StageCost], machine: Machine) -> str:
+    """Memory and time on `PROCESSES`, a row a stage; what is assumed stands in the first line."""
+    from playslot_rl.speed.cost import estimate
+
+    assumed = (
+        f"Estimated, assuming {machine.teraflops:g} TFLOP/s sustained a device, {machine.call_us:g} us a kernel at "
+        f"least, {machine.gigabytes_s:g} GB/s and {machine.exchange_us:g} us an exchange; "
+        "GiB a device, seconds a step, hours:"
+    )
+    titles = " | ".join(f"{n} device{'s' * (n > 1)}" for n in PROCESSES)
+    lines = [assumed, "", f"| estimated | {titles} |", "|---" * (1 + len(PROCESSES)) + "|"]
+    for cost in costs:
+        cells = []
+        for n in PROCESSES:
+            seconds = estimate(cost, n, machine)
+            memory = cost.memory(cost.batch / n) / 2**30
+            cells.append(f"{memory:.2f} GiB, {seconds:.3g} s, {seconds * cost.steps / 3600:.1f} h")
+        lines.append(f"| {cost.stage} | {' | '.join(cells)} |")
+    hours = [sum(estimate(cost, n, machine) * cost.steps for cost in costs) / 3600 for n in PROCESSES]
+    return "\n".join([*lines, f"| all stages | {' | '.join(f'{total:.0f} h' for total in hours)} |"])
+
+
+if __name__ == "__main__":
+    try:
+        print(main(compose(sys.argv[1:])))
+    except PlaySlotError as error:
+        sys.exit(f"cost: error: {explain(error)}")

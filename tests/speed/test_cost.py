@@ -1,0 +1,89 @@
+"""What a training step costs: counts against known sums, straight lines in the batch, and what is made of them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.compose import compose
+from playslot_rl.recipes import cost as recipe
+from playslot_rl.speed import cost
+from playslot_rl.speed.cost import Count, Machine, StageCost, estimate, stage_cost
+
+
+@pytest.fixture(scope="module")
+def config() -> ExperimentConfig:
+    return compose(["preset=smoke"])
+
+
+@pytest.fixture(scope="module")
+def costs(config: ExperimentConfig) -> dict[str, StageCost]:
+    return {stage: stage_cost(config, stage) for stage in cost.STAGES}
+
+
+class _Squares(nn.Module):
+    """A linear map of which products and bytes are known."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.rand(5, 7))
+
+    def forward(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {"loss_x": (x @ self.weight).sum()}
+
+
+def test_a_product_counts_two_a_multiplication_and_what_it_keeps_for_its_gradient() -> None:
+    count = cost._count(_Squares(), torch.rand(3, 5))  # type: ignore[arg-type]
+    assert count.flops == 2 * (2 * 3 * 5 * 7)  # forward, and the weight's gradient; the input has none
+    assert count.kept == 4 * 3 * 5  # the input; the weight is no activation
+
+
+@pytest.mark.parametrize("stage", cost.STAGES)
+def test_every_count_is_a_straight_line_in_the_batch(
+    config: ExperimentConfig, costs: dict[str, StageCost], stage: str
+) -> None:
+    found = costs[stage]
+    agent = cost.fresh_agent(config)
+    criterion, batch_of = cost._parts(config, stage, agent)
+    cost.begin(criterion, batch_of(2))
+    straight, direct = found.at(5), cost._count(criterion, batch_of(5))
+    assert straight.flops == direct.flops
+    assert straight.kept == pytest.approx(direct.kept, rel=1e-3)  # the codebook's bookkeeping
+    assert straight.calls == pytest.approx(direct.calls, rel=0.05)  # a dead code is revived
+    trained = {"slots": agent.world_model.savi, "policy": agent.policy, "decoder": agent.action_decoder}
+    if stage in trained:
+        assert found.parameters == sum(p.numel() for p in trained[stage].parameters() if p.requires_grad)
+        assert found.frozen == 0
+    else:
+        assert found.frozen == sum(p.numel() for p in agent.world_model.savi.parameters())
+
+
+def test_an_unknown_stage_is_refused(config: ExperimentConfig) -> None:
+    with pytest.raises(ValueError, match=r"stage: got all, expected one of slots, dynamics, policy, decoder"):
+        stage_cost(config, "all")
+
+
+def test_time_is_that_of_arithmetic_or_of_calls_and_of_one_exchange() -> None:
+    machine = Machine(teraflops=1.0, call_us=10.0, gigabytes_s=1.0, exchange_us=100.0)
+    heavy = StageCost("slots", 10, 4, 1_000_000, 0, Count(2e12, 100, 0), Count(3e12, 100, 0))
+    assert estimate(heavy, 1, machine) == pytest.approx(4.0)
+    assert estimate(heavy, 2, machine) == pytest.approx(2.0 + 4e6 / 1e9 + 1e-4)
+    light = StageCost("slots", 10, 4, 0, 0, Count(2.0, 1000, 0), Count(3.0, 1000, 0))
+    assert estimate(light, 1, machine) == pytest.approx(0.01)
+    assert estimate(light, 4, machine) == pytest.approx(0.01 + 1e-4), "calls are as many with a share of the batch"
+
+
+def test_memory_is_weights_gradients_adam_and_what_is_kept() -> None:
+    own = StageCost("slots", 10, 4, 100, 50, Count(0, 0, 2000), Count(0, 0, 3000))
+    assert own.memory(4) == 4 * (4 * 100 + 50) + 4000
+
+
+def test_the_tables_have_a_row_a_stage_and_name_what_is_assumed(costs: dict[str, StageCost]) -> None:
+    counted, estimated = recipe.counted([*costs.values()]), recipe.estimated([*costs.values()], Machine())
+    for stage in cost.STAGES:
+        assert f"| {stage} | {costs[stage].parameters:,} |" in counted
+        assert f"| {stage} |" in estimated
+    assert "Estimated, assuming 20 TFLOP/s sustained a device" in estimated
+    assert "| all stages |" in estimated
