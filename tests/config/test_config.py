@@ -193,7 +193,7 @@ def test_the_full_encoder_takes_no_strides() -> None:
 
 def test_roles_say_what_each_key_counts_for() -> None:
     looking = {"checkpoint_every", "validate_every", "log_every"}
-    assert keys_of(SlotsStageConfig, "free") == looking
+    assert keys_of(SlotsStageConfig, "free") == looking | {"compile", "optim.accumulate"}
     assert keys_of(DreamerConfig, "free") == {"minutes", "replay_on_disk", "evaluate_every"} | looking - {
         "validate_every"
     }
