@@ -77,8 +77,10 @@ class ArrayWriter:
         self._file.write(np.ascontiguousarray(rows, self.dtype).data)
         self.rows += len(rows)
 
-    def close(self) -> None:
-        """Finish; all rows must have been written."""
+    def close(self, *, whole: bool = True) -> None:
+        """Finish; all rows must have been written, unless it is not `whole`: the others are zeros."""
+        if not whole:
+            self._file.truncate(self._begin + int(np.prod(self.shape)) * self.dtype.itemsize)
         self._file.close()
-        if self.rows != self.shape[0]:
+        if whole and self.rows != self.shape[0]:
             raise ValueError(f"{self.path}: got {self.rows} rows, expected {self.shape[0]}")

@@ -27,6 +27,8 @@ from playslot_rl.storage.atomic import write_json
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from playslot_rl.data.weighted import Shares
+
 Frames = npt.NDArray[np.uint8]
 _FORMAT = "1"
 """Of the frame cache."""
@@ -96,6 +98,9 @@ class EpisodeFrames:
         fps: frames a second.
         task: the task in words.
         camera: feature the frames come from.
+        robot: what was recorded, as the data set says; empty where it says nothing.
+        name: the folder it was read from, for people.
+        shares: of several sets that are drawn from with weights, which rows are whose; None draws all windows alike.
     """
 
     frames: FrameRows
@@ -108,6 +113,9 @@ class EpisodeFrames:
     fps: float
     task: str
     camera: str
+    robot: str = ""
+    name: str = ""
+    shares: Shares | None = None
 
     @property
     def episodes(self) -> int:
@@ -182,7 +190,14 @@ def open_source(
             name: columns.get(name) for name in ("starts", "lengths", "actions", "success", "seeds")
         }
     return EpisodeFrames(
-        frames=frames, fingerprint=fingerprint, fps=meta["fps"], task=meta["task"], camera=camera, **labels
+        frames=frames,
+        fingerprint=fingerprint,
+        fps=meta["fps"],
+        task=meta["task"],
+        camera=camera,
+        robot=str(files.info.get("robot_type") or ""),
+        name=str(root),
+        **labels,
     )
 
 
@@ -236,6 +251,8 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
         success=joined("success"),
         seeds=joined("seeds"),
         fingerprint=hashlib.sha256("+".join(s.fingerprint for s in sources).encode()).hexdigest()[:16],
+        name=",".join(dict.fromkeys(s.name for s in sources)),
+        shares=None,
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.weighted import draw_episodes
 from playslot_rl.errors import DataError
 
 IntArray = npt.NDArray[np.int64]
@@ -142,10 +143,27 @@ class Clips:
         return spread_windows(self.source.starts, self.source.lengths, self.frames, self.shown, episodes)
 
     def sample(self, batch: int, generator: np.random.Generator) -> IntArray:
-        """Row indices (batch, T) of windows of the training episodes, drawn uniformly."""
-        return sample_windows(
-            self.source.starts, self.source.lengths, self.frames, batch, generator, self.train_episodes
-        )
+        """Row indices (batch, T) of windows of the training episodes, drawn uniformly; of sets with weights
+        (`playslot_rl.data.weighted`), uniformly in a set that was drawn by its weight.
+        """
+        source = self.source
+        if source.shares is None:
+            return sample_windows(source.starts, source.lengths, self.frames, batch, generator, self.train_episodes)
+        first, valid = _valid_starts(source.starts, source.lengths, self.frames, self.train_episodes)
+        episode, offset = draw_episodes(source.shares, first, valid, batch, generator)
+        rows: IntArray = (first[episode] + offset)[:, None] + np.arange(self.frames)
+        return rows
+
+    def sample_first(self, batch: int, generator: np.random.Generator) -> IntArray:
+        """First rows (batch,) of training episodes in which a clip fits, drawn uniformly or by their sets' weights."""
+        source = self.source
+        fits = self.train_episodes[source.lengths[self.train_episodes] >= self.frames]
+        if source.shares is None:
+            first: IntArray = source.starts[generator.choice(fits, batch)]
+            return first
+        episode, _ = draw_episodes(source.shares, source.starts[fits], np.ones_like(fits), batch, generator)
+        first = source.starts[fits[episode]]
+        return first
 
     def validation_batches(self) -> list[IntArray]:
         """The held-out windows, about eight at a time."""
