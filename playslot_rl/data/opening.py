@@ -7,6 +7,7 @@ from pathlib import Path
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import DataRoot, data_roots
+from playslot_rl.data.cache import Cache
 from playslot_rl.data.source import EpisodeFrames, open_sources
 from playslot_rl.data.stride import every
 from playslot_rl.data.weighted import weighted
@@ -29,5 +30,5 @@ def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path])
         return weighted(parts, [root.weight for root in named], [root.path for root in named])
     data, size = config.data, config.env.image_size
     paths = [root.path for root in named]
-    source = open_sources(paths, data.camera, data.cache, image_size=size, resize=data.resize)
+    source = open_sources(paths, data.camera, Cache.of(data), image_size=size, resize=data.resize)
     return every(source, data.stride)

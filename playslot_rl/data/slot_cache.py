@@ -16,10 +16,12 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from playslot_rl.data.cache import ArrayWriter, build_once, cache_folder, load_cached
+from playslot_rl.data.cache import ArrayWriter, CachePlace, build_once, cache_folder, load_cached
+from playslot_rl.data.cache_entries import ENTRY_NAME, make_room
 from playslot_rl.data.source import ConcatFrames, EpisodeFrames
 from playslot_rl.frames import normalise
 from playslot_rl.seeding import step_generator
+from playslot_rl.storage.atomic import write_json
 
 if TYPE_CHECKING:
     from playslot_rl.modules.savi import SAVi
@@ -39,7 +41,7 @@ def slot_cache(
     source: EpisodeFrames,
     savi: SAVi,
     savi_fingerprint: str,
-    cache: str | Path = "",
+    cache: CachePlace = "",
     device: torch.device | str = "cpu",
     progress: bool = False,
 ) -> SlotRows:
@@ -76,13 +78,16 @@ def slot_cache(
         if progress:
             print(f"slots: parsing {int(source.lengths.sum())} frames once", file=sys.stderr, flush=True)
         shape = (count, savi.config.n_slots, savi.config.slot_dim)
+        make_room(cache, int(np.prod(shape)) * 4, key)
         writer = ArrayWriter(temporary / "slots.npy", shape, np.float32)
         for start, slots in zip(source.starts, parse_episodes(source, savi, device), strict=True):
             writer.write(slots, int(start))
         writer.close(whole=whole)
+        facts = {"name": source.name, "camera": source.camera, "fingerprint": source.fingerprint}
+        write_json(temporary / ENTRY_NAME, {**facts, "savi": savi_fingerprint})
 
     build_once(folder, build)
-    slots: npt.NDArray[np.float32] = load_cached(folder, "slots.npy")
+    slots: npt.NDArray[np.float32] = load_cached(folder, "slots.npy", lambda: build_once(folder, build))
     return slots
 
 

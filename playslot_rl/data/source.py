@@ -11,6 +11,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -18,9 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.data.cache import ArrayWriter, build_once, cache_folder, load_cached
+from playslot_rl.data.cache import CachePlace, build_on, cache_folder, load_cached, settings
+from playslot_rl.data.cache_entries import ENTRY_NAME, make_room
 from playslot_rl.data.contents import Contents, open_files, stated_size
-from playslot_rl.data.frames import resize_frames, rgb_frames
+from playslot_rl.data.frame_build import FrameArray, build_frames
 from playslot_rl.errors import DataError
 from playslot_rl.storage.atomic import write_json
 
@@ -159,7 +161,7 @@ class EpisodeFrames:
 
 
 def open_source(
-    root: str | Path, camera: str = "", cache: str | Path = "", *, image_size: int | None = None, resize: bool = False
+    root: str | Path, camera: str = "", cache: CachePlace = "", *, image_size: int | None = None, resize: bool = False
 ) -> EpisodeFrames:
     """Open a LeRobot v3.0 data set through the frame cache; the first time decodes all its frames.
 
@@ -180,11 +182,17 @@ def open_source(
     # Refused before everything is decoded, where the metadata say it.
     if image_size is not None and not resize and stated != (image_size, image_size):
         raise _wrong_size(files, camera, stated, image_size)
-    folder, fingerprint = _frame_cache(files, camera, cache, image_size if resize else None)
-    frames: Frames = load_cached(folder, "frames.npy")
+    make = partial(_frame_cache, files, camera, cache, image_size if resize else None)
+    folder, fingerprint = make()
+    frames: Frames = load_cached(folder, "frames.npy", make)
     if image_size is not None and frames.shape[1:3] != (image_size, image_size):
         raise _wrong_size(files, camera, (frames.shape[1], frames.shape[2]), image_size)
-    meta = json.loads((folder / "meta.json").read_text())
+    meta = json.loads((folder / ENTRY_NAME).read_text())
+    if len(frames) != files.rows or meta.get("fingerprint", fingerprint) != fingerprint:
+        raise DataError(
+            f"{folder}: got {len(frames)} frames of {meta.get('fingerprint')}, expected {files.rows} of {fingerprint}: "
+            "delete it, it is made again"
+        )
     with np.load(folder / "columns.npz") as columns:
         labels: dict[str, Any] = {
             name: columns.get(name) for name in ("starts", "lengths", "actions", "success", "seeds")
@@ -204,7 +212,7 @@ def open_source(
 def open_sources(
     roots: str | Sequence[str | Path],
     camera: str = "",
-    cache: str | Path = "",
+    cache: CachePlace = "",
     *,
     image_size: int | None = None,
     resize: bool = False,
@@ -263,7 +271,7 @@ def _wrong_size(files: Contents, camera: str, got: tuple[int, int], expected: in
     )
 
 
-def _frame_cache(files: Contents, camera: str, cache: str | Path, size: int | None) -> tuple[Path, str]:
+def _frame_cache(files: Contents, camera: str, cache: CachePlace, size: int | None) -> tuple[Path, str]:
     """The cache folder of a data set's camera, made if needed, and the data set's fingerprint.
 
     It holds `frames.npy` uint8 (F, H, W, 3), `columns.npz` and `meta.json`, and is keyed by the data set's content, the
@@ -276,7 +284,16 @@ def _frame_cache(files: Contents, camera: str, cache: str | Path, size: int | No
         )
     fingerprint = _fingerprint(files, camera, folder)
     key = hashlib.sha256(json.dumps([_FORMAT, fingerprint, camera, size]).encode()).hexdigest()[:24]
-    return build_once(folder / "frames" / key, lambda tmp: _build(files, camera, size, tmp)), fingerprint
+
+    def build(part: Path) -> None:
+        make_room(cache, FrameArray(files, camera, size, part).bytes, key)
+        build_frames(files, camera, size, part, settings(cache).workers)
+        np.savez(part / "columns.npz", **_columns(files))  # type: ignore[arg-type]
+        tasks = files.episodes[0].tasks
+        facts = {"name": str(files.root), "camera": camera, "fingerprint": fingerprint}
+        write_json(part / ENTRY_NAME, {**facts, "fps": files.fps, "task": tasks[0] if tasks else ""})
+
+    return build_on(folder / "frames" / key, build), fingerprint
 
 
 def _fingerprint(files: Contents, camera: str, cache: Path) -> str:
@@ -294,21 +311,6 @@ def _fingerprint(files: Contents, camera: str, cache: Path) -> str:
     fingerprint = files.file_hash(camera)
     write_json(note, {"fingerprint": fingerprint})
     return fingerprint
-
-
-def _build(files: Contents, camera: str, size: int | None, folder: Path) -> None:
-    writer: ArrayWriter | None = None
-    for row, frame in rgb_frames(files, camera):
-        pixels = frame if size is None or frame.shape[:2] == (size, size) else resize_frames(frame[None], size)[0]
-        if writer is None:
-            writer = ArrayWriter(folder / "frames.npy", (files.rows, *pixels.shape), np.uint8)
-        writer.write(pixels[None], row)
-    if writer is None:
-        raise DataError(f"{files.root}: got no frames of {camera}, expected {files.rows}: collect or pull it again")
-    writer.close()
-    np.savez(folder / "columns.npz", **_columns(files))  # type: ignore[arg-type]
-    tasks = files.episodes[0].tasks
-    write_json(folder / "meta.json", {"camera": camera, "fps": files.fps, "task": tasks[0] if tasks else ""})
 
 
 def _columns(files: Contents) -> dict[str, npt.NDArray[Any]]:
