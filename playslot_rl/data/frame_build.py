@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from playslot_rl.data.cache import write_header
 from playslot_rl.data.contents import Contents, Span, stated_size
-from playslot_rl.data.frames import resize_frames, rgb_frames
+from playslot_rl.data.frames import rgb_frames, sized
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.storage.atomic import explain_write_errors, write_text
 from playslot_rl.threads import available_cores
@@ -83,8 +83,7 @@ class FrameArray:
         start, one, digest = self._start(), self.bytes // self.shape[0], 0
         with explain_write_errors(self.path), self.path.open("r+b") as file:
             for row, frame in rgb_frames(self.contents, self.camera, spans):
-                kept = self.size is None or frame.shape[:2] == (self.size, self.size)
-                pixels = frame if kept else resize_frames(frame[None], self.size or 0)[0]
+                pixels = sized(frame, self.size)
                 file.seek(start + row * one)
                 file.write(np.ascontiguousarray(pixels).data)
                 digest += _digest(row, pixels)

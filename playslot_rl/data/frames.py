@@ -83,6 +83,13 @@ def resize_frames(frames: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.ui
     return np.stack(resized)
 
 
+def sized(frame: npt.NDArray[np.uint8], size: int | None) -> npt.NDArray[np.uint8]:
+    """A frame (H, W, 3) as a model's, (size, size, 3); None keeps its size."""
+    if size is None or frame.shape[:2] == (size, size):
+        return frame
+    return resize_frames(frame[None], size)[0]
+
+
 def _image_frames(
     contents: Contents, camera: str, spans: Sequence[Span], problems: Problems
 ) -> Iterator[tuple[int, Decoded]]:

@@ -14,7 +14,7 @@ from playslot_rl.data.weighted import weighted
 
 
 def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path]) -> EpisodeFrames:
-    """One or several data sets as one, by `env.image_size` and `data.camera`, `.cache`, `.resize` and `.stride`.
+    """One or several data sets as one, by `env.image_size` and what `data` says of cameras, caches, size and stride.
 
     Args:
         config: of the command.
@@ -30,5 +30,6 @@ def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path])
         return weighted(parts, [root.weight for root in named], [root.path for root in named])
     data, size = config.data, config.env.image_size
     paths = [root.path for root in named]
-    source = open_sources(paths, data.camera, Cache.of(data), image_size=size, resize=data.resize)
+    buffer = data.shuffle_buffer if data.stream else None
+    source = open_sources(paths, data.camera, Cache.of(data), image_size=size, resize=data.resize, buffer=buffer)
     return every(source, data.stride)

@@ -181,12 +181,12 @@ def open_source(
     stated = stated_size(files.features[camera])
     # Refused before everything is decoded, where the metadata say it.
     if image_size is not None and not resize and stated != (image_size, image_size):
-        raise _wrong_size(files, camera, stated, image_size)
+        raise wrong_size(files, camera, stated, image_size)
     make = partial(_frame_cache, files, camera, cache, image_size if resize else None)
     folder, fingerprint = make()
     frames: Frames = load_cached(folder, "frames.npy", make)
     if image_size is not None and frames.shape[1:3] != (image_size, image_size):
-        raise _wrong_size(files, camera, (frames.shape[1], frames.shape[2]), image_size)
+        raise wrong_size(files, camera, (frames.shape[1], frames.shape[2]), image_size)
     meta = json.loads((folder / ENTRY_NAME).read_text())
     if len(frames) != files.rows or meta.get("fingerprint", fingerprint) != fingerprint:
         raise DataError(
@@ -216,11 +216,13 @@ def open_sources(
     *,
     image_size: int | None = None,
     resize: bool = False,
+    buffer: int | None = None,
 ) -> EpisodeFrames:
     """Open one or several data sets as one; `roots` is a list, or a string with commas.
 
     With several cameras (commas in `camera`) each episode comes once for each of them. Labels that not every data set
-    has are dropped. The frames must have one size.
+    has are dropped. The frames must have one size. With a `buffer`, frames of a shuffle buffer, they are not cached but
+    decoded while they are read (`playslot_rl.data.stream`).
 
     Raises:
         DataError: as `open_source`, or the frame sizes differ.
@@ -229,7 +231,13 @@ def open_sources(
     cameras = [name.strip() for name in camera.split(",")]
     pairs = [(name, one) for name in ([name for name in names if str(name)] or [""]) for one in cameras]
     names = [name for name, _ in pairs]
-    sources = [open_source(root, one, cache, image_size=image_size, resize=resize) for root, one in pairs]
+    if buffer is None:
+        opening = partial(open_source, image_size=image_size, resize=resize)
+    else:
+        from playslot_rl.data.stream import open_stream
+
+        opening = partial(open_stream, image_size=image_size, resize=resize, buffer=buffer)
+    sources = [opening(root, one, cache) for root, one in pairs]
     if len(sources) == 1:
         return sources[0]
     for name, source in zip(names, sources, strict=True):
@@ -264,7 +272,8 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
     )
 
 
-def _wrong_size(files: Contents, camera: str, got: tuple[int, int], expected: int) -> DataError:
+def wrong_size(files: Contents, camera: str, got: tuple[int, int], expected: int) -> DataError:
+    """Frames of another size than the model's."""
     return DataError(
         f"{files.root}: got frames of {got[0]}x{got[1]} from {camera}, expected {expected}x{expected}: "
         "set env.image_size, resize them by data.resize=true, or record at that size"
@@ -282,13 +291,13 @@ def _frame_cache(files: Contents, camera: str, cache: CachePlace, size: int | No
         raise DataError(
             f"data.cache={folder}: got a folder inside the data set {files.root}, expected one outside: move it"
         )
-    fingerprint = _fingerprint(files, camera, folder)
+    fingerprint = files_fingerprint(files, camera, folder)
     key = hashlib.sha256(json.dumps([_FORMAT, fingerprint, camera, size]).encode()).hexdigest()[:24]
 
     def build(part: Path) -> None:
         make_room(cache, FrameArray(files, camera, size, part).bytes, key)
         build_frames(files, camera, size, part, settings(cache).workers)
-        np.savez(part / "columns.npz", **_columns(files))  # type: ignore[arg-type]
+        np.savez(part / "columns.npz", **labels_of(files))  # type: ignore[arg-type]
         tasks = files.episodes[0].tasks
         facts = {"name": str(files.root), "camera": camera, "fingerprint": fingerprint}
         write_json(part / ENTRY_NAME, {**facts, "fps": files.fps, "task": tasks[0] if tasks else ""})
@@ -296,7 +305,7 @@ def _frame_cache(files: Contents, camera: str, cache: CachePlace, size: int | No
     return build_on(folder / "frames" / key, build), fingerprint
 
 
-def _fingerprint(files: Contents, camera: str, cache: Path) -> str:
+def files_fingerprint(files: Contents, camera: str, cache: Path) -> str:
     """Content hash of a data set, remembered by the names, sizes and times of its files: hashing videos is slow."""
     listing = sorted(
         (str(path.relative_to(files.root)), path.stat().st_size, path.stat().st_mtime_ns)
@@ -313,7 +322,8 @@ def _fingerprint(files: Contents, camera: str, cache: Path) -> str:
     return fingerprint
 
 
-def _columns(files: Contents) -> dict[str, npt.NDArray[Any]]:
+def labels_of(files: Contents) -> dict[str, npt.NDArray[Any]]:
+    """`starts`, `lengths`, and where there are some, `actions`, `success` and `seeds`, as of `EpisodeFrames`."""
     lengths = np.array([episode.length for episode in files.episodes], np.int64)
     starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
     found: dict[str, npt.NDArray[Any]] = {"starts": starts, "lengths": lengths}

@@ -166,6 +166,8 @@ class StageRecord:
         data: dict[str, Any] = {"data": self.data.fingerprint} if self.role else {}
         if self.role == "train":
             data["data.validation"] = self.config.data.validation
+            if self.config.data.stream:  # other windows than from the cache
+                data["data.shuffle_buffer"] = self.config.data.shuffle_buffer
         return {**self._of_stored(*self.counts), **data, **self.prints, **self.identity}
 
     def begin(self) -> None:
