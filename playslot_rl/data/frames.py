@@ -87,7 +87,8 @@ def sized(frame: npt.NDArray[np.uint8], size: int | None) -> npt.NDArray[np.uint
     """A frame (H, W, 3) as a model's, (size, size, 3); None keeps its size."""
     if size is None or frame.shape[:2] == (size, size):
         return frame
-    return resize_frames(frame[None], size)[0]
+    resized: npt.NDArray[np.uint8] = resize_frames(frame[None], size)[0]
+    return resized
 
 
 def _image_frames(

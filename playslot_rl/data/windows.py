@@ -181,7 +181,8 @@ class Clips:
         if not streams_of(source.frames):
             return None
         first, valid = _valid_starts(source.starts, source.lengths, self.frames, self.train_episodes)
-        groups, weights = np.zeros_like(first), np.ones(1)
+        groups = np.zeros_like(first)
+        weights: npt.NDArray[np.float64] = np.ones(1)
         if source.shares is not None:
             groups, weights = source.shares.of(first), source.shares.weights
         return ShuffleBuffer(source.frames, first, valid, groups, weights / weights.sum(), self.seed)
