@@ -6,12 +6,14 @@ CACHE/frames/.KEY.part                  one that is being made, or that a kill h
 
 from __future__ import annotations
 
+import mmap
 import os
 import shutil
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +27,10 @@ from playslot_rl.storage.sharing_locks import release_with, share
 
 if TYPE_CHECKING:
     from playslot_rl.config import DataConfig
+
+
+RELEASE_EVERY: Final = 2**28
+"""Bytes that are read from memory maps before their pages are given back."""
 
 
 @dataclass(frozen=True)
@@ -139,8 +145,30 @@ def load_cached(folder: Path, name: str, make: Callable[[], object] | None = Non
         if handle >= 0:
             os.close(handle)
         raise DataError(f"{folder / name} is damaged ({error}), expected a cached array: delete {folder}") from error
-    release_with(getattr(array, "_mmap", array), handle)
+    mapped = getattr(array, "_mmap", array)
+    release_with(mapped, handle)
+    _MAPPED.add(mapped)
     return array
+
+
+_MAPPED: weakref.WeakSet[Any] = weakref.WeakSet()
+"""Maps of this process."""
+_read = [0]
+
+
+def note_read(count: int) -> None:
+    """Say that so many bytes of memory maps were read: now and then their pages are given back.
+
+    Windows are drawn from all over a cache, and the system counts every page that was ever touched as this process's
+    memory, with those around it, although it may take them back at any time. They stay in the system's own cache.
+    """
+    _read[0] += count
+    if _read[0] < RELEASE_EVERY or not hasattr(mmap, "MADV_DONTNEED"):
+        return
+    _read[0] = 0
+    for mapped in list(_MAPPED):
+        if isinstance(mapped, mmap.mmap) and not mapped.closed:
+            mapped.madvise(mmap.MADV_DONTNEED)
 
 
 class ArrayWriter:

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.data.cache import CachePlace, build_on, cache_folder, load_cached, settings
+from playslot_rl.data.cache import CachePlace, build_on, cache_folder, load_cached, note_read, settings
 from playslot_rl.data.cache_entries import ENTRY_NAME, make_room
 from playslot_rl.data.contents import Contents, open_files, stated_size
 from playslot_rl.data.frame_build import FrameArray, build_frames
@@ -133,7 +133,9 @@ class EpisodeFrames:
         """Frames of rows of any shape (...) as a uint8 tensor (..., 3, H, W)."""
         import torch
 
-        return torch.from_numpy(np.ascontiguousarray(self.frames[np.asarray(rows)])).movedim(-1, -3)
+        frames = np.ascontiguousarray(self.frames[np.asarray(rows)])
+        note_read(frames.nbytes)
+        return torch.from_numpy(frames).movedim(-1, -3)
 
     def episode_rows(self, episode: int) -> npt.NDArray[np.int64]:
         """Row numbers of an episode."""

@@ -151,3 +151,28 @@ def test_limits_are_amounts() -> None:
             bytes_of(wrong)
         with pytest.raises((ConfigError, ValueError), match="cache_limit"):
             DataConfig(cache_limit=wrong)
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps").is_file(), reason="the kernel does not say")
+def test_pages_that_were_read_are_given_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from playslot_rl.data import cache
+
+    folder = tmp_path / "frames" / "k"
+    folder.mkdir(parents=True)
+    np.save(folder / "frames.npy", np.ones((1000, 10_000), np.uint8))
+    array = load_cached(folder, "frames.npy")
+
+    def resident() -> int:
+        _, _, rest = Path("/proc/self/smaps").read_text().partition(str(folder / "frames.npy"))
+        return int(rest.partition("Rss:")[2].split()[0]) * 1024
+
+    monkeypatch.setattr(cache, "_read", [0])
+    monkeypatch.setattr(cache, "RELEASE_EVERY", 9_000_000)
+    seen = []
+    for begin in range(0, 1000, 100):
+        assert array[begin : begin + 100].sum() == 1_000_000
+        cache.note_read(1_000_000)
+        seen.append(resident())
+    assert seen[7] > 7_000_000
+    assert seen[8] < 1_000_000
+    assert np.array_equal(array[0], np.ones(10_000, np.uint8))
