@@ -215,7 +215,10 @@ INTERRUPTED: Final = 130
 PEER_PATIENCE_S: Final = 5.0
 """How long a process that lost another one waits for that one's own error to be printed."""
 
-GROUPS: Final = {"dataset": "data sets: info, verify, repair, merge, split, viz, push, pull"}
+GROUPS: Final = {
+    "dataset": "data sets: info, verify, repair, merge, split, viz, push, pull",
+    "cache": "decoded frames and parsed slots on disk: list, clear",
+}
 """Commands with actions and options of their own instead of `key=value`."""
 
 KEYS_HELP: Final = """common keys (any key of playslot_rl/config works, with dots: slots.optim.lr=5e-4):
@@ -226,7 +229,7 @@ KEYS_HELP: Final = """common keys (any key of playslot_rl/config works, with dot
   seed=0                seed of collection, training or evaluation
   workers=0             collector processes; 0 means one per core
   out=DIR               folder to write
-  data.root=DIR[,DIR]   LeRobot v3.0 data set(s) of videos; data.demos=DIR for demonstrations
+  data.root=DIR[,DIR]   LeRobot v3.0 data set(s) of videos, DIR:2,DIR:1 with weights; data.demos=DIR for demonstrations
   run=DIR               run folder to go on from, with its stored config; `pretrained` is the shipped model
   demos=N               train-policy, train-baseline: the first N demonstrations; compare: a list of numbers
   protocol=simulation   evaluation protocol: simulation or imagination
@@ -289,11 +292,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         _top_parser().print_help()
         return 2
     name = arguments[0]
-    if name == "dataset":
-        from playslot_rl.recipes import dataset
-
-        options = dataset.parser(_Parser).parse_args(arguments[1:])
-        return _guarded(f"{name} {options.action}", lambda: dataset.run(options))
+    if name in GROUPS:
+        group = importlib.import_module(f"playslot_rl.recipes.{name}")
+        options = group.parser(_Parser).parse_args(arguments[1:])
+        return _guarded(f"{name} {options.action}", lambda: group.run(options))
     if name not in COMMANDS:
         # Ends here unless it is --help or --version: the rest of the line belongs to no known command.
         _top_parser().parse_args(arguments[:1])

@@ -29,6 +29,12 @@ def step_generator(seed: int, step: int, stream: str, device: torch.device | str
     return torch.Generator(device=device).manual_seed(derived_seed(seed, step, stream))
 
 
+class StepRandom(np.random.Generator):
+    """A NumPy generator that says which step it was made for: a shuffle buffer moves on with the steps."""
+
+    step = 0
+
+
 @dataclass(frozen=True)
 class StepGenerators:
     """What the fit loop hands to a stage: generators of one step, made on demand by the name of their stream.
@@ -48,8 +54,10 @@ class StepGenerators:
         return step_generator(self.seed, self.step, stream, self.device if device is None else device)
 
     def numpy(self, stream: str) -> np.random.Generator:
-        """NumPy generator of a stream."""
-        return np.random.default_rng(derived_seed(self.seed, self.step, stream))
+        """NumPy generator of a stream, `np.random.default_rng`'s, that knows its step."""
+        generator = StepRandom(np.random.PCG64(derived_seed(self.seed, self.step, stream)))
+        generator.step = self.step
+        return generator
 
 
 @contextlib.contextmanager

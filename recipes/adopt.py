@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from playslot_rl.config import ExperimentConfig, SAViConfig, to_dict
+from playslot_rl.config.weights import data_roots
 from playslot_rl.data.survey import Choice, Survey, choose_size, choose_stride, survey
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.recipes import inspect, train_dynamics, train_slots
@@ -43,7 +44,7 @@ def main(config: ExperimentConfig) -> None:
     """
     if config.env.name != "video":
         raise ConfigError(f"env: got {config.env.name}, expected video: adopt reads recorded videos; leave env= out")
-    if not config.data.root or "," in config.data.root:
+    if [root.weight for root in data_roots(config.data.root)] != [None]:
         raise ConfigError(
             f"data.root: got {config.data.root or 'nothing'}, expected one data set, such as data.root=SET"
         )

@@ -112,6 +112,7 @@ def choose_prototypes(config: ExperimentConfig, run: Path, out: Path, steps: int
     """
     import numpy as np
 
+    from playslot_rl.data.cache import Cache
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.evaluation.probes import infer_latents
     from playslot_rl.recipes import train_dynamics
@@ -126,7 +127,7 @@ def choose_prototypes(config: ExperimentConfig, run: Path, out: Path, steps: int
     model = load_world_model(out, config.device or "cpu")
     source = open_videos(config, config.data.root, "adopt")
     slots = slot_cache(
-        source, model.savi, slots_checkpoint(out).fingerprint, config.data.cache, module_device(model), False
+        source, model.savi, slots_checkpoint(out).fingerprint, Cache.of(config.data), module_device(model), False
     )
     _, codes, _ = infer_latents(model.inverse_dynamics, slots, source.starts, source.lengths)
     shares = np.sort(np.bincount(codes.reshape(-1), minlength=many) / codes.size)[::-1]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from playslot_rl.config import DataConfig, ExperimentConfig, from_dict
 from playslot_rl.config.methods import METHODS
+from playslot_rl.config.weights import data_roots
 from playslot_rl.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ def _known(config: ExperimentConfig) -> DataConfig:
         root = from_dict(ExperimentConfig, json.loads(stored.read_text())).data.root
     except ValueError as error:
         raise ConfigError(f"{stored} cannot be used: {error}; name the videos by data.root=") from error
-    there = root and all((Path(part) / "meta" / "info.json").is_file() for part in root.split(","))
+    there = root and all((Path(part.path) / "meta" / "info.json").is_file() for part in data_roots(root))
     return replace(config.data, root=root) if there else config.data
 
 

@@ -3,89 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import pkgutil
-import textwrap
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-Argument = tuple[str, dict[str, Any]]
-"""Name and settings of `ArgumentParser.add_argument`."""
-
-
-@dataclass(frozen=True)
-class Action:
-    """One action: what `--help` says about it, its arguments, and what it does.
-
-    Attributes:
-        summary: one line.
-        details: a paragraph.
-        examples: command lines.
-        does: `module:function`, imported when it is run; takes the arguments by name.
-        arguments: in the order of the help.
-        either: of which at most one may be given.
-    """
-
-    summary: str
-    details: str
-    examples: tuple[str, ...]
-    does: str
-    arguments: tuple[Argument, ...]
-    either: tuple[Argument, ...] = ()
+from playslot_rl.recipes.actions import JSON, Action, Argument, make_parser, run_action
 
 
 def parser(kind: type[argparse.ArgumentParser] = argparse.ArgumentParser) -> argparse.ArgumentParser:
     """The parser of `playslot dataset`; `kind` says how bad arguments end."""
-    width = max(map(len, ACTIONS))
-    lines = "\n".join(f"  {name:<{width}}  {action.summary}" for name, action in ACTIONS.items())
-    top = kind(
-        prog="playslot dataset",
-        usage="playslot dataset ACTION PATH [options]",
-        description="Look after LeRobot v3.0 data sets, ours or others', image or video.",
-        epilog=f"actions:\n{lines}\n\n`playslot dataset ACTION --help` explains one of them.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    actions = top.add_subparsers(
-        prog="playslot dataset", dest="action", metavar="ACTION", required=True, parser_class=kind
-    )
-    for name, action in ACTIONS.items():
-        examples = "\n".join(f"  {example}" for example in action.examples)
-        sub = actions.add_parser(
-            name,
-            description=f"{action.summary}\n\n{textwrap.fill(action.details, 100)}",
-            epilog=f"examples:\n{examples}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        for argument, settings in action.arguments:
-            sub.add_argument(argument, **settings)
-        if action.either:
-            group = sub.add_mutually_exclusive_group()
-            for argument, settings in action.either:
-                group.add_argument(argument, **settings)
-    return top
+    said = "Look after LeRobot v3.0 data sets, ours or others', image or video."
+    return make_parser(ACTIONS, "dataset", "ACTION PATH [options]", said, kind)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Do what the parsed arguments ask for.
-
-    Returns:
-        The exit code: 0 done, 1 a data set that is not sound.
-
-    Raises:
-        PlaySlotError: whatever the action raises.
-        KeyboardInterrupt: with a line about what that leaves.
-    """
-    values = dict(vars(options))
-    action, as_json = ACTIONS[values.pop("action")], values.pop("json", False)
-    try:
-        result = pkgutil.resolve_name(action.does)(**values)
-        lines = result if isinstance(result, list) else result.lines()
-        print(result.to_json() if as_json else "\n".join(lines))
-        return 0 if getattr(result, "ok", True) else 1
-    except KeyboardInterrupt as error:
-        raise KeyboardInterrupt(
-            str(error) or "interrupted; no data set was changed, run the same command again"
-        ) from error
+    """Do what the parsed arguments ask for (`run_action`)."""
+    return run_action(ACTIONS, options)
 
 
 def fractions(text: str) -> dict[str, float]:
@@ -109,7 +41,6 @@ def fractions(text: str) -> dict[str, float]:
 
 ROOT: Final[Argument] = ("root", {"type": Path, "metavar": "DIR", "help": "folder of the data set"})
 REPO_ID: Final[Argument] = ("repo_id", {"metavar": "REPO_ID", "help": "repository on the Hub, as in user/name"})
-JSON: Final[Argument] = ("--json", {"action": "store_true", "help": "print one JSON object instead of text"})
 
 
 def _out(what: str, *, required: bool = True) -> Argument:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import shipped
+from playslot_rl.config.weights import data_roots
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.recipes.evaluate import take_shipped
 from playslot_rl.recipes.run import existing_run, open_device, open_run, parent_run, stored_result
@@ -101,7 +102,7 @@ def facts(config: ExperimentConfig, run: str) -> dict[str, Any]:
     from playslot_rl.evaluation.card import DEFAULT_EPISODES
     from playslot_rl.training.runs import world_model_checkpoints
 
-    names = [Path(root.strip()).name for root in config.data.root.split(",") if root.strip()]
+    names = [Path(root.path).name for root in data_roots(config.data.root)]
     return {
         "run": config.run if shipped(config.run) else Path(config.run).resolve().name,
         "data": ", ".join(names),

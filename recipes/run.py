@@ -129,12 +129,15 @@ def demonstration_views(
         savi: parses the frames, on its device.
         slots_print: fingerprint of SAVi's checkpoint.
     """
+    from playslot_rl.data.cache import Cache
     from playslot_rl.data.demonstrations import shifted_copies
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.world_model import module_device
 
     def parse(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
-        return slot_cache(frames, savi, slots_print, config.data.cache, module_device(savi), config.logging.progress)
+        return slot_cache(
+            frames, savi, slots_print, Cache.of(config.data), module_device(savi), config.logging.progress
+        )
 
     def copies(of: EpisodeFrames) -> Sequence[EpisodeFrames]:
         return shifted_copies(of, config.behaviour.shift, config.behaviour.shifted_copies)

@@ -17,6 +17,7 @@ def main(config: ExperimentConfig) -> None:
         CheckpointError: no finished slots stage, or the run was begun otherwise.
         DataError, OutputError, TrainingError: see `playslot_rl.errors`.
     """
+    from playslot_rl.data.cache import Cache
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.seeding import global_seed
     from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
@@ -47,7 +48,9 @@ def main(config: ExperimentConfig) -> None:
             world = WorldModel(model, config.env)
         load_weights(slots, {"savi": world.savi})
         world.to(device)
-        cached = slot_cache(source, world.savi, slots.fingerprint, config.data.cache, device, config.logging.progress)
+        cached = slot_cache(
+            source, world.savi, slots.fingerprint, Cache.of(config.data), device, config.logging.progress
+        )
         clips = record.clips(own.seed_frames + own.predicted_frames)
         stage = DynamicsStage(world, clips, cached, own)
         patience = patience_of(own.patience, "mse_slot")

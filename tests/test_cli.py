@@ -63,7 +63,7 @@ def raising(error: BaseException) -> Recipe:
 
 def test_the_commands_are_the_promised_ones() -> None:
     assert list(cli.COMMANDS) == COMMANDS
-    assert list(cli.GROUPS) == ["dataset"]
+    assert list(cli.GROUPS) == ["dataset", "cache"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -20,6 +20,7 @@ from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import shipped
 from playslot_rl.config.methods import METHODS, MethodName, method_stage
 from playslot_rl.config.roles import without
+from playslot_rl.config.weights import data_roots
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
 
@@ -202,7 +203,7 @@ def job_config(config: ExperimentConfig, job: Job, world: str) -> ExperimentConf
         own = {job.method: replace(getattr(config.baselines, job.method), world=absolute(str(job.model)))}
     data = replace(
         config.data,
-        root=",".join(absolute(part.strip()) for part in config.data.root.split(",")),
+        root=absolute_roots(config.data.root),
         demos=absolute(config.data.demos),
         cache=absolute(config.data.cache),
         draw=None if METHODS[job.method].online else job.seed,
@@ -226,6 +227,11 @@ def job_config(config: ExperimentConfig, job: Job, world: str) -> ExperimentConf
 def absolute(path: str) -> str:
     """A path from the root; nothing and shipped models (`pretrained/ENV`) as they are."""
     return path if not path or shipped(path) else str(Path(path).expanduser().resolve())
+
+
+def absolute_roots(text: str) -> str:
+    """`data.root` with every folder from the root; weights stay."""
+    return ",".join(root._replace(path=absolute(root.path)).text for root in data_roots(text))
 
 
 def job_record(job: Job, config: ExperimentConfig, parents: Mapping[str, str]) -> dict[str, Any]:

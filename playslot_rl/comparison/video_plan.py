@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from playslot_rl.comparison.plan import absolute
+from playslot_rl.comparison.plan import absolute, absolute_roots
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.compare_video import ON_SLOTS, TITLES, CompareVideoConfig, VideoMethod
 from playslot_rl.config.methods import MethodName
@@ -176,7 +176,7 @@ def video_job_config(config: ExperimentConfig, job: VideoJob, world: str) -> Exp
     config = _with_context(config, job.method, own.trained_seed + own.trained_frames - 1)
     data = replace(
         config.data,
-        root=",".join(absolute(part.strip()) for part in config.data.root.split(",")),
+        root=absolute_roots(config.data.root),
         demos="",
         held_out=0,
         tested=0.0 if own.test else own.tested,

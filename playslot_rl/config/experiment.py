@@ -14,6 +14,7 @@ from playslot_rl.config.methods import MethodName
 from playslot_rl.config.model import ModelConfig
 from playslot_rl.config.planning import PlanConfig
 from playslot_rl.config.roles import SEED, Checked, at_least, between, role, within
+from playslot_rl.config.sizes import is_amount
 from playslot_rl.config.stages import BehaviourStageConfig, DynamicsStageConfig, SlotsStageConfig
 from playslot_rl.episode_seeds import EVALUATION
 
@@ -32,6 +33,11 @@ class DataConfig(Checked):
         stride: of each episode every `stride`-th frame is read (`playslot_rl.data.stride`).
         resize: resize frames of another size than `env.image_size` (area averaging) instead of refusing them.
         cache: folder of the frame and slot caches; empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
+        cache_limit: of all caches there together, such as `20GB`; the least recently used make room, never what a
+            process uses. Empty has none.
+        workers: processes that decode a data set into the frame cache; 0 means one per core.
+        stream: decode frames while they are read instead of into the cache, for sets larger than the disk.
+        shuffle_buffer: frames in memory from which windows are drawn with `stream`.
         validation: fraction of episodes held out from training.
         tested: fraction of episodes that no training and no validation sees, for `compare-video`; 0 keeps none.
     """
@@ -45,6 +51,10 @@ class DataConfig(Checked):
     stride: int = field(default=1, metadata=at_least(1, "1 (every frame) or more"))
     resize: bool = False
     cache: str = field(default="", metadata=role("machine", "folder"))
+    cache_limit: str = field(default="", metadata=role("machine") | within(is_amount, "an amount such as 20GB"))
+    workers: int = field(default=1, metadata=role("machine") | at_least(0, "0 (one per core) or more"))
+    stream: bool = False
+    shuffle_buffer: int = field(default=20_000, metadata=at_least(1))
     validation: float = field(default=0.05, metadata=within(lambda value: 0 <= value < 1, "a fraction in [0, 1)"))
     tested: float = field(default=0.0, metadata=within(lambda value: 0 <= value < 1, "a fraction in [0, 1)"))
 

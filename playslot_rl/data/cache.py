@@ -1,25 +1,71 @@
-"""Cache folders: made once, whole or absent, safe with several processes, outside every data set."""
+"""Cache folders: made once, whole or absent, safe with several processes, outside every data set.
+
+CACHE/frames/KEY   CACHE/slots/KEY      entries; what is in use is held by a lock in them
+CACHE/frames/.KEY.part                  one that is being made, or that a kill has left: the next use goes on there
+"""
 
 from __future__ import annotations
 
+import mmap
 import os
+import shutil
+import weakref
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.errors import DataError
-from playslot_rl.storage.atomic import explain_write_errors
+from playslot_rl.config.sizes import bytes_of
+from playslot_rl.errors import DataError, PlaySlotError
+from playslot_rl.storage.atomic import explain_write_errors, replace_dir
 from playslot_rl.storage.folders import new_folder
 from playslot_rl.storage.locks import locked
+from playslot_rl.storage.sharing_locks import release_with, share
+
+if TYPE_CHECKING:
+    from playslot_rl.config import DataConfig
 
 
-def cache_folder(cache: str | Path = "") -> Path:
+RELEASE_EVERY: Final = 2**28
+"""Bytes that are read from memory maps before their pages are given back."""
+
+
+@dataclass(frozen=True)
+class Cache:
+    """Where caches are, how large they may be, and who makes them.
+
+    Attributes:
+        folder: empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
+        limit: bytes of all entries together; None has none.
+        workers: processes that decode; 0 means one for each core, 1 none but this one.
+    """
+
+    folder: str | Path = ""
+    limit: int | None = None
+    workers: int = 1
+
+    @staticmethod
+    def of(config: DataConfig) -> Cache:
+        """As `data.cache`, `.cache_limit` and `.workers` say."""
+        return Cache(config.cache, bytes_of(config.cache_limit), config.workers)
+
+
+CachePlace = str | Path | Cache
+"""A cache, or only its folder."""
+
+
+def cache_folder(cache: CachePlace = "") -> Path:
     """The cache: as given, else `$PLAYSLOT_CACHE`, else `~/.cache/playslot_rl`."""
-    chosen = str(cache) or os.environ.get("PLAYSLOT_CACHE", "")
+    chosen = str(cache.folder if isinstance(cache, Cache) else cache) or os.environ.get("PLAYSLOT_CACHE", "")
     return Path(chosen).expanduser() if chosen else Path.home() / ".cache" / "playslot_rl"
+
+
+def settings(cache: CachePlace) -> Cache:
+    """The cache with its settings."""
+    return cache if isinstance(cache, Cache) else Cache(cache)
 
 
 def build_once(folder: Path, build: Callable[[Path], None]) -> Path:
@@ -32,26 +78,97 @@ def build_once(folder: Path, build: Callable[[Path], None]) -> Path:
     """
     if folder.is_dir():
         return folder
-    with explain_write_errors(folder):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-    with locked(folder.with_name(f".{folder.name}.lock")):
+    with _turn(folder):
         if not folder.is_dir():
             with new_folder(folder) as temporary:
                 build(temporary)
     return folder
 
 
-def load_cached(folder: Path, name: str) -> npt.NDArray[Any]:
-    """Memory-map an array of a cache folder, read-only.
+def build_on(folder: Path, build: Callable[[Path], None]) -> Path:
+    """As `build_once`, but a build that was killed is gone on with: `build` finds in its folder what it has made.
+
+    Raises:
+        OutputError: full disk; nothing is left behind, as after every other error.
+    """
+    if folder.is_dir():
+        return folder
+    part = part_folder(folder)
+    with _turn(folder):
+        if not folder.is_dir():
+            part.mkdir(exist_ok=True)
+            try:
+                build(part)
+                replace_dir(part, folder)
+            except Exception as error:  # not a kill or Ctrl-C
+                if type(error) is PlaySlotError:  # a worker of ours was killed
+                    raise
+                shutil.rmtree(part, ignore_errors=True)
+                raise
+    return folder
+
+
+def part_folder(folder: Path) -> Path:
+    """Where an entry is made."""
+    return folder.with_name(f".{folder.name}.part")
+
+
+def lock_file(folder: Path) -> Path:
+    """Held by the process that makes an entry."""
+    return folder.with_name(f".{folder.name}.lock")
+
+
+def _turn(folder: Path) -> Any:
+    with explain_write_errors(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    return locked(lock_file(folder))
+
+
+def load_cached(folder: Path, name: str, make: Callable[[], object] | None = None) -> npt.NDArray[Any]:
+    """Memory-map an array of a cache folder, read-only. The folder is in use as long as the array, or a view of it.
+
+    Args:
+        folder: of the entry.
+        name: of the file.
+        make: makes the entry; called where it is not there (any more: another process may make room at any time).
 
     Raises:
         DataError: the file was damaged after it was made.
     """
+    while (handle := share(folder)) is None:
+        if make is None:
+            raise DataError(f"{folder}: got no such folder, expected a cached array: run the same command again")
+        make()
     try:
         array: npt.NDArray[Any] = np.load(folder / name, mmap_mode="r")
     except (OSError, ValueError) as error:
+        if handle >= 0:
+            os.close(handle)
         raise DataError(f"{folder / name} is damaged ({error}), expected a cached array: delete {folder}") from error
+    mapped = getattr(array, "_mmap", array)
+    release_with(mapped, handle)
+    _MAPPED.add(mapped)
     return array
+
+
+_MAPPED: weakref.WeakSet[Any] = weakref.WeakSet()
+"""Maps of this process."""
+_read = [0]
+
+
+def note_read(count: int) -> None:
+    """Say that so many bytes of memory maps were read: now and then their pages are given back.
+
+    Windows are drawn from all over a cache, and the system counts every page that was ever touched as this process's
+    memory, with those around it, although it may take them back at any time. They stay in the system's own cache.
+    """
+    _read[0] += count
+    if _read[0] < RELEASE_EVERY or not hasattr(mmap, "MADV_DONTNEED"):
+        return
+    _read[0] = 0
+    for mapped in list(_MAPPED):
+        if isinstance(mapped, mmap.mmap) and not mapped.closed:
+            mapped.madvise(mmap.MADV_DONTNEED)
 
 
 class ArrayWriter:
@@ -64,9 +181,7 @@ class ArrayWriter:
         self.path, self.shape, self.dtype = path, tuple(shape), np.dtype(dtype)
         self.rows = 0
         self._file: IO[bytes] = path.open("wb")
-        header = {"descr": np.lib.format.dtype_to_descr(self.dtype), "fortran_order": False, "shape": self.shape}
-        np.lib.format.write_array_header_1_0(self._file, header)
-        self._begin = self._file.tell()
+        self._begin = write_header(self._file, self.shape, self.dtype)
 
     def write(self, rows: npt.NDArray[np.generic], first: int | None = None) -> None:
         """Write rows (n, *shape[1:]) from row `first` on; None goes on where the last ones ended."""
@@ -77,8 +192,17 @@ class ArrayWriter:
         self._file.write(np.ascontiguousarray(rows, self.dtype).data)
         self.rows += len(rows)
 
-    def close(self) -> None:
-        """Finish; all rows must have been written."""
+    def close(self, *, whole: bool = True) -> None:
+        """Finish; all rows must have been written, unless it is not `whole`: the others are zeros."""
+        if not whole:
+            self._file.truncate(self._begin + int(np.prod(self.shape)) * self.dtype.itemsize)
         self._file.close()
-        if self.rows != self.shape[0]:
+        if whole and self.rows != self.shape[0]:
             raise ValueError(f"{self.path}: got {self.rows} rows, expected {self.shape[0]}")
+
+
+def write_header(file: IO[bytes], shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
+    """Write the beginning of an `.npy` file; returns where its rows begin."""
+    header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)
+    return file.tell()

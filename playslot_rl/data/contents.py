@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -33,6 +33,8 @@ PLACE: Final = ("index", "episode_index", "task_index")
 """Columns that say where a row stands in its data set: they change when data sets are merged or split."""
 REQUIRED: Final = ("timestamp", "frame_index", *PLACE)
 
+EPISODES_AT_ONCE: Final = 64
+"""Of the metadata with statistics, some 150 columns."""
 UNREADABLE: Final = "unreadable parquet"
 
 Array = npt.NDArray[Any]
@@ -376,6 +378,24 @@ def _read_tasks(root: Path, problems: Problems) -> dict[int, str]:
         return {}
     numbers = table.column("task_index").to_pylist()
     return dict(zip((int(n) for n in numbers), map(str, table.column(words).to_pylist()), strict=True))
+
+
+def stored_episodes(contents: Contents) -> Iterator[Episode]:
+    """The rows of `meta/episodes` with their statistics, one after the other as they are stored; unreadable ones, which
+    `read_contents` notes, are left out.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    for path in _episode_files(contents.root):
+        try:
+            with pq.ParquetFile(path) as file:
+                for group in range(file.num_row_groups):
+                    table = file.read_row_group(group)
+                    for first in range(0, len(table), EPISODES_AT_ONCE):
+                        yield from _episodes(path, table.slice(first, EPISODES_AT_ONCE), Problems())
+        except (pa.ArrowException, OSError):
+            continue
 
 
 def _episodes(path: Path, table: Any, problems: Problems) -> list[Episode]:

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from playslot_rl.data.source import EpisodeFrames, FrameRows, Frames
+from playslot_rl.data.stride import ChosenFrames
 from playslot_rl.data.trimming import moving_rows, slot_motion
 from playslot_rl.errors import DataError
 from playslot_rl.frames import to_float
@@ -176,9 +177,12 @@ def split_tested(source: EpisodeFrames, fraction: float) -> tuple[EpisodeFrames,
 def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames:
     """Episodes `first` to `last` (exclusive) as a data set of their own, rows counted anew."""
     begin, end = int(source.starts[first]), int(source.starts[last - 1] + source.lengths[last - 1])
+    frames = source.frames
     return replace(
         source,
-        frames=source.frames[begin:end],
+        # A slice of a memory map is a view, but several in a row would be copied to memory, all of them.
+        frames=frames[begin:end] if isinstance(frames, np.ndarray) else ChosenFrames(frames, np.arange(begin, end)),
+        shares=None if source.shares is None else source.shares.between(begin, end),
         starts=source.starts[first:last] - begin,
         lengths=source.lengths[first:last],
         actions=None if source.actions is None else source.actions[begin:end],

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import io
+import itertools
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -82,38 +83,66 @@ def resize_frames(frames: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.ui
     return np.stack(resized)
 
 
+def sized(frame: npt.NDArray[np.uint8], size: int | None) -> npt.NDArray[np.uint8]:
+    """A frame (H, W, 3) as a model's, (size, size, 3); None keeps its size."""
+    if size is None or frame.shape[:2] == (size, size):
+        return frame
+    resized: npt.NDArray[np.uint8] = resize_frames(frame[None], size)[0]
+    return resized
+
+
 def _image_frames(
     contents: Contents, camera: str, spans: Sequence[Span], problems: Problems
 ) -> Iterator[tuple[int, Decoded]]:
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
-    wanted = {row for span in spans for row in range(span.start, span.stop)}
+    wanted = np.zeros(contents.rows, bool)
+    for span in spans:
+        wanted[span.start : span.stop] = True
     decode = functools.partial(_decode_image, contents.root)
     size = stated_size(contents.features[camera])
     row = 0
     # Decoding PNG releases the interpreter lock; two threads suffice to keep one core busy with it.
     with ThreadPoolExecutor(2) as pool:
         for path, rows in zip(contents.data_files, contents.file_rows, strict=True):
-            file = pq.ParquetFile(path)
-            if camera not in file.schema_arrow.names:
-                problems.error("missing column", f"{path}: got no column {camera}, expected the camera's frames")
-                row += rows
+            begin, row = row, row + rows
+            if not wanted[begin:row].any():
                 continue
-            begin = row
-            for batch in file.iter_batches(ROWS_A_PIECE, columns=[camera]):
-                here = [i for i in range(len(batch)) if row + i in wanted]
-                cells = batch.column(0).take(pa.array(here, pa.int64())).to_pylist()  # there may be none
-                for i, result in zip(here, pool.map(decode, cells), strict=True):
+            for first, cells in _stored_images(path, camera, wanted[begin:row], problems):
+                numbers = (first + np.flatnonzero(wanted[begin + first : begin + first + len(cells)])).tolist()
+                chosen = cells.take(pa.array([number - first for number in numbers], pa.int64())).to_pylist()
+                for number, result in zip(numbers, pool.map(decode, chosen), strict=True):
                     if isinstance(result, str):
                         fault = f"cannot be decoded ({result}), expected a PNG or JPEG image"
                     elif result.shape[:2] != size:
                         fault = f"got {result.shape[:2]}, expected {size} as stated"
                     else:
-                        yield row + i, result
+                        yield begin + number, result
                         continue
-                    problems.error(DAMAGED, f"{path}: row {row + i - begin}, {camera}: {fault}")
-                row += len(batch)
+                    problems.error(DAMAGED, f"{path}: row {number}, {camera}: {fault}")
+
+
+def _stored_images(
+    path: Path, camera: str, wanted: npt.NDArray[np.bool_], problems: Problems
+) -> Iterator[tuple[int, Any]]:
+    """Pieces of a file's column with the number of their first row; row groups without a wanted row are not read."""
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path) as file:
+        if camera not in file.schema_arrow.names:
+            problems.error("missing column", f"{path}: got no column {camera}, expected the camera's frames")
+            return
+        counts = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
+        ends = np.cumsum(counts).tolist()
+        needed = [bool(wanted[end - count : end].any()) for count, end in zip(counts, ends, strict=True)]
+        for some, run in itertools.groupby(range(len(counts)), key=needed.__getitem__):
+            groups = list(run)
+            if not some:
+                continue
+            first = ends[groups[0]] - counts[groups[0]]
+            for batch in file.iter_batches(ROWS_A_PIECE, row_groups=groups, columns=[camera]):
+                yield first, batch.column(0)
+                first += len(batch)
 
 
 def _decode_image(root: Path, cell: dict[str, Any] | None) -> Array | str:
@@ -173,24 +202,35 @@ def _frames_at(path: Path, times: Sequence[float], tolerance: float) -> Iterator
     """
     import av
 
-    wanted = iter(times)
-    due = next(wanted, None)
-    reason = "it ends too early"
-    try:
-        with av.open(str(path)) as container:
-            stream: Any = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            for frame in container.decode(stream):
-                now = float(frame.pts * stream.time_base) if frame.pts is not None else -1.0
-                if due is None or now > due + tolerance:
+    # A video without an index may be sought past what is wanted; then it is read from its beginning.
+    for seek in (True, False) if times[0] > tolerance else (False,):
+        number, reason = 0, "it ends too early"
+        try:
+            for now, frame in _decoded_from(path, times[0] if seek else 0.0):
+                if number == len(times) or now > times[number] + tolerance:
                     break
-                if now >= due - tolerance:
+                if now >= times[number] - tolerance:
                     yield frame
-                    due = next(wanted, None)
-    except (av.FFmpegError, OSError, IndexError) as error:
-        reason = str(error).splitlines()[0]
-    if due is not None:
+                    number += 1
+        except (av.FFmpegError, OSError, IndexError) as error:
+            reason = str(error).splitlines()[0]
+        if number:
+            break
+    if number < len(times):
         raise DataError(
-            f"{path}: cannot decode the frame at {due:.3f} s ({reason}), expected a whole video of {len(times)} "
-            "frames: the data set is damaged, collect or pull it again"
+            f"{path}: cannot decode the frame at {times[number]:.3f} s ({reason}), expected a whole video of "
+            f"{len(times)} frames: the data set is damaged, collect or pull it again"
         )
+
+
+def _decoded_from(path: Path, begin: float) -> Iterator[tuple[float, Any]]:
+    """Time, seconds, and frame of a video from the last key frame up to `begin` on."""
+    import av
+
+    with av.open(str(path)) as container:
+        stream: Any = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        if begin > 0:
+            container.seek(int(begin / stream.time_base), stream=stream)
+        for frame in container.decode(stream):
+            yield (float(frame.pts * stream.time_base) if frame.pts is not None else -1.0), frame

@@ -10,21 +10,28 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from playslot_rl.data.cache import ArrayWriter, build_once, cache_folder, load_cached
-from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.cache import ArrayWriter, CachePlace, build_once, cache_folder, load_cached
+from playslot_rl.data.cache_entries import ENTRY_NAME, make_room
+from playslot_rl.data.source import ConcatFrames, EpisodeFrames
 from playslot_rl.frames import normalise
 from playslot_rl.seeding import step_generator
+from playslot_rl.storage.atomic import write_json
 
 if TYPE_CHECKING:
     from playslot_rl.modules.savi import SAVi
 
+SlotRows = npt.NDArray[np.float32]
+"""Slots (F, N, D) by row: an array, or (`ConcatFrames`) several that are indexed by rows as one."""
+
 _FORMAT = "1"
+_BY_ROW = "2"
+"""Where episodes are left out between others: slots stand at their frames' rows, too."""
 EPISODES_A_BATCH = 32
 FRAMES_A_PASS = 4
 """Frames of each episode parsed at a time: bounds the memory of the encoder's activations."""
@@ -34,10 +41,10 @@ def slot_cache(
     source: EpisodeFrames,
     savi: SAVi,
     savi_fingerprint: str,
-    cache: str | Path = "",
+    cache: CachePlace = "",
     device: torch.device | str = "cpu",
     progress: bool = False,
-) -> npt.NDArray[np.float32]:
+) -> SlotRows:
     """Slots of every frame of a data set, each episode parsed from its first frame on.
 
     Args:
@@ -49,29 +56,44 @@ def slot_cache(
         progress: print a line to standard error before a long computation.
 
     Returns:
-        float32 (F, N, D), memory-mapped.
+        float32 (F, N, D), memory-mapped, by the row of the frame; of sets with weights, the sets' caches in a row.
 
     Raises:
         OutputError: full disk.
 
     Note: sampled initial slots (`gaussian`) are drawn by generators with fixed seeds, so the slots repeat.
     """
-    key = hashlib.sha256(json.dumps([_FORMAT, source.fingerprint, source.camera, source.image_size, savi_fingerprint])
-                         .encode()).hexdigest()[:24]  # fmt: skip
+    shares = source.shares
+    if shares is not None and shares.sources and source.fingerprint == shares.fingerprint:
+        # Each set's own, whatever the weights.
+        parts = [slot_cache(s, savi, savi_fingerprint, cache, device, progress) for s in shares.sources]
+        return cast("SlotRows", ConcatFrames(parts))
+    whole = _in_order(source)
+    identity = [_FORMAT if whole else _BY_ROW, source.fingerprint, source.camera, source.image_size, savi_fingerprint]
+    key = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:24]
     folder = cache_folder(cache) / "slots" / key
-    count = int(source.lengths.sum())
+    count = int((source.starts + source.lengths).max())
 
     def build(temporary: Path) -> None:
         if progress:
-            print(f"slots: parsing {count} frames once", file=sys.stderr, flush=True)
-        writer = ArrayWriter(temporary / "slots.npy", (count, savi.config.n_slots, savi.config.slot_dim), np.float32)
-        for slots in parse_episodes(source, savi, device):
-            writer.write(slots)
-        writer.close()
+            print(f"slots: parsing {int(source.lengths.sum())} frames once", file=sys.stderr, flush=True)
+        shape = (count, savi.config.n_slots, savi.config.slot_dim)
+        make_room(cache, int(np.prod(shape)) * 4, key)
+        writer = ArrayWriter(temporary / "slots.npy", shape, np.float32)
+        for start, slots in zip(source.starts, parse_episodes(source, savi, device), strict=True):
+            writer.write(slots, int(start))
+        writer.close(whole=whole)
+        facts = {"name": source.name, "camera": source.camera, "fingerprint": source.fingerprint}
+        write_json(temporary / ENTRY_NAME, {**facts, "savi": savi_fingerprint})
 
     build_once(folder, build)
-    slots: npt.NDArray[np.float32] = load_cached(folder, "slots.npy")
+    slots: npt.NDArray[np.float32] = load_cached(folder, "slots.npy", lambda: build_once(folder, build))
     return slots
+
+
+def _in_order(source: EpisodeFrames) -> bool:
+    """Whether the episodes fill all rows up to the last one of theirs; of some chosen ones, those between are left."""
+    return bool(np.array_equal(source.starts, np.cumsum(source.lengths) - source.lengths))
 
 
 @torch.no_grad()

@@ -11,6 +11,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -18,14 +19,17 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.data.cache import ArrayWriter, build_once, cache_folder, load_cached
+from playslot_rl.data.cache import CachePlace, build_on, cache_folder, load_cached, note_read, settings
+from playslot_rl.data.cache_entries import ENTRY_NAME, make_room
 from playslot_rl.data.contents import Contents, open_files, stated_size
-from playslot_rl.data.frames import resize_frames, rgb_frames
+from playslot_rl.data.frame_build import FrameArray, build_frames
 from playslot_rl.errors import DataError
 from playslot_rl.storage.atomic import write_json
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from playslot_rl.data.weighted import Shares
 
 Frames = npt.NDArray[np.uint8]
 _FORMAT = "1"
@@ -96,6 +100,9 @@ class EpisodeFrames:
         fps: frames a second.
         task: the task in words.
         camera: feature the frames come from.
+        robot: what was recorded, as the data set says; empty where it says nothing.
+        name: the folder it was read from, for people.
+        shares: of several sets that are drawn from with weights, which rows are whose; None draws all windows alike.
     """
 
     frames: FrameRows
@@ -108,6 +115,9 @@ class EpisodeFrames:
     fps: float
     task: str
     camera: str
+    robot: str = ""
+    name: str = ""
+    shares: Shares | None = None
 
     @property
     def episodes(self) -> int:
@@ -123,7 +133,9 @@ class EpisodeFrames:
         """Frames of rows of any shape (...) as a uint8 tensor (..., 3, H, W)."""
         import torch
 
-        return torch.from_numpy(np.ascontiguousarray(self.frames[np.asarray(rows)])).movedim(-1, -3)
+        frames = np.ascontiguousarray(self.frames[np.asarray(rows)])
+        note_read(frames.nbytes)
+        return torch.from_numpy(frames).movedim(-1, -3)
 
     def episode_rows(self, episode: int) -> npt.NDArray[np.int64]:
         """Row numbers of an episode."""
@@ -151,7 +163,7 @@ class EpisodeFrames:
 
 
 def open_source(
-    root: str | Path, camera: str = "", cache: str | Path = "", *, image_size: int | None = None, resize: bool = False
+    root: str | Path, camera: str = "", cache: CachePlace = "", *, image_size: int | None = None, resize: bool = False
 ) -> EpisodeFrames:
     """Open a LeRobot v3.0 data set through the frame cache; the first time decodes all its frames.
 
@@ -171,33 +183,48 @@ def open_source(
     stated = stated_size(files.features[camera])
     # Refused before everything is decoded, where the metadata say it.
     if image_size is not None and not resize and stated != (image_size, image_size):
-        raise _wrong_size(files, camera, stated, image_size)
-    folder, fingerprint = _frame_cache(files, camera, cache, image_size if resize else None)
-    frames: Frames = load_cached(folder, "frames.npy")
+        raise wrong_size(files, camera, stated, image_size)
+    make = partial(_frame_cache, files, camera, cache, image_size if resize else None)
+    folder, fingerprint = make()
+    frames: Frames = load_cached(folder, "frames.npy", make)
     if image_size is not None and frames.shape[1:3] != (image_size, image_size):
-        raise _wrong_size(files, camera, (frames.shape[1], frames.shape[2]), image_size)
-    meta = json.loads((folder / "meta.json").read_text())
+        raise wrong_size(files, camera, (frames.shape[1], frames.shape[2]), image_size)
+    meta = json.loads((folder / ENTRY_NAME).read_text())
+    if len(frames) != files.rows or meta.get("fingerprint", fingerprint) != fingerprint:
+        raise DataError(
+            f"{folder}: got {len(frames)} frames of {meta.get('fingerprint')}, expected {files.rows} of {fingerprint}: "
+            "delete it, it is made again"
+        )
     with np.load(folder / "columns.npz") as columns:
         labels: dict[str, Any] = {
             name: columns.get(name) for name in ("starts", "lengths", "actions", "success", "seeds")
         }
     return EpisodeFrames(
-        frames=frames, fingerprint=fingerprint, fps=meta["fps"], task=meta["task"], camera=camera, **labels
+        frames=frames,
+        fingerprint=fingerprint,
+        fps=meta["fps"],
+        task=meta["task"],
+        camera=camera,
+        robot=str(files.info.get("robot_type") or ""),
+        name=str(root),
+        **labels,
     )
 
 
 def open_sources(
     roots: str | Sequence[str | Path],
     camera: str = "",
-    cache: str | Path = "",
+    cache: CachePlace = "",
     *,
     image_size: int | None = None,
     resize: bool = False,
+    buffer: int | None = None,
 ) -> EpisodeFrames:
     """Open one or several data sets as one; `roots` is a list, or a string with commas.
 
     With several cameras (commas in `camera`) each episode comes once for each of them. Labels that not every data set
-    has are dropped. The frames must have one size.
+    has are dropped. The frames must have one size. With a `buffer`, frames of a shuffle buffer, they are not cached but
+    decoded while they are read (`playslot_rl.data.stream`).
 
     Raises:
         DataError: as `open_source`, or the frame sizes differ.
@@ -206,7 +233,13 @@ def open_sources(
     cameras = [name.strip() for name in camera.split(",")]
     pairs = [(name, one) for name in ([name for name in names if str(name)] or [""]) for one in cameras]
     names = [name for name, _ in pairs]
-    sources = [open_source(root, one, cache, image_size=image_size, resize=resize) for root, one in pairs]
+    if buffer is None:
+        opening = partial(open_source, image_size=image_size, resize=resize)
+    else:
+        from playslot_rl.data.stream import open_stream
+
+        opening = partial(open_stream, image_size=image_size, resize=resize, buffer=buffer)
+    sources = [opening(root, one, cache) for root, one in pairs]
     if len(sources) == 1:
         return sources[0]
     for name, source in zip(names, sources, strict=True):
@@ -236,17 +269,20 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
         success=joined("success"),
         seeds=joined("seeds"),
         fingerprint=hashlib.sha256("+".join(s.fingerprint for s in sources).encode()).hexdigest()[:16],
+        name=",".join(dict.fromkeys(s.name for s in sources)),
+        shares=None,
     )
 
 
-def _wrong_size(files: Contents, camera: str, got: tuple[int, int], expected: int) -> DataError:
+def wrong_size(files: Contents, camera: str, got: tuple[int, int], expected: int) -> DataError:
+    """Frames of another size than the model's."""
     return DataError(
         f"{files.root}: got frames of {got[0]}x{got[1]} from {camera}, expected {expected}x{expected}: "
         "set env.image_size, resize them by data.resize=true, or record at that size"
     )
 
 
-def _frame_cache(files: Contents, camera: str, cache: str | Path, size: int | None) -> tuple[Path, str]:
+def _frame_cache(files: Contents, camera: str, cache: CachePlace, size: int | None) -> tuple[Path, str]:
     """The cache folder of a data set's camera, made if needed, and the data set's fingerprint.
 
     It holds `frames.npy` uint8 (F, H, W, 3), `columns.npz` and `meta.json`, and is keyed by the data set's content, the
@@ -257,12 +293,21 @@ def _frame_cache(files: Contents, camera: str, cache: str | Path, size: int | No
         raise DataError(
             f"data.cache={folder}: got a folder inside the data set {files.root}, expected one outside: move it"
         )
-    fingerprint = _fingerprint(files, camera, folder)
+    fingerprint = files_fingerprint(files, camera, folder)
     key = hashlib.sha256(json.dumps([_FORMAT, fingerprint, camera, size]).encode()).hexdigest()[:24]
-    return build_once(folder / "frames" / key, lambda tmp: _build(files, camera, size, tmp)), fingerprint
+
+    def build(part: Path) -> None:
+        make_room(cache, FrameArray(files, camera, size, part).bytes, key)
+        build_frames(files, camera, size, part, settings(cache).workers)
+        np.savez(part / "columns.npz", **labels_of(files))  # type: ignore[arg-type]
+        tasks = files.episodes[0].tasks
+        facts = {"name": str(files.root), "camera": camera, "fingerprint": fingerprint}
+        write_json(part / ENTRY_NAME, {**facts, "fps": files.fps, "task": tasks[0] if tasks else ""})
+
+    return build_on(folder / "frames" / key, build), fingerprint
 
 
-def _fingerprint(files: Contents, camera: str, cache: Path) -> str:
+def files_fingerprint(files: Contents, camera: str, cache: Path) -> str:
     """Content hash of a data set, remembered by the names, sizes and times of its files: hashing videos is slow."""
     listing = sorted(
         (str(path.relative_to(files.root)), path.stat().st_size, path.stat().st_mtime_ns)
@@ -279,22 +324,8 @@ def _fingerprint(files: Contents, camera: str, cache: Path) -> str:
     return fingerprint
 
 
-def _build(files: Contents, camera: str, size: int | None, folder: Path) -> None:
-    writer: ArrayWriter | None = None
-    for row, frame in rgb_frames(files, camera):
-        pixels = frame if size is None or frame.shape[:2] == (size, size) else resize_frames(frame[None], size)[0]
-        if writer is None:
-            writer = ArrayWriter(folder / "frames.npy", (files.rows, *pixels.shape), np.uint8)
-        writer.write(pixels[None], row)
-    if writer is None:
-        raise DataError(f"{files.root}: got no frames of {camera}, expected {files.rows}: collect or pull it again")
-    writer.close()
-    np.savez(folder / "columns.npz", **_columns(files))  # type: ignore[arg-type]
-    tasks = files.episodes[0].tasks
-    write_json(folder / "meta.json", {"camera": camera, "fps": files.fps, "task": tasks[0] if tasks else ""})
-
-
-def _columns(files: Contents) -> dict[str, npt.NDArray[Any]]:
+def labels_of(files: Contents) -> dict[str, npt.NDArray[Any]]:
+    """`starts`, `lengths`, and where there are some, `actions`, `success` and `seeds`, as of `EpisodeFrames`."""
     lengths = np.array([episode.length for episode in files.episodes], np.int64)
     starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
     found: dict[str, npt.NDArray[Any]] = {"starts": starts, "lengths": lengths}

@@ -6,11 +6,14 @@ Shapes: F frames of a data set, E episodes, B batch, T window.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.stream import ShuffleBuffer, streams_of
+from playslot_rl.data.weighted import draw_episodes
 from playslot_rl.errors import DataError
 
 IntArray = npt.NDArray[np.int64]
@@ -133,7 +136,7 @@ class Clips:
     """
 
     def __init__(self, source: EpisodeFrames, frames: int, validation: float, seed: int, shown: int = 32) -> None:
-        self.source, self.frames, self.shown = source, frames, shown
+        self.source, self.frames, self.shown, self.seed = source, frames, shown, seed
         self.train_episodes, held_out = split_episodes(source.episodes, validation, seed)
         self.held_out = self.spread(held_out)
 
@@ -142,10 +145,47 @@ class Clips:
         return spread_windows(self.source.starts, self.source.lengths, self.frames, self.shown, episodes)
 
     def sample(self, batch: int, generator: np.random.Generator) -> IntArray:
-        """Row indices (batch, T) of windows of the training episodes, drawn uniformly."""
-        return sample_windows(
-            self.source.starts, self.source.lengths, self.frames, batch, generator, self.train_episodes
-        )
+        """Row indices (batch, T) of windows of the training episodes, drawn uniformly; of sets with weights
+        (`playslot_rl.data.weighted`), uniformly in a set that was drawn by its weight; of streams
+        (`playslot_rl.data.stream`), from the shuffle buffer of the step that the generator belongs to.
+        """
+        source, chosen = self.source, self._near(batch, generator)
+        if source.shares is None:
+            return sample_windows(source.starts, source.lengths, self.frames, batch, generator, chosen)
+        first, valid = _valid_starts(source.starts, source.lengths, self.frames, chosen)
+        episode, offset = draw_episodes(source.shares, first, valid, batch, generator)
+        rows: IntArray = (first[episode] + offset)[:, None] + np.arange(self.frames)
+        return rows
+
+    def sample_first(self, batch: int, generator: np.random.Generator) -> IntArray:
+        """First rows (batch,) of training episodes in which a clip fits, drawn as `sample` draws windows."""
+        source, chosen = self.source, self._near(batch, generator)
+        fits = chosen[source.lengths[chosen] >= self.frames]
+        if source.shares is None:
+            first: IntArray = source.starts[generator.choice(fits, batch)]
+            return first
+        episode, _ = draw_episodes(source.shares, source.starts[fits], np.ones_like(fits), batch, generator)
+        first = source.starts[fits[episode]]
+        return first
+
+    def _near(self, batch: int, generator: np.random.Generator) -> IntArray:
+        """Training episodes that can be drawn from: all, or those in the shuffle buffer."""
+        if self._buffer is None:
+            return self.train_episodes
+        near: IntArray = self.train_episodes[self._buffer.episodes(getattr(generator, "step", 0), batch)]
+        return near
+
+    @cached_property
+    def _buffer(self) -> ShuffleBuffer | None:
+        source = self.source
+        if not streams_of(source.frames):
+            return None
+        first, valid = _valid_starts(source.starts, source.lengths, self.frames, self.train_episodes)
+        groups = np.zeros_like(first)
+        weights: npt.NDArray[np.float64] = np.ones(1)
+        if source.shares is not None:
+            groups, weights = source.shares.of(first), source.shares.weights
+        return ShuffleBuffer(source.frames, first, valid, groups, weights / weights.sum(), self.seed)
 
     def validation_batches(self) -> list[IntArray]:
         """The held-out windows, about eight at a time."""

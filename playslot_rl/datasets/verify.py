@@ -25,10 +25,11 @@ from playslot_rl.data.contents import (
     Stats,
     is_depth,
     read_contents,
+    stored_episodes,
 )
 from playslot_rl.data.problems import Problems
 from playslot_rl.datasets.fingerprint import CameraScan, fingerprint_of, scan_frames
-from playslot_rl.datasets.statistics import aggregate, differing, of_numbers, rounded
+from playslot_rl.datasets.statistics import Aggregate, differing, of_numbers, rounded
 from playslot_rl.errors import DataError
 
 TIME_TOLERANCE_S = 1e-4
@@ -81,7 +82,7 @@ def verify(root: str | Path, *, statistics: bool = True) -> Verification:
     """
     problems = Problems()
     try:
-        contents = read_contents(root, problems)
+        contents = read_contents(root, problems, statistics=False)
     except DataError as error:
         return Verification(str(root), False, (str(error),), (), 0, 0, "")
     check_rows(contents, problems)
@@ -293,21 +294,36 @@ def _check_places(contents: Contents, problems: Problems) -> None:
 
 def check_statistics(contents: Contents, scans: Mapping[str, CameraScan], problems: Problems) -> None:
     """Recompute the statistics of every episode and of all, and compare."""
-    by_index = {episode.index: episode for episode in contents.episodes}
-    actual, theirs = (
-        [episode_statistics(contents, scans, number, as_lerobot=rounds) for number in range(len(contents.spans))]
-        for rounds in (False, True)
-    )
-    for span, exact, rounded_ones in zip(contents.spans, actual, theirs, strict=True):
-        episode = by_index.get(span.index)
-        if episode is None or episode.length != span.length:
+    numbers = {span.index: number for number, span in enumerate(contents.spans)}
+    total, their_total, left = Aggregate(), Aggregate(), set(range(len(contents.spans)))
+
+    def recomputed(number: int) -> tuple[Stats, Stats]:
+        left.discard(number)
+        exact, theirs = (episode_statistics(contents, scans, number, as_lerobot=rounds) for rounds in (False, True))
+        total.add(exact)
+        their_total.add(theirs)
+        return exact, theirs
+
+    # One episode after the other, as they are stored: those of all at once are some 40 KB each.
+    for episode in stored_episodes(contents):
+        number = numbers.get(episode.index)
+        if number not in left:
+            continue
+        exact, theirs = recomputed(number)
+        if episode.length != contents.spans[number].length:
             continue
         where = f"episode {episode.index}"
         for name in exact:
             if name in episode.stats:
-                _compare(contents, where, name, episode.stats[name], exact[name], rounded_ones[name], problems)
+                _compare(contents, where, name, episode.stats[name], exact[name], theirs[name], problems)
             else:
                 problems.warning("no statistics", f"{where}: got no statistics of {name} in meta/episodes")
+    for number in sorted(left):
+        recomputed(number)
+    _check_total(contents, total.result(), their_total.result(), problems)
+
+
+def _check_total(contents: Contents, total: Stats, their_total: Stats, problems: Problems) -> None:
     path = contents.root / STATS_NAME
     try:
         content: dict[str, dict[str, Any]] = json.loads(path.read_text())
@@ -316,7 +332,6 @@ def check_statistics(contents: Contents, scans: Mapping[str, CameraScan], proble
         reason = "no such file" if isinstance(error, FileNotFoundError) else f"{error!r}"
         problems.error("wrong statistics", f"{path}: got {reason}, expected the statistics of all frames")
         return
-    total, their_total = aggregate(actual), aggregate(theirs)
     for name, feature in contents.features.items():
         if name not in total or is_depth(feature):
             continue

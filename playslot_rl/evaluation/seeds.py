@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.weights import data_roots
 from playslot_rl.episode_seeds import episode_seed
 from playslot_rl.errors import ConfigError, DataError
 
@@ -47,7 +48,7 @@ def _seeds_in(node: Any) -> Iterable[int]:
 
 def data_folders(config: ExperimentConfig, run: Path | None = None) -> list[Path]:
     """Data sets the config names, then what is in the run's `data` folder."""
-    named = [Path(root.strip()) for root in f"{config.data.root},{config.data.demos}".split(",") if root.strip()]
+    named = [Path(root.path) for root in data_roots(f"{config.data.root},{config.data.demos}")]
     return [*named, *(sorted((run / "data").glob("*")) if run is not None else [])]
 
 

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.weights import data_roots
 from playslot_rl.data.contents import read_info
 from playslot_rl.errors import CheckpointError, ConfigError, DataError
 from playslot_rl.evaluation.success import PROTOCOLS, run_facts
@@ -160,7 +161,8 @@ def camera(config: ExperimentConfig) -> str:
     """
     names = [name.strip() for name in config.data.camera.split(",") if name.strip()]
     if not names:
-        root = (config.data.demos or config.data.root).partition(",")[0].strip()
+        roots = data_roots(config.data.demos or config.data.root)
+        root = roots[0].path if roots else ""
         try:
             features = read_info(Path(root))["features"] if root else {}
         except DataError:

@@ -43,6 +43,7 @@ class Sizes:
         rollout_batch, rollout_slots, rollout_steps: of the rollout.
         play_slots, play_steps: of a game: four slots are what a task has, the steps fill the predictor's context.
         episodes, episode_frames: the data set that windows are read from.
+        parsed: episodes of it that are parsed into slots.
         window, window_batch: frames a window, windows a batch.
         loader_batches: batches a repeat that LeRobotDataset + DataLoader delivers.
         cache_batches: batches a repeat that the frame cache delivers.
@@ -65,6 +66,7 @@ class Sizes:
     play_steps: int = 30
     episodes: int = 40
     episode_frames: int = 21
+    parsed: int = 8
     window: int = 14
     window_batch: int = 32
     loader_batches: int = 6
@@ -85,8 +87,8 @@ def quick_sizes() -> Sizes:
     return Sizes(
         model=small, image_size=32, savi_batch=1, savi_frames=2, dynamics_batch=1, seed_frames=2, predicted_frames=2,
         decoded_frames=1, rollout_batch=2, rollout_slots=3, rollout_steps=5, play_slots=3, play_steps=2, episodes=3,
-        episode_frames=8, window=4, window_batch=2, loader_batches=1, cache_batches=2, fast_frames=2, full_frames=1,
-        repeats=1,
+        episode_frames=8, parsed=2, window=4, window_batch=2, loader_batches=1, cache_batches=2, fast_frames=2,
+        full_frames=1, repeats=1,
     )  # fmt: skip
 
 

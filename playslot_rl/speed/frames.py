@@ -8,6 +8,7 @@ off-screen settings, same scene, same process.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import tempfile
 import time
 from collections.abc import Callable, Generator
@@ -23,9 +24,11 @@ from torch import Tensor
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.data.source import open_source
-from playslot_rl.data.windows import sample_windows
+from playslot_rl.data.stream import open_stream
+from playslot_rl.data.windows import Clips, sample_windows
 from playslot_rl.frames import normalise
 from playslot_rl.progress import quiet_datasets
+from playslot_rl.seeding import StepGenerators
 from playslot_rl.speed.cases import Sizes
 from playslot_rl.threads import available_cores
 
@@ -33,12 +36,13 @@ _FPS = 10
 
 
 def sampling_rates(sizes: Sizes) -> dict[str, float]:
-    """Frames a second: `cache`, and `lerobot` with as many DataLoader workers as there are cores.
+    """Frames a second: `cache`, `stream` (the shuffle buffer holds a quarter of the set), and `lerobot` with as many
+    DataLoader workers as there are cores.
 
     The repeats take turns. Building the cache, which happens once per data set, and starting the workers are not
     counted; the workers end with their turn, so that none reads ahead while the cache is timed.
     """
-    rates: dict[str, list[float]] = {"lerobot": [], "cache": []}
+    rates: dict[str, list[float]] = {"lerobot": [], "stream": [], "cache": []}
     frames = sizes.window_batch * sizes.window
     with tempfile.TemporaryDirectory(prefix="playslot-bench-") as folder, quiet_datasets():
         root = write_dataset(Path(folder) / "data", sizes)
@@ -49,8 +53,17 @@ def sampling_rates(sizes: Sizes) -> dict[str, float]:
             rows = sample_windows(source.starts, source.lengths, sizes.window, sizes.window_batch, generator)
             return normalise(source.pixels(rows))
 
+        streamed = open_stream(root, cache=Path(folder) / "cache", buffer=len(source.frames) // 4)
+        clips, steps = Clips(streamed, sizes.window, 0.0, 0), itertools.count()
+
+        def decoded() -> Tensor:
+            """The same from the data set's files, decoded as they are read."""
+            rows = clips.sample(sizes.window_batch, StepGenerators(0, next(steps)).numpy("windows"))
+            return normalise(streamed.pixels(rows))
+
         for _ in range(sizes.repeats + 1):
             rates["cache"].append(frames / _seconds(cached, sizes.cache_batches, sizes))
+            rates["stream"].append(frames / _seconds(decoded, sizes.loader_batches * 4, sizes))
             with contextlib.closing(lerobot_batches(root, sizes)) as batches:
                 for _ in range(2 * available_cores()):  # what the workers read ahead while they start
                     next(batches)

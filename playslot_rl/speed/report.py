@@ -21,8 +21,14 @@ TARGETS: Final = {
     "render": 12.0,
     "render_block_push": 5.0,
     "play_step": 10.0,
+    "verify": 20.0,
+    "export": 20.0,
+    "slot_cache": 20.0,
 }
-"""Ratios that the project asks of itself (on two CPU cores); of `play_step`, imagined frames a second."""
+"""Ratios that the project asks of itself (on two CPU cores); of `play_step`, imagined frames a second, of `verify` and
+`export` episodes a second, of `slot_cache` frames a second.
+"""
+RATES: Final = {"verify": "episodes/s", "export": "episodes/s", "slot_cache": "frames/s"}
 
 Figures = dict[str, Any]
 
@@ -40,7 +46,7 @@ def measure(
 
     Returns:
         For each key of `TARGETS` a dict with `ratio`, `unit` and the medians it was made of; and `machine`. The
-        `ratio` of `play_step` is no ratio of two paths but imagined frames a second.
+        `ratio` of `play_step` is no ratio of two paths but imagined frames a second, that of `RATES` what they say.
 
     Raises:
         PlaySlotError: a child died. RenderError: no GL backend.
@@ -49,6 +55,7 @@ def measure(
     from playslot_rl.envs import block_config
     from playslot_rl.speed.frames import render_seconds, sampling_rates
     from playslot_rl.speed.race import race
+    from playslot_rl.speed.sets import set_rates
 
     tune_allocator()  # of this process, which samples windows, as every recipe does; each child sets its own
     say("SAVi training step, eight variants")
@@ -61,6 +68,8 @@ def measure(
     play = race(play_variants(), sizes, threads)
     say("window sampling against LeRobotDataset + DataLoader")
     rates = sampling_rates(sizes)
+    say("export, verify, slot cache")
+    sets = set_rates(sizes)
     say("rendering, fast against default")
     render = render_seconds(EnvConfig(image_size=sizes.image_size, warmup_steps=1), sizes)
     block_push = replace(block_config("block_push", BlocksConfig()), image_size=sizes.image_size)
@@ -73,6 +82,7 @@ def measure(
         "render": _entry(render, "full", "fast"),
         "render_block_push": _entry(blocks, "full", "fast"),
         "play_step": _played(play, sizes.play_steps),
+        **{name: {"ratio": sets[name], "unit": unit, "rate": sets[name]} for name, unit in RATES.items()},
         "machine": {**_machine(), "threads": threads, "repeats": sizes.repeats, "quick": quick},
     }
 
@@ -119,7 +129,7 @@ def table(figures: Figures) -> str:
         unit = figures[key]["unit"]
         for name, value in figures[key].items():
             if name not in ("ratio", "unit"):
-                shown = f"{value:,.0f} frames/s" if unit == "frames/s" else f"{value * 1000:,.1f} ms"
+                shown = f"{value * 1000:,.1f} ms" if unit == "s" else f"{value:,.0f} {unit}"
                 medians.append([f"`{key}`", f"`{name}`", shown])
     m = figures["machine"]
     versions = f"Python {m['python']}, torch {m['torch']}, mujoco {m['mujoco']}, lerobot {m['lerobot']}"

@@ -13,9 +13,11 @@ from torch import nn
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.roles import fixed_keys
+from playslot_rl.config.weights import data_roots
 from playslot_rl.data.demonstrations import DemonstrationSplit, episode_range, split_demonstrations, split_tested
 from playslot_rl.data.opening import open_configured
-from playslot_rl.data.source import EpisodeFrames, concatenate
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.weighted import weighted
 from playslot_rl.data.windows import Clips
 from playslot_rl.errors import CheckpointError, DataError
 from playslot_rl.processes import here, wait
@@ -42,7 +44,8 @@ def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrame
 
     if not roots:
         raise DataError(f"{what}: got no data set, expected data.root=DIR; record one by `playslot collect`")
-    names = [name.strip() for name in roots.split(",")]
+    named = data_roots(roots)
+    names = [root.path for root in named]
     if config.data.tested:
         return split_tested(open_configured(config, roots), config.data.tested)[0]
     if not config.data.held_out or config.data.demos not in names or len(names) == 1:
@@ -50,7 +53,7 @@ def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrame
     parts = {name: open_configured(config, name) for name in names}
     demos = parts[config.data.demos]
     parts[config.data.demos] = episode_range(demos, 0, demos.episodes - config.data.held_out)
-    return concatenate([parts[name] for name in names])
+    return weighted([parts[name] for name in names], [root.weight for root in named], names)
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,11 @@ class StageRecord:
         """
         config = self.config
         data, most = config.data, config.collect.validation_episodes
+        if self.videos.shares is not None:
+            raise DataError(
+                f"data.demos={self.roots}: got weights, expected none: a policy is cloned from every transition of "
+                "its demonstrations alike; leave the weights out"
+            )
         return split_demonstrations(self.videos, config.demos, data.held_out, most, data.draw)
 
     def clips(self, frames: int, shown: int = 32) -> Clips:
@@ -159,6 +167,8 @@ class StageRecord:
         data: dict[str, Any] = {"data": self.data.fingerprint} if self.role else {}
         if self.role == "train":
             data["data.validation"] = self.config.data.validation
+            if self.config.data.stream:  # other windows than from the cache
+                data["data.shuffle_buffer"] = self.config.data.shuffle_buffer
         return {**self._of_stored(*self.counts), **data, **self.prints, **self.identity}
 
     def begin(self) -> None:

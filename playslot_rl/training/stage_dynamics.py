@@ -70,8 +70,7 @@ class DynamicsStage:
         config, numpy, clips = self.config, generators.numpy("windows"), self.clips
         rows = clips.sample(config.batch_size, numpy)
         if config.from_start > 0:
-            fits = clips.train_episodes[self.source.lengths[clips.train_episodes] >= clips.frames]
-            first = self.source.starts[numpy.choice(fits, config.batch_size)]
+            first = clips.sample_first(config.batch_size, numpy)
             chosen = numpy.random(config.batch_size) < config.from_start
             rows[chosen] = first[chosen, None] + np.arange(clips.frames)
         return rows

@@ -42,13 +42,14 @@ def data_roots(given: ReportInput) -> list[Path]:
 
 def read_latents(model: WorldModel, root: Path, given: ReportInput, most_episodes: int = 200) -> LatentData:
     """Latent actions of up to `most_episodes` episodes of a data set, with the probe where it has actions."""
+    from playslot_rl.data.cache import Cache
     from playslot_rl.data.opening import open_configured
     from playslot_rl.data.slot_cache import slot_cache
 
     data = given.config.data
     source = open_configured(given.config, [root])
     prints = str(given.metas.get("slots", {}).get("fingerprint", ""))
-    slots = slot_cache(source, model.savi, prints, data.cache, module_device(model))
+    slots = slot_cache(source, model.savi, prints, Cache.of(data), module_device(model))
     starts, lengths = source.starts[:most_episodes], source.lengths[:most_episodes]
     z, codes, episodes = infer_latents(model.inverse_dynamics, slots, starts, lengths, source.actions)
     if source.actions is None:

@@ -87,6 +87,7 @@ def _on_pixels(config: ExperimentConfig, record: StageRecord) -> Training:
 
 def _on_slots(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.baselines.video.load import uncontrolled
+    from playslot_rl.data.cache import Cache
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.seeding import global_seed
     from playslot_rl.storage.checkpoints import load_weights
@@ -103,7 +104,7 @@ def _on_slots(config: ExperimentConfig, record: StageRecord) -> Training:
     load_weights(slots, {"savi": world.savi})
     world.to(device)
     source = record.data
-    cached = slot_cache(source, world.savi, slots.fingerprint, config.data.cache, device, config.logging.progress)
+    cached = slot_cache(source, world.savi, slots.fingerprint, Cache.of(config.data), device, config.logging.progress)
     stage = DynamicsStage(world, record.clips(own.seed_frames + own.predicted_frames), cached, own)
     return _training(config, record, stage, device, patience_of(own.patience, "mse_slot"))
 

@@ -57,3 +57,12 @@ def test_sampled_initial_slots_repeat(source: EpisodeFrames) -> None:
     savi = SAVi(replace(tiny_config().model.savi, initial="gaussian", decoder_channels=(16, 16)), 32)
     one, two = (np.concatenate(list(parse_episodes(source, savi))) for _ in range(2))
     assert np.array_equal(one, two)
+
+
+def test_slots_of_some_episodes_stand_at_their_frames_rows(source: EpisodeFrames, savi: SAVi, tmp_path: Path) -> None:
+    whole = slot_cache(source, savi, "f" * 16, tmp_path)
+    some = replace(source, starts=source.starts[1:], lengths=source.lengths[1:], fingerprint="d" * 16)
+    slots = slot_cache(some, savi, "f" * 16, tmp_path)
+    for episode in range(some.episodes):
+        rows = some.episode_rows(episode)
+        np.testing.assert_allclose(slots[rows], whole[rows], atol=1e-5, rtol=1e-4)

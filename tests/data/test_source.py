@@ -14,7 +14,7 @@ import pytest
 import torch
 from foreign import LENGTHS, foreign_frames, write_foreign
 
-from playslot_rl.data.cache import ArrayWriter, build_once, cache_folder
+from playslot_rl.data.cache import build_once, cache_folder
 from playslot_rl.data.source import ConcatFrames, open_source, open_sources
 from playslot_rl.errors import DataError, OutputError
 
@@ -60,7 +60,7 @@ def test_lossless_video_is_close_to_what_was_recorded(foreign_video: Path, tmp_p
 def test_the_second_opening_decodes_nothing(
     foreign_images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from playslot_rl.data import source as module
+    from playslot_rl.data import frame_build as module
     from playslot_rl.data.contents import Contents
 
     first = open_source(foreign_images, cache=tmp_path)
@@ -222,7 +222,7 @@ def test_a_full_disk_leaves_no_cache(foreign_images: Path, tmp_path: Path, monke
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(ArrayWriter, "write", full)
+        patch.setattr("os.fsync", full)
         with pytest.raises(OutputError, match="the disk is full"):
             open_source(foreign_images, cache=tmp_path)
     assert not list(tmp_path.rglob("*.npy"))

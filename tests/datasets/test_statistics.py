@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from damage import edit_column
 
-from playslot_rl.datasets.statistics import of_frames, of_numbers, rounded
+from playslot_rl.datasets.statistics import QUANTILES, Aggregate, aggregate, of_frames, of_numbers, rounded
 from playslot_rl.datasets.verify import verify
 
 Frames = np.ndarray[Any, np.dtype[np.uint8]]
@@ -108,3 +108,27 @@ def test_means_of_numbers_are_those_of_lerobot_to_the_last_bit(kind: Any, shape:
 
 def iter_once(values: Any) -> Iterator[Any]:
     yield values
+
+
+def test_statistics_of_all_one_episode_after_the_other_are_the_same() -> None:
+    generator = np.random.default_rng(3)
+    episodes = []
+    for count in (5, 1, 40, 7):
+        values = generator.normal(1e6, 2.0, (count, 3))
+        episodes.append({"a": of_numbers(values), "b": of_numbers(values[:, 0])})
+    running = Aggregate()
+    for episode in episodes:
+        running.add(episode)
+    for name, stats in aggregate(episodes).items():
+        for key, value in stats.items():
+            np.testing.assert_allclose(running.result()[name][key], value, rtol=1e-9, atol=1e-6)
+            assert running.result()[name][key].shape == value.shape
+
+
+def test_quantiles_are_numpys_without_interpolation() -> None:
+    generator = np.random.default_rng(4)
+    for count in (1, 2, 9, 10, 21, 26, 100, 1000):
+        values = generator.normal(size=(count, 2))
+        expected = np.quantile(values, list(QUANTILES.values()), axis=0, method="inverted_cdf")
+        found = of_numbers(values)
+        assert np.array_equal(np.stack([found[name] for name in QUANTILES]), expected)

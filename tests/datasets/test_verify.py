@@ -201,3 +201,21 @@ def test_statistics_are_those_of_lerobot(images: Path) -> None:
     parts = [{"a": of_numbers(numbers[:100])}, {"a": of_numbers(numbers[100:])}]
     for key, value in aggregate_stats(parts)["a"].items():
         np.testing.assert_allclose(aggregate(parts)["a"][key], value)
+
+
+def test_statistics_are_read_a_few_episodes_at_a_time(images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from playslot_rl.data import contents
+
+    sizes: list[tuple[int, bool]] = []
+    real = contents._episodes
+
+    def episodes(path: Path, table: Any, problems: Any) -> Any:
+        sizes.append((len(table), any(name.startswith("stats/") for name in table.column_names)))
+        return real(path, table, problems)
+
+    monkeypatch.setattr(contents, "_episodes", episodes)
+    monkeypatch.setattr(contents, "EPISODES_AT_ONCE", 2)
+    assert verify(images).ok
+    with_statistics = [size for size, there in sizes if there]
+    assert sum(with_statistics) == 3
+    assert max(with_statistics) <= 2

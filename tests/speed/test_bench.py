@@ -37,7 +37,7 @@ from playslot_rl.speed.cases import (
     slots_loss,
 )
 from playslot_rl.speed.race import start
-from playslot_rl.speed.report import TARGETS, table
+from playslot_rl.speed.report import RATES, TARGETS, table
 
 ALL = savi_variants() | dynamics_variants(1) | rollout_variants()
 
@@ -162,6 +162,14 @@ def test_the_command_writes_every_key_with_its_ratio_and_medians(
     played = figures["play_step"]
     assert set(play_variants()) <= set(played)
     assert played["ratio"] == pytest.approx(1 / played["shipped"])
+    assert set(sampling) == {"ratio", "unit", "cache", "stream", "lerobot"}
+    for key, unit in RATES.items():
+        assert figures[key] == {
+            "ratio": figures[key]["rate"],
+            "unit": unit,
+            "rate": pytest.approx(figures[key]["rate"]),
+        }
+        assert figures[key]["rate"] > 0
     assert figures["machine"]["quick"] is True
     printed = capsys.readouterr().out
     assert table(figures) in printed

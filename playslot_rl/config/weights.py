@@ -1,0 +1,64 @@
+"""`data.root=a:2,b:1`: the data sets that a command reads, and how often each is drawn from."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+from playslot_rl.errors import ConfigError
+
+
+class DataRoot(NamedTuple):
+    """One data set of `data.root`.
+
+    Attributes:
+        path: its folder, as it was written.
+        weight: how often windows are drawn from it, relative to the others; None where none is given.
+    """
+
+    path: str
+    weight: float | None
+
+    @property
+    def text(self) -> str:
+        """As in `data.root`."""
+        return self.path if self.weight is None else f"{self.path}:{self.weight:g}"
+
+
+def data_roots(text: str, key: str = "data.root") -> list[DataRoot]:
+    """The data sets that a text with commas names; empty parts are left out.
+
+    What follows a part's last colon is its weight if it is a number, unless a folder has the whole part as its name:
+    `sets/a:2` is the folder of that name where there is one. Windows' `C:/sets/a` has no weight.
+
+    Args:
+        text: `a`, `a,b` or `a:2,b:1`; where only some have a weight, the others have 1.
+        key: config key, for the message.
+
+    Raises:
+        ConfigError: a weight that is not above 0.
+
+    Examples:
+        >>> data_roots("sets/a, sets/b")
+        [DataRoot(path='sets/a', weight=None), DataRoot(path='sets/b', weight=None)]
+        >>> [root.text for root in data_roots("a:2,b")]
+        ['a:2', 'b:1']
+    """
+    roots = [_one(part.strip(), key) for part in text.split(",") if part.strip()]
+    if any(root.weight is not None for root in roots):
+        roots = [root if root.weight is not None else DataRoot(root.path, 1.0) for root in roots]
+    return roots
+
+
+def _one(part: str, key: str) -> DataRoot:
+    path, _, number = part.rpartition(":")
+    if not path or Path(part).expanduser().exists():
+        return DataRoot(part, None)
+    try:
+        weight = float(number)
+    except ValueError:
+        return DataRoot(part, None)
+    if not (math.isfinite(weight) and weight > 0):
+        raise ConfigError(f"{key}: got the weight {number} in {part}, expected a number above 0, as in a:2,b:1")
+    return DataRoot(path, weight)

@@ -1,0 +1,209 @@
+"""What the caches hold, and making room in them: least recently used first, never what a process uses."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+from filelock import FileLock, Timeout
+
+from playslot_rl.config.sizes import shown
+from playslot_rl.data.cache import CachePlace, cache_folder, settings
+from playslot_rl.errors import DataError
+from playslot_rl.storage.sharing_locks import alone, last_use, remove_unused
+
+KINDS: Final = ("frames", "slots")
+ENTRY_NAME: Final = "meta.json"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry of a cache.
+
+    Attributes:
+        path: its folder.
+        kind: `frames` or `slots`.
+        data: folder of the data set it was made from, as it was named then; empty where an older version made it.
+        bytes: on disk.
+        used: when it was last opened, seconds since 1970.
+        in_use: whether a process has it open, or makes it.
+        part: whether it is not finished: it is being made, or a kill has left it.
+    """
+
+    path: str
+    kind: str
+    data: str
+    bytes: int
+    used: float
+    in_use: bool
+    part: bool
+
+    @property
+    def name(self) -> str:
+        """What `playslot cache clear` calls it."""
+        folder = Path(self.path).name
+        return folder.removeprefix(".").removesuffix(".part") if self.part else folder
+
+    def line(self) -> str:
+        """For people."""
+        when = time.strftime("%Y-%m-%d %H:%M", time.localtime(self.used))
+        state = "in use" if self.in_use else "unfinished" if self.part else "free"
+        return f"{self.name}  {self.kind:6}  {shown(self.bytes):>8}  {when}  {state:10}  {self.data or '-'}"
+
+
+def entries(cache: CachePlace = "") -> list[Entry]:
+    """All entries, those first that were used longest ago."""
+    found = []
+    for kind in KINDS:
+        for folder in (cache_folder(cache) / kind).glob("*"):
+            part = folder.name.startswith(".") and folder.name.endswith(".part")
+            if folder.is_dir() and (part or not folder.name.startswith(".")):
+                with contextlib.suppress(FileNotFoundError):  # removed meanwhile
+                    found.append(_entry(folder, kind, part))
+    return sorted(found, key=lambda entry: entry.used)
+
+
+def _entry(folder: Path, kind: str, part: bool) -> Entry:
+    used, size = last_use(folder), sum(_stored(path) for path in folder.rglob("*") if path.is_file())
+    try:
+        data = str(json.loads((folder / ENTRY_NAME).read_text()).get("name", ""))
+    except (OSError, ValueError, AttributeError):
+        data = ""
+    busy = _being_made(folder) if part else _taken(folder)
+    return Entry(str(folder), kind, data, size, used, busy, part)
+
+
+def _stored(path: Path) -> int:
+    """Bytes on disk: an array that is being made has holes."""
+    status = path.stat()
+    return min(status.st_size, status.st_blocks * 512) if hasattr(status, "st_blocks") else status.st_size
+
+
+def _taken(folder: Path) -> bool:
+    with alone(folder) as free:
+        return not free
+
+
+def _being_made(part: Path) -> bool:
+    lock = FileLock(part.with_name(f"{part.name.removesuffix('.part')}.lock"), timeout=0)
+    try:
+        with lock:
+            return False
+    except Timeout:
+        return True
+
+
+def remove(entry: Entry) -> bool:
+    """Remove an entry that nobody uses.
+
+    Returns:
+        Whether it is gone.
+    """
+    folder = Path(entry.path)
+    if not entry.part:
+        return remove_unused(folder)
+    lock = FileLock(folder.with_name(f"{folder.name.removesuffix('.part')}.lock"), timeout=0)
+    try:
+        with lock:
+            shutil.rmtree(folder, ignore_errors=True)
+            return not folder.exists()
+    except Timeout:
+        return False
+
+
+def make_room(cache: CachePlace, needed: int, key: str) -> None:
+    """Remove entries, the least recently used first, until `needed` more bytes fit below the cache's limit.
+
+    Args:
+        cache: with its limit; nothing is done without one.
+        needed: bytes of what is to be made.
+        key: its name: what a killed process has left of it does not count.
+
+    Raises:
+        DataError: it does not fit beside what is in use; then nothing is removed.
+    """
+    limit = settings(cache).limit
+    if limit is None:
+        return
+    there = [entry for entry in entries(cache) if entry.name != key]
+    total, kept = sum(entry.bytes for entry in there), sum(entry.bytes for entry in there if entry.in_use)
+    if kept + needed > limit:
+        raise DataError(
+            f"data.cache_limit={shown(limit)}: got {shown(needed)} to store beside {shown(kept)} in use, expected "
+            "less: raise it, wait for the other processes, or read without a frame cache by data.stream=true"
+        )
+    for entry in there:
+        if total + needed <= limit:
+            return
+        if not entry.in_use and remove(entry):
+            total -= entry.bytes
+
+
+@dataclass(frozen=True)
+class Listing:
+    """What `playslot cache list` says."""
+
+    folder: str
+    entries: Sequence[Entry]
+
+    def to_json(self) -> str:
+        """One JSON object."""
+        rows = [{"name": entry.name, **asdict(entry)} for entry in self.entries]
+        return json.dumps({"folder": self.folder, "entries": rows}, indent=2)
+
+    def lines(self) -> list[str]:
+        """For people."""
+        total = f"{self.folder}: {len(self.entries)} entries, {shown(sum(entry.bytes for entry in self.entries))}"
+        return [*(entry.line() for entry in self.entries), total]
+
+
+def listing(cache: Path | None = None) -> Listing:
+    """What a cache holds; None means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`."""
+    folder = cache_folder(cache or "")
+    return Listing(str(folder), entries(folder))
+
+
+@dataclass(frozen=True)
+class Cleared:
+    """What `playslot cache clear` says."""
+
+    folder: str
+    removed: Sequence[Entry]
+    kept: Sequence[Entry]
+
+    def to_json(self) -> str:
+        """One JSON object."""
+        names = {"removed": [entry.name for entry in self.removed], "in_use": [entry.name for entry in self.kept]}
+        return json.dumps({"folder": self.folder, **names, "bytes": self._freed()}, indent=2)
+
+    def lines(self) -> list[str]:
+        """For people."""
+        lines = [f"{entry.name}: in use, left" for entry in self.kept]
+        return [*lines, f"{self.folder}: {len(self.removed)} entries removed, {shown(self._freed())} free again"]
+
+    def _freed(self) -> int:
+        return sum(entry.bytes for entry in self.removed)
+
+
+def clear(names: Sequence[str] = (), cache: Path | None = None) -> Cleared:
+    """Remove entries that nobody uses: all of them, or those of some names (their beginnings will do).
+
+    Raises:
+        DataError: no entry of such a name.
+    """
+    folder = cache_folder(cache or "")
+    there = entries(folder)
+    for name in names:
+        if not any(entry.name.startswith(name) for entry in there):
+            raise DataError(f"{folder}: got no entry {name}, expected one of `playslot cache list`")
+    chosen = [entry for entry in there if not names or entry.name.startswith(tuple(names))]
+    gone = {entry.path: remove(entry) for entry in chosen}
+    return Cleared(
+        str(folder), [e for e in chosen if gone[e.path]], [entry for entry in chosen if not gone[entry.path]]
+    )

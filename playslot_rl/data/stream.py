@@ -1,0 +1,299 @@
+"""Frames of sets that fit neither memory nor the disk's cache: decoded while they are read, with a shuffle buffer.
+
+A set is cut into blocks of whole episodes, a sixteenth of the buffer each, and the blocks are put in an order drawn
+anew for every epoch. The buffer of step s is a stretch of that order,
+
+    blocks  o(p), ..., o(p + 15),    p = floor(s b / w)
+
+with b windows a batch and w windows a block, so that an epoch draws as many windows as there are; a batch's windows are
+drawn uniformly from the buffer's blocks. All of it is a function of (seed, step): a resumed run reads the same frames.
+
+Shapes: F frames, E episodes, B batch, H W image height and width.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.data.cache import CachePlace, cache_folder
+from playslot_rl.data.contents import Contents, Span, open_files, stated_size
+from playslot_rl.data.demonstrations import ShiftedFrames
+from playslot_rl.data.frames import rgb_frames, sized
+from playslot_rl.data.source import (
+    ConcatFrames,
+    EpisodeFrames,
+    FrameRows,
+    Frames,
+    files_fingerprint,
+    labels_of,
+    wrong_size,
+)
+from playslot_rl.data.stride import ChosenFrames
+
+IntArray = npt.NDArray[np.int64]
+BLOCKS: Final = 16
+"""Blocks of a full buffer."""
+ORDER_STREAM: Final = 0x57EA
+"""Keeps the order of the blocks apart from what else a seed draws."""
+
+
+class FrameStream:
+    """Frames uint8 (F, H, W, 3) that are decoded when they are read.
+
+    Blocks that `hold` names stay in memory once they are read; of other episodes, those read last, a quarter of the
+    buffer.
+
+    Args:
+        contents: the data set; its columns are not kept.
+        camera: whose frames.
+        size: side to resize to; None keeps them.
+        buffer: frames of the shuffle buffer.
+    """
+
+    def __init__(self, contents: Contents, camera: str, size: int | None, buffer: int) -> None:
+        self._spans = contents.spans
+        self._contents, self.camera, self.size, self.buffer = contents, camera, size, buffer
+        height, width = stated_size(contents.features[camera])
+        self.shape = (contents.rows, size or height, size or width, 3)
+        self.dtype = np.dtype(np.uint8)
+        self.blocks = _blocks(self._spans, max(1, buffer // BLOCKS))
+        self._first = np.array([block[0].start for block in self.blocks], np.int64)
+        self._starts = np.array([span.start for span in self._spans], np.int64)
+        self._held: dict[int, Frames | None] = {}
+        self._coming: dict[int, Future[Frames]] = {}
+        self._loose: OrderedDict[int, Frames] = OrderedDict()
+        self._lock = threading.Lock()  # PyAV and Pillow release the interpreter, so two threads may ask at once
+        self._ahead = ThreadPoolExecutor(1, thread_name_prefix="stream")
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def block_of(self, rows: IntArray) -> IntArray:
+        """Number of the block of each row."""
+        found: IntArray = np.searchsorted(self._first, rows, side="right").astype(np.int64) - 1
+        return found
+
+    def hold(self, blocks: Sequence[int], coming: Sequence[int] = ()) -> None:
+        """Keep these blocks from now on, and no others; begin to decode those that are coming."""
+        with self._lock:
+            self._held = {block: self._held.get(block) for block in blocks}
+            self._coming = {b: f for b, f in self._coming.items() if b in self._held or b in coming}
+            for block in coming:
+                if block not in self._held and block not in self._coming:
+                    self._coming[block] = self._ahead.submit(self._decode, self.blocks[block])
+
+    def __getitem__(self, rows: Any) -> Frames:
+        """Rows by an integer, a slice or an integer array of any shape."""
+        if isinstance(rows, slice):
+            rows = np.arange(*rows.indices(len(self)))
+        index = np.asarray(rows, np.int64)
+        flat = np.where(index < 0, index + len(self), index).reshape(-1)
+        if flat.size and (flat.min() < 0 or flat.max() >= len(self)):
+            raise IndexError(f"row {int(flat.max())}: expected 0 to {len(self) - 1}")
+        out = np.empty((len(flat), *self.shape[1:]), np.uint8)
+        with self._lock:
+            block = self.block_of(flat)
+            held = np.isin(block, list(self._held))
+            for number in np.unique(block[held]):
+                here = block == number
+                out[here] = self._block(int(number))[flat[here] - self._first[number]]
+            self._gather_loose(flat, np.flatnonzero(~held), out)
+        return out.reshape(*index.shape, *self.shape[1:])
+
+    def _block(self, number: int) -> Frames:
+        frames = self._held[number]
+        if frames is None:
+            future = self._coming.pop(number, None)
+            frames = self._held[number] = self._decode(self.blocks[number]) if future is None else future.result()
+        return frames
+
+    def _gather_loose(self, flat: IntArray, places: IntArray, out: Frames) -> None:
+        """Rows of episodes that no held block has: decoded whole, the missing ones together."""
+        if not len(places):
+            return
+        episode = np.searchsorted(self._starts, flat[places], side="right") - 1
+        wanted = np.unique(episode).tolist()
+        missing = [self._spans[number] for number in wanted if number not in self._loose]
+        if missing:
+            frames, begin = self._decode(missing), 0
+            for number in (number for number in wanted if number not in self._loose):
+                self._loose[number] = frames[begin : begin + self._spans[number].length]
+                begin += self._spans[number].length
+        for number in wanted:
+            self._loose.move_to_end(number)
+            here = places[episode == number]
+            out[here] = self._loose[number][flat[here] - self._starts[number]]
+        kept = sum(len(frames) for frames in self._loose.values())
+        while kept > self.buffer // 4 and len(self._loose) > len(wanted):
+            kept -= len(self._loose.popitem(last=False)[1])
+
+    def _decode(self, spans: Sequence[Span]) -> Frames:
+        first = np.cumsum([0, *(span.length for span in spans)])
+        place = {
+            span.start + i: begin + i for span, begin in zip(spans, first, strict=False) for i in range(span.length)
+        }
+        frames = np.empty((int(first[-1]), *self.shape[1:]), np.uint8)
+        for row, frame in rgb_frames(self._contents, self.camera, spans):
+            frames[place[row]] = sized(frame, self.size)
+        return frames
+
+
+def _blocks(spans: Sequence[Span], frames: int) -> list[list[Span]]:
+    """Episodes in order, in runs of about so many frames; none crosses a file, so that each file is opened once."""
+    found: list[list[Span]] = []
+    for span in spans:
+        if not found or found[-1][-1].file != span.file or sum(s.length for s in found[-1]) >= frames:
+            found.append([])
+        found[-1].append(span)
+    return found
+
+
+def open_stream(
+    root: str | Path,
+    camera: str = "",
+    cache: CachePlace = "",
+    *,
+    buffer: int,
+    image_size: int | None = None,
+    resize: bool = False,
+) -> EpisodeFrames:
+    """Open a LeRobot v3.0 data set without a frame cache.
+
+    Args:
+        root, camera, cache, image_size, resize: as of `playslot_rl.data.source.open_source`; the cache only remembers
+            the data set's fingerprint.
+        buffer: frames of the shuffle buffer.
+
+    Raises:
+        DataError: as `open_source`; a frame that cannot be decoded is found when it is read.
+    """
+    files = open_files(root)
+    camera = files.camera(camera)
+    stated = stated_size(files.features[camera])
+    if image_size is not None and not resize and stated != (image_size, image_size):
+        raise wrong_size(files, camera, stated, image_size)
+    labels = labels_of(files)
+    fingerprint = files_fingerprint(files, camera, cache_folder(cache))
+    tasks, _ = files.episodes[0].tasks, files.spans  # found from the columns, which are not kept
+    files = replace(files, columns={"episode_index": files.columns["episode_index"]})
+    return EpisodeFrames(
+        frames=FrameStream(files, camera, image_size if resize else None, buffer),
+        starts=labels["starts"],
+        lengths=labels["lengths"],
+        actions=labels.get("actions"),
+        success=labels.get("success"),
+        seeds=labels.get("seeds"),
+        fingerprint=fingerprint,
+        fps=files.fps,
+        task=tasks[0] if tasks else "",
+        camera=camera,
+        robot=str(files.info.get("robot_type") or ""),
+        name=str(root),
+    )
+
+
+def streams_of(frames: FrameRows) -> list[FrameStream]:
+    """The streams that frames are read from, whatever is done to them; none for a frame cache."""
+    match frames:
+        case FrameStream():
+            return [frames]
+        case ChosenFrames() | ShiftedFrames():
+            return streams_of(frames.frames)
+        case ConcatFrames():
+            return [stream for part in frames.parts for stream in streams_of(part)]
+    return []
+
+
+def blocks_of(frames: FrameRows, rows: IntArray) -> IntArray:
+    """Number of the block of each row, counted through all of `streams_of`."""
+    match frames:
+        case FrameStream():
+            return frames.block_of(rows)
+        case ChosenFrames():
+            return blocks_of(frames.frames, frames.rows[rows])
+        case ShiftedFrames():
+            return blocks_of(frames.frames, rows)
+        case ConcatFrames():
+            found, begin, counted = np.empty(len(rows), np.int64), 0, 0
+            for part in frames.parts:
+                here = (rows >= begin) & (rows < begin + len(part))
+                found[here] = blocks_of(part, rows[here] - begin) + counted
+                begin, counted = begin + len(part), counted + sum(len(s.blocks) for s in streams_of(part))
+            return found
+    raise TypeError(f"got {type(frames).__name__}, expected frames that are streamed")
+
+
+class ShuffleBuffer:
+    """Which episodes a step's windows are drawn from.
+
+    Args:
+        frames: streamed.
+        starts: first row of each episode that is trained on (E,).
+        places: windows of each (E,).
+        groups: set of each (E,), of sets with weights; all 0 else.
+        shares: how much of the batch comes from each set; they add up to 1.
+        seed: of the order.
+    """
+
+    def __init__(
+        self,
+        frames: FrameRows,
+        starts: IntArray,
+        places: IntArray,
+        groups: IntArray,
+        shares: npt.NDArray[np.float64],
+        seed: int,
+    ) -> None:
+        self._streams, self.seed, self.shares = streams_of(frames), seed, shares
+        self._ends = np.cumsum([len(stream.blocks) for stream in self._streams])
+        self.block = blocks_of(frames, starts)
+        sizes = np.array([sum(s.length for s in block) for stream in self._streams for block in stream.blocks])
+        buffer, kept = self._streams[0].buffer, places > 0
+        self._blocks = [np.unique(self.block[kept & (groups == g)]) for g in range(len(shares))]
+        windows = [places[groups == g].sum() for g in range(len(shares))]
+        self._windows = [max(1.0, w / max(1, len(b))) for w, b in zip(windows, self._blocks, strict=True)]
+        self._held = [
+            max(1, min(len(b), round(share * buffer / max(1.0, sizes[b].mean() if len(b) else 1.0))))
+            for b, share in zip(self._blocks, shares, strict=True)
+        ]
+        self._orders: dict[tuple[int, int], IntArray] = {}
+        self._at: list[list[int]] = []
+
+    def episodes(self, step: int, batch: int) -> IntArray:
+        """Indices of the episodes that step `step` may draw from; the buffer moves there."""
+        held, coming = [], []
+        for group, blocks in enumerate(self._blocks):
+            if not len(blocks):
+                continue
+            first = int(step * batch * self.shares[group] / self._windows[group])
+            held += [self._ordered(group, first + i) for i in range(self._held[group])]
+            coming.append(self._ordered(group, first + self._held[group]))
+        if [held, coming] != self._at:
+            self._at = [held, coming]
+            begin = 0
+            for stream, end in zip(self._streams, self._ends, strict=True):
+                stream.hold(
+                    [b - begin for b in held if begin <= b < end], [b - begin for b in coming if begin <= b < end]
+                )
+                begin = int(end)
+        found: IntArray = np.flatnonzero(np.isin(self.block, held))
+        return found
+
+    def _ordered(self, group: int, place: int) -> int:
+        """The block at a place of the endless order."""
+        epoch, i = divmod(place, len(self._blocks[group]))
+        key = group, epoch
+        if key not in self._orders:
+            self._orders = {k: order for k, order in self._orders.items() if k[1] >= epoch - 1}
+            generator = np.random.default_rng([self.seed, ORDER_STREAM, group, epoch])
+            self._orders[key] = generator.permutation(self._blocks[group])
+        return int(self._orders[key][i])

@@ -1,0 +1,106 @@
+"""Who reads a folder: any number of processes hold its lock together, and it is removed by one that has it alone.
+
+The system drops the locks of a process that ends, however it ends. A lock is held by an open file, so two uses within
+one process are two, too. Where the system has no `flock` (Windows) nothing is locked: there a file that is mapped
+cannot be removed anyway.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from playslot_rl.storage.atomic import temporary_name
+
+NAME: Final = "in_use.lock"
+"""Of the file in the folder; its time says when the folder was last taken."""
+
+
+def share(folder: Path) -> int | None:
+    """Take a folder into use; its last use is now.
+
+    Returns:
+        An open file that holds it until it is closed (`release_with`), -1 where the folder cannot be locked (a
+        read-only file system), or None where the folder is not there any more.
+    """
+    path = folder / NAME
+    try:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except FileNotFoundError:
+        return None
+    except OSError:
+        return -1 if folder.is_dir() else None
+    _lock(handle, alone=False)
+    try:
+        there = path.stat().st_ino == os.fstat(handle).st_ino
+    except FileNotFoundError:
+        there = False
+    if not there:  # removed by the process that had it alone
+        os.close(handle)
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)
+    return handle
+
+
+def release_with(owner: Any, handle: int) -> None:
+    """Hold what `share` returned as long as an object lives."""
+    if handle >= 0:
+        weakref.finalize(owner, os.close, handle)
+
+
+@contextlib.contextmanager
+def alone(folder: Path) -> Iterator[bool]:
+    """Whether nobody uses the folder; inside the block nobody begins to."""
+    path = folder / NAME
+    try:
+        used = last_use(folder)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        os.utime(path, (used, used))  # looking is no use, also where the file is made now
+    except OSError:
+        yield False
+        return
+    try:
+        yield _lock(handle, alone=True)
+    finally:
+        os.close(handle)
+
+
+def last_use(folder: Path) -> float:
+    """Seconds since 1970."""
+    path = folder / NAME
+    return (path if path.is_file() else folder).stat().st_mtime
+
+
+def remove_unused(folder: Path) -> bool:
+    """Remove a folder that nobody uses.
+
+    Returns:
+        Whether it is gone.
+    """
+    with alone(folder) as free:
+        if not free:
+            return not folder.is_dir()
+        hidden = temporary_name(folder)
+        folder.rename(hidden)
+    shutil.rmtree(hidden, ignore_errors=True)
+    return not hidden.exists()
+
+
+def _lock(handle: int, *, alone: bool) -> bool:
+    try:
+        import fcntl
+    except ImportError:
+        return True
+    try:
+        fcntl.flock(handle, (fcntl.LOCK_EX | fcntl.LOCK_NB) if alone else fcntl.LOCK_SH)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return not alone
+    return True

@@ -1,0 +1,100 @@
+"""Commands with actions and options of their own, `playslot dataset ACTION ...`: the arguments, and what is printed."""
+
+from __future__ import annotations
+
+import argparse
+import pkgutil
+import textwrap
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+Argument = tuple[str, dict[str, Any]]
+"""Name and settings of `ArgumentParser.add_argument`."""
+
+
+@dataclass(frozen=True)
+class Action:
+    """One action: what `--help` says about it, its arguments, and what it does.
+
+    Attributes:
+        summary: one line.
+        details: a paragraph.
+        examples: command lines.
+        does: `module:function`, imported when it is run; takes the arguments by name.
+        arguments: in the order of the help.
+        either: of which at most one may be given.
+    """
+
+    summary: str
+    details: str
+    examples: tuple[str, ...]
+    does: str
+    arguments: tuple[Argument, ...]
+    either: tuple[Argument, ...] = ()
+
+
+def make_parser(
+    actions: Mapping[str, Action], command: str, usage: str, description: str, kind: type[argparse.ArgumentParser]
+) -> argparse.ArgumentParser:
+    """The parser of `playslot COMMAND`.
+
+    Args:
+        actions: by name.
+        command: its name.
+        usage: what follows the name.
+        description: of all of them.
+        kind: says how bad arguments end.
+    """
+    width = max(map(len, actions))
+    lines = "\n".join(f"  {name:<{width}}  {action.summary}" for name, action in actions.items())
+    prog = f"playslot {command}"
+    top = kind(
+        prog=prog,
+        usage=f"{prog} {usage}",
+        description=description,
+        epilog=f"actions:\n{lines}\n\n`{prog} ACTION --help` explains one of them.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parsers = top.add_subparsers(prog=prog, dest="action", metavar="ACTION", required=True, parser_class=kind)
+    for name, action in actions.items():
+        examples = "\n".join(f"  {example}" for example in action.examples)
+        sub = parsers.add_parser(
+            name,
+            description=f"{action.summary}\n\n{textwrap.fill(action.details, 100)}",
+            epilog=f"examples:\n{examples}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        for argument, settings in action.arguments:
+            sub.add_argument(argument, **settings)
+        if action.either:
+            group = sub.add_mutually_exclusive_group()
+            for argument, settings in action.either:
+                group.add_argument(argument, **settings)
+    return top
+
+
+def run_action(actions: Mapping[str, Action], options: argparse.Namespace) -> int:
+    """Do what the parsed arguments ask for.
+
+    Returns:
+        The exit code: 0 done, 1 a data set that is not sound.
+
+    Raises:
+        PlaySlotError: whatever the action raises.
+        KeyboardInterrupt: with a line about what that leaves.
+    """
+    values = dict(vars(options))
+    action, as_json = actions[values.pop("action")], values.pop("json", False)
+    try:
+        result = pkgutil.resolve_name(action.does)(**values)
+        lines = result if isinstance(result, list) else result.lines()
+        print(result.to_json() if as_json else "\n".join(lines))
+        return 0 if getattr(result, "ok", True) else 1
+    except KeyboardInterrupt as error:
+        raise KeyboardInterrupt(
+            str(error) or "interrupted; no data set was changed, run the same command again"
+        ) from error
+
+
+JSON: Final[Argument] = ("--json", {"action": "store_true", "help": "print one JSON object instead of text"})

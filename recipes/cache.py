@@ -1,0 +1,47 @@
+"""`playslot cache ACTION ...`: what the caches of decoded frames and parsed slots hold, and making room."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Final
+
+from playslot_rl.recipes.actions import JSON, Action, Argument, make_parser, run_action
+
+
+def parser(kind: type[argparse.ArgumentParser] = argparse.ArgumentParser) -> argparse.ArgumentParser:
+    """The parser of `playslot cache`; `kind` says how bad arguments end."""
+    said = "Look after the caches of decoded frames and parsed slots. What is removed is made again when it is needed."
+    return make_parser(ACTIONS, "cache", "ACTION [options]", said, kind)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Do what the parsed arguments ask for (`run_action`)."""
+    return run_action(ACTIONS, options)
+
+
+CACHE: Final[Argument] = (
+    "--cache",
+    {"type": Path, "metavar": "DIR", "help": "the cache (default $PLAYSLOT_CACHE or ~/.cache/playslot_rl)"},
+)
+NAMES: Final[Argument] = (
+    "names",
+    {"nargs": "*", "metavar": "NAME", "help": "entries of `playslot cache list`; none means all"},
+)
+ACTIONS: Final[dict[str, Action]] = {
+    "list": Action(
+        "what is there: data set, size, last use, and whether a process uses it",
+        "One line an entry, the least recently used first: those make room where data.cache_limit= is reached.",
+        ("playslot cache list", "playslot cache list --json --cache data/cache"),
+        "playslot_rl.data.cache_entries:listing",
+        (CACHE, JSON),
+    ),
+    "clear": Action(
+        "remove what no process uses",
+        "Removes all entries, or those named (the beginning of a name will do). What a process has open or makes "
+        "stays.",
+        ("playslot cache clear", "playslot cache clear 3f9a01 --cache data/cache"),
+        "playslot_rl.data.cache_entries:clear",
+        (NAMES, CACHE, JSON),
+    ),
+}

@@ -1,0 +1,182 @@
+"""Frames that are decoded while they are read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from foreign import LENGTHS, foreign_frames
+
+from playslot_rl.config import DataConfig
+from playslot_rl.data.demonstrations import shifted
+from playslot_rl.data.opening import open_configured
+from playslot_rl.data.slot_cache import slot_cache
+from playslot_rl.data.source import concatenate, open_source
+from playslot_rl.data.stream import FrameStream, ShuffleBuffer, open_stream, streams_of
+from playslot_rl.data.stride import every
+from playslot_rl.data.windows import Clips
+from playslot_rl.errors import DataError
+from playslot_rl.modules.savi import SAVi
+from playslot_rl.seeding import StepGenerators
+from playslot_rl.testing import tiny_config
+
+CAMERA = "observation.images.top"
+
+
+@pytest.fixture
+def decoded(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
+    """Episodes of each decoding."""
+    found: list[list[int]] = []
+    real = FrameStream._decode
+
+    def decode(stream: FrameStream, spans: list[object]) -> np.ndarray[object, np.dtype[np.uint8]]:
+        found.append([span.index for span in spans])  # type: ignore[attr-defined]
+        return real(stream, spans)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(FrameStream, "_decode", decode)
+    return found
+
+
+@pytest.mark.parametrize("kind", ["foreign_images", "foreign_video"])
+@pytest.mark.parametrize("buffer", [1, 6, 1000])
+def test_streamed_frames_are_those_of_the_cache(
+    kind: str, buffer: int, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    root = request.getfixturevalue(kind)
+    cached, streamed = open_source(root, CAMERA, tmp_path), open_stream(root, CAMERA, tmp_path, buffer=buffer)
+    rows = np.array([[14, 0, 3], [7, 7, 4]])
+    assert np.array_equal(streamed.frames[rows], cached.frames[rows])
+    assert np.array_equal(streamed.frames[5:9], cached.frames[5:9])
+    assert np.array_equal(streamed.frames[-1], cached.frames[-1])
+    streamed.frames.hold([0])  # type: ignore[attr-defined]
+    assert np.array_equal(streamed.frames[rows], cached.frames[rows])
+    assert streamed.fingerprint == cached.fingerprint
+    assert streamed.actions is not None
+    assert np.array_equal(streamed.actions, cached.actions)  # type: ignore[arg-type]
+    assert (streamed.fps, streamed.task, streamed.camera) == (cached.fps, cached.task, cached.camera)
+
+
+def test_nothing_is_written_but_the_fingerprint(foreign_images: Path, tmp_path: Path) -> None:
+    open_stream(foreign_images, cache=tmp_path, buffer=100).frames[np.arange(15)]
+    assert {path.relative_to(tmp_path).parts[0] for path in tmp_path.rglob("*.*")} == {"fingerprints"}
+
+
+def test_episodes_outside_the_buffer_are_kept_only_while_they_are_read(
+    foreign_images: Path, tmp_path: Path, decoded: list[list[int]]
+) -> None:
+    frames = open_stream(foreign_images, cache=tmp_path, buffer=24).frames  # six loose frames
+    frames[np.array([0, 1])]
+    frames[np.array([2, 4])]
+    assert decoded == [[0]]
+    frames[np.array([5, 14])]  # episodes 1 and 2: ten frames, all needed at once
+    assert decoded == [[0], [1, 2]]
+    frames[np.array([6])]
+    assert decoded == [[0], [1, 2]]
+    frames[np.array([0])]
+    assert decoded == [[0], [1, 2], [0]]
+
+
+def test_the_buffer_moves_through_every_block_once_an_epoch() -> None:
+    class Stream(FrameStream):
+        def __init__(self) -> None:  # blocks of one episode of ten frames
+            self.buffer, self.moves = 60, list[list[int]]()
+            self.blocks = [[type("Span", (), {"length": 10})()] for _ in range(20)]  # type: ignore[list-item]
+
+        def __len__(self) -> int:
+            return 200
+
+        def block_of(self, rows: np.ndarray[object, np.dtype[np.int64]]) -> np.ndarray[object, np.dtype[np.int64]]:
+            return rows // 10
+
+        def hold(self, blocks: list[int], coming: list[int] = []) -> None:  # type: ignore[override]  # noqa: B006
+            self.moves.append([*blocks, *coming])
+
+    def visited(seed: int, steps: range) -> list[list[int]]:
+        stream, starts = Stream(), np.arange(0, 200, 10)
+        buffer = ShuffleBuffer(stream, starts, np.full(20, 8), np.zeros(20, int), np.ones(1), seed)
+        return [sorted(buffer.episodes(step, 4).tolist()) for step in steps]
+
+    epoch = 20 * 8 // 4
+    held = visited(0, range(epoch))
+    assert {episode for episodes in held for episode in episodes} == set(range(20))
+    inside = held[:29]  # later the next epoch's first blocks may be some that are there
+    assert all(len(episodes) == 6 for episodes in inside)
+    changes = [len(set(after) - set(before)) for before, after in pairwise(inside)]
+    assert changes == [0, 1] * 14  # a new block each two steps
+    assert visited(0, range(13, 20)) == held[13:20]  # from any step on the same
+    assert visited(1, range(epoch)) != held
+
+
+def test_a_resumed_run_reads_the_same_windows(foreign_images: Path, tmp_path: Path) -> None:
+    def rows(steps: range) -> list[list[int]]:
+        clips = Clips(open_stream(foreign_images, cache=tmp_path, buffer=4), 2, 0.0, seed=3)
+        return [clips.sample(3, StepGenerators(3, step).numpy("windows"))[:, 0].tolist() for step in steps]
+
+    whole = rows(range(12))
+    assert rows(range(5, 12)) == whole[5:]
+    assert {row for step in whole for row in step} > {0, 5}
+
+
+def test_a_buffer_as_large_as_the_set_draws_as_the_cache_does(foreign_images: Path, tmp_path: Path) -> None:
+    sets = [open_source(foreign_images, cache=tmp_path), open_stream(foreign_images, cache=tmp_path, buffer=10_000)]
+    drawn = [Clips(s, 2, 0.0, seed=0).sample(50, StepGenerators(0, 1).numpy("windows")) for s in sets]
+    assert np.array_equal(*drawn)
+
+
+def test_the_step_of_a_generator_does_not_change_what_it_draws() -> None:
+    from playslot_rl.seeding import derived_seed
+
+    plain = np.random.default_rng(derived_seed(1, 7, "windows"))
+    assert np.array_equal(StepGenerators(1, 7).numpy("windows").random(9), plain.random(9))
+
+
+def test_strides_shifts_and_several_sets_are_streamed_too(foreign_images: Path, tmp_path: Path) -> None:
+    def made(of: object) -> object:
+        source = every(of, 2)  # type: ignore[arg-type]
+        return concatenate([source, shifted(source, (1, 0))])
+
+    cached = made(open_source(foreign_images, cache=tmp_path))
+    streamed = made(open_stream(foreign_images, cache=tmp_path, buffer=4))
+    assert len(streams_of(streamed.frames)) == 2  # type: ignore[attr-defined]
+    clips = Clips(streamed, 2, 0.0, seed=0)  # type: ignore[arg-type]
+    seen = set()
+    for step in range(20):
+        rows = clips.sample(4, StepGenerators(0, step).numpy("windows"))
+        seen |= set(rows[:, 0].tolist())
+        assert np.array_equal(streamed.frames[rows], cached.frames[rows])  # type: ignore[attr-defined]
+    assert min(seen) < sum(-(-n // 2) for n in LENGTHS) <= max(seen)
+
+
+def test_a_config_streams_with_weights(foreign_images: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.symlink_to(foreign_images)
+    data = DataConfig(cache=str(tmp_path), stream=True, shuffle_buffer=40)
+    config = replace(tiny_config(), data=data)
+    config = replace(config, env=replace(config.env, image_size=32))
+    both = open_configured(config, f"{foreign_images}:3,{other}:1")
+    assert len(streams_of(both.frames)) == 2
+    clips = Clips(both, 2, 0.0, seed=0)
+    rows = np.concatenate([clips.sample(20, StepGenerators(0, step).numpy("windows")) for step in range(60)])
+    assert abs((rows[:, 0] < 15).mean() - 0.75) < 0.05
+    assert not (tmp_path / "frames").exists()
+
+
+def test_slots_of_a_stream_are_those_of_the_cache(foreign_images: Path, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    savi = SAVi(replace(tiny_config().model.savi, decoder_channels=(16, 16)), 32)
+    cached = slot_cache(open_source(foreign_images, cache=tmp_path), savi, "f" * 16, tmp_path / "a")
+    streamed = slot_cache(open_stream(foreign_images, cache=tmp_path, buffer=4), savi, "f" * 16, tmp_path / "b")
+    assert np.array_equal(cached, streamed)
+
+
+def test_frames_of_another_size_are_resized_or_refused(foreign_images: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="expected 64x64"):
+        open_stream(foreign_images, cache=tmp_path, buffer=9, image_size=64)
+    resized = open_stream(foreign_images, cache=tmp_path, buffer=9, image_size=64, resize=True)
+    expected = open_source(foreign_images, cache=tmp_path, image_size=64, resize=True)
+    assert np.array_equal(resized.frames[3:8], expected.frames[3:8])
+    assert len(foreign_frames()) == resized.episodes
