@@ -218,6 +218,7 @@ def test_roles_say_what_each_key_counts_for() -> None:
         "play",
         "port",
     }
+    machine |= {"data.cache_limit", "data.workers"}
     named = {"data.root", "data.demos", "data.cache", "behaviour.policy_from"}
     named |= {f"baselines.{method}.world" for method in ("lapo", "caddy_policy", "caddy_oracle")}
     measures = {"data.held_out", "collect.validation_episodes"}
