@@ -27,7 +27,7 @@ from playslot_rl.training.fit import build_adam, clip_gradients, trainable_param
 if TYPE_CHECKING:
     from playslot_rl.world_model import WorldModel
 
-Case = Literal["savi_step", "dynamics_step", "rollout_cache", "play_step"]
+Case = Literal["savi_step", "dynamics_step", "rollout_cache", "play_step", "ddp_2"]
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class Sizes:
         model: all networks.
         image_size: side of the frames, pixels.
         savi_batch, savi_frames: clips and frames of SAVi's training step.
+        shared_batch: clips of that step where processes share it.
         dynamics_batch, seed_frames, predicted_frames: clips and frames of the dynamics step.
         decoded_frames: predicted frames that its extra row decodes.
         rollout_batch, rollout_slots, rollout_steps: of the rollout.
@@ -55,6 +56,7 @@ class Sizes:
     image_size: int = 64
     savi_batch: int = 2
     savi_frames: int = 4
+    shared_batch: int = 4
     dynamics_batch: int = 2
     seed_frames: int = 6
     predicted_frames: int = 8
@@ -85,8 +87,8 @@ def quick_sizes() -> Sizes:
         predictor=PredictorConfig(dim=32, layers=1, heads=2, head_dim=16, mlp_dim=64),
     )
     return Sizes(
-        model=small, image_size=32, savi_batch=1, savi_frames=2, dynamics_batch=1, seed_frames=2, predicted_frames=2,
-        decoded_frames=1, rollout_batch=2, rollout_slots=3, rollout_steps=5, play_slots=3, play_steps=2, episodes=3,
+        model=small, image_size=32, savi_batch=1, savi_frames=2, shared_batch=2, dynamics_batch=1, seed_frames=2,
+        predicted_frames=2, decoded_frames=1, rollout_batch=2, rollout_slots=3, rollout_steps=5, play_slots=3, play_steps=2, episodes=3,
         episode_frames=8, parsed=2, window=4, window_batch=2, loader_batches=1, cache_batches=2, fast_frames=2,
         full_frames=1, repeats=1,
     )  # fmt: skip
@@ -105,6 +107,7 @@ class Variant:
         cached: rollout with cached keys and values.
         decoded_frames: predicted frames decoded for the image loss; 0 decodes all.
         shipped: the world model that ships for ButtonPress, in the place of `Sizes.model`.
+        rank, world, port: which of how many processes it is, and where they meet.
     """
 
     case: Case
@@ -115,6 +118,9 @@ class Variant:
     cached: bool = True
     decoded_frames: int = 0
     shipped: bool = False
+    rank: int = 0
+    world: int = 1
+    port: int = 0
 
 
 def savi_variants() -> dict[str, Variant]:
@@ -154,14 +160,19 @@ def play_variants() -> dict[str, Variant]:
 Step = Callable[[], Tensor]
 """Computes once and returns a scalar, the loss where there is one."""
 
-_OPTIM = OptimConfig(lr=1e-4)
+OPTIM = OptimConfig(lr=1e-4)
 _ACTION_DIM = 4
 
 
 def build_step(variant: Variant, sizes: Sizes) -> Step:
     """Networks and data of a variant, the same for all variants, and the function to time."""
     torch.manual_seed(0)
-    steps = {"savi_step": _savi_step, "dynamics_step": _dynamics_step, "rollout_cache": _rollout, "play_step": _play}
+    from playslot_rl.speed.several import several_step
+
+    steps: dict[Case, Callable[[Variant, Sizes], Step]] = {
+        "savi_step": _savi_step, "dynamics_step": _dynamics_step, "rollout_cache": _rollout, "play_step": _play,
+        "ddp_2": several_step,
+    }  # fmt: skip
     return steps[variant.case](variant, sizes)
 
 
@@ -281,13 +292,13 @@ def _play_model(variant: Variant, sizes: Sizes) -> WorldModel:
 
 def _training_step(modules: dict[str, torch.nn.Module], loss: Step) -> Step:
     parameters = trainable_parameters(modules)
-    optimizer = build_adam(parameters, _OPTIM)
+    optimizer = build_adam(parameters, OPTIM)
 
     def step() -> Tensor:
         optimizer.zero_grad(set_to_none=True)
         value = loss()
         value.backward()
-        clip_gradients(parameters, _OPTIM.grad_clip)
+        clip_gradients(parameters, OPTIM.grad_clip)
         optimizer.step()
         return value.detach()
 

@@ -35,8 +35,8 @@ def serve(pipe: Connection[Any, Any], variant: Variant, sizes: Sizes, threads: i
         while True:
             pipe.recv()
             begin = time.perf_counter()
-            float(step())
-            pipe.send({"seconds": time.perf_counter() - begin})
+            value = float(step())
+            pipe.send({"seconds": time.perf_counter() - begin, "value": value})
     except (EOFError, KeyboardInterrupt):
         return
     except (RuntimeError, ValueError) as error:  # told to the parent, which stops with it; torch raises these
@@ -54,9 +54,13 @@ class Child:
 
     def ask(self) -> None:
         """Have one step computed, wait for its end, and keep its seconds."""
+        self.begin()
+        self.seconds.append(self.answer()["seconds"])
+
+    def begin(self) -> None:
+        """Have one step computed; its seconds are the next `answer`."""
         with suppress(BrokenPipeError):  # `answer` says why
             self.pipe.send("go")
-        self.seconds.append(self.answer()["seconds"])
 
     def answer(self) -> dict[str, Any]:
         """What the child sends next.

@@ -24,6 +24,7 @@ TARGETS: Final = {
     "verify": 20.0,
     "export": 20.0,
     "slot_cache": 20.0,
+    "ddp_2": 1.0,
 }
 """Ratios that the project asks of itself (on two CPU cores); of `play_step`, imagined frames a second, of `verify` and
 `export` episodes a second, of `slot_cache` frames a second.
@@ -56,12 +57,15 @@ def measure(
     from playslot_rl.speed.frames import render_seconds, sampling_rates
     from playslot_rl.speed.race import race
     from playslot_rl.speed.sets import set_rates
+    from playslot_rl.speed.several import several_seconds
 
     tune_allocator()  # of this process, which samples windows, as every recipe does; each child sets its own
     say("SAVi training step, eight variants")
     savi = race(savi_variants(), sizes, threads)
     say("dynamics training step")
     dynamics = race(dynamics_variants(sizes.decoded_frames), sizes, threads)
+    say("SAVi training step, two processes against two threads")
+    several = several_seconds(sizes)
     say("rollout, cached against full")
     rollout = race(rollout_variants(), sizes, threads)
     say("playing in imagination")
@@ -83,6 +87,7 @@ def measure(
         "render_block_push": _entry(blocks, "full", "fast"),
         "play_step": _played(play, sizes.play_steps),
         **{name: {"ratio": sets[name], "unit": unit, "rate": sets[name]} for name, unit in RATES.items()},
+        "ddp_2": _entry(several, "one_process_two_threads", "two_processes"),
         "machine": {**_machine(), "threads": threads, "repeats": sizes.repeats, "quick": quick},
     }
 

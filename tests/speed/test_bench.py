@@ -8,6 +8,8 @@ from __future__ import annotations
 import json
 import math
 import platform
+import socket
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -111,6 +113,25 @@ def test_the_dynamics_loss_is_the_stages(decoded_frames: int, sizes: Sizes) -> N
     torch.testing.assert_close(got, expected)
 
 
+def test_two_processes_share_the_batch_of_one(sizes: Sizes) -> None:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        port = found.getsockname()[1]
+    variants = [Variant("ddp_2"), *(replace(Variant("ddp_2"), rank=rank, world=2, port=port) for rank in range(2))]
+    with ExitStack() as stack:
+        children = [stack.enter_context(start(f"{v.rank} of {v.world}", v, sizes, 1)) for v in variants]
+        losses = []
+        for _ in range(2):
+            for child in children:
+                if not losses:
+                    child.answer()
+                child.begin()
+            losses.append([child.answer()["value"] for child in children])
+    assert losses[0] == pytest.approx([losses[0][0]] * 3, rel=1e-3)  # bf16
+    assert losses[1] == pytest.approx([losses[1][0]] * 3, rel=1e-3)
+    assert losses[0] != losses[1]
+
+
 @pytest.mark.slow
 def test_a_child_that_fails_ends_the_benchmark_with_one_line(sizes: Sizes) -> None:
     broken = replace(sizes, rollout_steps=0)
@@ -153,6 +174,7 @@ def test_the_command_writes_every_key_with_its_ratio_and_medians(
         "rollout_cache": ("full", "cached"),
         "render": ("full", "fast"),
         "render_block_push": ("full", "fast"),
+        "ddp_2": ("one_process_two_threads", "two_processes"),
     }
     for key, (slow, fast) in pairs.items():
         assert figures[key]["ratio"] == pytest.approx(figures[key][slow] / figures[key][fast])

@@ -1,0 +1,104 @@
+"""Two processes of one thread against one process of two threads: a training step of SAVi on equal cores.
+
+Both compute the same global batch, by `playslot_rl.training.batches`, as `fit` does: the two processes half of it each,
+with one flat sum of the gradients between the backward pass and the clipping.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from statistics import median
+
+import torch
+from torch import Tensor, nn
+
+from playslot_rl import processes
+from playslot_rl.config import SlotsStageConfig
+from playslot_rl.modules.savi import SAVi
+from playslot_rl.seeding import StepGenerators
+from playslot_rl.shares import own_rows
+from playslot_rl.speed.cases import OPTIM, Sizes, Step, Variant, build_savi, slots_loss
+from playslot_rl.speed.race import Child, start
+from playslot_rl.training.batches import GlobalBatches
+from playslot_rl.training.fit import build_adam, clip_gradients, trainable_parameters
+
+CORES = 2
+
+
+def several_seconds(sizes: Sizes) -> dict[str, float]:
+    """Median seconds a step of `one_process_two_threads` and of `two_processes`, which take turns.
+
+    Raises:
+        PlaySlotError: a process failed or was killed.
+    """
+    alone = Variant("ddp_2")
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        port = int(found.getsockname()[1])
+    ranks = [replace(alone, rank=rank, world=CORES, port=port) for rank in range(CORES)]
+    teams = {"one_process_two_threads": [(alone, CORES)], "two_processes": [(rank, 1) for rank in ranks]}
+    with ExitStack() as stack:
+        running = {
+            name: [stack.enter_context(start(name, variant, sizes, threads)) for variant, threads in team]
+            for name, team in teams.items()
+        }
+        for child in (child for team in running.values() for child in team):
+            child.answer()
+        seconds: dict[str, list[float]] = {name: [] for name in running}
+        for _ in range(sizes.repeats + 1):
+            for name, team in running.items():
+                seconds[name].append(_together(team))
+    return {name: median(values[1:]) for name, values in seconds.items()}
+
+
+def _together(team: Sequence[Child]) -> float:
+    """Seconds of one step that all processes of a team compute at once: those of the slowest."""
+    for child in team:
+        child.begin()
+    return max(child.answer()["seconds"] for child in team)
+
+
+def several_step(variant: Variant, sizes: Sizes) -> Step:
+    """SAVi's training step in one of `variant.world` processes; its loss is that of the global batch."""
+    if variant.world > 1:
+        ranks = {"RANK": variant.rank, "LOCAL_RANK": variant.rank, "WORLD_SIZE": variant.world}
+        os.environ |= {name: str(value) for name, value in ranks.items()}
+        os.environ |= {"LOCAL_WORLD_SIZE": str(variant.world), "MASTER_ADDR": "127.0.0.1"}
+        os.environ["MASTER_PORT"] = str(variant.port)
+        processes.start("cpu")
+    stage = _SharedSAVi(build_savi(variant, sizes), sizes)
+    parameters = trainable_parameters(stage.modules)
+    config = SlotsStageConfig(batch_size=sizes.shared_batch, optim=OPTIM)
+    batches, optimizer = GlobalBatches(stage, config, parameters, "slots"), build_adam(parameters, OPTIM)
+    batches.meet()
+
+    def step() -> Tensor:
+        optimizer.zero_grad(set_to_none=True)
+        losses = batches.backward(0, 0, "cpu")
+        clip_gradients(parameters, OPTIM.grad_clip)
+        optimizer.step()
+        return losses["loss"].detach()
+
+    return step
+
+
+class _SharedSAVi:
+    """A stage that reconstructs the same clips in every step."""
+
+    def __init__(self, savi: SAVi, sizes: Sizes) -> None:
+        self.savi = savi
+        self.frames = torch.rand(sizes.shared_batch, sizes.savi_frames, 3, sizes.image_size, sizes.image_size)
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        return {"savi": self.savi}
+
+    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        return {"loss": slots_loss(self.savi, own_rows(self.frames), generators.torch("slots"))}
+
+    def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
+        return {}
