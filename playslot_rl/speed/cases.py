@@ -88,9 +88,9 @@ def quick_sizes() -> Sizes:
     )
     return Sizes(
         model=small, image_size=32, savi_batch=1, savi_frames=2, shared_batch=2, dynamics_batch=1, seed_frames=2,
-        predicted_frames=2, decoded_frames=1, rollout_batch=2, rollout_slots=3, rollout_steps=5, play_slots=3, play_steps=2, episodes=3,
-        episode_frames=8, parsed=2, window=4, window_batch=2, loader_batches=1, cache_batches=2, fast_frames=2,
-        full_frames=1, repeats=1,
+        predicted_frames=2, decoded_frames=1, rollout_batch=2, rollout_slots=3, rollout_steps=5, play_slots=3,
+        play_steps=2, episodes=3, episode_frames=8, parsed=2, window=4, window_batch=2, loader_batches=1,
+        cache_batches=2, fast_frames=2, full_frames=1, repeats=1,
     )  # fmt: skip
 
 

@@ -59,7 +59,7 @@ def _together(team: Sequence[Child]) -> float:
     """Seconds of one step that all processes of a team compute at once: those of the slowest."""
     for child in team:
         child.begin()
-    return max(child.answer()["seconds"] for child in team)
+    return max(float(child.answer()["seconds"]) for child in team)
 
 
 def several_step(variant: Variant, sizes: Sizes) -> Step:
