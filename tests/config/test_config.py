@@ -230,11 +230,20 @@ def test_roles_say_what_each_key_counts_for() -> None:
 def test_a_config_without_a_role_keeps_all_other_keys() -> None:
     config = ExperimentConfig()
     left, whole = without(config, "machine"), to_dict(config)
-    assert whole["data"].keys() - left["data"].keys() == {"root", "demos", "cache", "held_out"}
+    assert whole["data"].keys() - left["data"].keys() == {
+        "root",
+        "demos",
+        "cache",
+        "held_out",
+        "workers",
+        "cache_limit",
+    }
     assert {**whole["data"], **left["data"]} == whole["data"]
     assert to_dict(config) == whole
     fixed = fixed_keys(whole)
-    assert fixed["slots"] == {k: v for k, v in whole["slots"].items() if not k.endswith("_every")}
+    kept = {k: v for k, v in whole["slots"].items() if not k.endswith("_every") and k != "compile"}
+    kept["optim"] = {k: v for k, v in kept["optim"].items() if k != "accumulate"}
+    assert fixed["slots"] == kept
     assert "minutes" not in fixed["baselines"]["dreamer"]
 
 
@@ -265,7 +274,7 @@ def test_a_group_checks_its_ranges_under_its_own_name() -> None:
         f"baselines.{method}.policy." for method in ("lapo", "caddy_policy", "caddy_oracle")
     }
     assert {prefix: config.group for prefix, config in checked.items()} == {
-        prefix: "" if prefix in shared else prefix for prefix in checked
+        prefix: "" if prefix in shared else "optim." if prefix.endswith(".optim.") else prefix for prefix in checked
     }
     assert {"", "env.", "env.grid.", "model.savi.", "dynamics.", "baselines.sold."} <= checked.keys()
 

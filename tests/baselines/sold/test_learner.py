@@ -62,7 +62,7 @@ def test_the_image_loss_reaches_the_dynamics_through_the_frozen_decoder(make_lea
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("gradient", ["dynamics", "reinforce"])
+@pytest.mark.parametrize("gradient", ["dynamics", pytest.param("reinforce", marks=pytest.mark.slow)])
 def test_the_actor_gets_a_gradient_by_both_estimators(make_learner: Make, batch: TensorDict, gradient: str) -> None:
     learner = make_learner(actor_gradient=gradient, entropy=0.0)
     assert learner.update(batch, StepGenerators(0, 0))["actor_grad_norm"] > 0
@@ -270,7 +270,7 @@ def test_the_critic_finds_the_value_of_a_constant_reward(make_learner: Make) -> 
     assert value.item() == pytest.approx(2.0, abs=0.15)
 
 
-@pytest.mark.parametrize("gradient", ["dynamics", "reinforce"])
+@pytest.mark.parametrize("gradient", ["dynamics", pytest.param("reinforce", marks=pytest.mark.slow)])
 def test_an_action_that_moves_slots_towards_reward_is_found(make_learner: Make, gradient: str) -> None:
     """A world of one number: the action adds to it and the reward is that number. The policy learns to push it up."""
     learner = make_learner(
