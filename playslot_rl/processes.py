@@ -63,6 +63,12 @@ def launched() -> Processes:
     return Processes(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
 
 
+def launcher_variables(rank: int, world: int, port: int) -> dict[str, str]:
+    """The environment that torchrun gives process `rank` of `world` on one machine, which meet at `port`."""
+    numbers = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": world, "LOCAL_WORLD_SIZE": world, "MASTER_PORT": port}
+    return {"MASTER_ADDR": "127.0.0.1", **{name: str(number) for name, number in numbers.items()}}
+
+
 def start(device: str = "") -> None:
     """Meet the other processes. From then on only the first one prints to standard output.
 

@@ -6,7 +6,7 @@ import contextlib
 import json
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
@@ -14,7 +14,7 @@ from typing import Final
 from filelock import FileLock, Timeout
 
 from playslot_rl.config.sizes import shown
-from playslot_rl.data.cache import CachePlace, cache_folder, settings
+from playslot_rl.data.cache import CachePlace, cache_folder, lock_file, settings
 from playslot_rl.errors import DataError
 from playslot_rl.storage.sharing_locks import alone, last_use, remove_unused
 
@@ -75,8 +75,8 @@ def _entry(folder: Path, kind: str, part: bool) -> Entry:
         data = str(json.loads((folder / ENTRY_NAME).read_text()).get("name", ""))
     except (OSError, ValueError, AttributeError):
         data = ""
-    busy = _being_made(folder) if part else _taken(folder)
-    return Entry(str(folder), kind, data, size, used, busy, part)
+    with _unmade(folder) if part else alone(folder) as free:
+        return Entry(str(folder), kind, data, size, used, not free, part)
 
 
 def _stored(path: Path) -> int:
@@ -85,18 +85,19 @@ def _stored(path: Path) -> int:
     return min(status.st_size, status.st_blocks * 512) if hasattr(status, "st_blocks") else status.st_size
 
 
-def _taken(folder: Path) -> bool:
-    with alone(folder) as free:
-        return not free
-
-
-def _being_made(part: Path) -> bool:
-    lock = FileLock(part.with_name(f"{part.name.removesuffix('.part')}.lock"), timeout=0)
+@contextlib.contextmanager
+def _unmade(part: Path) -> Iterator[bool]:
+    """Whether nobody makes the entry; inside the block nobody begins to."""
+    lock = FileLock(lock_file(part.with_name(part.name.removeprefix(".").removesuffix(".part"))), timeout=0)
     try:
-        with lock:
-            return False
+        lock.acquire()
     except Timeout:
-        return True
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        lock.release()
 
 
 def remove(entry: Entry) -> bool:
@@ -108,13 +109,10 @@ def remove(entry: Entry) -> bool:
     folder = Path(entry.path)
     if not entry.part:
         return remove_unused(folder)
-    lock = FileLock(folder.with_name(f"{folder.name.removesuffix('.part')}.lock"), timeout=0)
-    try:
-        with lock:
+    with _unmade(folder) as free:
+        if free:
             shutil.rmtree(folder, ignore_errors=True)
-            return not folder.exists()
-    except Timeout:
-        return False
+        return free and not folder.exists()
 
 
 def make_room(cache: CachePlace, needed: int, key: str) -> None:

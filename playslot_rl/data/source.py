@@ -54,6 +54,28 @@ class FrameRows(Protocol):
         """Frames of an integer, a slice or an integer array of any shape."""
 
 
+def row_numbers(rows: Any, count: int) -> tuple[npt.NDArray[np.int64], tuple[int, ...]]:
+    """The rows that an index means.
+
+    Args:
+        rows: an integer, a slice or an integer array of any shape; negative numbers count from the end.
+        count: of all rows.
+
+    Returns:
+        Numbers from 0 on, int64 (n,), and the shape of the index.
+
+    Raises:
+        IndexError: there is no such row.
+    """
+    if isinstance(rows, slice):
+        rows = np.arange(*rows.indices(count))
+    index = np.asarray(rows, np.int64)
+    flat = np.where(index < 0, index + count, index).reshape(-1)
+    if flat.size and (flat.min() < 0 or flat.max() >= count):
+        raise IndexError(f"row {int(flat.max())}: expected 0 to {count - 1}")
+    return flat, index.shape
+
+
 class ConcatFrames:
     """Several memory-mapped arrays as one along the first axis, gathered by row numbers; nothing is copied before."""
 
@@ -68,19 +90,14 @@ class ConcatFrames:
 
     def __getitem__(self, rows: Any) -> Frames:
         """Rows by an integer, a slice or an integer array of any shape."""
-        if isinstance(rows, slice):
-            rows = np.arange(*rows.indices(len(self)))
-        index = np.asarray(rows, np.int64)
-        flat = np.where(index < 0, index + len(self), index).reshape(-1)
-        if flat.size and (flat.min() < 0 or flat.max() >= len(self)):
-            raise IndexError(f"row {int(flat.max())}: expected 0 to {len(self) - 1}")
+        flat, shape = row_numbers(rows, len(self))
         part = np.searchsorted(self._ends, flat, side="right")
         out = np.empty((len(flat), *self.shape[1:]), self.dtype)
         for number in np.unique(part):
             here = part == number
             offset = self._ends[number] - len(self.parts[number])
             out[here] = self.parts[number][flat[here] - offset]
-        return out.reshape(*index.shape, *self.shape[1:])
+        return out.reshape(*shape, *self.shape[1:])
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ from playslot_rl.data.source import (
     Frames,
     files_fingerprint,
     labels_of,
+    row_numbers,
     wrong_size,
 )
 from playslot_rl.data.stride import ChosenFrames
@@ -93,12 +94,7 @@ class FrameStream:
 
     def __getitem__(self, rows: Any) -> Frames:
         """Rows by an integer, a slice or an integer array of any shape."""
-        if isinstance(rows, slice):
-            rows = np.arange(*rows.indices(len(self)))
-        index = np.asarray(rows, np.int64)
-        flat = np.where(index < 0, index + len(self), index).reshape(-1)
-        if flat.size and (flat.min() < 0 or flat.max() >= len(self)):
-            raise IndexError(f"row {int(flat.max())}: expected 0 to {len(self) - 1}")
+        flat, shape = row_numbers(rows, len(self))
         out = np.empty((len(flat), *self.shape[1:]), np.uint8)
         with self._lock:
             block = self.block_of(flat)
@@ -107,7 +103,7 @@ class FrameStream:
                 here = block == number
                 out[here] = self._block(int(number))[flat[here] - self._first[number]]
             self._gather_loose(flat, np.flatnonzero(~held), out)
-        return out.reshape(*index.shape, *self.shape[1:])
+        return out.reshape(*shape, *self.shape[1:])
 
     def _block(self, number: int) -> Frames:
         frames = self._held[number]

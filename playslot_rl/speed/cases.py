@@ -9,7 +9,7 @@ Shapes: frames (B, T, 3, H, W) in [0, 1]; slots (B, T, N, D).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -290,16 +290,25 @@ def _play_model(variant: Variant, sizes: Sizes) -> WorldModel:
     return model.eval()
 
 
-def _training_step(modules: dict[str, torch.nn.Module], loss: Step) -> Step:
+def training_step(modules: Mapping[str, torch.nn.Module], backward: Step) -> Step:
+    """Clipping and Adam around a backward pass, which says its loss."""
     parameters = trainable_parameters(modules)
     optimizer = build_adam(parameters, OPTIM)
 
     def step() -> Tensor:
         optimizer.zero_grad(set_to_none=True)
-        value = loss()
-        value.backward()
+        value = backward()
         clip_gradients(parameters, OPTIM.grad_clip)
         optimizer.step()
         return value.detach()
 
     return step
+
+
+def _training_step(modules: Mapping[str, torch.nn.Module], loss: Step) -> Step:
+    def backward() -> Tensor:
+        value = loss()
+        value.backward()
+        return value
+
+    return training_step(modules, backward)

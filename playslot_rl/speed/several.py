@@ -21,12 +21,22 @@ from playslot_rl.config import SlotsStageConfig
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.seeding import StepGenerators
 from playslot_rl.shares import own_rows
-from playslot_rl.speed.cases import OPTIM, Sizes, Step, Variant, build_savi, slots_loss
+from playslot_rl.speed.cases import OPTIM, Sizes, Step, Variant, build_savi, slots_loss, training_step
 from playslot_rl.speed.race import Child, start
 from playslot_rl.training.batches import GlobalBatches
-from playslot_rl.training.fit import build_adam, clip_gradients, trainable_parameters
+from playslot_rl.training.fit import trainable_parameters
 
 CORES = 2
+
+
+def teams() -> dict[str, list[tuple[Variant, int]]]:
+    """The processes of each side, with their threads."""
+    alone = Variant("ddp_2")
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        port = int(found.getsockname()[1])
+    ranks = [replace(alone, rank=rank, world=CORES, port=port) for rank in range(CORES)]
+    return {"one_process_two_threads": [(alone, CORES)], "two_processes": [(rank, 1) for rank in ranks]}
 
 
 def several_seconds(sizes: Sizes) -> dict[str, float]:
@@ -35,16 +45,10 @@ def several_seconds(sizes: Sizes) -> dict[str, float]:
     Raises:
         PlaySlotError: a process failed or was killed.
     """
-    alone = Variant("ddp_2")
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        port = int(found.getsockname()[1])
-    ranks = [replace(alone, rank=rank, world=CORES, port=port) for rank in range(CORES)]
-    teams = {"one_process_two_threads": [(alone, CORES)], "two_processes": [(rank, 1) for rank in ranks]}
     with ExitStack() as stack:
         running = {
             name: [stack.enter_context(start(name, variant, sizes, threads)) for variant, threads in team]
-            for name, team in teams.items()
+            for name, team in teams().items()
         }
         for child in (child for team in running.values() for child in team):
             child.answer()
@@ -65,25 +69,13 @@ def _together(team: Sequence[Child]) -> float:
 def several_step(variant: Variant, sizes: Sizes) -> Step:
     """SAVi's training step in one of `variant.world` processes; its loss is that of the global batch."""
     if variant.world > 1:
-        ranks = {"RANK": variant.rank, "LOCAL_RANK": variant.rank, "WORLD_SIZE": variant.world}
-        os.environ |= {name: str(value) for name, value in ranks.items()}
-        os.environ |= {"LOCAL_WORLD_SIZE": str(variant.world), "MASTER_ADDR": "127.0.0.1"}
-        os.environ["MASTER_PORT"] = str(variant.port)
+        os.environ |= processes.launcher_variables(variant.rank, variant.world, variant.port)
         processes.start("cpu")
     stage = _SharedSAVi(build_savi(variant, sizes), sizes)
-    parameters = trainable_parameters(stage.modules)
     config = SlotsStageConfig(batch_size=sizes.shared_batch, optim=OPTIM)
-    batches, optimizer = GlobalBatches(stage, config, parameters, "slots"), build_adam(parameters, OPTIM)
+    batches = GlobalBatches(stage, config, trainable_parameters(stage.modules), "slots")
     batches.meet()
-
-    def step() -> Tensor:
-        optimizer.zero_grad(set_to_none=True)
-        losses = batches.backward(0, 0, "cpu")
-        clip_gradients(parameters, OPTIM.grad_clip)
-        optimizer.step()
-        return losses["loss"].detach()
-
-    return step
+    return training_step(stage.modules, lambda: batches.backward(0, 0, "cpu")["loss"])
 
 
 class _SharedSAVi:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import math
 import platform
-import socket
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -40,6 +39,7 @@ from playslot_rl.speed.cases import (
 )
 from playslot_rl.speed.race import start
 from playslot_rl.speed.report import RATES, TARGETS, table
+from playslot_rl.speed.several import teams
 
 ALL = savi_variants() | dynamics_variants(1) | rollout_variants()
 
@@ -114,10 +114,7 @@ def test_the_dynamics_loss_is_the_stages(decoded_frames: int, sizes: Sizes) -> N
 
 
 def test_two_processes_share_the_batch_of_one(sizes: Sizes) -> None:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        port = found.getsockname()[1]
-    variants = [Variant("ddp_2"), *(replace(Variant("ddp_2"), rank=rank, world=2, port=port) for rank in range(2))]
+    variants = [variant for team in teams().values() for variant, _ in team]
     with ExitStack() as stack:
         children = [stack.enter_context(start(f"{v.rank} of {v.world}", v, sizes, 1)) for v in variants]
         losses = []

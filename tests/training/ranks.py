@@ -42,14 +42,7 @@ def _rank(rank: int, world: int, port: int, work: Callable[..., None], arguments
     from playslot_rl import processes
 
     torch.set_num_threads(1)
-    os.environ |= {
-        "RANK": str(rank),
-        "LOCAL_RANK": str(rank),
-        "WORLD_SIZE": str(world),
-        "LOCAL_WORLD_SIZE": str(world),
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(port),
-    }
+    os.environ |= processes.launcher_variables(rank, world, port)
     try:
         processes.start("cpu")
         work(*arguments)
