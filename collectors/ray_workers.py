@@ -7,20 +7,14 @@ backend; no shared disk: episodes come back encoded, and this process stores the
 from __future__ import annotations
 
 import contextlib
-import importlib.util
-import os
-import socket
-import warnings
+from functools import partial
 from typing import Any
 
 from playslot_rl.collectors.episodes import EpisodeCollector, TaskMaker, collector_settings, make_policy
 from playslot_rl.collectors.journal import Journal, encode
 from playslot_rl.collectors.recording import Report
-from playslot_rl.errors import ConfigError, PlaySlotError
-
-CONNECT_S = 10.0
-STARTS = 3
-"""Attempts to start Ray on this machine: it gives its own processes 30 seconds, too few where all cores are busy."""
+from playslot_rl.errors import PlaySlotError
+from playslot_rl.ray_cluster import RayCluster, worker_cannot_start
 
 
 class RemoteEpisodeCollector(EpisodeCollector):
@@ -48,15 +42,10 @@ class RayWorkers:
     """
 
     def __init__(self, journal: Journal, count: int, address: str = "") -> None:
-        if importlib.util.find_spec("ray") is None:
-            raise ConfigError(
-                "collector.backend=ray: got no ray package, expected ray 2.60; pip install 'playslot_rl[ray]', "
-                "or use collector.backend=local"
-            )
         self.journal = journal
         self._tasks: dict[Any, int] = {}
         self._actors: list[Any] = [None] * count
-        self._pool = _connect(journal, count, address)
+        self._pool = RayCluster.find(address, count).connect(partial(_collector, journal))
 
     def start(self, slot: int) -> None:
         """See `playslot_rl.collectors.recording.Workers`."""
@@ -86,16 +75,8 @@ class RayWorkers:
         try:
             index, content = ray.get(task)
         except ray.exceptions.ActorDiedError as error:
-            text = str(error)
-            if "ModuleNotFoundError" in text or "creation task" in text:
-                last = next((line for line in reversed(text.splitlines()) if line.strip()), "no reason given")
-                return Report(
-                    slot,
-                    error=PlaySlotError(
-                        f"collector.backend=ray: a worker could not start, got {last.strip()}, expected playslot_rl of "
-                        "this version and a GL backend on every machine of the cluster; install them there"
-                    ),
-                )
+            if (cause := worker_cannot_start(error)) is not None:
+                return Report(slot, error=cause)
             self.kill(slot)
             return Report(slot, dead="on Ray died")
         except ray.exceptions.RayTaskError as error:
@@ -126,49 +107,17 @@ class RayWorkers:
         self._pool.shutdown()
 
 
-def _connect(journal: Journal, count: int, address: str) -> Any:
+def _collector(journal: Journal, init: dict[str, Any]) -> Any:
     """TorchRL's Ray collector, without actors yet."""
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray announces a change of its own
-    where = address or os.environ.get("RAY_ADDRESS", "")
-    alone = not where
-    host, colon, port = where.removeprefix("ray://").rpartition(":")
-    if colon and port.isdigit():  # "auto" and the like are Ray's to judge
-        try:  # whether anybody listens: Ray itself would try for minutes
-            socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
-        except (OSError, OverflowError) as error:
-            raise PlaySlotError(_no_cluster(where, error)) from error
     from torchrl.collectors.distributed import RayCollector
 
-    init: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "logging_level": "error"}
-    init |= {"address": "local", "num_cpus": count} if alone else {"address": where}
-    for attempt in range(STARTS if alone else 1):
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of weight updates: these policies have no weights
-                return RayCollector(
-                    [],
-                    make_policy(journal.spec),
-                    collector_class=RemoteEpisodeCollector,
-                    frames_per_batch=journal.spec.steps,
-                    collector_kwargs=[],
-                    remote_configs=[],
-                    ray_init_config=init,
-                    weight_sync_schemes={},
-                )
-        except Exception as error:  # a node that does not start in time is a plain Exception
-            import ray
-
-            ray.shutdown()
-            if not alone or attempt == STARTS - 1:
-                raise PlaySlotError(_no_cluster(where, error)) from error
-    raise AssertionError("unreachable")
-
-
-def _no_cluster(where: str, error: Exception) -> str:
-    text = " ".join(str(error).split())
-    if not where:
-        return f"collector.backend=ray: got {text}, expected Ray to start on this machine; use collector.backend=local"
-    return (
-        f"collector.backend=ray: got {text}, expected a cluster at {where!r}; "
-        "check collector.ray_address, or leave it out to use this machine alone"
+    return RayCollector(
+        [],
+        make_policy(journal.spec),
+        collector_class=RemoteEpisodeCollector,
+        frames_per_batch=journal.spec.steps,
+        collector_kwargs=[],
+        remote_configs=[],
+        ray_init_config=init,
+        weight_sync_schemes={},
     )

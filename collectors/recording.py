@@ -7,11 +7,8 @@ nothing waits for the parent, and a process that stops in the middle of an episo
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import multiprocessing
-import os
 import signal
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -23,6 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from playslot_rl.children import begin_worker
 from playslot_rl.collectors.episodes import EpisodeCollector, record
 from playslot_rl.collectors.journal import Journal, RecordedEpisode
 from playslot_rl.collectors.spec import CollectionSpec
@@ -32,7 +30,6 @@ from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.envs.rendering import check_rendering
 from playslot_rl.errors import PlaySlotError
 
-PR_SET_PDEATHSIG = 1
 AHEAD = 2
 """Episodes in a worker's hands: while it records one, the next is there already."""
 POLL_S = 1.0
@@ -75,12 +72,8 @@ class Workers(Protocol):
 
 def serve(pipe: Connection[Any, Any], journal: Journal) -> None:
     """Body of a worker process: record and store what comes through the pipe, until it closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's
+    begin_worker()
     torch.set_num_threads(1)
-    if sys.platform.startswith("linux"):
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() == 1:  # the parent died before the line above
-            os._exit(1)
     try:
         collector = EpisodeCollector.make(journal.spec)
         pipe.send(None)  # ready

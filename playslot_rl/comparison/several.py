@@ -7,19 +7,19 @@ started by torchrun. Any launcher may run such jobs side by side: each torchrun 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import re
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from typing import IO, Final
 
+from playslot_rl.children import end_with_parent
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.spelling import spelled
 from playslot_rl.errors import PlaySlotError
 
-PR_SET_PDEATHSIG: Final = 1
 PATIENCE_S: Final = 30.0
 """What torchrun is given to end its processes when the job is interrupted."""
 ERROR: Final = re.compile(r"playslot [a-z-]+(?: \(rank \d+\))?: error: (.*)")
@@ -49,7 +49,9 @@ def train_on_several(command: str, config: ExperimentConfig, processes: int) -> 
         KeyboardInterrupt: Ctrl-C; torchrun has ended its processes.
     """
     started = training_command(command, config, processes)
-    with _ended(subprocess.Popen(started, stderr=subprocess.PIPE, text=True, preexec_fn=_end_with_parent)) as process:
+    # A job that is killed takes torchrun, and that its processes, with it.
+    tied = partial(end_with_parent, signal.SIGTERM)
+    with _ended(subprocess.Popen(started, stderr=subprocess.PIPE, text=True, preexec_fn=tied)) as process:
         said = _relay(process.stderr)
         code = process.wait()
     if code != 0:
@@ -80,9 +82,3 @@ def _ended(process: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-
-
-def _end_with_parent() -> None:
-    """In the child: a job that is killed takes torchrun, and that its processes, with it."""
-    if sys.platform.startswith("linux"):
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)

@@ -149,6 +149,8 @@ class OnlineConfig(Checked):
             so that how far it got depends on the machine.
         prefill: agent steps of uniformly random actions before the first update.
         envs: episodes played side by side, a round: the policy changes between rounds only.
+        workers: processes that play the rounds while this one learns, each `envs / workers` episodes, with weights that
+            are one round old; 0 plays them in this process, between its updates, with the newest ones.
         update_ratio: updates for each agent step.
         batch_size: sequences in an update (B).
         sequence: frames in a sequence (T); 0 means whole episodes. Sequences longer than an episode run across
@@ -167,6 +169,7 @@ class OnlineConfig(Checked):
     minutes: float = field(default=0.0, metadata=role("free") | at_least(0))
     prefill: int = field(default=1000, metadata=at_least(1))
     envs: int = field(default=1, metadata=at_least(1))
+    workers: int = field(default=0, metadata=at_least(0))
     update_ratio: float = field(default=0.5, metadata=ABOVE_ZERO)
     batch_size: int = field(default=16, metadata=at_least(1))
     sequence: int = field(default=64, metadata=SEQUENCE)
@@ -181,6 +184,8 @@ class OnlineConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         check(self.prefill <= self.steps, "prefill", self.prefill, f"at most steps ({self.steps})")
+        divided = self.workers == 0 or self.envs % self.workers == 0
+        check(divided, "workers", self.workers, f"0 or a divisor of envs ({self.envs})")
 
 
 @dataclass(frozen=True)

@@ -128,9 +128,9 @@ def test_too_many_dead_workers_end_the_collection(tmp_path: Path, monkeypatch: p
 
 
 def test_missing_ray_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from playslot_rl.collectors import ray_workers
+    from playslot_rl import ray_cluster
 
-    monkeypatch.setattr(ray_workers.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(ray_cluster.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"playslot_rl\[ray\]"):
         list(record_into(Journal(tmp_path / "j", spec_of(2)), range(2), 2, CollectorConfig(backend="ray")))
 

@@ -108,3 +108,14 @@ def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(run: Path, tmp_p
     train(out)
     assert weights(out) == weights(run)
     assert not list(out.rglob("*.tmp-*"))
+
+
+@pytest.mark.slow
+def test_a_killed_run_with_workers_ends_with_the_weights_of_one_that_was_not(tmp_path: Path) -> None:
+    workers = ("baselines.dreamer.envs=2", "baselines.dreamer.workers=2")
+    train(tmp_path / "whole", *workers)
+    killed_at_first_checkpoint(
+        tmp_path / "killed" / "dreamer", "train-baseline", *SMOKE, *workers, f"out={tmp_path / 'killed'}"
+    )
+    train(tmp_path / "killed", *workers)
+    assert weights(tmp_path / "killed") == weights(tmp_path / "whole")

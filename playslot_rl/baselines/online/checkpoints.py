@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 
 from playslot_rl.baselines.online.replay import Replay
 from playslot_rl.errors import CheckpointError
@@ -38,6 +38,8 @@ class OnlineState:
         metrics: the last point of the learning curve.
         curve: all points.
         random: the random policy's point.
+        ahead: of a round that workers have played ahead (`playslot_rl.baselines.online.players`): `returns` and
+            `successes`. Its frames lie in the checkpoint.
     """
 
     step: int = 0
@@ -49,6 +51,12 @@ class OnlineState:
     metrics: dict[str, float] = field(default_factory=dict)
     curve: list[dict[str, Any]] = field(default_factory=list)
     random: dict[str, Any] = field(default_factory=dict)
+    ahead: dict[str, Any] = field(default_factory=dict)
+
+
+def whole_episodes(tensors: Mapping[str, Tensor]) -> TensorDict:
+    """Tensors (n, L, ...) of one round as a TensorDict of batch size [n, L]."""
+    return TensorDict(dict(tensors), next(iter(tensors.values())).shape[:2])
 
 
 class ReplayJournal:
@@ -104,8 +112,7 @@ class ReplayJournal:
                 f"{self.folder}: got episodes up to {found}, expected {total}: "
                 f"delete {self.folder.parent} to start anew"
             )
-        lead = next(iter(whole.values())).shape[:2]
-        return TensorDict(whole, lead)
+        return whole_episodes(whole)
 
 
 class OnlineCheckpoints(TrainingCheckpoints):
@@ -128,6 +135,7 @@ class OnlineCheckpoints(TrainingCheckpoints):
         optimizers: Mapping[str, torch.optim.Optimizer],
         new: TensorDictBase | None,
         capacity: int,
+        ahead: TensorDictBase | None = None,
     ) -> Path:
         """Write a checkpoint, and the episodes that came since the last one.
 
@@ -136,6 +144,7 @@ class OnlineCheckpoints(TrainingCheckpoints):
             modules, optimizers: of the learner.
             new: episodes since the last checkpoint, batch size [n, L], the last of them number `state.episodes` - 1.
             capacity: episodes that the replay holds.
+            ahead: the episodes of `state.ahead`, batch size [m, L].
 
         Raises:
             OutputError: full disk; the earlier checkpoints stay.
@@ -148,11 +157,23 @@ class OnlineCheckpoints(TrainingCheckpoints):
             for key, value in optimizer_tensors(optimizer).items()
         }
         tensors = {"modules": module_tensors(modules), "optimizers": stored}
+        if ahead is not None:
+            tensors["ahead"] = {str(key): value for key, value in ahead.items()}
         final = self._write(state.step, tensors, asdict(state))
         # Both checkpoints that are kept must find their episodes.
         self._counted = [*self._counted, state.episodes][-KEPT:]
         self.journal.forget(self._counted[0] - capacity)
         return final
+
+    def ahead(self) -> TensorDict:
+        """The frames of `OnlineState.ahead`, of the newest checkpoint, batch size [m, L].
+
+        Raises:
+            CheckpointError: the file is missing or damaged.
+        """
+        last = self.last()
+        assert last is not None
+        return whole_episodes(load_tensors(last / "ahead.safetensors"))
 
     def resume_online(
         self, modules: Mapping[str, nn.Module], optimizers: Mapping[str, torch.optim.Optimizer], replay: Replay
@@ -173,7 +194,7 @@ class OnlineCheckpoints(TrainingCheckpoints):
         for name, optimizer in optimizers.items():
             own = {key.removeprefix(f"{name}/"): value for key, value in tensors.items() if key.startswith(f"{name}/")}
             restore_optimizer(optimizer, own, str(last))
-        state = OnlineState(**{item.name: stored[item.name] for item in fields(OnlineState)})
+        state = OnlineState(**{item.name: stored[item.name] for item in fields(OnlineState) if item.name in stored})
         self.journal.rewind(state.episodes)
         replay.restore(self.journal.read(state.episodes), state.episodes)
         self._counted = [state.episodes]

@@ -7,10 +7,12 @@ for bit on a CPU (with a budget of minutes: as far as the time reaches).
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,9 +20,10 @@ import torch
 from tensordict import TensorDictBase
 
 from playslot_rl.acting.episodes import LOCKSTEP, TaskPool
-from playslot_rl.baselines.online.acting import play
+from playslot_rl.baselines.online.acting import PlayedEpisodes, play
 from playslot_rl.baselines.online.checkpoints import OnlineCheckpoints, OnlineState
 from playslot_rl.baselines.online.learner import Learner
+from playslot_rl.baselines.online.players import Players, Round, play_round
 from playslot_rl.baselines.online.replay import Replay
 from playslot_rl.config import to_dict
 from playslot_rl.config.baselines import OnlineConfig
@@ -73,7 +76,7 @@ def train_online(
     run.watch.history.rewind(start)
     if not run.finished:
         progress = StageProgress(record.name, start, online.steps, logging.progress, online.evaluate_every)
-        with run.watch.running(logging, start), progress, run.pool:
+        with run.watch.running(logging, start), progress, run.pool, run.playing():
             while not run.finished:
                 run.advance(progress)
     run.write_curve()
@@ -106,8 +109,25 @@ class _Run:
         self.ratio: DreamerV3UpdateRatio = DreamerV3UpdateRatio(online.update_ratio)
         self.ratio.load_state_dict({"ratio": online.update_ratio, "previous": self.state.ratio_from})
         self.pool = TaskPool(config.env, config.render)
+        self.players: Players | None = None
+        self.ahead: PlayedEpisodes | None = None
+        if self.state.ahead:
+            self.ahead = PlayedEpisodes(self.checkpoints.ahead(), **self.state.ahead)
         self.new: list[TensorDictBase] = []
         self._began = time.monotonic() - self.state.seconds
+
+    @contextlib.contextmanager
+    def playing(self) -> Iterator[None]:
+        """Inside the block workers play the episodes, if there are to be any."""
+        count, config = self.online.workers, self.config
+        if count:
+            make_pool = partial(TaskPool, config.env, config.render)
+            self.players = Players(self.learner, make_pool, count, config.collector)
+        try:
+            yield
+        finally:
+            if self.players is not None:
+                self.players.close()
 
     @property
     def finished(self) -> bool:
@@ -143,18 +163,30 @@ class _Run:
 
     def _play(self) -> None:
         state, n = self.state, self.online.envs
-        seeds = [episode_seed("training", self.config.seed, state.episodes + i) for i in range(n)]
-        generator = step_generator(self.config.seed, state.rounds, "act", self.device)
-        self._mode(False)
-        with global_seed(self.config.seed, state.rounds, "act"):
-            random = state.step < self.online.prefill
-            played = play(self.pool, seeds, self.learner, self.device, generator, explore=True, random=random)
+        played = self._next()
         self.replay.add(played.frames)
         self.new.append(played.frames)
         step = state.step + n * self.config.env.max_steps
         self.state = replace(state, step=step, rounds=state.rounds + 1, episodes=state.episodes + n)
         values = {"return": sum(played.returns) / n, "success": sum(played.successes) / n}
         self._log("acting", values)
+        if self.players is not None and step < self.online.steps:
+            self.players.begin(self._round())  # with the weights from before the updates that come now
+
+    def _round(self) -> Round:
+        """The episodes that are to be played next."""
+        state, seed = self.state, self.config.seed
+        seeds = tuple(episode_seed("training", seed, state.episodes + i) for i in range(self.online.envs))
+        return Round(seed, state.rounds, seeds, random=state.step < self.online.prefill)
+
+    def _next(self) -> PlayedEpisodes:
+        """Those of `_round`, played."""
+        if self.players is None:
+            return play_round(self.pool, self.learner, self.device, self._round())
+        if self.ahead is None and not self.players.playing:
+            self.players.begin(self._round())
+        played, self.ahead = self.ahead or self.players.finish(), None
+        return played
 
     def _learn(self) -> None:
         self._mode(True)
@@ -228,8 +260,14 @@ class _Run:
     def _save(self) -> None:
         self.watch.require_finite(self.learner.modules, self._when())
         new = torch.cat(self.new) if self.new else None
+        if self.players is not None and self.players.playing:
+            self.ahead = self.players.finish()  # played with weights that no checkpoint holds
+        ahead = self.ahead
+        told = {} if ahead is None else {"returns": ahead.returns, "successes": ahead.successes}
+        self.state = replace(self.state, ahead=told)
         modules, optimizers = self.learner.modules, self.learner.optimizers
-        self.checkpoints.save_online(self.state, modules, optimizers, new, self.replay.capacity)
+        frames = None if ahead is None else ahead.frames
+        self.checkpoints.save_online(self.state, modules, optimizers, new, self.replay.capacity, frames)
         self.new = []
 
     def _when(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -17,6 +18,7 @@ from playslot_rl.baselines.online.checkpoints import OnlineState
 from playslot_rl.baselines.online.loop import train_online
 from playslot_rl.config import EnvConfig, ExperimentConfig, LoggingConfig, RenderConfig
 from playslot_rl.config.baselines import OnlineConfig
+from playslot_rl.errors import PlaySlotError
 from playslot_rl.seeding import StepGenerators, global_seed
 from playslot_rl.training.record import StageRecord
 
@@ -65,6 +67,21 @@ class ToyPool:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         pass
+
+
+class HangingPool(ToyPool):
+    """Its episodes never begin."""
+
+    def take(self, count: int) -> list[ToyTask]:
+        signal.pause()
+        return []
+
+
+class BrokenPool(ToyPool):
+    """Has no GL backend, say."""
+
+    def take(self, count: int) -> list[ToyTask]:
+        raise PlaySlotError("render: got none, expected one")
 
 
 class ToyLearner:
