@@ -7,7 +7,6 @@ with one flat sum of the gradients between the backward pass and the clipping.
 from __future__ import annotations
 
 import os
-import socket
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -19,6 +18,7 @@ from torch import Tensor, nn
 from playslot_rl import processes
 from playslot_rl.config import SlotsStageConfig
 from playslot_rl.modules.savi import SAVi
+from playslot_rl.processes import free_port
 from playslot_rl.seeding import StepGenerators
 from playslot_rl.shares import own_rows
 from playslot_rl.speed.cases import OPTIM, Sizes, Step, Variant, build_savi, slots_loss, training_step
@@ -32,9 +32,7 @@ CORES = 2
 def teams() -> dict[str, list[tuple[Variant, int]]]:
     """The processes of each side, with their threads."""
     alone = Variant("ddp_2")
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        port = int(found.getsockname()[1])
+    port = free_port()
     ranks = [replace(alone, rank=rank, world=CORES, port=port) for rank in range(CORES)]
     return {"one_process_two_threads": [(alone, CORES)], "two_processes": [(rank, 1) for rank in ranks]}
 

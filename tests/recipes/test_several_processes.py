@@ -1,5 +1,5 @@
 """Commands under a launcher: one result, one error, one Ctrl-C. The launcher is torchrun's own agent, which forks its
-ranks here from a process that has the imports already; one slow test starts `torchrun` itself.
+ranks here from a process that has the imports already; slow tests start `torchrun` and `accelerate launch` themselves.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from commands import ONE_CORE, smoke
 
 from playslot_rl import cli
 from playslot_rl.errors import TrainingError
+from playslot_rl.processes import free_port
 from playslot_rl.seeding import StepGenerators
 from playslot_rl.storage.tensors import load_tensors
 from playslot_rl.training.stage_slots import SlotsStage
@@ -207,10 +208,33 @@ def test_what_was_stopped_carries_on(
     assert rows[-1] == 60
 
 
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run"]
+ACCELERATE = [
+    sys.executable,
+    "-m",
+    "accelerate.commands.launch",
+    "--cpu",
+    "--mixed_precision=no",
+    "--dynamo_backend=no",
+]
+
+
 @pytest.mark.slow
-def test_torchrun_itself(tmp_path: Path, videos: Path) -> None:
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    command = [*torchrun, "-m", "playslot_rl", *slots(tmp_path / "two", videos), *ONE_CORE]
-    subprocess.run(command, check=True, timeout=300, env=os.environ | {"OMP_NUM_THREADS": "1"})
+@pytest.mark.parametrize(
+    "launchers",
+    [
+        [[*TORCHRUN, "--standalone", "--nproc-per-node=2"]],
+        [[*ACCELERATE, "--dynamo_backend=no", "--num_machines=1", "--num_processes=2", "--main_process_port=0"]],
+        [[*TORCHRUN, "--nnodes=2", "--nproc-per-node=1", "--rdzv-backend=c10d", "--rdzv-endpoint=PLACE"]] * 2,
+    ],
+    ids=["torchrun", "accelerate launch", "torchrun on two machines"],
+)
+def test_the_launchers_themselves(tmp_path: Path, videos: Path, launchers: list[list[str]]) -> None:
+    place, started = f"127.0.0.1:{free_port()}", []
+    for launcher in launchers:
+        command = [part.replace("PLACE", place) for part in launcher]
+        command += ["-m", "playslot_rl", *slots(tmp_path / "two", videos), *ONE_CORE]
+        started.append(subprocess.Popen(command, env=os.environ | {"OMP_NUM_THREADS": "1"}))
+    assert [process.wait(300) for process in started] == [0] * len(started)
     smoke(*slots(tmp_path / "one", videos))
     assert_equal(tmp_path / "two", tmp_path / "one")

@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import socket
 import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from playslot_rl import processes
+
 TIMEOUT_S = 300
-
-
-def free_port() -> int:
-    """A port that nobody listens on."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
 
 
 def run_ranks(world: int, work: Callable[..., None], *arguments: Any) -> list[int]:
     """`work(*arguments)` on so many ranks with a gloo group; the exit codes, by rank."""
-    context, port = multiprocessing.get_context("fork"), free_port()
+    context, port = multiprocessing.get_context("fork"), processes.free_port()
     ranks = [context.Process(target=_rank, args=(rank, world, port, work, arguments)) for rank in range(world)]
     for process in ranks:
         process.start()
@@ -38,8 +32,6 @@ def run_ranks(world: int, work: Callable[..., None], *arguments: Any) -> list[in
 
 def _rank(rank: int, world: int, port: int, work: Callable[..., None], arguments: tuple[Any, ...]) -> None:
     import torch
-
-    from playslot_rl import processes
 
     torch.set_num_threads(1)
     os.environ |= processes.launcher_variables(rank, world, port)
