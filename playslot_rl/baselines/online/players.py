@@ -230,7 +230,12 @@ class Players:
             except BrokenProcessPool:
                 self._replace(i, "died")
             except Exception as error:
-                if self._ray is None or not _lost(error):
+                if self._ray is None:
+                    raise
+                if not _lost(error):
+                    told = getattr(error, "cause", None)  # Ray wraps it in its own, of many lines
+                    if isinstance(told, PlaySlotError):
+                        raise told from error
                     raise
                 if (cause := worker_cannot_start(error)) is not None:
                     raise cause from error

@@ -206,3 +206,11 @@ def test_two_workers_on_ray_play_what_two_processes_play(monkeypatch: pytest.Mon
             crew.close()
     assert torch.equal(found[0].frames[keys.ACTION], found[1].frames[keys.ACTION])
     assert found[0].returns == found[1].returns
+    learner: Any = ToyLearner()
+    crew = Players(learner, partial(BrokenPool, *TASK), 1, CollectorConfig(backend="ray"))
+    try:
+        crew.begin(wanted)
+        with pytest.raises(PlaySlotError, match=r"^render: got none"):
+            crew.finish()
+    finally:
+        crew.close()
