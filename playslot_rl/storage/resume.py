@@ -53,6 +53,7 @@ class TrainingState:
 ADDED: Final[Mapping[str, Any]] = {
     "reward_scale": 1.0,
     "actor_average": 0.0,
+    "workers": 0,
     "kind": "cocvp",
     "targets": "quantised",
     "trim": 0.0,

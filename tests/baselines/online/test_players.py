@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from collections.abc import Mapping
@@ -138,6 +139,19 @@ def test_a_run_that_was_interrupted_ends_with_the_weights_of_one_that_was_not(
     broken, result = train(tmp_path / "broken", workers=2)
     assert result.resumed_from > 0
     assert same(weights(whole), weights(broken))
+
+
+def test_a_run_from_before_there_were_workers_carries_on_without_them(tmp_path: Path) -> None:
+    whole, _ = train(tmp_path / "whole")
+    train(tmp_path / "old", steps=32)
+    for path in tmp_path.glob("old/toy/checkpoints/*/state.json"):
+        state = json.loads(path.read_text())
+        state["identity"]["toy"] |= {"steps": 64}
+        del state["identity"]["toy"]["workers"], state["ahead"]
+        path.write_text(json.dumps(state))
+    carried, result = train(tmp_path / "old")
+    assert result.resumed_from == 32
+    assert same(weights(whole), weights(carried))
 
 
 def test_workers_divide_the_episodes_of_a_round() -> None:
