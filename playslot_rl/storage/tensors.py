@@ -18,17 +18,21 @@ def module_tensors(modules: Mapping[str, nn.Module]) -> dict[str, Tensor]:
     return {f"{name}.{key}": value for name, module in modules.items() for key, value in module.state_dict().items()}
 
 
+def tensor_bytes(tensors: Mapping[str, Tensor]) -> bytes:
+    """The content of a safetensors file. Tensors are copied, because it refuses those that share memory."""
+    from safetensors.torch import save
+
+    return save({key: value.detach().to("cpu", copy=True).contiguous() for key, value in tensors.items()})
+
+
 def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
     """Write tensors to a safetensors file, atomically.
 
     Raises:
         OutputError: full disk.
     """
-    from safetensors.torch import save
-
-    # Serialised in memory and written by us: safetensors' own writer hides the errno of a full disk. Copies, because
-    # it refuses tensors that share memory.
-    write_bytes(path, save({key: value.detach().to("cpu", copy=True).contiguous() for key, value in tensors.items()}))
+    # Serialised in memory and written by us: safetensors' own writer hides the errno of a full disk.
+    write_bytes(path, tensor_bytes(tensors))
 
 
 def load_tensors(path: Path) -> dict[str, Tensor]:

@@ -209,14 +209,7 @@ def test_what_was_stopped_carries_on(
 
 
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run"]
-ACCELERATE = [
-    sys.executable,
-    "-m",
-    "accelerate.commands.launch",
-    "--cpu",
-    "--mixed_precision=no",
-    "--dynamo_backend=no",
-]
+ACCELERATE = [sys.executable, "-m", "accelerate.commands.launch", "--cpu", "--mixed_precision=no"]
 
 
 @pytest.mark.slow

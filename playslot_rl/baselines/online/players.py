@@ -15,14 +15,14 @@ worker takes, and also if one dies and its part is played again by another.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
-from safetensors.torch import load, save
+from safetensors.torch import load
 from tensordict import TensorDict
 
 from playslot_rl.acting.episodes import TaskPool
@@ -34,7 +34,7 @@ from playslot_rl.config import CollectorConfig
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.ray_cluster import RayCluster, worker_cannot_start
 from playslot_rl.seeding import global_seed, step_generator
-from playslot_rl.storage.tensors import load_modules, module_tensors
+from playslot_rl.storage.tensors import load_modules, module_tensors, tensor_bytes
 
 START_S = 300.0
 """What a worker is given to import everything, beyond `collector.timeout_s`."""
@@ -55,6 +55,11 @@ class Round:
     number: int
     seeds: tuple[int, ...]
     random: bool
+
+    def split(self, count: int) -> list[Round]:
+        """The parts of `count` workers, equally long, in order."""
+        share = len(self.seeds) // count
+        return [replace(self, seeds=self.seeds[i * share : (i + 1) * share]) for i in range(count)]
 
 
 def play_round(pool: TaskPool, learner: Learner, device: torch.device, wanted: Round, part: int = 0) -> PlayedEpisodes:
@@ -84,8 +89,8 @@ class Player:
         """Frames as safetensors, and the episodes without them."""
         load_modules(self.learner.modules, load(weights), "the learner's weights")
         played = play_round(self.pool, self.learner, torch.device("cpu"), wanted, part)
-        values = {str(key): value.contiguous() for key, value in played.frames.items()}
-        return save(values), PlayedEpisodes(TensorDict({}, []), played.returns, played.successes)
+        values = {str(key): value for key, value in played.frames.items()}
+        return tensor_bytes(values), PlayedEpisodes(TensorDict({}, []), played.returns, played.successes)
 
 
 _player: Player | None = None
@@ -179,12 +184,8 @@ class Players:
 
     def begin(self, wanted: Round) -> None:
         """Begin a round with the learner's present weights."""
-        self._weights = save(_plain(module_tensors(self.learner.modules)))
-        share = len(wanted.seeds) // len(self._workers)
-        self._parts = [
-            Round(wanted.seed, wanted.number, wanted.seeds[i * share : (i + 1) * share], wanted.random)
-            for i in range(len(self._workers))
-        ]
+        self._weights = tensor_bytes(module_tensors(self.learner.modules))
+        self._parts = wanted.split(len(self._workers))
         self._futures = [
             worker.submit(self._weights, part, i)
             for i, (worker, part) in enumerate(zip(self._workers, self._parts, strict=True))
@@ -255,10 +256,6 @@ class Players:
         self.replaced += 1
         self._workers[i], self._ready[i] = self._made(), False
         self._futures[i] = self._workers[i].submit(self._weights, self._parts[i], i)
-
-
-def _plain(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    return {key: value.detach().to("cpu", copy=True).contiguous() for key, value in tensors.items()}
 
 
 def _init_ray(settings: dict[str, Any]) -> None:

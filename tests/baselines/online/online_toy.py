@@ -20,6 +20,7 @@ from playslot_rl.config import EnvConfig, ExperimentConfig, LoggingConfig, Rende
 from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.storage.tensors import module_tensors
 from playslot_rl.training.record import StageRecord
 
 STEPS = 4
@@ -133,6 +134,14 @@ class ToyLearner:
         for optimizer in self._optimizers.values():
             optimizer.step()
         return {"loss": loss.detach()}
+
+
+def weights(learner: ToyLearner) -> dict[str, Tensor]:
+    return {key: value.clone() for key, value in module_tensors(learner.modules).items()}
+
+
+def same(one: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> bool:
+    return one.keys() == other.keys() and all(torch.equal(one[key], other[key]) for key in one)
 
 
 def toy_online(**changes: Any) -> OnlineConfig:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from online_toy import STEPS, ToyLearner, ToyPool, toy_online, train
+from online_toy import STEPS, ToyLearner, ToyPool, same, toy_online, train, weights
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -22,20 +22,11 @@ from playslot_rl.baselines.online.acting import play
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.errors import CheckpointError, TrainingError
 from playslot_rl.seeding import StepGenerators
-from playslot_rl.storage.tensors import module_tensors
 
 
 @pytest.fixture(autouse=True)
 def _toy_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "TaskPool", ToyPool)
-
-
-def weights(learner: ToyLearner) -> dict[str, Tensor]:
-    return {key: value.clone() for key, value in module_tensors(learner.modules).items()}
-
-
-def same(one: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> bool:
-    return one.keys() == other.keys() and all(torch.equal(one[key], other[key]) for key in one)
 
 
 def test_an_action_is_stored_with_the_frame_that_it_led_to() -> None:

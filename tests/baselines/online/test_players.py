@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import torch
-from online_toy import STEPS, BrokenPool, HangingPool, ToyLearner, ToyPool, toy_online, train
+from online_toy import STEPS, BrokenPool, HangingPool, ToyLearner, ToyPool, same, toy_online, train, weights
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -32,14 +32,6 @@ CPU = torch.device("cpu")
 @pytest.fixture(autouse=True)
 def _toy_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "TaskPool", ToyPool)
-
-
-def weights(learner: ToyLearner) -> dict[str, Tensor]:
-    return {key: value.clone() for key, value in module_tensors(learner.modules).items()}
-
-
-def same(one: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> bool:
-    return one.keys() == other.keys() and all(torch.equal(one[key], other[key]) for key in one)
 
 
 class Beside:
@@ -62,14 +54,8 @@ class Beside:
         actor = ToyLearner()
         for key, value in module_tensors(actor.modules).items():
             value.copy_(old[key])
-        share = len(wanted.seeds) // self.count
         pool: Any = self.pool
-        parts = [
-            play_round(
-                pool, actor, CPU, Round(wanted.seed, wanted.number, wanted.seeds[i * share :][:share], wanted.random), i
-            )
-            for i in range(self.count)
-        ]
+        parts = [play_round(pool, actor, CPU, part, i) for i, part in enumerate(wanted.split(self.count))]
         sums = [value for part in parts for value in part.returns]
         solved = [value for part in parts for value in part.successes]
         return PlayedEpisodes(torch.cat([part.frames for part in parts]), tuple(sums), tuple(solved))
