@@ -104,8 +104,11 @@ def check_torch(device: str = "") -> Check:
         return Check("torch", "FAIL", _one_line(error), "choose device=cpu" if device else _REINSTALL)
     if total != 512.0:
         return Check("torch", "FAIL", f"a product of ones sums to {total}, expected 512", _REINSTALL)
+    from playslot_rl.precision import resolve_precision
+
     what = torch.cuda.get_device_name() if name.startswith("cuda") else f"{torch.get_num_threads()} threads"
-    return Check("torch", "ok", f"{torch.__version__}, device {name} ({what})")
+    chosen = resolve_precision("auto", torch.device(name).type)
+    return Check("torch", "ok", f"{torch.__version__}, device {name} ({what}), precision=auto is {chosen}")
 
 
 def check_rendering() -> Check:

@@ -7,7 +7,7 @@ from typing import Literal
 
 from playslot_rl.config.roles import Checked, at_least, between, role, within
 
-Precision = Literal["fp32", "bf16"]
+Precision = Literal["fp32", "bf16", "auto"]
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class StageConfig(Checked):
         steps: optimiser steps.
         batch_size: windows per step.
         optim: optimiser.
-        precision: `bf16` autocasts the convolutions.
+        precision: `bf16` autocasts the convolutions; `auto` does so where the processor multiplies bf16 itself.
         checkpoint_every: steps between checkpoints.
         validate_every: steps between validations.
         log_every: steps between log lines.

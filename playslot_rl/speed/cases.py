@@ -101,7 +101,7 @@ class Variant:
     Attributes:
         case: what is computed.
         collapse: collapsed first layer of the decoder.
-        precision: of the convolutions.
+        precision: of the convolutions; `auto` is what this processor is fastest in.
         channels_last: memory format of the convolutions' maps.
         allocator: keep freed memory (`playslot_rl.allocator`).
         cached: rollout with cached keys and values.
@@ -112,7 +112,7 @@ class Variant:
 
     case: Case
     collapse: bool = True
-    precision: Precision = "bf16"
+    precision: Precision = "auto"
     channels_last: bool = True
     allocator: bool = True
     cached: bool = True
@@ -154,7 +154,11 @@ def rollout_variants() -> dict[str, Variant]:
 def play_variants() -> dict[str, Variant]:
     """The shipped model as `playslot play` runs it, in fp32, and one of the paper's sizes in both precisions."""
     plain = Variant("play_step", precision="fp32", channels_last=False)
-    return {"shipped": replace(plain, shipped=True), "paper_fp32": plain, "paper_bf16": Variant("play_step")}
+    return {
+        "shipped": replace(plain, shipped=True),
+        "paper_fp32": plain,
+        "paper_bf16": Variant("play_step", precision="bf16"),
+    }
 
 
 Step = Callable[[], Tensor]

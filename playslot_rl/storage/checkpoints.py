@@ -20,6 +20,7 @@ from torch import nn
 
 from playslot_rl.config.plain import flatten
 from playslot_rl.errors import CheckpointError
+from playslot_rl.precision import native_bf16
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.folders import new_folder
 from playslot_rl.storage.resume import first_difference, read_json
@@ -214,7 +215,7 @@ def provenance() -> dict[str, Any]:
         "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {'' if native_bf16('cpu') else 'no '}bf16",
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else "",
     }
 

@@ -76,11 +76,16 @@ ADDED: Final[Mapping[str, Any]] = {
 
 
 def first_difference(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> tuple[str, Any, Any] | None:
-    """The first dotted key at which two nested configs differ: (key, stored value, wanted value)."""
+    """The first dotted key at which two nested configs differ: (key, stored value, wanted value).
+
+    A wanted precision of `auto` is equal to any that was stored.
+    """
     right = flatten(wanted)
     added = {key: ADDED[name] for key in right if (name := key.rpartition(".")[-1]) in ADDED}
     left = {**added, **flatten(stored)}
     for key in sorted(left.keys() | right.keys()):
+        if key.rpartition(".")[-1] == "precision" and right.get(key) == "auto":
+            continue  # whatever this processor is good at: a run goes on on another one
         if left.get(key, _ABSENT) != right.get(key, _ABSENT):
             return key, left.get(key, _ABSENT), right.get(key, _ABSENT)
     return None

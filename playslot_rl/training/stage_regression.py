@@ -21,6 +21,7 @@ from playslot_rl.config import Precision
 from playslot_rl.data.demonstrations import Transitions, real_actions, shift_frames
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
+from playslot_rl.precision import autocast
 from playslot_rl.processes import spread
 from playslot_rl.seeding import StepGenerators
 from playslot_rl.shares import own_noise, own_rows
@@ -157,7 +158,7 @@ class RegressionStage:
         held_out: demonstrations that are not trained on, checked as `unexplained_held_out`.
         validated: at most so many rows of each, evenly spread, are looked at in a validation; 0 takes all.
         stream: name of the generator that draws the rows; `name` if empty.
-        precision: `bf16` trains the network under autocast; it is validated in fp32.
+        precision: `bf16` trains the network under autocast (`auto`: where that pays); it is validated in fp32.
 
     Raises:
         ValueError: numbers of inputs and targets differ.
@@ -198,7 +199,7 @@ class RegressionStage:
         rows = own_rows(drawn).to(device)
         observed = dict(zip(self.criterion.observed, _several(self.inputs.draw(rows, generators)), strict=True))
         batch = {**observed, self.criterion.tensor_keys.action: self.targets[rows]}
-        with torch.autocast(device.type, torch.bfloat16, enabled=self.precision == "bf16"):
+        with autocast(device.type, self.precision):
             losses = self.criterion(TensorDict(batch, [len(rows)]))
         return {"loss": losses[self.criterion.out_name]}
 

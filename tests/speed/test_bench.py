@@ -24,6 +24,7 @@ from playslot_rl.losses.dynamics import DynamicsLoss
 from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.predictors.cocvp import COCVP
+from playslot_rl.precision import resolve_precision
 from playslot_rl.speed.cases import (
     Sizes,
     Variant,
@@ -59,7 +60,7 @@ def test_the_savi_rows_are_first_layer_times_precision_times_allocator() -> None
     rows = {(v.collapse, v.precision, v.allocator) for v in savi_variants().values()}
     assert len(rows) == len(savi_variants()) == 8
     assert savi_variants()["plain_fp32_glibc"] == Variant("savi_step", False, "fp32", False, False)
-    assert savi_variants()["collapsed_bf16_allocator"] == Variant("savi_step")
+    assert savi_variants()["collapsed_bf16_allocator"] == Variant("savi_step", precision="bf16")
 
 
 @pytest.mark.parametrize("case", ["savi_step", "dynamics_step", "rollout_cache"])
@@ -166,7 +167,7 @@ def test_the_command_writes_every_key_with_its_ratio_and_medians(
     figures = json.loads(path.read_text())
     assert set(figures) == {*TARGETS, "machine"}
     pairs = {
-        "savi_step": ("plain_fp32_glibc", "collapsed_bf16_allocator"),
+        "savi_step": ("plain_fp32_glibc", f"collapsed_{resolve_precision('auto', 'cpu')}_allocator"),
         "dynamics_step": ("plain_fp32_glibc", "fast"),
         "rollout_cache": ("full", "cached"),
         "render": ("full", "fast"),

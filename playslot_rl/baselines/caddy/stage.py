@@ -27,6 +27,7 @@ from playslot_rl.config.video import CADDYConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise
 from playslot_rl.modules.quantizer import usage
+from playslot_rl.precision import autocast
 from playslot_rl.processes import spread
 from playslot_rl.seeding import StepGenerators
 from playslot_rl.shares import own_rows
@@ -66,7 +67,7 @@ class CADDYStage:
         rows = own_rows(self.clips.sample(config.batch_size, generators.numpy("clips")))
         frames = self._frames(rows[:, : clip_length(config, step)])
         wanted = self._wanted(frames.shape[1], generators)
-        with torch.autocast(frames.device.type, torch.bfloat16, enabled=config.precision == "bf16"):
+        with autocast(frames.device.type, config.precision):
             rollout = self.model(
                 frames,
                 config.seed_frames,

@@ -24,6 +24,7 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise
 from playslot_rl.modules.quantizer import usage
+from playslot_rl.precision import autocast
 from playslot_rl.processes import spread
 from playslot_rl.seeding import StepGenerators
 from playslot_rl.shares import own_rows
@@ -54,7 +55,7 @@ class LAPOModelStage:
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         """Error of one batch of pairs."""
         first, second = self._frames(own_rows(self.clips.sample(self.config.batch_size, generators.numpy("pairs"))))
-        with torch.autocast(first.device.type, torch.bfloat16, enabled=self.config.precision == "bf16"):
+        with autocast(first.device.type, self.config.precision):
             inferred = self.inverse(first, second)
             predicted = self.forward(first, inferred.z)
         image = (predicted.float() - second).square().mean() / self.still

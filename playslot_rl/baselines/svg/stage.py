@@ -15,6 +15,7 @@ from playslot_rl.baselines.svg.model import SVG
 from playslot_rl.config.video import SVGConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise
+from playslot_rl.precision import autocast
 from playslot_rl.processes import spread
 from playslot_rl.seeding import StepGenerators, step_generator
 from playslot_rl.shares import own_rows
@@ -48,7 +49,7 @@ class SVGStage:
         device = frames.device
         batch, count = frames.shape[:2]
         steps = draw_steps(batch, count - 1, config.decoded_frames, generators.torch("decoded", device))
-        with torch.autocast(device.type, torch.bfloat16, enabled=config.precision == "bf16"):
+        with autocast(device.type, config.precision):
             out = self.model(frames, config.seed_frames, generators.torch("latents", device), steps)
         return svg_objective(out, frames, config.kl_weight)
 

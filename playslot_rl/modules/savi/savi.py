@@ -18,6 +18,7 @@ from playslot_rl.modules.savi.decoder import BroadcastDecoder, PixelShuffleDecod
 from playslot_rl.modules.savi.encoder import SAViEncoder
 from playslot_rl.modules.savi.initializer import SlotInitializer
 from playslot_rl.modules.savi.transition import SlotTransition
+from playslot_rl.precision import autocast
 
 
 class Decoded(NamedTuple):
@@ -101,7 +102,7 @@ class SAVi(nn.Module):
         return Decoded((rgb * masks).sum(dim=-4), rgb, masks)
 
     def _autocast(self, x: Tensor) -> torch.autocast:
-        return torch.autocast(x.device.type, torch.bfloat16, enabled=self.precision == "bf16")
+        return autocast(x.device.type, self.precision)
 
 
 def _initialise(module: nn.Module) -> None:
