@@ -15,7 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from playslot_rl.datasets.verify import verify
 from playslot_rl.processes import free_port
@@ -91,6 +93,53 @@ def picture(page: Any) -> bytes:
     """What the imagined scene looks like on the screen."""
     content: bytes = page.locator(".pixels").first.screenshot()
     return content
+
+
+def says(page: Any, text: str) -> bool:
+    """Whether a text is on the page."""
+    return text in page.inner_text("body")
+
+
+def test_hold_upload_and_touch(server: tuple[str, Path, subprocess.Popen[str]], tmp_path: Path) -> None:
+    """A button acts until it is let go; a picture is played from, a broken one told of; a slot is frozen and removed."""
+    address, _, _ = server
+    with chromium() as browser:
+        page, _ = open_page(browser, address)
+        page.get_by_text("hold", exact=True).click()
+        button = page.locator("button:has(.proto)").nth(1)
+        button.hover()
+        page.mouse.down()
+        wait(page, lambda: moment(page) >= 3)
+        page.mouse.up()
+        page.wait_for_timeout(500)  # a step that was under way
+        stopped = moment(page)
+        page.wait_for_timeout(1000)
+        assert moment(page) == stopped >= 3, "letting go ends it"
+
+        true = page.locator(".pixels").nth(1)
+        assert true.is_visible()
+        Image.fromarray(np.full((96, 128, 3), 90, np.uint8)).save(tmp_path / "grey.png")
+        chooser = page.locator("input[type=file]").first
+        chooser.set_input_files(tmp_path / "grey.png")
+        wait(page, lambda: says(page, "grey.png") and moment(page) == 0)
+        wait(page, lambda: not true.is_visible())  # no simulator stands behind a picture
+        (tmp_path / "broken.png").write_bytes(b"no picture")
+        chooser.set_input_files(tmp_path / "broken.png")
+        wait(page, lambda: says(page, "broken.png"))
+        assert moment(page) == 0
+
+        page.get_by_text("Start here", exact=True).click()
+        wait(page, true.is_visible)
+        page.get_by_text("Remove", exact=True).click()
+        wait(page, lambda: says(page, "choose a slot first"))
+        page.locator(".pixels").first.click(position={"x": 190, "y": 190})
+        wait(page, lambda: re.search(r"slot \d", page.inner_text("body")) is not None)
+        page.get_by_text("Freeze or let go", exact=True).click()
+        wait(page, lambda: says(page, ", frozen"))
+        before = picture(page)
+        page.get_by_text("Remove", exact=True).click()
+        wait(page, lambda: says(page, "no slot chosen"))
+        assert picture(page) != before
 
 
 def test_a_user_plays_records_and_leaves(server: tuple[str, Path, subprocess.Popen[str]]) -> None:
