@@ -101,7 +101,7 @@ def says(page: Any, text: str) -> bool:
 
 
 def test_hold_upload_and_touch(server: tuple[str, Path, subprocess.Popen[str]], tmp_path: Path) -> None:
-    """A button acts until it is let go; a picture is played from, a broken one told of; a slot is frozen and removed."""
+    """A button acts until let go; a picture is played from, a broken one told of; a slot is frozen and removed."""
     address, _, _ = server
     with chromium() as browser:
         page, _ = open_page(browser, address)
