@@ -122,10 +122,10 @@ def slots(run: Path, videos: Path, *more: str) -> tuple[str, ...]:
 
 
 def assert_equal(one: Path, other: Path) -> None:
-    """The finished slots of two runs, but for rounding."""
+    """The finished slots of two runs, but for rounding, which Adam enlarges where gradients are small."""
     first, second = (load_tensors(run / "slots" / "checkpoint" / "weights.safetensors") for run in (one, other))
     assert first.keys() == second.keys()
-    assert max(float((first[key] - second[key]).abs().max()) for key in first) < 1e-5
+    assert max(float((first[key] - second[key]).abs().max()) for key in first) < 1e-4
 
 
 LONG = ("slots.steps=60", "slots.checkpoint_every=4", "slots.validate_every=30")

@@ -77,13 +77,15 @@ def test_training_predicts_the_change_and_the_codes_tell_directions_apart(
 ) -> None:
     inverse, forward = models
     source = moving_square(episodes=24)
-    config = StageConfig(steps=120, batch_size=16, optim=OptimConfig(lr=3e-3))
+    config = StageConfig(steps=200, batch_size=16, optim=OptimConfig(lr=3e-3))
     stage = LAPOModelStage(inverse, forward, Clips(source, 2, validation=0.2, seed=0, shown=256), config)
     optimizer = torch.optim.Adam([*inverse.parameters(), *forward.parameters()], lr=3e-3)
     with torch.no_grad():
         start = stage.loss(0, StepGenerators(0, 0))["loss_image"]
     assert 0.5 < float(start) < 2, "before training the error is that of no change"
     for step in range(config.steps):
+        # Falling to 0: at a constant rate the last steps' noise, another on each processor, decided.
+        optimizer.param_groups[0]["lr"] = 3e-3 * (1 - step / config.steps)
         optimizer.zero_grad()
         with global_seed(0, step):
             stage.loss(step, StepGenerators(0, step))["loss"].backward()
