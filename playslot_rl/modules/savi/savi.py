@@ -77,7 +77,7 @@ class SAVi(nn.Module):
             Slots (B, T, N, D), and the state to go on from.
         """
         b, t = frames.shape[:2]
-        tokens = self.encoder(frames.flatten(0, 1), self._autocast(frames))
+        tokens = self.encoder(frames.flatten(0, 1), autocast(frames.device.type, self.precision))
         keys, values = self.corrector.keys_values(tokens)
         keys, values = keys.view(b, t, *keys.shape[1:]), values.view(b, t, *values.shape[1:])
         first = state is None
@@ -93,16 +93,13 @@ class SAVi(nn.Module):
     def decode(self, slots: Tensor) -> Decoded:
         """Render slots (..., N, D)."""
         lead = slots.shape[:-1]
-        with self._autocast(slots):
+        with autocast(slots.device.type, self.precision):
             out = self.decoder(slots.reshape(-1, slots.shape[-1]))
         out = out.float()
         out = out.reshape(*lead, *out.shape[1:])
         rgb, logits = out[..., :3, :, :], out[..., 3:, :, :]
         masks = torch.softmax(logits, dim=-4)
         return Decoded((rgb * masks).sum(dim=-4), rgb, masks)
-
-    def _autocast(self, x: Tensor) -> torch.autocast:
-        return autocast(x.device.type, self.precision)
 
 
 def _initialise(module: nn.Module) -> None:
