@@ -14,7 +14,7 @@ STAMP := $(VENV)/.setup-done
 LOCK := requirements.lock
 PLUGIN := lerobot_policy_playslot
 ARGS ?=
-PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile
+PARALLEL := --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 PYTHON ?=
 
 export UV_PYTHON := $(BIN)/python

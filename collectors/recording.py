@@ -7,20 +7,19 @@ nothing waits for the parent, and a process that stops in the middle of an episo
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
+from multiprocessing.context import ForkServerProcess
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 
-from playslot_rl.children import begin_worker
+from playslot_rl.children import begin_worker, worker_context
 from playslot_rl.collectors.episodes import EpisodeCollector, record
 from playslot_rl.collectors.journal import Journal, RecordedEpisode
 from playslot_rl.collectors.spec import CollectionSpec
@@ -98,8 +97,8 @@ class LocalWorkers:
 
     def __init__(self, journal: Journal, count: int) -> None:
         self.journal = journal
-        self._context = multiprocessing.get_context("spawn")
-        self._processes: list[SpawnProcess | None] = [None] * count
+        self._context = worker_context()
+        self._processes: list[ForkServerProcess | None] = [None] * count
         self._pipes: list[Connection[Any, Any] | None] = [None] * count
 
     def start(self, slot: int) -> None:

@@ -19,12 +19,43 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+LONGEST = (
+    "training/test_several_processes.py",
+    "recipes/test_compare_video.py",
+    "baselines/online/test_players.py",
+    "recipes/test_compare.py",
+    "recipes/test_several_processes.py",
+    "recipes/test_baselines.py",
+    "speed/test_bench.py",
+    "recipes/test_bad_input.py",
+    "test_docs_site.py",
+    "hub/test_circle.py",
+    "recipes/test_commands.py",
+    "collectors/test_collect.py",
+    "test_docs_python.py",
+    "recipes/test_sold.py",
+)
+"""Files that take longest, the longest first. They begin: no worker is left alone with one of them at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first (`make test` hands files to its workers in this order)."""
+    first = {REPOSITORY / "tests" / name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: first.get(item.path, len(LONGEST)))
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _caches_in_a_temporary_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PLAYSLOT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_waiting_for_the_disk() -> Iterator[None]:
+    """Tests kill processes, never the machine: what was written survives them without an fsync, which is dear."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
         yield
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from playslot_rl import keys
 from playslot_rl.baselines.caddy.model import CADDY
@@ -150,6 +151,9 @@ def resnet() -> Part:
     data, config = videos(32), replace(_plain(), steps=2, checkpoint_every=2, validate_every=2)
     with global_seed(0, 0, "test"):
         network = ResNetPolicy(SIZES, 32, 2)
+        # A thirteenth of the weights, and still blocks, shortcuts and BatchNorm.
+        network.trunk.layer3 = nn.Sequential(nn.Conv2d(128, 256, 1, stride=2), nn.BatchNorm2d(256))
+        network.trunk.layer4 = nn.Sequential(nn.Conv2d(256, 512, 1, stride=2), nn.BatchNorm2d(512))
     criterion = BehaviourLoss(network)
     criterion.set_keys(observation=keys.PIXELS, action=keys.ACTION)
     rows = np.arange(42)

@@ -29,7 +29,7 @@ from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.baselines.online.acting import PlayedEpisodes, play
 from playslot_rl.baselines.online.checkpoints import whole_episodes
 from playslot_rl.baselines.online.learner import Learner
-from playslot_rl.children import begin_worker
+from playslot_rl.children import begin_worker, worker_context
 from playslot_rl.config import CollectorConfig
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.ray_cluster import RayCluster, worker_cannot_start
@@ -121,8 +121,7 @@ class _LocalWorker:
     """A process of this machine."""
 
     def __init__(self, setup: bytes) -> None:
-        context = torch.multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(1, context, _begin, (setup,))
+        self._pool = ProcessPoolExecutor(1, worker_context(), _begin, (setup,))
 
     def submit(self, weights: bytes, wanted: Round, part: int) -> Future[Any]:
         return self._pool.submit(_play, weights, wanted, part)
