@@ -29,9 +29,11 @@ from playslot_rl.recipes.adopt_trials import (
     with_slots,
 )
 from playslot_rl.recipes.run import open_run
+from playslot_rl.training.runs import slots_checkpoint, stage_model
 
 SHARES: Final = {"slots_trials": 0.18, "slots": 0.42, "dynamics_trial": 0.06, "dynamics": 0.28}
-"""Of the time; the rest is for looking, parsing and the report card."""
+"""Of the time; the rest is for looking, parsing and the report card. A stage has the share of a trial that is left out,
+too."""
 
 
 def main(config: ExperimentConfig) -> None:
@@ -78,9 +80,21 @@ def _for_frames(config: ExperimentConfig, seen: Survey, decide: Decisions) -> Ex
         env=replace(config.env, image_size=size, action_dim=max(1, seen.action_dim), max_steps=max(2, typical - 1)),
         model=replace(config.model, savi=savi_for(config.model.savi, size)),
         data=replace(config.data, camera=seen.camera, stride=stride, resize=True),
-        slots=replace(config.slots, clip_frames=min(config.slots.clip_frames, typical)),
+        slots=replace(
+            config.slots,
+            clip_frames=min(config.slots.clip_frames, typical),
+            start_from=start_for(config.slots.start_from, size),
+        ),
         dynamics=replace(dynamics, predicted_frames=predicted),
     )
+
+
+def start_for(where: str, size: int) -> str:
+    """What SAVi starts from: a model of frames of another size has other weights."""
+    if where and stage_model(slots_checkpoint(where))[1].image_size != size:
+        print(f"note: frames of {size} pixels, other than those of slots.start_from={where}: SAVi starts from scratch")
+        return ""
+    return where
 
 
 def savi_for(savi: SAViConfig, size: int) -> SAViConfig:
@@ -101,15 +115,18 @@ def _chosen_slots(config: ExperimentConfig, run: Path, decide: Decisions, budget
     milliseconds = decide(
         "milliseconds a step of SAVi", lambda: _timed(with_slots(config, max(tried)), "slots", trials)
     )
-    if len(tried) > 1:
-        steps = steps_within(budget["slots_trials"] / len(tried), milliseconds / 1000)
-        few = too_short(steps, "the scene is not taken apart", config.model.savi.n_slots)
-        slots = decide("slots", lambda: few or choose_slots(config, trials, steps))
-    else:
-        slots = decide("slots", lambda: Choice(tried[0], "as asked for"))
-    steps = steps_within(budget["slots"], milliseconds / 1000)
+    of_one = steps_within(budget["slots_trials"] / len(tried), milliseconds / 1000)
+    few = too_short(of_one, "the scene is not taken apart", config.model.savi.n_slots)
+    left_out = Choice(tried[0], "as asked for") if len(tried) == 1 else few
+    slots = decide("slots", lambda: left_out or choose_slots(config, trials, of_one))
+    if slots != max(tried):
+        milliseconds = decide(
+            f"milliseconds a step with {slots} slots", lambda: _timed(with_slots(config, slots), "slots", trials)
+        )
+    seconds = budget["slots"] + (budget["slots_trials"] if left_out else 0.0)
+    steps = steps_within(seconds, milliseconds / 1000)
     if steps < config.slots.steps / 2:
-        enough = math.ceil(config.minutes * config.slots.steps / steps)
+        enough = math.ceil(config.slots.steps * milliseconds / 1000 / 60 / SHARES["slots"])
         print(
             f"note: minutes={config.minutes:g} are {steps} steps of SAVi on this machine; the preset's "
             f"{config.slots.steps} would take minutes={enough}",
@@ -124,13 +141,15 @@ def _chosen_prototypes(
     """The config with the number of prototypes and with the steps that fit."""
     trials, child = run / "trials", replace(config, run=str(run))
     milliseconds = decide("milliseconds a step of the dynamics", lambda: _timed(child, "dynamics", trials))
-    steps = steps_within(budget["dynamics_trial"], milliseconds / 1000)
-    few = too_short(steps, "one prototype holds all", config.model.inverse_dynamics.n_prototypes)
-    prototypes = decide("prototypes", lambda: few or choose_prototypes(config, run, trials / "prototypes", steps))
-    steps = steps_within(budget["dynamics"], milliseconds / 1000)
+    of_trial = steps_within(budget["dynamics_trial"], milliseconds / 1000)
+    few = too_short(of_trial, "one prototype holds all", config.model.inverse_dynamics.n_prototypes)
+    prototypes = decide("prototypes", lambda: few or choose_prototypes(config, run, trials / "prototypes", of_trial))
+    seconds = budget["dynamics"] + (budget["dynamics_trial"] if few else 0.0)
+    steps = steps_within(seconds, milliseconds / 1000)
     return scheduled(with_prototypes(config, prototypes), "dynamics", steps, config.adopt.patience)
 
 
 def _timed(config: ExperimentConfig, stage: str, trials: Path) -> Choice:
-    seconds = seconds_a_step(config, stage, trials / f"time_{stage}")
+    slots = f"_{config.model.savi.n_slots}" if stage == "slots" else ""
+    seconds = seconds_a_step(config, stage, trials / f"time_{stage}{slots}")
     return Choice(max(1, round(1000 * seconds)), "measured here, the first steps included")

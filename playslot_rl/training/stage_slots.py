@@ -118,7 +118,8 @@ def warm_start(savi: SAVi, source: SAVi, where: str) -> None:
     for name, got, expected in shapes:
         if got != expected:
             raise CheckpointError(
-                f"slots.start_from={where}: got {name} of {got}, expected {expected}: give model.savi.* its sizes"
+                f"slots.start_from={where}: got {name} of {got}, expected {expected}: give model.savi.* its sizes, or "
+                "start from scratch (slots.start_from=)"
             )
     with torch.no_grad():
         rows = min(len(own[INITIAL_SLOTS]), len(other[INITIAL_SLOTS]))

@@ -15,8 +15,10 @@ from commands import refused, smoke
 from playslot_rl.config.compose import compose
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.recipes import adopt_trials
-from playslot_rl.recipes.adopt import savi_for
+from playslot_rl.recipes.adopt import savi_for, start_for
 from playslot_rl.recipes.adopt_trials import SHORTEST, scheduled, steps_within, too_short
+from playslot_rl.training.runs import load_savi
+from playslot_rl.training.stage_slots import warm_start
 
 QUICK = ("minutes=0.02", "adopt.slots=[2,3]", "adopt.prototypes=4")
 
@@ -117,3 +119,14 @@ def test_schedules_shrink_with_the_time_that_there_is() -> None:
     assert long.optim.warmup_steps == config.slots.optim.warmup_steps
     assert steps_within(60, 0.5) == 120
     assert steps_within(0.1, 0.5) == SHORTEST
+
+
+def test_slots_start_from_a_model_that_takes_scenes_apart(capsys: pytest.CaptureFixture[str]) -> None:
+    config = compose(["env=video", "preset=compact"])
+    start = config.slots.start_from
+    savi = SAVi(replace(config.model.savi, n_slots=4), config.env.image_size)
+    warm_start(savi, load_savi(start), start)  # refuses other sizes
+    assert (start_for(start, 64), start_for("", 128)) == (start, "")
+    assert capsys.readouterr().out == ""
+    assert start_for(start, 128) == ""
+    assert capsys.readouterr().out.startswith("note: frames of 128 pixels, other than those of slots.start_from=")
