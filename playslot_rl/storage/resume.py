@@ -71,6 +71,7 @@ ADDED: Final[Mapping[str, Any]] = {
     "patience": 0,
     "project_out": True,
     "ema": 0.0,
+    "motion_weight": 0.0,
 }
 """Settings that came after the first checkpoints, and what those were trained with."""
 

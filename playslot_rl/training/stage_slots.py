@@ -39,7 +39,7 @@ class SlotsStage:
 
     def __init__(self, savi: SAVi, clips: Clips, config: SlotsStageConfig) -> None:
         self.savi, self.clips, self.config, self.device = savi, clips, config, module_device(savi)
-        self.criterion = SlotsLoss(savi)
+        self.criterion = SlotsLoss(savi, config.motion_weight)
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:

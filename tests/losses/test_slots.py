@@ -7,6 +7,7 @@ from tensordict import TensorDict
 
 from playslot_rl import keys
 from playslot_rl.losses import SlotsLoss, total_loss
+from playslot_rl.losses.slots import moving
 from playslot_rl.testing import tiny_agent
 
 
@@ -50,3 +51,24 @@ def test_the_network_stays_an_ordinary_submodule_and_keys_can_be_renamed() -> No
     loss.set_keys(pixels="video")
     assert loss.in_keys == ["video"]
     loss(clips().rename_key_(keys.PIXELS, "video"))
+
+
+def test_a_pixel_that_moves_counts_more_in_its_own_clip() -> None:
+    savi, frames = tiny_agent().world_model.savi, torch.full((2, 3, 3, 64, 64), 0.5)
+    frames[0, 1:, :, 4:8, 10] = 0.9  # moves from the first frame to the second, then stands still
+    batch = TensorDict({keys.PIXELS: frames}, [2])
+    moves = moving(frames)
+    assert (moves.sum((2, 3)) == torch.tensor([[4.0, 4.0, 0.0], [0.0, 0.0, 0.0]])).all()
+    assert (moves[0, :2, 4:8, 10] == 1).all()
+
+    error = (savi.decode(savi(frames)[0]).frames - frames).square().mean(2)
+    of_moving, rest = error[0][moves[0] > 0].sum(), error[0][moves[0] == 0].sum()
+    first = (10 * of_moving + rest) / (10 * 8 + error[0].numel() - 8)
+    weighted, plain = SlotsLoss(savi, motion_weight=9.0)(batch), SlotsLoss(savi)(batch)
+    torch.testing.assert_close(weighted["loss_reconstruction"], (first + error[1].mean()) / 2)
+    assert weighted["loss_reconstruction"] > plain["loss_reconstruction"]
+    assert torch.equal(weighted["psnr"], plain["psnr"])
+
+
+def test_nothing_moves_in_a_clip_of_one_frame() -> None:
+    assert moving(torch.rand(2, 1, 3, 4, 4)).sum() == 0
