@@ -86,12 +86,17 @@ def session_of(pid: int) -> list[int]:
     return found
 
 
+def parent_of(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[1])
+
+
 def workers_of(pid: int) -> list[int]:
-    """Collector processes of a parent (not multiprocessing's resource tracker)."""
-    found = []
-    for child in session_of(pid):
+    """Collector processes of a parent: those that its fork server has started (not that server, not the tracker)."""
+    found, session = [], session_of(pid)
+    for child in session:
         with contextlib.suppress(OSError):
-            if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
+            forked = b"multiprocessing.forkserver" in Path(f"/proc/{child}/cmdline").read_bytes()
+            if forked and parent_of(child) in session:
                 found.append(child)
     return found
 

@@ -127,11 +127,9 @@ class _LocalWorker:
         return self._pool.submit(_play, weights, wanted, part)
 
     def close(self) -> None:
-        processes = list((self._pool._processes or {}).values())  # one that hangs is ended no other way
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
+        for process in list((self._pool._processes or {}).values()):  # one that hangs is ended no other way
             process.kill()
-            process.join()
+        self._pool.shutdown(cancel_futures=True)  # and wait: what is left to the garbage collector may leak semaphores
 
 
 class _RayWorker:
