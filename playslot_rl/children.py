@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from multiprocessing.context import ForkServerContext
 from typing import Final
 
@@ -15,14 +16,17 @@ IMPORTED: Final = ("torchrl.envs",)
 """What every worker needs and takes seconds to import; with it torch and tensordict."""
 
 
-def worker_context() -> ForkServerContext:
+def worker_context(imported: Sequence[str] = IMPORTED) -> ForkServerContext:
     """How workers start: forked from one server, which has the imports, and no thread, GL context or GPU.
 
     The first worker starts as quickly as a fresh process, each further one in tens of milliseconds, and all of them
     share the memory of the imports. The server ends with this process, and its workers with it (`begin_worker`).
+
+    Args:
+        imported: modules; a process has one server, with the imports that were wanted when its first worker started.
     """
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(IMPORTED))
+    context.set_forkserver_preload(list(imported))
     return context
 
 

@@ -150,6 +150,5 @@ def _chosen_prototypes(
 
 
 def _timed(config: ExperimentConfig, stage: str, trials: Path) -> Choice:
-    slots = f"_{config.model.savi.n_slots}" if stage == "slots" else ""
-    seconds = seconds_a_step(config, stage, trials / f"time_{stage}{slots}")
+    seconds = seconds_a_step(config, stage, trials / f"time_{stage}_{config.model.savi.n_slots}")
     return Choice(max(1, round(1000 * seconds)), "measured here, the first steps included")

@@ -28,7 +28,7 @@ from playslot_rl import keys
 from playslot_rl.frames import normalise
 from playslot_rl.losses.common import psnr
 from playslot_rl.modules.savi import Decoded, SAVi
-from playslot_rl.modules.savi.health import changes
+from playslot_rl.modules.savi.health import moves
 
 
 class SlotsLoss(LossModule):
@@ -103,8 +103,8 @@ class SlotsLoss(LossModule):
 
 def moving(frames: Tensor) -> Tensor:
     """1 where a pixel changes from the frame before or to the one after, else 0: (B, T, H, W) of (B, T, 3, H, W)."""
-    changed = changes(frames).to(frames.dtype).squeeze(2)
-    moves = torch.zeros_like(frames[:, :, 0])
-    moves[:, 1:] = changed
-    moves[:, :-1] = torch.maximum(moves[:, :-1], changed)
-    return moves
+    changed = moves(frames[:, 1:] - frames[:, :-1]).squeeze(2).to(frames.dtype)
+    either = torch.zeros_like(frames[:, :, 0])
+    either[:, 1:] = changed
+    either[:, :-1] = torch.maximum(either[:, :-1], changed)
+    return either

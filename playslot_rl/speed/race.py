@@ -6,7 +6,6 @@ and from the same memory. Forking is safe there: the server has no compute threa
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import time
 from collections.abc import Iterator, Mapping
@@ -18,6 +17,7 @@ from statistics import median
 from typing import Any
 
 from playslot_rl.allocator import tune_allocator
+from playslot_rl.children import worker_context
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.speed.cases import Sizes, Variant
 from playslot_rl.threads import set_threads
@@ -84,8 +84,7 @@ class Child:
 @contextmanager
 def start(name: str, variant: Variant, sizes: Sizes, threads: int) -> Iterator[Child]:
     """Start the process of a variant; it ends with the block."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["playslot_rl.speed.cases"])
+    context = worker_context(["playslot_rl.speed.cases"])
     ours, theirs = context.Pipe()
     process = context.Process(target=serve, args=(theirs, variant, sizes, threads), daemon=True)
     with _no_malloc_settings():

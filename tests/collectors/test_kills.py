@@ -68,9 +68,15 @@ def wait_for(happened: Any, process: subprocess.Popen[bytes] | None = None, time
         time.sleep(0.005)
 
 
+def status_of(pid: int) -> tuple[str, int, int]:
+    """State, parent and session of a process, as the kernel tells them."""
+    state, parent, _, session = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[:4]
+    return state, int(parent), int(session)
+
+
 def alive(pid: int) -> bool:
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+        return status_of(pid)[0] != "Z"
     except OSError:
         return False
 
@@ -78,16 +84,12 @@ def alive(pid: int) -> bool:
 def session_of(pid: int) -> list[int]:
     """Processes of the session that `pid` leads, itself left out: orphans stay in it."""
     found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
+    for path in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            fields = path.read_text().rsplit(")", 1)[1].split()
-            if int(fields[3]) == pid and fields[0] != "Z" and int(path.parent.name) != pid:
-                found.append(int(path.parent.name))
+            state, _, session = status_of(int(path.name))
+            if session == pid and state != "Z" and int(path.name) != pid:
+                found.append(int(path.name))
     return found
-
-
-def parent_of(pid: int) -> int:
-    return int(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[1])
 
 
 def workers_of(pid: int) -> list[int]:
@@ -96,7 +98,7 @@ def workers_of(pid: int) -> list[int]:
     for child in session:
         with contextlib.suppress(OSError):
             forked = b"multiprocessing.forkserver" in Path(f"/proc/{child}/cmdline").read_bytes()
-            if forked and parent_of(child) in session:
+            if forked and status_of(child)[1] in session:
                 found.append(child)
     return found
 

@@ -135,13 +135,13 @@ class SlotHealth:
         return found | ({"moving_explained": 1.0 - self._error / self._motion} if self._motion else {})
 
 
-def changes(frames: Tensor) -> Tensor:
-    """Which pixels move from each frame to the next: clips (B, T, 3, H, W) in [0, 1] to booleans (B, T-1, 1, H, W)."""
-    return (frames[:, 1:] - frames[:, :-1]).abs().amax(2, keepdim=True) >= MOVING
+def moves(change: Tensor) -> Tensor:
+    """Which pixels move: changes from frame to frame (B, T-1, 3, H, W) of [0, 1] to booleans (B, T-1, 1, H, W)."""
+    return change.abs().amax(2, keepdim=True) >= MOVING
 
 
 def change_errors(frames: Tensor, reconstructed: Tensor) -> tuple[float, float]:
     """Sums over the pixels that move, of clips (B, T, 3, H, W): squared error of the change, and squared change."""
     real, drawn = frames[:, 1:] - frames[:, :-1], reconstructed[:, 1:] - reconstructed[:, :-1]
-    moves = changes(frames).float()
-    return float(((drawn - real).square() * moves).sum()), float((real.square() * moves).sum())
+    where = moves(real).float()
+    return float(((drawn - real).square() * where).sum()), float((real.square() * where).sum())
