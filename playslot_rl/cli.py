@@ -187,7 +187,7 @@ COMMANDS: Final[dict[str, Command]] = {
                 "playslot compare-video env=block_push preset=compact methods=svg,caddy,slotformer,ocvp_seq,playslot "
                 "seeds=0 run=pretrained out=runs/video"
             ),
-            "playslot compare-video data.root=data/mine env=sketchy compare_video.budget_minutes=15 out=runs/video",
+            "playslot compare-video env=video data.root=data/mine compare_video.budget_minutes=15 out=runs/video",
         ),
     ),
     "demo": Command(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.errors import PlaySlotError
+from playslot_rl.errors import ConfigError, PlaySlotError
 from playslot_rl.recipes.run import parent_run
 
 TEST_SEED = 1_000_003
@@ -44,17 +44,23 @@ def compare(config: ExperimentConfig) -> None:
     from playslot_rl.comparison.launch import comparison_lock, open_comparison, run_due
     from playslot_rl.comparison.video_plan import check_variants, video_job_config, video_job_record, video_jobs
     from playslot_rl.comparison.video_report import VideoComparison
+    from playslot_rl.envs import RECORDED
     from playslot_rl.evaluation.lpips import open_lpips
 
     began, own, out = time.monotonic(), config.compare_video, Path(config.out)
     check_variants(config)
     run = parent_run(config, out) if config.run else ""
+    _check_models(config, run)
     data = replace(config.data, tested=own.tested if config.data.root and not own.test else 0.0)
     config = replace(config, run=run, data=data, demos=None)
     lpips = open_lpips(config.metrics.lpips_weights)  # a wrong file is refused before anything is computed
     recorded = bool(config.data.root)
     if recorded:
         _check_clips(config)
+    elif config.env.name in RECORDED:
+        raise ConfigError(
+            f"data.root: got nothing with env={config.env.name}, which nothing records, expected a data set of videos"
+        )
     open_comparison(out)
     with comparison_lock(out):
         config = _prepare(config, out)
@@ -62,7 +68,8 @@ def compare(config: ExperimentConfig) -> None:
             _check_clips(config)
         parents, jobs = _parents(config), {}
         for job in video_jobs(config, out):
-            jobs[job] = video_job_record(job, video_job_config(config, job, config.run), parents)
+            own_config = video_job_config(config, job, config.run)
+            jobs[job] = video_job_record(job, own_config, parents, lpips=lpips.network is not None)
         references, truth = _references(config, out, parents)
         report = VideoComparison(config, out, jobs, references, truth, lpips.reason, began)
         run_due("compare-video", report, own.launcher, own.hydra)
@@ -77,20 +84,48 @@ def compare(config: ExperimentConfig) -> None:
         )
 
 
-def _check_clips(config: ExperimentConfig) -> None:
-    """Refuse data without enough clips, before anything long is computed.
+def _check_models(config: ExperimentConfig, run: str) -> None:
+    """Refuse models that do not fit the frames, before anything is computed.
 
     Raises:
+        ConfigError, CheckpointError: SAVi was trained on frames of another size, SVG-LP or CADDY cannot take these, or
+            the weights of a perceptual loss cannot be read.
+    """
+    from playslot_rl.baselines.video.load import check_pixel_model
+    from playslot_rl.comparison.video_plan import uses_slots
+    from playslot_rl.config.compare_video import ON_SLOTS
+    from playslot_rl.storage.checkpoints import require_config
+    from playslot_rl.training.runs import slots_checkpoint
+
+    for method in config.compare_video.methods:
+        if method not in ON_SLOTS:
+            check_pixel_model(method, config.baselines, config.env.image_size)
+    if run and uses_slots(config):
+        require_config(slots_checkpoint(run), {"env": {"image_size": config.env.image_size}})
+
+
+def _check_clips(config: ExperimentConfig) -> None:
+    """Refuse data without enough clips, and tests on what is trained on, before anything long is computed.
+
+    Raises:
+        ConfigError: a test set is one of the sets that are trained on.
         DataError: too few episodes, or none as long as a clip of training or test.
     """
-    from playslot_rl.comparison.video_clips import tested_clips
+    from playslot_rl.comparison.video_clips import test_sets, tested_clips
+    from playslot_rl.config.weights import data_roots
     from playslot_rl.data.windows import Clips
     from playslot_rl.training.record import open_videos
 
     own = config.compare_video
-    for _ in tested_clips(config):
-        pass
     trained = open_videos(config, config.data.root, "compare-video")
+    folders = {Path(root.path).resolve() for root in data_roots(config.data.root)}
+    for tested in tested_clips(config):
+        test = test_sets(config)[tested.label]
+        if test and (Path(test).resolve() in folders or tested.source.fingerprint == trained.fingerprint):
+            raise ConfigError(
+                f"compare_video.test={test}: got videos of data.root, which models are trained on, expected others: "
+                "leave it out to keep a tenth of data.root's episodes"
+            )
     Clips(trained, own.trained_seed + own.trained_frames, config.data.validation, config.seed)
 
 
@@ -167,11 +202,13 @@ def _references(
     if "slots" in parents:
         models[RECONSTRUCTION] = ("the frames themselves", Reconstruction(load_savi(config.run, device)))
     stored = read_references(out / "references.json", print_)
-    rows, truth = stored or [], {}
-    for label, shown, source, at in tested_clips(config):
+    rows, truth, clips = stored or [], {}, []
+    for tested in tested_clips(config):
+        label, shown, source, at = tested
+        clips.append(tested.fingerprint)
         truth[label, shown] = source.frames[at[: own.pictures, shown:]]
         for title, (sees, model) in models.items() if stored is None else ():
             scores, _ = score_clips(as_function(model, shown), source, at, shown, device, lpips=network)
             rows.append({"title": title, "row": "", "sees": sees, "clips_of": label, "seed_frames": shown, **scores})
-    write_json(out / "references.json", {"fingerprint": print_, "rows": rows})
+    write_json(out / "references.json", {"fingerprint": print_, "clips": clips, "rows": rows})
     return rows, truth

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig, from_dict
+from playslot_rl.errors import TrainingError
 
 if TYPE_CHECKING:
     from playslot_rl.comparison.video_plan import VideoJob
@@ -45,36 +46,44 @@ def _train(job: VideoJob, config: ExperimentConfig, processes: int) -> None:
 
 def _chosen(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> ExperimentConfig:
     """The config with the learning rate that was best after short trials, and the steps that fit the budget."""
-    from playslot_rl.comparison.video_plan import asked_of, training_of, with_training
+    from playslot_rl.comparison.video_plan import asked_of, in_steps, training_of, with_training
     from playslot_rl.storage.atomic import write_json
 
     asked, own, path = asked_of(record), training_of(config, job.method), job.choice
     stored = json.loads(path.read_text()) if path.is_file() else {}
     if stored.get("fingerprint") != record["fingerprint"]:
-        tried = []
+        tried = list[dict[str, Any]]()
         if len(asked.rates) > 1 or asked.budget_minutes:
             processes = int(record["processes"])
             tried = [_trial(job, config, rate, asked.trial_steps, processes) for rate in asked.rates]
-        best = max(tried, key=lambda trial: float(trial["psnr"])) if tried else {"rate": asked.rates[0]}
-        seconds = min((float(trial["seconds_a_step"]) for trial in tried), default=0.0)
+        ended = [trial for trial in tried if trial["psnr"] is not None]
+        if tried and not ended:
+            raise TrainingError(f"compare_video.rates={','.join(map(str, asked.rates))}: {tried[0]['error']}")
+        best = max(ended, key=lambda trial: float(trial["psnr"])) if tried else {"rate": asked.rates[0]}
+        seconds = min((float(trial["seconds_a_step"]) for trial in ended), default=0.0)
         steps = max(1, round(60 * asked.budget_minutes / seconds)) if asked.budget_minutes and seconds else own.steps
         stored = {"fingerprint": record["fingerprint"], "rate": best["rate"], "steps": steps, "tried": tried}
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, stored)
     optim = replace(own.optim, lr=own.optim.lr * float(stored["rate"]))
-    return with_training(config, job.method, steps=int(stored["steps"]), optim=optim)
+    return in_steps(with_training(config, job.method, optim=optim), job.method, int(stored["steps"]))
 
 
-def _trial(job: VideoJob, config: ExperimentConfig, rate: float, steps: int, processes: int) -> dict[str, float]:
-    """Validation PSNR after a short training with a factor of the learning rate, and what a step takes."""
-    from playslot_rl.comparison.video_plan import training_of, with_training
+def _trial(job: VideoJob, config: ExperimentConfig, rate: float, steps: int, processes: int) -> dict[str, Any]:
+    """Validation PSNR after a short training with a factor of the learning rate, and what a step takes; both None with
+    a rate that the training does not survive, and its `error`."""
+    from playslot_rl.comparison.video_plan import in_steps, training_of, with_training
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
 
+    config = in_steps(config, job.method, steps)
     own = training_of(config, job.method)
     out = job.trials / f"rate_{rate:g}"
-    optim = replace(own.optim, lr=own.optim.lr * rate, warmup_steps=min(own.optim.warmup_steps, steps // 4))
-    changes: dict[str, Any] = {"steps": steps, "optim": optim, "checkpoint_every": steps, "validate_every": steps}
-    _train(job, replace(with_training(config, job.method, **changes), out=str(out)), processes)
+    optim = replace(own.optim, lr=own.optim.lr * rate)
+    changes: dict[str, Any] = {"optim": optim, "checkpoint_every": steps, "validate_every": steps}
+    try:
+        _train(job, replace(with_training(config, job.method, **changes), out=str(out)), processes)
+    except TrainingError as error:
+        return {"rate": rate, "psnr": None, "seconds_a_step": None, "error": str(error)}
     done = read_stage(checkpoint_folder(out, job.stage), job.stage)
     return {
         "rate": rate,
@@ -102,7 +111,10 @@ def _score(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> N
     done = read_stage(checkpoint_folder(job.run, job.stage), job.stage)
     network = open_lpips(config.metrics.lpips_weights).network
     scores, pictures = [], dict[str, Any]()
-    for label, shown, source, rows in tested_clips(config):
+    clips = []
+    for tested in tested_clips(config):
+        label, shown, source, rows = tested
+        clips.append(tested.fingerprint)
         for row in method_rows(model, shown):
             values, frames = score_clips(
                 row.predict, source, rows, shown, device, lpips=network, shuffled=row.shuffled, shown=asked.pictures
@@ -116,6 +128,7 @@ def _score(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> N
         job.scores,
         {
             "fingerprint": record["fingerprint"],
+            "clips": clips,
             "scores": scores,
             "metrics": done.meta["metrics"],
             "validation": _validations(job),
@@ -123,6 +136,7 @@ def _score(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> N
             "train_seconds": done.meta["seconds"],
             "score_seconds": round(time.monotonic() - began, 1),
             "choice": json.loads(job.choice.read_text()),
+            "perceptual": done.meta.get("perceptual"),
         },
     )
 

@@ -15,8 +15,8 @@ def main(config: ExperimentConfig) -> None:
     """Train `config.method` into `out`; killed, the same command carries on; finished, it says so.
 
     Raises:
-        ConfigError: no `out`, or the folder of the world model in `run`; a method on slots without `run`; an
-            environment without a simulator.
+        ConfigError: no `out`, or the folder of the world model in `run`; a method on slots without `run`; one
+            that acts, and an environment without a simulator.
         PlaySlotError: see the method's recipe.
     """
     if not config.out:
@@ -31,6 +31,7 @@ def main(config: ExperimentConfig) -> None:
             f"run: got nothing with method={config.method}, expected the world model whose slots it builds on: "
             "a run folder, or run=pretrained"
         )
-    gym_id(config.env.name)
+    if method.actor:
+        gym_id(config.env.name)
     recipe = importlib.import_module(f"playslot_rl.recipes.{method.recipe}")
     recipe.main(config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -11,13 +12,25 @@ from playslot_rl.data.demonstrations import split_tested
 from playslot_rl.data.opening import open_configured
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray, spread_windows
-from playslot_rl.errors import DataError
+from playslot_rl.errors import ConfigError, DataError
 
 
 def test_sets(config: ExperimentConfig) -> dict[str, str]:
-    """The data sets whose clips are tested, by folder name; one of them, or episodes kept of `data.root`, has none."""
+    """The data sets whose clips are tested, by folder name; one of them, or episodes kept of `data.root`, has none.
+
+    Raises:
+        ConfigError: two folders of one name.
+    """
     roots = [part.strip() for part in config.compare_video.test.split(",") if part.strip()]
-    return {Path(root).name: root for root in roots} if len(roots) > 1 else {"": "".join(roots)}
+    if len(roots) <= 1:
+        return {"": "".join(roots)}
+    named = {Path(root).name: root for root in roots}
+    if len(named) < len(roots):
+        raise ConfigError(
+            f"compare_video.test={config.compare_video.test}: got folders of one name, expected one each: tables are "
+            "named by it"
+        )
+    return named
 
 
 class Tested(NamedTuple):
@@ -34,6 +47,11 @@ class Tested(NamedTuple):
     shown: int
     source: EpisodeFrames
     rows: IntArray
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the true frames."""
+        return hashlib.sha256(self.source.frames[self.rows].tobytes()).hexdigest()[:16]
 
 
 def tested_clips(config: ExperimentConfig) -> Iterator[Tested]:
@@ -69,11 +87,14 @@ def open_clips(config: ExperimentConfig, test: str, frames: int, count: int) -> 
         DataError: too few episodes, none so long, fewer than two clips, or a data set that cannot be read.
     """
     data = config.data
-    source = open_configured(config, test or data.root)
-    tested = source if test else split_tested(source, data.tested)[1]
-    rows = spread_windows(tested.starts, tested.lengths, frames, count, range(tested.episodes))
+    place, cure = ("compare_video.test", "") if test else ("data.root", ", or raise compare_video.tested")
+    try:
+        source = open_configured(config, test or data.root)
+        tested = source if test else split_tested(source, data.tested)[1]
+        rows = spread_windows(tested.starts, tested.lengths, frames, count, range(tested.episodes))
+    except DataError as error:
+        raise DataError(f"{place}, for clips of compare_video.shown and predicted frames: {error}") from None
     if len(rows) < 2:
-        place, cure = ("compare_video.test", "") if test else ("data.root", ", or raise compare_video.tested")
         raise DataError(
             f"{place}={test or data.root}: got {len(rows)} held-out clip of {frames} frames, expected at least 2: "
             f"collect more episodes{cure}"

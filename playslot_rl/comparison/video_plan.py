@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +17,10 @@ from playslot_rl.config.methods import MethodName
 from playslot_rl.config.roles import without
 from playslot_rl.errors import ConfigError
 
+VARIED = ("model.inverse_dynamics.", "model.predictor.", "dynamics.")
+"""Where the settings are that change what PlaySlot predicts, on a SAVi that is there."""
+PHASES = ("teacher_steps", "warmup_steps", "anneal_steps", "growth_steps", "validate_every")
+"""Settings of a training that are parts of its steps."""
 NOT_OF_A_JOB = ("methods", "seeds", "vary", "values", "objects", "processes", "launcher", "hydra")
 """Settings of the whole comparison: another choice of them leaves a job as it is."""
 
@@ -38,8 +43,14 @@ class VideoJob:
 
     @property
     def name(self) -> str:
-        """Such as `svg-s0`, or `playslot-mode=hybrid-s0`."""
-        return "-".join(part for part in (self.method, self.variant, f"s{self.seed}") if part)
+        """Such as `svg-s0`, or `playslot-mode-hybrid-s0`: a folder's, and a word to Hydra, which `=` would end."""
+        variant = re.sub(r"[^\w.]+", "-", self.variant).strip("-")
+        return "-".join(part for part in (self.method, variant, f"s{self.seed}") if part)
+
+    @property
+    def value(self) -> str:
+        """Of the setting that varies."""
+        return self.variant.partition("=")[2]
 
     @property
     def title(self) -> str:
@@ -106,14 +117,24 @@ def video_jobs(config: ExperimentConfig, out: Path) -> list[VideoJob]:
 
 
 def check_variants(config: ExperimentConfig) -> None:
-    """Refuse a setting that is not there, and values it cannot have.
+    """Refuse a setting that is not there or that a comparison sets itself, and values it cannot have.
 
     Raises:
         ConfigError: one line.
     """
     own = config.compare_video
-    for value in own.values:
-        _with_setting(config, own.vary, value)
+    if own.vary and not any(method.startswith("playslot") for method in own.methods):
+        raise ConfigError(f"vary: got methods={','.join(own.methods)}, expected playslot or playslot_m among them")
+    if own.vary == "dynamics.steps" and own.budget_minutes:
+        raise ConfigError("vary: got dynamics.steps with compare_video.budget_minutes, expected one of them")
+    for job in video_jobs(config, Path()):
+        if job.variant:
+            wanted = _with_setting(config, own.vary, job.value)
+            if _setting(video_job_config(config, job, ""), own.vary) != _setting(wanted, own.vary):
+                raise ConfigError(
+                    f"values: got {job.value} for {own.vary}, expected what a comparison leaves as it is: methods, "
+                    "lengths of clips and the context they allow are its own (compare_video.*)"
+                )
 
 
 def _parsed(text: str) -> Any:
@@ -123,16 +144,24 @@ def _parsed(text: str) -> Any:
         return text  # a name, such as `hybrid`
 
 
+def _setting(config: ExperimentConfig, key: str) -> Any:
+    at: Any = to_dict(config)
+    for part in key.split("."):
+        at = at[part]
+    return at
+
+
 def _with_setting(config: ExperimentConfig, key: str, text: str) -> ExperimentConfig:
-    """The config with one setting under `model` or `dynamics` changed."""
+    """The config with one setting of inverse dynamics, predictor or their training changed."""
     values = to_dict(config)
     group, _, name = key.rpartition(".")
     at: Any = values
     for part in group.split("."):
         at = at.get(part, {}) if isinstance(at, dict) else {}
-    settable = key.startswith(("model.", "dynamics.")) and name in at and not isinstance(at[name], dict)
+    settable = key.startswith(VARIED) and name in at and not isinstance(at[name], dict)
     if not settable:
-        raise ConfigError(f"vary: got {key!r}, expected a setting under model or dynamics")
+        known = ", ".join(part.removesuffix(".") for part in VARIED)
+        raise ConfigError(f"vary: got {key!r}, expected a setting under {known}")
     at[name] = _parsed(text)
     try:
         return from_dict(ExperimentConfig, values)
@@ -158,8 +187,27 @@ def training_of(config: ExperimentConfig, method: VideoMethod) -> Any:
     return config.dynamics if method.startswith("playslot") else getattr(config.baselines, method)
 
 
+def in_steps(config: ExperimentConfig, method: VideoMethod, steps: int) -> ExperimentConfig:
+    """The config with a training of so many steps, its phases and warm-up shortened or stretched with it.
+
+    So a trial is the training in small: a step of it takes, on average, what a step of the training takes.
+    """
+    own = training_of(config, method)
+    if steps == own.steps:
+        return config
+
+    whole = int(own.steps)
+
+    def share(of: int) -> int:
+        return -(-of * steps // whole)
+
+    changes: dict[str, Any] = {name: share(getattr(own, name)) for name in PHASES if hasattr(own, name)}
+    changes["optim"] = replace(own.optim, warmup_steps=share(own.optim.warmup_steps))
+    return with_training(config, method, steps=steps, **changes)
+
+
 def video_job_config(config: ExperimentConfig, job: VideoJob, world: str) -> ExperimentConfig:
-    """What a job trains with: the preset's settings, on clips of the same lengths for every method.
+    """What a job trains with: the preset's settings, on clips of the same lengths, drawn alike, for every method.
 
     Args:
         config: of the comparison, with `data` complete.
@@ -167,12 +215,14 @@ def video_job_config(config: ExperimentConfig, job: VideoJob, world: str) -> Exp
         world: run folder of the SAVi, or `pretrained`.
     """
     own = config.compare_video
+    if job.variant:
+        config = _with_setting(config, own.vary, job.value)
     if job.trained_as == "playslot":  # whatever the task brings: the two rows are these two
         inverse = replace(config.model.inverse_dynamics, variant="multi" if job.method == "playslot_m" else "single")
         config = replace(config, model=replace(config.model, inverse_dynamics=inverse))
-    if job.variant:
-        config = _with_setting(config, own.vary, job.variant.partition("=")[2])
     config = with_training(config, job.method, seed_frames=own.trained_seed, predicted_frames=own.trained_frames)
+    if job.method in ON_SLOTS:  # those on pixels have no such setting
+        config = with_training(config, job.method, from_start=0.0)
     config = _with_context(config, job.method, own.trained_seed + own.trained_frames - 1)
     data = replace(
         config.data,
@@ -210,13 +260,16 @@ def _with_context(config: ExperimentConfig, method: VideoMethod, frames: int) ->
     return config
 
 
-def video_job_record(job: VideoJob, config: ExperimentConfig, parents: Mapping[str, str]) -> dict[str, Any]:
+def video_job_record(
+    job: VideoJob, config: ExperimentConfig, parents: Mapping[str, str], lpips: bool
+) -> dict[str, Any]:
     """What the job's file says.
 
     Args:
         job: which one.
         config: its own (`video_job_config`).
         parents: fingerprints of the slots and the videos it builds on.
+        lpips: whether there are weights for LPIPS: scores without it are not those with it.
     """
     own = to_dict(config.compare_video)
     asked = {key: own[key] for key in own if key not in NOT_OF_A_JOB}
@@ -224,7 +277,7 @@ def video_job_record(job: VideoJob, config: ExperimentConfig, parents: Mapping[s
     result.pop("compare_video", None)
     result["baselines"] = result["baselines"].get(job.method, {})  # another method's settings are none of this job's
     content = {key: value for key, value in asked.items() if key != "test"}  # of a data set the content counts
-    identity = json.dumps([result, content, dict(parents)], sort_keys=True)
+    identity = json.dumps([result, content, dict(parents), lpips], sort_keys=True)
     return {
         "kind": "video",
         "name": job.name,

@@ -36,7 +36,8 @@ FALLING = 0.05
 
 def job_summary(job: VideoJob, fingerprint: str) -> dict[str, Any]:
     """One training: `name`, `method`, `title`, `seed`, `status`, `error`, `parameters`, `steps`, `train_seconds`,
-    `rate` and `tried` (learning rates), `validation_psnr`, `still_improving`; null where there is nothing to say.
+    `rate` and `tried` (learning rates), `perceptual` (CADDY's loss had that term), `validation_psnr`,
+    `still_improving`; null where there is nothing to say.
 
     Args:
         job: which one.
@@ -60,6 +61,7 @@ def job_summary(job: VideoJob, fingerprint: str) -> dict[str, Any]:
         "train_seconds": done.get("train_seconds"),
         "rate": done.get("choice", {}).get("rate"),
         "tried": done.get("choice", {}).get("tried"),
+        "perceptual": done.get("perceptual"),
         "validation_psnr": curve[-1] if curve else None,
         "still_improving": curve[-1] - curve[-2] > FALLING if len(curve) > 1 else None,
         "scores": done.get("scores", []),
@@ -151,7 +153,8 @@ class VideoComparison:
             "jobs": [{key: value for key, value in job.items() if key != "scores"} for job in jobs],
             "test": own.test,
             "slots_of": "" if config.run == str(self.out / "world_model") else config.run,
-            "perceptual": bool(config.baselines.caddy.perceptual),
+            "test_recorded": str(self.out / "data" / "test") in own.test,
+            "perceptual": any(job["perceptual"] for job in jobs),
             "seconds": round(self._spent + time.monotonic() - self._began, 1),
             "command": made["command"],
             "commit": made["commit"],

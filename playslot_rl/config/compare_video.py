@@ -7,7 +7,7 @@ from typing import Final, Literal, get_args
 
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import SEED, Checked, at_least, role, within
+from playslot_rl.config.roles import SEED, Checked, at_least, between, role, within
 
 VideoMethod = Literal["svg", "caddy", "slotformer", "ocvp_seq", "playslot", "playslot_m"]
 VIDEO_METHODS: Final[tuple[VideoMethod, ...]] = get_args(VideoMethod)
@@ -41,8 +41,8 @@ class CompareVideoConfig(Checked):
         tested: fraction of the episodes that are kept for the test where there is no such data set; validation clips,
             which choose the learning rate, are of others.
         episodes: that a recorded test set has.
-        vary: setting under `model` or `dynamics` that PlaySlot is trained with in each of `values`, such as
-            `model.inverse_dynamics.mode`; empty trains it as the config says.
+        vary: setting under `model.inverse_dynamics`, `model.predictor` or `dynamics` that PlaySlot is trained with in
+            each of `values`, such as `model.inverse_dynamics.mode`; empty trains it as the config says.
         values: of that setting.
         objects: with `env=grid_shapes`, numbers of objects: one comparison each, and one table of all.
         clips: clips of these that are scored, at most.
@@ -51,7 +51,7 @@ class CompareVideoConfig(Checked):
             steps.
         rates: factors of the preset's learning rate, of which each method takes the one that is best on validation
             clips; one of them means no choice.
-        trial_steps: steps of each trial.
+        trial_steps: steps of each trial, which is the training in small: its phases are as much shorter.
         processes, launcher, hydra: as for `compare`.
     """
 
@@ -66,7 +66,7 @@ class CompareVideoConfig(Checked):
     tested_on: tuple[Literal["expert", "random"], ...] = ("expert",)
     vary: str = ""
     values: tuple[str, ...] = ()
-    objects: tuple[int, ...] = field(default=(), metadata=at_least(1, "numbers of at least 1"))
+    objects: tuple[int, ...] = field(default=(), metadata=between(1, 5, "numbers of 1 to 5"))
     episodes: int = field(default=40, metadata=at_least(2))
     tested: float = field(default=0.1, metadata=within(lambda share: 0 < share < 1, "a fraction in (0, 1)"))
     clips: int = field(default=64, metadata=at_least(2))

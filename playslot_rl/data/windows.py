@@ -71,7 +71,7 @@ def spread_windows(
     first, valid = _valid_starts(starts, lengths, window, episodes)
     begins = np.concatenate([s + np.arange(0, n, window) for s, n in zip(first, valid, strict=True)])
     windows: IntArray = begins[:, None].astype(np.int64) + np.arange(window)
-    return windows[:: max(1, len(windows) // count)][:count]
+    return spread_evenly(windows, count)
 
 
 def spread_evenly(items: IntArray, count: int) -> IntArray:

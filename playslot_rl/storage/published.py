@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from playslot_rl.errors import CheckpointError
-from playslot_rl.storage.tensors import load_tensors
 
 
 def read_published(path: Path, key: str, network: str, cure: str) -> dict[str, Tensor]:
@@ -25,11 +24,14 @@ def read_published(path: Path, key: str, network: str, cure: str) -> dict[str, T
     Raises:
         CheckpointError: it is missing or damaged.
     """
-    if path.suffix == ".safetensors":
-        return load_tensors(path)
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
     try:
+        if path.suffix == ".safetensors":
+            return load(path.read_bytes())
         state: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
+    except (OSError, RuntimeError, ValueError, EOFError, SafetensorError, pickle.UnpicklingError) as error:
         said = (str(error).splitlines() or [type(error).__name__])[0]  # an empty file says nothing
         raise CheckpointError(
             f"{key}={path}: got {said}, expected a file of {network}'s weights: check the path, or {cure}"

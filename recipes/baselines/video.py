@@ -82,7 +82,8 @@ def _on_pixels(config: ExperimentConfig, record: StageRecord) -> Training:
     clips = record.clips(own.seed_frames + own.predicted_frames)
     sizes = config.baselines
     stage = CADDYStage(model, clips, sizes.caddy) if isinstance(model, CADDY) else SVGStage(model, clips, sizes.svg)
-    return _training(config, record, stage, device)
+    known = {"perceptual": stage.perceptual_on} if isinstance(stage, CADDYStage) else {}
+    return _training(config, record, stage, device, extra=known)
 
 
 def _on_slots(config: ExperimentConfig, record: StageRecord) -> Training:
@@ -110,7 +111,12 @@ def _on_slots(config: ExperimentConfig, record: StageRecord) -> Training:
 
 
 def _training(
-    config: ExperimentConfig, record: StageRecord, stage: Any, device: Any, patience: Patience | None = None
+    config: ExperimentConfig,
+    record: StageRecord,
+    stage: Any,
+    device: Any,
+    patience: Patience | None = None,
+    extra: Mapping[str, Any] | None = None,
 ) -> Training:
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
@@ -120,5 +126,5 @@ def _training(
         [Part(f"baselines.{name}", stage, own, patience=patience)],
         device,
         lambda metrics: f"{name}: {metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {record.folder}",
-        extra={"episodes": record.data.episodes},
+        extra={"episodes": record.data.episodes} | dict(extra or {}),
     )

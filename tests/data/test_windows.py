@@ -47,7 +47,11 @@ def test_windows_longer_than_every_episode_are_refused(episodes: list[int] | Non
 def test_spread_windows_are_disjoint_and_cover_the_episodes_evenly() -> None:
     every = spread_windows(STARTS, LENGTHS, 2, 100, [0, 1, 2, 3])
     assert every.tolist() == [[s, s + 1] for s in (0, 2, 5, 7, 9, 11, 13, 15, 17)]
-    assert spread_windows(STARTS, LENGTHS, 2, 3, [0, 1, 2, 3])[:, 0].tolist() == [0, 7, 13]
+    assert spread_windows(STARTS, LENGTHS, 2, 3, [0, 1, 2, 3])[:, 0].tolist() == [0, 9, 17]
+    episodes = np.arange(40)
+    rows = spread_windows(episodes * 10, np.full(40, 10), 5, 64, episodes)
+    assert len(rows) == 64
+    assert set(rows[:, 0] // 10) == set(range(40))
     assert spread_windows(STARTS, LENGTHS, 5, 100, [0, 2])[:, 0].tolist() == [0, 7, 12]
 
 

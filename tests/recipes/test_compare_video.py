@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,10 @@ import numpy as np
 import pytest
 from commands import playslot, refused, run_jobs_here, smoke
 
+from playslot_rl.comparison.launch import sweep_command
+from playslot_rl.comparison.video_plan import VideoJob, in_steps, video_job_config
 from playslot_rl.config.compare_video import TITLES, VIDEO_METHODS
+from playslot_rl.config.compose import compose
 
 METHODS = ",".join(VIDEO_METHODS)
 
@@ -74,10 +78,13 @@ def test_page_plot_and_sheets_are_there(finished: Path) -> None:
 
 
 def test_all_models_predict_the_same_clips(finished: Path) -> None:
+    references = json.loads((finished / "references.json").read_text())
+    assert len(set(references["clips"])) == 2  # after two frames and after one
     shapes = set()
     for file in sorted(finished.glob("runs/*/video.npz")):
         with np.load(file) as stored:
             shapes.add(stored["frames_2"].shape)
+        assert json.loads(file.with_suffix(".json").read_text())["clips"] == references["clips"]
     assert shapes == {(2, 3, 64, 64, 3)}
 
 
@@ -90,18 +97,22 @@ def test_the_same_command_trains_nothing_again_and_gives_the_same_numbers(finish
 
 @pytest.mark.usefixtures("started")
 def test_a_method_that_fails_leaves_a_row_that_says_so(finished: Path, tmp_path: Path) -> None:
-    """A learning rate that blows up ends one training, not the others."""
+    """A learning rate that blows up ends one training, not the others; and one of several, that trial alone."""
     data = f"{finished}/data/random"
     done = playslot(
         "compare-video", "env=button_press", "preset=smoke", f"data.root={data}", "methods=svg,slotformer",
-        f"run={finished}/world_model", "baselines.svg.optim.lr=1e30", f"out={tmp_path / 'out'}", "threads=1",
-        "device=cpu",
+        f"run={finished}/world_model", "baselines.svg.optim.lr=1e30", "compare_video.rates=[1.0,1e30]",
+        f"out={tmp_path / 'out'}", "threads=1", "device=cpu",
     )  # fmt: skip
     assert done.code == 1
     assert "1 of 2 trainings failed (svg-s0)" in done.err
-    status = {job["name"]: job["status"] for job in result(tmp_path / "out")["jobs"]}
-    assert status == {"svg-s0": "failed", "slotformer-s0": "done"}
-    assert "**svg-s0: failed.**" in (tmp_path / "out" / "video.md").read_text()
+    jobs = {job["name"]: job for job in result(tmp_path / "out")["jobs"]}
+    assert {name: job["status"] for name, job in jobs.items()} == {"svg-s0": "failed", "slotformer-s0": "done"}
+    assert jobs["slotformer-s0"]["rate"] == 1
+    assert [trial["psnr"] is None for trial in jobs["slotformer-s0"]["tried"]] == [False, True]
+    page = (tmp_path / "out" / "video.md").read_text()
+    assert "**svg-s0: failed.**" in page
+    assert "1e+30: failed" in page
 
 
 @pytest.mark.parametrize(
@@ -137,10 +148,11 @@ def test_clips_that_do_not_fit_are_refused_before_anything_is_trained(finished: 
 @pytest.mark.usefixtures("started")
 def test_a_setting_of_playslot_is_varied_on_two_kinds_of_clips(finished: Path, tmp_path: Path) -> None:
     """Action representation in one command; real actions count as what they are."""
-    out, data = tmp_path / "out", finished / "data"
+    out, data, other = tmp_path / "out", finished / "data", tmp_path / "random"
+    smoke("collect", "policy=random", "env=button_press", "seed=77", f"out={other}")
     smoke(
         "compare-video", "preset=smoke", "env=button_press", f"run={finished}/world_model", "methods=playslot",
-        f"data.root={data}/random", f"compare_video.test='{data}/test/expert,{data}/random'",
+        f"data.root={data}/random", f"compare_video.test='{data}/test/expert,{other}'",
         "vary=model.inverse_dynamics.mode", "values=discrete,ground_truth", "compare_video.rates=[1.0]", f"out={out}",
     )  # fmt: skip
     rows = [row for row in result(out)["summary"] if row["method"] and row["seed_frames"] == 2]
@@ -151,16 +163,30 @@ def test_a_setting_of_playslot_is_varied_on_two_kinds_of_clips(finished: Path, t
         for clips in ("expert", "random")
     }
     modes = {name: json.loads((out / "runs" / name / "config.json").read_text()) for name in
-             ("playslot-mode=discrete-s0", "playslot-mode=ground_truth-s0")}  # fmt: skip
+             ("playslot-mode-discrete-s0", "playslot-mode-ground_truth-s0")}  # fmt: skip
     assert [stored["model"]["inverse_dynamics"]["mode"] for stored in modes.values()] == ["discrete", "ground_truth"]
     assert all((out / f"frames_{clips}_2.png").is_file() for clips in ("expert", "random"))
+
+
+def test_the_command_line_of_a_launcher_takes_every_name() -> None:
+    """Hydra's grammar has its own `=`, commas and brackets."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    jobs = [
+        VideoJob("playslot", 3, Path("/tmp"), variant)
+        for variant in ("mode=hybrid", "n_prototypes=8", "residual=false", "image_weight=1e-3", "decoded_frames=0")
+    ]
+    command = sweep_command([job.file for job in jobs], "joblib", ())
+    job = next(part for part in command if part.startswith("+job="))
+    (parsed,) = OverridesParser.create().parse_overrides([job])
+    assert list(parsed.sweep_string_iterator()) == [job.name for job in jobs]
 
 
 @pytest.mark.usefixtures("started")
 def test_numbers_of_objects_have_one_table(tmp_path: Path) -> None:
     out = tmp_path / "out"
     smoke(
-        "compare-video", "env=grid_shapes", "methods=playslot,playslot_m", "objects=1,2", "slots.start_from=",
+        "compare-video", "env=grid_shapes", "methods=playslot,playslot_m,svg", "objects=1,2", "slots.start_from=",
         "compare_video.rates=[1.0]", f"out={out}",
     )  # fmt: skip
     found = result(out)["objects"]
@@ -168,7 +194,7 @@ def test_numbers_of_objects_have_one_table(tmp_path: Path) -> None:
     for number, part in found.items():
         run = json.loads((out / f"objects_{number}" / "runs" / "playslot-s0" / "config.json").read_text())
         assert run["env"]["action_dim"] == 2 * int(number)
-        assert {row["method"] for row in part["summary"]} == {None, "playslot", "playslot_m"}
+        assert {row["method"] for row in part["summary"]} == {None, "playslot", "playslot_m", "svg"}
     variants = [
         json.loads((out / "objects_2" / "runs" / f"{name}-s0" / "config.json").read_text())["model"]["inverse_dynamics"]
         for name in ("playslot", "playslot_m")
@@ -180,15 +206,62 @@ def test_numbers_of_objects_have_one_table(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("vary=model.nothing", "values=1"), "vary: got 'model.nothing', expected a setting under model or dynamics"),
+        (("vary=model.nothing", "values=1"), r"vary: got 'model.nothing', expected a setting under model\.inverse_dyn"),
+        (("vary=model.savi.n_slots", "values=1,2"), r"vary: got 'model.savi.n_slots', expected a setting under"),
+        (
+            ("vary=dynamics.predicted_frames", "values=3,4"),
+            "values: got 3 for dynamics.predicted_frames",
+        ),
+        (("vary=model.predictor.context", "values=99"), "values: got 99 for model.predictor.context, expected what"),
+        (("vary=dynamics.steps", "values=3", "compare_video.budget_minutes=1"), "vary: got dynamics.steps with"),
+        (("vary=dynamics.steps", "values=3", "methods=svg"), "vary: got methods=svg, expected playslot"),
+        (("env.image_size=32", "methods=svg"), r"env\.image_size: got 32, expected 64, .*leave out method svg"),
+        (("env.image_size=32", "methods=ocvp_seq", "run=pretrained"), "env.image_size.*64"),
+        (("metrics.lpips_weights=nowhere.safetensors",), r"metrics\.lpips_weights=nowhere\.safetensors: got .*No such"),
+        (("env=video",), "data.root: got nothing with env=video"),
         (("vary=model.inverse_dynamics.mode", "values=loud"), "values: got 'loud' for model.inverse_dynamics.mode"),
         (("objects=1,2",), "objects: got a task or videos with a number of objects of their own"),
     ],
 )
 def test_what_cannot_be_varied_is_refused(tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
     out = tmp_path / "out"
-    refused("compare-video", "env=button_press", "methods=playslot", f"out={out}", *arguments, message=message)
+    first = ("compare-video", "env=button_press", "methods=playslot", f"out={out}")
+    refused(*first, *arguments, message=message)
     assert not out.exists()
+
+
+def test_a_test_on_what_is_trained_on_is_refused(finished: Path, tmp_path: Path) -> None:
+    data, other = finished / "data" / "random", tmp_path / "random"
+    shutil.copytree(data, other)
+    for tests, message in (
+        (str(data), "got videos of data.root, which models are trained on"),
+        (str(other), "got videos of data.root, which models are trained on"),
+        (f"'{data},{other}'", "got folders of one name"),
+        (str(tmp_path / "nothing"), r"compare_video\.test"),
+    ):
+        refused(
+            "compare-video", "preset=smoke", "methods=svg", f"data.root={data}", f"compare_video.test={tests}",
+            f"out={tmp_path / 'out'}", message=message,
+        )  # fmt: skip
+        assert not (tmp_path / "out").exists()
+
+
+def test_a_trial_is_the_training_in_small() -> None:
+    config = compose(["preset=compact", "env=button_press"])
+    small = in_steps(config, "playslot", 150).dynamics
+    assert small.steps == 150
+    assert small.teacher_steps / small.steps == pytest.approx(config.dynamics.teacher_steps / config.dynamics.steps)
+    assert in_steps(config, "playslot", config.dynamics.steps) == config
+    caddy = in_steps(config, "caddy", 2).baselines.caddy
+    assert (caddy.warmup_steps, caddy.anneal_steps, caddy.growth_steps) == (1, 2, 1)
+    assert in_steps(config, "svg", 100).baselines.svg.optim.warmup_steps < config.baselines.svg.optim.warmup_steps
+
+
+def test_clips_are_drawn_alike() -> None:
+    config = compose(["preset=compact", "env=button_press"], "compare-video")
+    assert config.dynamics.from_start > 0
+    job = video_job_config(config, VideoJob("playslot", 0, Path("out")), "pretrained")
+    assert job.dynamics.from_start == 0
 
 
 def test_no_predictor_attends_to_more_frames_than_its_training_clips_show(finished: Path) -> None:

@@ -9,6 +9,7 @@ import torch
 
 from playslot_rl.baselines.caddy.load import load_model
 from playslot_rl.baselines.caddy.model import CADDY
+from playslot_rl.baselines.caddy.perceptual import load_perceptual
 from playslot_rl.baselines.svg.model import SVG
 from playslot_rl.baselines.video.predictor import VideoPredictor
 from playslot_rl.baselines.video.slots import SlotVideo
@@ -18,6 +19,7 @@ from playslot_rl.config import (
     SVGConfig,
 )
 from playslot_rl.config.baselines import BaselinesConfig
+from playslot_rl.errors import ConfigError
 from playslot_rl.storage.checkpoints import (
     checkpoint_folder,
     load_weights,
@@ -39,9 +41,25 @@ def build_pixel_model(method: str, config: BaselinesConfig, image_size: int) -> 
     """An untrained SVG-LP or CADDY.
 
     Raises:
-        ValueError: frames of a size that its convolutions do not fit.
+        ConfigError: frames of a size that its convolutions do not fit.
     """
-    return SVG(config.svg, image_size) if method == "svg" else CADDY(config.caddy, image_size)
+    try:
+        return SVG(config.svg, image_size) if method == "svg" else CADDY(config.caddy, image_size)
+    except ValueError as error:
+        raise ConfigError(f"env.{error}: change it, or leave out method {method}") from None
+
+
+def check_pixel_model(method: str, config: BaselinesConfig, image_size: int) -> None:
+    """Refuse frames or weights that SVG-LP or CADDY cannot take, before anything is computed.
+
+    Raises:
+        ConfigError: as `build_pixel_model`.
+        CheckpointError: as `load_perceptual`.
+    """
+    with torch.device("meta"):
+        build_pixel_model(method, config, image_size)
+    if method == "caddy":
+        load_perceptual(config.caddy.perceptual)
 
 
 def uncontrolled(model: ModelConfig, config: BaselinesConfig, method: str) -> ModelConfig:

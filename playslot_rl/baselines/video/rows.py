@@ -50,8 +50,12 @@ def method_rows(model: VideoPredictor, seed: int) -> list[Row]:
 
 
 def _from_prior(model: SVG, seed: int) -> Predict:
+    generators: dict[torch.device, torch.Generator] = {}  # one for all clips, so that each has its own sample
+
     def predict(frames: Tensor, donors: Tensor | None, actions: Tensor | None) -> Tensor:  # noqa: ARG001
-        return model.sample(frames, seed, torch.Generator(frames.device).manual_seed(0))
+        if frames.device not in generators:
+            generators[frames.device] = torch.Generator(frames.device).manual_seed(0)
+        return model.sample(frames, seed, generators[frames.device])
 
     return predict
 

@@ -22,7 +22,8 @@ class OCVPSeq(AutoregressivePredictor):
     """Slot predictor, conditioned on actions where there are any.
 
     Note: OCVP-Seq attends over time without a mask. Here a frame sees its past only, so that a prediction does not
-    depend on what comes after it and keys and values can be kept; sizes and parameters are the same.
+    depend on what comes after it and keys and values can be kept; sizes and parameters are the same, but for a
+    LayerNorm before the head (2 dim parameters), as the other predictors have it.
 
     Args:
         config: sizes; a layer is one block over objects and one over time.
