@@ -75,14 +75,16 @@ COMMANDS: Final[dict[str, Command]] = {
     ),
     "train-baseline": Command(
         "one of the methods PlaySlot is compared with, as a run of its own",
-        "Trains method=slot_oracle, resnet_oracle, lapo, caddy_policy, caddy_oracle, dreamer or sold "
-        "(docs/baselines.md) into out=; `playslot evaluate run=OUT` then measures it as it does PlaySlot. run= is the "
-        "world model whose slots slot_oracle and sold build on; settings come from env= and preset=, not from that "
-        "run. demos=N takes the first N demonstrations.",
+        "Trains method=slot_oracle, slot_bc, resnet_oracle, resnet_bc, lapo, caddy_policy, caddy_oracle, dreamer or "
+        "sold (docs/baselines.md) into out=; `playslot evaluate run=OUT` then measures it as it does PlaySlot. Or one "
+        "that predicts videos: svg, caddy, slotformer or ocvp_seq (docs/video.md; `playslot compare-video` scores it). "
+        "run= is the world model whose slots slot_oracle, slot_bc, sold, slotformer and ocvp_seq build on; settings "
+        "come from env= and preset=, not from that run. demos=N takes the first N demonstrations.",
         (
             "playslot train-baseline method=slot_oracle run=pretrained data.demos=data/expert demos=50 out=runs/oracle",
             "playslot train-baseline method=lapo data.root=data/random data.demos=data/expert out=runs/lapo",
             "playslot train-baseline method=dreamer env=block_reach out=runs/dreamer",
+            "playslot train-baseline method=svg data.root=data/random out=runs/svg",
         ),
     ),
     "evaluate": Command(
@@ -164,12 +166,14 @@ COMMANDS: Final[dict[str, Command]] = {
         "methods side by side: success against demonstrations, table and plot",
         "Trains and evaluates every method with every number of demonstrations and every seed, on the same held-out "
         "episodes, and writes OUT/comparison.json, .md, .png and .svg. What is done is reused, so the same command "
-        "carries on after a stop and tries what failed again. Here demos=, seeds= and methods= are lists. The world "
+        "carries on after a stop and tries what failed again. Here demos=, labels=, seeds= and methods= are lists; "
+        "labels= makes it a table by labelled demonstrations, beside slot_bc and resnet_bc on these alone. The world "
         "model is run=, or trained once into OUT/world_model; data are data.root and data.demos, or recorded once "
         "into OUT/data. Jobs run one after the other, or by a Hydra launcher: hydra.launcher=joblib, submitit_local, "
         "submitit_slurm or ray, with its own keys as hydra.launcher.KEY=VALUE.",
         (
             "playslot compare run=pretrained demos=10,50,100,150 seeds=0,1,2 out=runs/comparison",
+            "playslot compare run=pretrained demos=150 labels=2,5,25 methods=playslot,lapo,slot_bc out=runs/labels",
             "playslot compare env=block_push_easy methods=playslot,slot_oracle demos=100,600 seeds=0 out=runs/blocks",
             "playslot compare run=pretrained hydra.launcher=joblib hydra.launcher.n_jobs=2 out=runs/comparison",
         ),
@@ -232,7 +236,8 @@ KEYS_HELP: Final = """common keys (any key of playslot_rl/config works, with dot
   data.root=DIR[,DIR]   LeRobot v3.0 data set(s) of videos, DIR:2,DIR:1 with weights; data.demos=DIR for demonstrations
   run=DIR               run folder to go on from, with its stored config; `pretrained` is the shipped model
   demos=N               train-policy, train-baseline: the first N demonstrations; compare: a list of numbers
-  protocol=simulation   evaluation protocol: simulation or imagination
+  labels=N,...          compare: numbers of labelled demonstrations
+  protocol=simulation   evaluation protocol: simulation or imagination (or slots: scores against the segmentation)
 
 environment variables: PLAYSLOT_DEBUG=1 shows tracebacks, PLAYSLOT_CACHE=DIR moves the caches,
 MUJOCO_GL chooses the GL backend (egl by default on Linux)."""

@@ -6,6 +6,7 @@ Writes `DIR/evaluation/PROTOCOL/eval_info.json` and renews `DIR/report.md` and `
 from __future__ import annotations
 
 import importlib
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -18,6 +19,8 @@ from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes import objects, slots
 from playslot_rl.recipes.run import existing_run, open_run, parent_run, stored_result
 
+SAME_TASK: Final = ("name", "image_size", "action_dim")
+"""Of an environment: what it shares with the one a policy was trained for."""
 PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")
 
 
@@ -57,8 +60,8 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
 
     check_protocol(config.protocol)
     run_facts(run)  # a run without a policy is refused before anything is loaded
+    check_environment(config, trained_environment(run, "policy"))
     agent = load_agent(run, open_device(config))
-    check_environment(config, agent.world_model.env.image_size, agent.world_model.env.action_dim)
     with TaskPool(config.env, config.render) as pool:
         result = evaluate_run(run, agent, config, config.protocol, pool)
         print(describe(result, run))
@@ -78,14 +81,10 @@ def evaluate_baseline(config: ExperimentConfig, run: Path) -> None:
     from playslot_rl.acting.episodes import TaskPool
     from playslot_rl.evaluation.success import check_baseline_protocol, evaluate_actor, run_facts
     from playslot_rl.recipes.run import open_device
-    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
-    from playslot_rl.training.runs import stage_config
 
     check_baseline_protocol(config)
     run_facts(run, config.method)  # a run without a policy is refused before anything is loaded
-    stage = method_stage(config.method)
-    env = stage_config(read_stage(checkpoint_folder(run, stage), stage), EnvConfig, "env")
-    check_environment(config, env.image_size, env.action_dim)
+    check_environment(config, trained_environment(run, method_stage(config.method)))
     device = open_device(config)
     module, _, function = METHODS[config.method].actor.partition(":")
     actor = getattr(importlib.import_module(module), function)(run, device)
@@ -166,6 +165,7 @@ def take_shipped(config: ExperimentConfig) -> Path:
     folder = checkpoint_folder(run_folder(parent), "policy")
     policy = read_stage(folder, "policy") if (folder / "meta.json").is_file() else None
     if policy is not None:
+        check_environment(config, trained_environment(run_folder(parent), "policy"))
         require_adoptable(policy, run)
     store_config(replace(config, run="", out=""), run)
     use_world_model(run, parent)
@@ -174,18 +174,36 @@ def take_shipped(config: ExperimentConfig) -> Path:
     return run
 
 
-def check_environment(config: ExperimentConfig, image_size: int, action_dim: int) -> None:
-    """Refuse an environment whose frames or actions are not those the run was trained on.
+def trained_environment(run: Path, stage: str) -> EnvConfig:
+    """The environment that a stage of a run was trained for.
+
+    Raises:
+        CheckpointError: it is missing or damaged.
+    """
+    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+    from playslot_rl.training.runs import stage_config
+
+    return stage_config(read_stage(checkpoint_folder(run, stage), stage), EnvConfig, "env")
+
+
+def check_environment(config: ExperimentConfig, trained: EnvConfig, names: Sequence[str] = SAME_TASK) -> None:
+    """Refuse an environment that is not the one the run was trained on: of another task, frame size or action size.
+
+    Args:
+        config: of the command.
+        trained: the environment that a checkpoint of the run names.
+        names: of the settings that have to agree.
 
     Raises:
         ConfigError: they differ.
     """
-    for name, got, expected in (
-        ("image_size", config.env.image_size, image_size),
-        ("action_dim", config.env.action_dim, action_dim),
-    ):
+    for name in names:
+        got, expected = getattr(config.env, name), getattr(trained, name)
         if got != expected:
-            raise ConfigError(f"env.{name}: got {got}, expected {expected}, with which run={config.run} was trained")
+            key = "env" if name == "name" else f"env.{name}"
+            raise ConfigError(
+                f"{key}: got {got}, expected {expected}, with which run={config.run} was trained: leave {key}= out"
+            )
 
 
 def describe(result: dict[str, Any], run: Path) -> str:

@@ -25,7 +25,7 @@ def main(config: ExperimentConfig, run: Path) -> None:
     from playslot_rl.visualization.report import write_report
 
     model = load_world_model(run, open_device(config))
-    check_environment(config, model.env.image_size, model.env.action_dim)
+    check_environment(config, model.env)
     print(
         f"{config.env.name}: nothing to act on, so slots and latent actions are scored instead of a policy", flush=True
     )

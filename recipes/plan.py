@@ -16,7 +16,7 @@ from playslot_rl.config.compose import shipped
 from playslot_rl.config.planning import GoalName
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.recipes.evaluate import check_environment, check_run, take_shipped
+from playslot_rl.recipes.evaluate import check_environment, check_run, take_shipped, trained_environment
 
 if TYPE_CHECKING:
     from playslot_rl.evaluation.goals import GoalEpisode, GoalPool
@@ -55,7 +55,7 @@ def main(config: ExperimentConfig) -> None:
 
     facts = run_facts(run)
     agent = load_agent(run, open_device(config))
-    check_environment(config, agent.world_model.env.image_size, agent.world_model.env.action_dim)
+    check_environment(config, trained_environment(run, "policy"))
     folder, parts = run / "planning", {}
     for goals, size in sizes.items():
         with GoalPool(config.env, config.render) as pool:

@@ -63,11 +63,11 @@ def simulated_starts(config: ExperimentConfig, world: WorldModel) -> SimulatedSt
     from playslot_rl.envs import ENVIRONMENTS, task_metadata
     from playslot_rl.evaluation.seeds import first_seed
     from playslot_rl.play.starts import SimulatedStarts, task_maker
-    from playslot_rl.recipes.evaluate import check_environment
+    from playslot_rl.recipes.evaluate import SAME_TASK, check_environment
 
     if config.env.name not in ENVIRONMENTS:
         return None
-    check_environment(config, world.env.image_size, world.env.action_dim)
+    check_environment(config, world.env, SAME_TASK[1:])
     metadata = task_metadata(config.env)
     fps = metadata["control_hz"] / config.env.frame_skip
     maker = task_maker(config.env, config.render)

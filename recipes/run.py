@@ -164,6 +164,11 @@ def held_out_text(demos: DemonstrationSplit) -> str:
     return "none held out" if demos.held_out is None else f"{demos.held_out.episodes} held out"
 
 
+def kept_text(kept: float) -> str:
+    """For a closing line: the share of the demonstrations' rows that trimming left."""
+    return f"{100 * kept:.0f} % of their rows kept"
+
+
 def parent_run(config: ExperimentConfig, folder: Path) -> str:
     """Where a stage finds its parents: `run` if given (`pretrained` is the task's own), else the folder it writes."""
     return f"{SHIPPED}/{config.env.name}" if config.run == SHIPPED else config.run or str(folder)

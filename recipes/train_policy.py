@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -16,6 +15,7 @@ from playslot_rl.recipes.run import (
     adopt_policy,
     demonstration_views,
     held_out_text,
+    kept_text,
     open_device,
     open_run,
     parent_run,
@@ -98,6 +98,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
     if held_out is not None:
         held_out = held_out.trimmed(behaviour.trim, behaviour.trim_margin)
     horizon = trained_horizon(record.parents["dynamics"])
+    demos.labelled(behaviour.labelled_demos)  # none that say anything are refused before anything is trained
 
     def parts() -> Iterator[Part]:
         cloning = cloning_settings(behaviour)
@@ -106,10 +107,10 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
         agent.eval()
         if agent.action_decoder.reads_slots:
             agent.action_decoder.trusts_slots.fill_(False)  # one demonstration cannot tell
-        if agent.action_decoder.reads_slots and behaviour.labelled_demos > 1:
-            trial = DecoderStage.trial(deepcopy(agent.action_decoder), agent.policy, demos, behaviour, horizon)
-            yield _part("decoder_trial", trial, behaviour, -(-behaviour.decoder_steps // 2), behaviour.decoder_lr)
-            agent.action_decoder.trusts_slots.fill_(trial.slots_pay())
+            trial = DecoderStage.trial(agent.action_decoder, agent.policy, demos, behaviour, horizon)
+            if trial is not None:
+                yield _part("decoder_trial", trial, behaviour, -(-behaviour.decoder_steps // 2), behaviour.decoder_lr)
+                agent.action_decoder.trusts_slots.fill_(trial.slots_pay())
         decoder = DecoderStage(agent.action_decoder, agent.policy, demos, behaviour, held_out, horizon)
         yield _part("decoder", decoder, behaviour, behaviour.decoder_steps, behaviour.decoder_lr)
         if behaviour.finetune_steps:
@@ -117,10 +118,8 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
             yield _part("finetune", both, behaviour, behaviour.finetune_steps, behaviour.finetune_lr)
 
     kept = len(demos.slots) / len(whole.slots)
-    said = (
-        f"policy: {len(demos.lengths)} demos, {100 * kept:.0f} % of their rows kept, {behaviour.labelled_demos} "
-        f"labelled, {held_out_text(split)}"
-    )
+    labelled = f"{behaviour.labelled_demos} labelled"
+    said = f"policy: {len(demos.lengths)} demos, {kept_text(kept)}, {labelled}, {held_out_text(split)}"
     return Training(
         parts(),
         device,

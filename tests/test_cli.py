@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import subprocess
 import sys
 import types
@@ -200,3 +201,9 @@ def test_the_installed_command_works_from_another_folder(tmp_path: Path) -> None
     assert done.returncode == 2
     assert "run=nothing: got no nothing/config.json" in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_every_command_stands_in_the_table_of_the_recipes_page(repository: Path) -> None:
+    page = (repository / "docs" / "recipes.md").read_text()
+    table = page.split("|---|---|---|", 1)[1].split("\n\n", 1)[0]
+    assert set(re.findall(r"^\| `([a-z-]+)` \|", table, re.MULTILINE)) == {*cli.COMMANDS, *cli.GROUPS}

@@ -21,8 +21,9 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.config import ExperimentConfig, Precision
-from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, moving_frames
+from playslot_rl.data.demonstrations import NOTHING_LABELLED, DemonstrationSplit, Transitions, moving_frames
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.errors import DataError
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.training.stage_regression import (
@@ -63,7 +64,7 @@ class LatentCloning(ABC):
         shift: of frames in the policy's training, pixels.
 
     Raises:
-        DataError: demonstrations without actions, or in which nothing moves.
+        DataError: demonstrations without actions, or in which nothing moves, or nothing in the labelled ones.
     """
 
     policy: nn.Module
@@ -72,6 +73,9 @@ class LatentCloning(ABC):
     def __init__(self, config: ExperimentConfig, demos: DemonstrationSplit, device: torch.device, shift: int) -> None:
         self.config, self.device = config, device
         self.trained = self._seen(demos.trained, shift)
+        self.labelled = np.flatnonzero(self.trained.episode < config.behaviour.labelled_demos)
+        if not len(self.labelled):
+            raise DataError(NOTHING_LABELLED.format(config.behaviour.labelled_demos))
         self.held_out = None if demos.held_out is None else self._seen(demos.held_out)
 
     @abstractmethod
@@ -122,8 +126,7 @@ class LatentCloning(ABC):
             loss: `l2` or `l1`.
             batch_size, precision: of its training.
         """
-        labelled = np.flatnonzero(self.trained.episode < self.config.behaviour.labelled_demos)
-        inputs, actions = self._decoded(self.trained, torch.from_numpy(labelled).to(self.device))
+        inputs, actions = self._decoded(self.trained, torch.from_numpy(self.labelled).to(self.device))
         held_out = None
         if self.held_out is not None:
             held_out = self._decoded(self.held_out, torch.arange(len(self.held_out.actions), device=self.device))

@@ -121,6 +121,8 @@ def _footnotes(result: Result) -> list[str]:
     notes += _one_each(done, "pretraining", "{title} starts from {value} weights.")
     sizes = _one_each(done, "parameters", "{title} {value}")
     notes += [f"Parameters, those of the models it builds on included: {'; '.join(sizes)}."] if sizes else []
+    kept = [f"{title} {_kept(shares)}" for title in _titles(done) if (shares := _shares(done, title))]
+    notes += [f"Rows learned from; still stretches of the videos are left out: {'; '.join(kept)}."] if kept else []
     samples = _one_each(done, "samples", "{title} {value}")
     notes += [f"Training of the policy, optimiser steps times batch: {'; '.join(samples)}."] if samples else []
     notes.append(_times(done, result))
@@ -204,6 +206,15 @@ def _labels(rows: Sequence[Result], title: str) -> str:
             found.setdefault(row["demos"], set()).add(row["labelled_demos"])
     said = _list(f"{_list(sorted(labels))} of {demos}" for demos, labels in sorted(found.items()))
     return f"{said} demonstrations" if said else ""
+
+
+def _shares(rows: Sequence[Result], title: str) -> list[float]:
+    return sorted({row["kept_rows"] for row in rows if row["title"] == title and row.get("kept_rows") is not None})
+
+
+def _kept(shares: Sequence[float]) -> str:
+    least, most = f"{100 * shares[0]:.0f}", f"{100 * shares[-1]:.0f}"
+    return f"{least} %" if least == most else f"{least} to {most} %"
 
 
 def _one_each(rows: Sequence[Result], key: str, text: str) -> list[str]:

@@ -34,8 +34,9 @@ def job_rows(job: Job, frame_skip: int, fingerprint: str | None = None) -> list[
     `status`, `error`, `labelled_demos`, `agent_steps`
     and `env_steps` (an agent step is `frame_skip` of them), `samples` (optimiser steps times batch),
     `success_rate`, `successes`, `episodes`, `ci95` (Wilson), `mean_steps_to_success`, `train_seconds`,
-    `evaluation_seconds`, `parameters`, `pretraining` (null where there is nothing to say), `curve` (rows of an online
-    method's learning curve, with both kinds of steps).
+    `evaluation_seconds`, `parameters`, `pretraining`, `kept_rows` (share of the demonstrations' rows that trimming
+    left; both null where there is nothing to say), `curve` (rows of an online method's learning curve, with both
+    kinds of steps).
 
     Args:
         job: which one.
@@ -74,6 +75,7 @@ def job_rows(job: Job, frame_skip: int, fingerprint: str | None = None) -> list[
                 "evaluation_seconds": info.get("wall_seconds"),
                 "parameters": count_parameters(job.run, job.stage) if meta else None,
                 "pretraining": meta.get("pretraining"),
+                "kept_rows": meta.get("kept_rows"),
                 "curve": learning_curve(job, frame_skip) if METHODS[job.method].online else None,
             }
         )

@@ -168,7 +168,7 @@ class PolicyConfig:
 
 
 @dataclass(frozen=True)
-class ActionDecoderConfig:
+class ActionDecoderConfig(Checked):
     """Sizes of the action decoder: a three-layer MLP (paper, appendix A.4).
 
     Attributes:
@@ -180,13 +180,19 @@ class ActionDecoderConfig:
         state_dropout: fraction of the training rows in which the network that reads slots goes without them.
     """
 
-    hidden_dim: int = 128
-    state_dim: int = 64
-    state_layers: int = 2
-    state_heads: int = 4
-    state_dropout: float = 0.5
+    group = "model.action_decoder."
+    hidden_dim: int = field(default=128, metadata=at_least(1))
+    state_dim: int = field(default=64, metadata=at_least(1))
+    state_layers: int = field(default=2, metadata=at_least(1))
+    state_heads: int = field(default=4, metadata=at_least(1))
+    state_dropout: float = field(default=0.5, metadata=within(lambda share: 0 <= share < 1, "0 to below 1"))
     whiten: bool = False
     reads_slots: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        heads = f"a multiple of state_heads, {self.state_heads}"
+        check(self.state_dim % self.state_heads == 0, "model.action_decoder.state_dim", self.state_dim, heads)
 
 
 @dataclass(frozen=True)

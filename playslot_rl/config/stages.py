@@ -140,10 +140,10 @@ class BehaviourStageConfig(StageConfig):
     """
 
     group = "behaviour."
-    labelled_demos: int = 50
+    labelled_demos: int = field(default=50, metadata=at_least(1))
     imagined: bool = True
     loss: Literal["l2", "l1"] = "l2"
-    slot_noise: float = 0.0
+    slot_noise: float = field(default=0.0, metadata=at_least(0, "0 (none) or more"))
     shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
     shifted_copies: int = field(default=8, metadata=between(1, 8, "1 to 8"))
     trim: float = field(default=0.0, metadata=at_least(0, "0 (keep all) or more"))
@@ -152,9 +152,9 @@ class BehaviourStageConfig(StageConfig):
     whiten: bool = False
     decoder_inputs: Literal["inverse_dynamics", "policy", "both"] = "inverse_dynamics"
     decoder_state: bool = False
-    decoder_steps: int = 2000
-    decoder_lr: float = 2e-4
+    decoder_steps: int = field(default=2000, metadata=at_least(1))
+    decoder_lr: float = field(default=2e-4, metadata=within(lambda rate: rate > 0, "above 0"))
     finetune_steps: int = field(default=0, metadata=at_least(0, "0 (none) or more"))
-    finetune_lr: float = 2e-4
+    finetune_lr: float = field(default=2e-4, metadata=within(lambda rate: rate > 0, "above 0"))
     policy_from: str = field(default="", metadata=role("machine", "folder"))
     oracle: bool = True

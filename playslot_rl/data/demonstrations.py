@@ -88,10 +88,19 @@ class Demonstrations:
         decoder sees.
 
         Raises:
-            DataError: there are fewer demonstrations.
+            DataError: there are fewer demonstrations, or trimming has left no row of them.
         """
         require_labelled(demos, len(self.lengths))
-        return torch.nonzero(self.episode < demos)[:, 0]
+        rows = torch.nonzero(self.episode < demos)[:, 0]
+        if not len(rows):
+            raise DataError(NOTHING_LABELLED.format(demos))
+        return rows
+
+
+NOTHING_LABELLED = (
+    "behaviour.labelled_demos={0}: got demonstrations in which nothing moves, expected some that do: label "
+    "more of them, or lower behaviour.trim and behaviour.trim_pixels"
+)
 
 
 def require_labelled(labelled: int, demos: int) -> None:
@@ -131,15 +140,17 @@ def first_demonstrations(source: EpisodeFrames, demos: int | None) -> EpisodeFra
     )
 
 
-def drawn_demonstrations(source: EpisodeFrames, seed: int) -> EpisodeFrames:
-    """The same episodes in an order drawn by a seed; row numbers stay."""
-    order = np.random.default_rng([seed, DRAW_STREAM]).permutation(source.episodes)
+def drawn_demonstrations(source: EpisodeFrames, seed: int, among: int | None = None) -> EpisodeFrames:
+    """The same episodes, the first `among` of them (None: all) in an order drawn by a seed; row numbers stay."""
+    first = first_demonstrations(source, among)
+    order = np.random.default_rng([seed, DRAW_STREAM]).permutation(first.episodes)
+    order = np.concatenate((order, np.arange(first.episodes, source.episodes)))
     return replace(
         source,
         starts=source.starts[order],
         lengths=source.lengths[order],
         seeds=None if source.seeds is None else source.seeds[order],
-        fingerprint=hashlib.sha256(f"{source.fingerprint}/drawn {seed}".encode()).hexdigest()[:16],
+        fingerprint=hashlib.sha256(f"{first.fingerprint}/drawn {seed}".encode()).hexdigest()[:16],
     )
 
 
@@ -217,17 +228,25 @@ def split_demonstrations(
         demos: how many are trained on; None for all that are not kept.
         kept: the last ones, which were recorded to measure (`data.held_out`).
         measured: at most so many of the last ones beyond those that are trained on measure, if more than `kept`.
-        draw: seed that decides which of those that do not measure are the first ones; None keeps their order.
+        draw: seed that decides which are the first ones, the same whatever `demos`; None keeps their order. The last
+            ones, which may measure (but half of the set at most, beyond `kept`), are not drawn: they come after the
+            others.
 
     Raises:
-        DataError: there are fewer episodes than `demos`.
+        DataError: there are fewer episodes than `demos`, or none that is not kept.
     """
-    free = max(1, source.episodes - kept)
+    free = source.episodes - kept
+    if free < 1:
+        raise DataError(
+            f"data.held_out: got {kept}, expected less than the {source.episodes} demonstrations there are: lower it "
+            "or collect more"
+        )
     trained = first_demonstrations(source, free if demos is None else demos)
     parsed = first_demonstrations(source, max(free, trained.episodes))
-    rest = source.episodes - min(max(kept, measured), source.episodes - trained.episodes)
+    last = max(kept, measured if draw is None else min(measured, source.episodes // 2))
+    rest = source.episodes - min(last, source.episodes - trained.episodes)
     if draw is not None:
-        trained = first_demonstrations(drawn_demonstrations(first_demonstrations(source, rest), draw), trained.episodes)
+        trained = first_demonstrations(drawn_demonstrations(source, draw, source.episodes - last), trained.episodes)
     usable = bool((source.lengths[rest:] >= 2).any())
     return DemonstrationSplit(trained, parsed, episode_range(source, rest, source.episodes) if usable else None)
 

@@ -52,7 +52,8 @@ def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrame
         return open_configured(config, roots)
     parts = {name: open_configured(config, name) for name in names}
     demos = parts[config.data.demos]
-    parts[config.data.demos] = episode_range(demos, 0, demos.episodes - config.data.held_out)
+    free = split_demonstrations(demos, None, config.data.held_out, 0).trained.episodes
+    parts[config.data.demos] = episode_range(demos, 0, free)
     return weighted([parts[name] for name in names], [root.weight for root in named], names)
 
 

@@ -6,6 +6,7 @@ Two `Stage`s for `fit`. The world model is frozen and has labelled the demonstra
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -195,12 +196,16 @@ class DecoderStage(RegressionStage):
         demos: Demonstrations,
         config: BehaviourStageConfig,
         horizon: int | None = None,
-    ) -> DecoderStage:
-        """On the first half of the labelled demonstrations, measured on the second: see `slots_pay`."""
+    ) -> DecoderStage | None:
+        """A copy of the decoder on the first half of the labelled demonstrations, measured on the second: see
+        `slots_pay`. None where a half has no rows: one demonstration, or trimming, leaves nothing to measure on."""
         labelled = demos.take(demos.labelled(config.labelled_demos))
         half = (config.labelled_demos + 1) // 2
-        second = labelled.take(labelled.episode >= half)
-        return cls(decoder, policy, labelled, replace(config, labelled_demos=half), second, horizon)
+        second = labelled.episode >= half
+        if second.all() or not second.any():
+            return None
+        own = replace(config, labelled_demos=half)
+        return cls(deepcopy(decoder), policy, labelled, own, labelled.take(second), horizon)
 
     def slots_pay(self) -> bool:
         """Whether the decoder does better on `held_out` with slots than without; mean absolute error of the actions."""

@@ -13,6 +13,7 @@ from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
     demonstration_views,
     held_out_text,
+    kept_text,
     open_device,
     open_run,
     parent_run,
@@ -86,11 +87,11 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
     slots, actions = examples(views)
     whole = len(views) * int((split.trained.lengths - 1).sum())
     stage = oracle_stage(oracle, slots, actions, behaviour, examples(others) if others else None)
-    demos = int((split.trained.lengths >= 2).sum())
-    said = f"{record.name}: {demos} demos, all labelled, {held_out_text(split)}"
+    demos, kept = int((split.trained.lengths >= 2).sum()), round(len(slots) / whole, 4)
+    said = f"{record.name}: {demos} demos, {kept_text(kept)}, all labelled, {held_out_text(split)}"
     return Training(
         [Part(record.name, stage, config.behaviour, lr_key="behaviour.optim.lr")],
         device,
         lambda _: f"{said}, {record.folder}",
-        extra={"demos": demos, "labelled_demos": demos, "kept_rows": round(len(slots) / whole, 4)},
+        extra={"demos": demos, "labelled_demos": demos, "kept_rows": kept},
     )

@@ -64,6 +64,7 @@ def test_the_page_has_the_table_the_footnotes_and_the_failure(ended: dict[str, A
     assert "PlaySlot saw the real actions of 5 of 10 demonstrations" in page
     assert "Slot Oracle saw the real actions of 10 of 10, 50 of 50 demonstrations" in page
     assert "ResNet Oracle starts from scratch weights" in page
+    assert "still stretches of the videos are left out: ResNet Oracle 50 %." in page
     assert "**lapo-d10-s0: failed.** loss is nan at step 3" in page
     assert "DreamerV3: 10,000 environment steps, which are 2,000 agent steps of 5; mean over the seeds" in page
     assert "of training on 700 videos without actions" in page

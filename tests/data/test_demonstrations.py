@@ -109,6 +109,32 @@ def test_a_draw_changes_who_comes_first_and_nothing_else(source: EpisodeFrames) 
     )
 
 
+@pytest.mark.parametrize(("episodes", "kept", "measured"), [(150, 0, 10), (155, 10, 10), (160, 10, 10), (12, 0, 10)])
+def test_few_demonstrations_of_a_draw_are_the_first_of_many(episodes: int, kept: int, measured: int) -> None:
+    """Slot BC's labelled demonstrations are PlaySlot's, which trains on more of them."""
+    frames, numbers = np.zeros((2 * episodes, 4, 4, 3), np.uint8), np.arange(episodes)
+    source = EpisodeFrames(frames, 2 * numbers, np.full(episodes, 2), None, None, numbers, "f", 10.0, "", "c")
+    orders = set()
+    for draw in range(5):
+        many = split_demonstrations(source, episodes - 5, kept, measured, draw)
+        for demos in (1, 5, episodes - 5):
+            few = split_demonstrations(source, demos, kept, measured, draw)
+            assert few.trained.starts.tolist() == many.trained.starts[:demos].tolist()
+            assert few.held_out is not None
+            assert few.held_out.seeds is not None
+            assert few.trained.seeds is not None
+            assert not {*few.held_out.seeds.tolist()} & {*few.trained.seeds.tolist()}
+        assert len({*many.trained.starts.tolist()}) == episodes - 5
+        orders.add(tuple(many.trained.starts[:5]))
+    assert len(orders) == 5
+
+
+@pytest.mark.parametrize("kept", [3, 9])
+def test_demonstrations_that_are_all_held_out_are_refused(source: EpisodeFrames, kept: int) -> None:
+    with pytest.raises(DataError, match=f"data.held_out: got {kept}, expected less than the 3 demonstrations"):
+        split_demonstrations(source, None, kept, 0)
+
+
 @pytest.mark.parametrize("draw", range(6))
 def test_what_measures_is_never_drawn(source: EpisodeFrames, draw: int) -> None:
     split = split_demonstrations(source, 1, 1, 0, draw)

@@ -121,5 +121,7 @@ def test_what_decides_the_policy_says_nothing_of_labels_and_decoder() -> None:
 def test_a_trial_leaves_the_decoder_it_copies_alone() -> None:
     policy, decoder = networks()
     before = deepcopy(decoder.state_dict())
-    train(DecoderStage.trial(deepcopy(decoder), policy, demonstrations(), CONFIG), 3)
+    trial = DecoderStage.trial(decoder, policy, demonstrations(), CONFIG)
+    assert trial is not None
+    train(trial, 3)
     assert all(torch.equal(value, before[name]) for name, value in decoder.state_dict().items())
