@@ -215,6 +215,8 @@ COMMANDS: Final[dict[str, Command]] = {
 
 SEVERAL: Final = ("train-slots", "train-dynamics", "train-policy", "train-baseline")
 """Commands that torchrun and accelerate launch may start on several processes."""
+ANEW: Final = ("inspect", "plan", "play", "bench", "doctor", "dataset", "cache")
+"""Commands that start over when they are typed again."""
 INTERRUPTED: Final = 130
 PEER_PATIENCE_S: Final = 5.0
 """How long a process that lost another one waits for that one's own error to be printed."""
@@ -349,7 +351,8 @@ def _guarded(name: str, run: Callable[[], int]) -> int:
     try:
         return run()
     except KeyboardInterrupt as error:
-        where = str(error) or "interrupted; the same command carries on from the last checkpoint or episode"
+        goes_on = "; the same command carries on from the last checkpoint or episode"
+        where = str(error) or "interrupted" + ("" if name in ANEW else goes_on)
         return _fail(name, where, INTERRUPTED)
     except PeerError as error:
         if _debugging():

@@ -12,9 +12,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from playslot_rl.config import ExperimentConfig, SAViConfig, to_dict
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.survey import Choice, Survey, choose_size, choose_stride, survey
+from playslot_rl.data.windows import IntArray, split_episodes
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.recipes import inspect, train_dynamics, train_slots
 from playslot_rl.recipes.adopt_decisions import Decisions
@@ -52,6 +55,12 @@ def main(config: ExperimentConfig) -> None:
         )
     run = open_run(config)
     seen = survey(config.data.root, config.data.camera)
+    least = shortest(config)
+    if np.median(seen.lengths) < least:
+        raise DataError(
+            f"{seen.root}: got episodes of {np.median(seen.lengths):.0f} frames (median), expected at least {least} in "
+            "half of them: record longer episodes"
+        )
     asked = {"minutes": config.minutes, "seed": config.seed, "preset": config.preset, **to_dict(config.adopt)}
     decide = Decisions(run, {"data.root": config.data.root, "camera": seen.camera, **asked})
     config = _for_frames(config, seen, decide)
@@ -69,24 +78,48 @@ def _for_frames(config: ExperimentConfig, seen: Survey, decide: Decisions) -> Ex
     """The config with frame size, stride, and clips that the episodes have room for."""
     size = decide("frame size", lambda: choose_size(seen))
     stride = decide("stride", lambda: choose_stride(seen, size))
-    kept = sorted(-(-int(length) // stride) for length in seen.lengths)
-    typical = kept[len(kept) // 2]
-    if typical < 3:
-        raise DataError(f"{seen.root}: got episodes of {typical} frames, expected at least 3 in half of them")
-    dynamics = config.dynamics
-    predicted = min(dynamics.predicted_frames, typical - dynamics.seed_frames)
+    kept = -(-seen.lengths // stride)
+    typical, dynamics = int(np.median(kept)), config.dynamics
+    longest, validation = clip_room(kept, shortest(config), config.data.validation, config.seed)
+    predicted = min(dynamics.predicted_frames, longest - dynamics.seed_frames)
     return replace(
         config,
         env=replace(config.env, image_size=size, action_dim=max(1, seen.action_dim), max_steps=max(2, typical - 1)),
         model=replace(config.model, savi=savi_for(config.model.savi, size)),
-        data=replace(config.data, camera=seen.camera, stride=stride, resize=True),
+        data=replace(config.data, camera=seen.camera, stride=stride, resize=True, validation=validation),
         slots=replace(
             config.slots,
-            clip_frames=min(config.slots.clip_frames, typical),
+            clip_frames=min(config.slots.clip_frames, longest),
             start_from=start_for(config.slots.start_from, size),
         ),
         dynamics=replace(dynamics, predicted_frames=predicted),
     )
+
+
+def shortest(config: ExperimentConfig) -> int:
+    """Frames that a clip of the dynamics has at least."""
+    return max(3, config.dynamics.seed_frames + 1)
+
+
+def clip_room(lengths: IntArray, least: int, validation: float, seed: int) -> tuple[int, float]:
+    """The longest clip that nine tenths of the episodes which have one at all have room for, and one of those held out.
+
+    Args:
+        lengths: frames of each episode that the stride leaves.
+        least: frames of a clip, at least; half of the episodes have them.
+        validation: fraction of the episodes that is held out.
+        seed: of that split.
+
+    Returns:
+        Frames; and the fraction, which is larger where all that were held out are too short.
+    """
+    room = np.sort(lengths[lengths >= least])
+    longest = int(room[len(room) // 10])
+    for share in (validation, 0.1, 0.2, 0.5):
+        held_out = lengths[split_episodes(len(lengths), share, seed)[1]].max()
+        if share >= validation and held_out >= least:
+            return min(longest, int(held_out)), share
+    return longest, 0.0  # measured on what is trained on
 
 
 def start_for(where: str, size: int) -> str:

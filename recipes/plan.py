@@ -56,6 +56,12 @@ def main(config: ExperimentConfig) -> None:
     facts = run_facts(run)
     agent = load_agent(run, open_device(config))
     check_environment(config, trained_environment(run, "policy"))
+    mode = agent.world_model.config.inverse_dynamics.mode
+    if mode in ("ground_truth", "none"):
+        raise CheckpointError(
+            f"run={config.run}: got a world model of mode {mode}, expected one that infers latents, which costs "
+            "compare: train one with model.inverse_dynamics.mode=hybrid"
+        )
     folder, parts = run / "planning", {}
     for goals, size in sizes.items():
         with GoalPool(config.env, config.render) as pool:

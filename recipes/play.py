@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,8 +35,9 @@ def main(config: ExperimentConfig) -> None:
         raise ConfigError("play: got no NiceGUI, expected the extra `play`: make setup, or pip install nicegui==3.18.0")
     from playslot_rl.play.server import HOST, choose_port, serve
 
-    port = choose_port(config.port)  # before the model is loaded
+    choose_port(config.port)  # one that is taken is refused before the model is loaded
     studio = open_studio(config)
+    port = choose_port(config.port)  # again: loading took seconds, in which another may have taken it
     address = f"http://{HOST}:{port}"
     print(f"{studio.title}: {address}  (Ctrl-C ends it; recordings go to {studio.out})", flush=True)
     serve(studio, port, config.play.show)
@@ -55,7 +57,7 @@ def open_studio(config: ExperimentConfig) -> Studio:
     if recorded is None and simulated is None:
         print("no data set and no simulator to start from: upload a picture, or give data.root=", flush=True)
     out = Path(config.out or "runs") / "play"
-    return Studio(world, agent, recorded, simulated, out, config.run, config.play.fps)
+    return Studio(world, agent, recorded, simulated, out, config.run, config.play.fps, squeezes=config.data.resize)
 
 
 def simulated_starts(config: ExperimentConfig, world: WorldModel) -> SimulatedStarts | None:
@@ -74,6 +76,12 @@ def simulated_starts(config: ExperimentConfig, world: WorldModel) -> SimulatedSt
     return SimulatedStarts(world, maker, fps, metadata["task"], first_seed(config, config.seed))
 
 
+def _stored_root(run: Path) -> str:
+    """The data sets that a run was trained on, as its config names them; nothing where it has none."""
+    stored = run / "config.json"
+    return str(json.loads(stored.read_text())["data"]["root"]) if stored.is_file() else ""
+
+
 def recorded_starts(config: ExperimentConfig, world: WorldModel, agent: Agent | None) -> RecordedStarts | None:
     """Frames of `data.root`, or of the data sets that the run names and that are on this machine."""
     from playslot_rl.data.opening import open_configured
@@ -84,10 +92,12 @@ def recorded_starts(config: ExperimentConfig, world: WorldModel, agent: Agent | 
     known = shipped(config.run)
     named = data_folders(config, None if known else Path(config.run))
     found = [root for root in named if (root / "meta" / "info.json").is_file()]
+    missing = [root for root in named if root not in found]
+    # A shipped model names no data set, so the user did; a run names those of its training.
+    typed = known or config.data.root != _stored_root(Path(config.run))
+    if missing and (typed or (not found and config.env.name not in ENVIRONMENTS)):
+        raise DataError(f"data.root={missing[0]}: got no data set, expected a LeRobot v3.0 one: check data.root=")
     if named and not found:
-        # A shipped model names no data set, so the user did.
-        if known or config.env.name not in ENVIRONMENTS:
-            raise DataError(f"data.root={named[0]}: got no data set, expected a LeRobot v3.0 one: check data.root=")
         print(f"the run's data sets are not on this machine ({named[0]}): the simulator makes the starts", flush=True)
     if not found:
         return None

@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from playslot_rl.data.contents import Contents, open_files, stated_size
 from playslot_rl.data.frames import resize_frames, rgb_frames
+from playslot_rl.data.windows import spread_evenly
 from playslot_rl.errors import DataError
 
 Frames = npt.NDArray[np.uint8]
@@ -87,7 +88,7 @@ def survey(root: str | Path, camera: str = "") -> Survey:
     if lengths.max() < 2:
         raise DataError(f"{root}: got episodes of one frame, expected videos: nothing can move from frame to frame")
     side = 128 if min(stated_size(files.features[camera])) >= 128 else 64
-    episodes = [frames for frames in _some_episodes(files, camera, side) if len(frames) > 1]
+    episodes = _some_episodes(files, camera, side)
     found = Survey(
         files.root,
         camera,
@@ -178,9 +179,9 @@ def _noise(episodes: Sequence[Frames]) -> float:
 
 
 def _some_episodes(files: Contents, camera: str, side: int) -> list[Frames]:
-    chosen = files.spans[:: max(1, len(files.spans) // EPISODES)][:EPISODES]
+    long = np.flatnonzero([episode.length > 1 for episode in files.episodes]).astype(np.int64)
     found: list[Frames] = []
-    for span in chosen:
+    for span in (files.spans[episode] for episode in spread_evenly(long, EPISODES)):
         frames = []
         for _, frame in rgb_frames(files, camera, [span]):
             frames.append(resize_frames(frame[None], side)[0])

@@ -81,11 +81,11 @@ def _candidates(
         if config.validation > 0 and len(chosen := np.intersect1d(held, usable)):
             return chosen, "the world model's own videos, the episodes that its validation held out", True
         return usable[-max(1, len(usable) // 4) :], "the world model's own videos, none of which were held out", False
-    last = _policy_held_out(source, metas.get("policy", {}), config) or config.held_out
-    if last:
-        chosen = usable[usable >= source.episodes - last]
-        if len(chosen):
-            return chosen, f"the last {last} episodes, which are held out from training", True
+    last = _policy_held_out(source, metas.get("policy", {}), config)
+    if len(chosen := usable[usable >= source.episodes - last]):
+        return chosen, f"the last {last} episodes, which are held out from training", True
+    if len(chosen := usable[usable >= source.episodes - config.held_out]):
+        return chosen, f"the last {config.held_out} episodes, as data.held_out says", False
     what = "the last quarter of the episodes; the checkpoints do not say whether the world model was trained on them"
     return usable[-max(1, len(usable) // 4) :], what, False
 

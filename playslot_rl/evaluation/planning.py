@@ -220,11 +220,11 @@ def cost_along_solution(
         cost = GoalCost(model, slots[:1], z[0, :0], distances["slots"])
         errors.append(float((cost.imagine(z)[0, -1] - slots[-1]).square().mean()))
         moved.append(float((slots[0] - slots[-1]).square().mean()))
-    found: dict[str, Any] = {name: _shape(ways) for name, ways in curves.items()}
+    found: dict[str, Any] = {name: shape(ways) for name, ways in curves.items()}
     return {**found, "model_error": float(np.mean(errors)), "moved": float(np.mean(moved))}
 
 
-def _shape(ways: list[list[float]]) -> dict[str, Any]:
+def shape(ways: list[list[float]]) -> dict[str, Any]:
     """What curves from start to goal look like."""
     steps = [after < before for way in ways for before, after in itertools.pairwise(way)]
     return {

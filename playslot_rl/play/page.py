@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import logging
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any, Final
@@ -162,9 +163,13 @@ class PlayPage:
                     self.chosen = None
                 drawn = await self.studio.do(self._paint)
                 self.begun = True  # only now: the mouse needs to know what it points at
-            except (PlaySlotError, ValueError) as error:
+            except Exception as error:
                 self._halt()
-                ui.notify(explain(error) if isinstance(error, PlaySlotError) else str(error), type="warning")
+                known = isinstance(error, (PlaySlotError, ValueError))
+                if not known:
+                    logging.getLogger(__name__).error("play", exc_info=error)
+                said = str(error) if type(error) is ValueError else explain(error)
+                ui.notify(said, type="warning" if known else "negative")
                 return False
             if not self.closed:
                 self._show(drawn)
@@ -263,7 +268,7 @@ class PlayPage:
 
     async def _begin(self) -> None:
         if not await self.starts.first():
-            self.status.set_text("nothing to start from: upload a picture, or give data.root=")
+            self.status.set_text("nothing to start from: choose another start, upload a picture, or give data.root=")
 
     async def _start(self, start: Callable[[], Start]) -> bool:
         """Have the session begin at a start, which the worker makes."""

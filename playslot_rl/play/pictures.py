@@ -21,6 +21,8 @@ from playslot_rl.visualization.grid import side_by_side
 EDGE: Final = 0.75
 TINT: Final = 0.35
 ANIMATION_FPS: Final = 6.0
+MOST_PICTURES: Final = 300
+"""In a session's animation: each takes memory and time, and nobody watches minutes of it."""
 CURVE: Final = (300, 110)
 """Width and height of the error's curve, pixels."""
 
@@ -98,7 +100,12 @@ def animated(frames: Frame, fps: float = ANIMATION_FPS, scale: int = 1, last_s: 
 
 
 def session_animation(path: Sequence[SceneMoment], fps: float) -> bytes:
-    """The moments of a path as an endless GIF: imagined, and beside it what is true where there is a simulator."""
+    """The moments of a path as an endless GIF: imagined, and beside it what is true where there is a simulator.
+
+    Of a path of more than `MOST_PICTURES` moments, every so many-th, at the speed of the session.
+    """
+    stride = -(-len(path) // MOST_PICTURES)
+    path = path[::stride]
     both = all(moment.true is not None for moment in path)
     clips = [np.stack([moment.frame for moment in path])]
     if both:
@@ -110,7 +117,7 @@ def session_animation(path: Sequence[SceneMoment], fps: float) -> bytes:
         ground = Image.new("RGBA", picture.size, (255, 255, 255, 255))
         ground.alpha_composite(picture)
         whites.append(np.asarray(ground.convert("RGB")))
-    return animated(np.stack(whites), fps)
+    return animated(np.stack(whites), fps / stride)
 
 
 def error_curve(errors: Sequence[float | None], at: int) -> str:

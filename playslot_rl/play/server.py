@@ -80,6 +80,9 @@ def serve(studio: Studio, port: int, show: bool) -> None:
         studio: closed at the end.
         port: that is free.
         show: open it in the browser too.
+
+    Raises:
+        ConfigError: another program has just taken the port.
     """
     from nicegui import ui
 
@@ -95,5 +98,8 @@ def serve(studio: Studio, port: int, show: bool) -> None:
                 show_welcome_message=False,
                 message_history_length=200,
             )
+    except SystemExit as error:  # the web server's, which has said why
+        if error.code:
+            raise ConfigError(f"port={port}: got a taken one, expected a free one: choose another") from None
     finally:
         studio.close()

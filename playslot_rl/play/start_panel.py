@@ -12,6 +12,8 @@ from playslot_rl.play.studio import Studio
 
 MOST_BYTES: Final = 50_000_000
 """Of an uploaded picture."""
+REFUSED: Final = f"got no picture, or one above {MOST_BYTES // 1_000_000} MB, expected a PNG or JPEG file"
+"""What the browser does not send."""
 
 
 class StartPanel:
@@ -39,20 +41,22 @@ class StartPanel:
             ui.button("Start here", on_click=self._on_start).props("dense no-caps").mark("start")
             ui.button("Next episode", on_click=self._on_next).props("dense no-caps flat").mark("next")
             ui.upload(
-                label="or a picture", auto_upload=True, on_upload=self._on_upload, max_file_size=MOST_BYTES
+                label="or a picture",
+                auto_upload=True,
+                on_upload=self._on_upload,
+                max_file_size=MOST_BYTES,
+                on_rejected=lambda: ui.notify(REFUSED, type="warning"),
             ).props("accept=image/* dense flat bordered").classes("w-44").style("max-height: 56px; min-height: 0").mark(
                 "upload"
             )
 
     async def first(self) -> bool:
-        """Begin at the first frame of the first source; False where there is none to begin at."""
+        """Begin at the first frame of the first source; False where there is none to begin at, or it cannot be read."""
         source = next(iter(self.studio.sources), "")
-        if source:
-            await self._start_at((source, 0, 0))
-        return bool(source)
+        return bool(source) and await self._start_at((source, 0, 0))
 
-    async def _start_at(self, key: tuple[str, int, int]) -> None:
-        await self._begin(lambda: self.studio.start(*key))
+    async def _start_at(self, key: tuple[str, int, int]) -> bool:
+        return await self._begin(lambda: self.studio.start(*key))
 
     async def _on_start(self) -> None:
         self._halt()
@@ -63,6 +67,6 @@ class StartPanel:
         await self._on_start()
 
     async def _on_upload(self, event: events.UploadEventArguments) -> None:
-        content, name, model = await event.file.read(), event.file.name, self.studio.world_model
+        content, name, studio = await event.file.read(), event.file.name, self.studio
         self._halt()
-        await self._begin(lambda: picture_start(model, content, name))
+        await self._begin(lambda: picture_start(studio.world_model, content, name, whole=studio.squeezes))

@@ -21,7 +21,7 @@ from playslot_rl.data.frames import resize_frames
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import spread_evenly
 from playslot_rl.episode_seeds import redraw_stride
-from playslot_rl.errors import DataError
+from playslot_rl.errors import DataError, RenderError
 from playslot_rl.frames import to_float
 from playslot_rl.play.twin import Twin
 from playslot_rl.world_model import WorldModel, module_device
@@ -115,13 +115,17 @@ class RecordedStarts:
         return Start(title, frames[-1].copy(), slots, self.source.fps, task, self._twin(episode, rows, frames[-1]))
 
     def _twin(self, episode: int, rows: npt.NDArray[np.int64], seen: Frame) -> Twin | None:
-        """The episode run again to this frame, if what it shows is what was recorded."""
+        """The episode run again to this frame, if it can be drawn and shows what was recorded."""
         if not self._simulated or self.make_task is None:
             return None
         assert self.source.seeds is not None
         assert self.source.actions is not None
         task = self.make_task()
-        twin = Twin(task, int(self.source.seeds[episode]), list(self.source.actions[rows[:-1]]))
+        try:
+            twin = Twin(task, int(self.source.seeds[episode]), list(self.source.actions[rows[:-1]]))
+        except RenderError:
+            task.close()
+            return None
         if twin.first.shape != seen.shape or np.abs(twin.first.astype(float) - seen).mean() > SAME:
             twin.close()
             return None
@@ -203,14 +207,17 @@ def task_maker(env: EnvConfig, render: RenderConfig) -> Callable[[], Task]:
     return make
 
 
-def picture_start(model: WorldModel, content: bytes, name: str = "picture", seed: int = 0) -> Start:
-    """Start from a picture of any size: its largest centred square, resized by area averaging as in training.
+def picture_start(
+    model: WorldModel, content: bytes, name: str = "picture", seed: int = 0, whole: bool = False
+) -> Start:
+    """Start from a picture of any size, resized by area averaging: its largest centred square, or all of it.
 
     Args:
         model: parses it.
         content: of a PNG, JPEG or other picture file.
         name: for messages.
         seed: of sampled initial slots.
+        whole: squeeze all of it into a square, as the frames of a model that was trained with `data.resize` were.
 
     Raises:
         DataError: it is no picture, or too large.
@@ -232,8 +239,10 @@ def picture_start(model: WorldModel, content: bytes, name: str = "picture", seed
         raise DataError(
             f"{name}: got no picture that can be read, expected a PNG or JPEG file: choose another"
         ) from error
-    height, width = pixels.shape[:2]
-    cut = min(height, width)
-    top, left = (height - cut) // 2, (width - cut) // 2
-    frame = resize_frames(pixels[None, top : top + cut, left : left + cut], side)[0]
+    if not whole:
+        height, width = pixels.shape[:2]
+        cut = min(height, width)
+        top, left = (height - cut) // 2, (width - cut) // 2
+        pixels = pixels[top : top + cut, left : left + cut]
+    frame = resize_frames(pixels[None], side)[0]
     return Start(name, frame, parse_last(model, frame[None], seed))

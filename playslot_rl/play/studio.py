@@ -34,6 +34,7 @@ class Studio:
         out: folder that recordings go to.
         title: of the model, for the page.
         fps: of free play, at first.
+        squeezes: the model's frames were squeezed into squares (`data.resize`), and uploaded pictures are likewise.
         drivers: further ones that may take over, such as planners, by name.
 
     Attributes:
@@ -54,7 +55,9 @@ class Studio:
         title: str = "world model",
         fps: float = 8.0,
         drivers: dict[str, Driver] | None = None,
+        squeezes: bool = False,
     ) -> None:
+        self.squeezes = squeezes
         self.world_model, self.agent, self.out, self.title, self.fps = world_model.eval(), agent, out, title, fps
         self.recorded, self.simulated, self.drivers = recorded, simulated, dict(drivers or {})
         self._worker = ThreadPoolExecutor(1, "play")

@@ -187,7 +187,8 @@ def test_the_policys_demonstrations_are_measured_on_those_it_held_out() -> None:
     found = hold_out(source, {"policy": policy}, DataConfig(), 100)
     assert (found.tested.tolist(), found.known) == ([9, 10, 11], True)
     assert hold_out(source, {"policy": policy | {"demos": 7}}, DataConfig(), 100).known is False
-    assert hold_out(source, {}, DataConfig(held_out=2), 100).tested.tolist() == [10, 11]
+    named = hold_out(source, {}, DataConfig(held_out=2), 100)
+    assert (named.tested.tolist(), named.known) == ([10, 11], False)
 
 
 def test_at_most_so_many_episodes_are_taken_and_short_ones_left_out() -> None:

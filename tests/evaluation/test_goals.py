@@ -14,7 +14,7 @@ from playslot_rl.config import PlanConfig, RenderConfig
 from playslot_rl.config.env import EnvConfig
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.goals import GoalPool, make_goals
-from playslot_rl.evaluation.planning import cost_along_solution, play, results
+from playslot_rl.evaluation.planning import cost_along_solution, play, results, shape
 from playslot_rl.evaluation.planning_table import table
 from playslot_rl.testing import tiny_agent
 
@@ -65,13 +65,17 @@ def test_no_goal_at_all_is_refused(pool: GoalPool) -> None:
     pool.env = ENV
 
 
+def test_curves_are_told_by_their_end_their_slope_and_their_top() -> None:
+    ways = [[2.0, 1.0, 0.0], [1.0, 3.0, 2.0]]
+    assert shape(ways) == {"goal_is_minimum": 0.5, "downhill": 0.75, "hill": 2.0, "curves": ways}
+
+
 def test_the_cost_along_the_way_and_the_table(pool: GoalPool) -> None:
     goals = make_goals(pool, SEEDS, "ahead", PlanConfig(), 0)
     found = cost_along_solution(tiny_agent(), goals, looks=2)
     for name in ("slots", "dynamics", "image"):
         assert [len(way) for way in found[name]["curves"]] == [6, 6]
-        assert 0 <= found[name]["goal_is_minimum"] <= 1
-        assert found[name]["hill"] >= 1
+        assert found[name] == shape(found[name]["curves"])
     assert found["moved"] > 0
     random = results(play(pool, RandomActor(10, 4), goals, "ahead", 10, 1, draw=False), goals, 0.05)
     settings = {"ahead": 25, "budget": 50}

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import socket
 from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,8 @@ from nicegui import ui
 from nicegui.testing import User, user_simulation
 from scene import DotTask
 
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config.experiment import DataConfig
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.play.gallery import Gallery
 from playslot_rl.play.page import PlayPage
@@ -234,9 +237,19 @@ def test_a_taken_port_is_refused_in_one_line_and_nothing_takes_the_next_free_one
     assert choose_port(0) >= 8080
 
 
-def test_play_wants_a_run_and_a_data_set_that_is_there(tmp_path: Path) -> None:
-    from dataclasses import replace
+def test_data_sets_of_a_run_may_be_gone_and_typed_ones_may_not(
+    agent: Agent, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = replace(ExperimentConfig(run=str(tmp_path)), data=DataConfig(root=f"{tmp_path}/elsewhere"))
+    (tmp_path / "config.json").write_text(json.dumps(to_dict(config)))
+    assert play.recorded_starts(config, agent.world_model, None) is None
+    assert "are not on this machine" in capsys.readouterr().out
+    typed = replace(config, data=DataConfig(root=f"{tmp_path}/typo"))
+    with pytest.raises(DataError, match="typo: got no data set, expected a LeRobot"):
+        play.recorded_starts(typed, agent.world_model, None)
 
+
+def test_play_wants_a_run_and_a_data_set_that_is_there(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="run: got nothing, expected a run or a shipped model"):
         play.open_studio(ExperimentConfig())
     config = ExperimentConfig(run="pretrained", device="cpu")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from playslot_rl import keys
 from playslot_rl.data.source import open_source
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError
-from playslot_rl.play import recording
+from playslot_rl.play import pictures, recording
 from playslot_rl.play.recording import columns, record
 from playslot_rl.play.session import PlaySession
 
@@ -51,6 +53,20 @@ def test_a_recording_is_a_sound_data_set(session: PlaySession, tmp_path: Path, s
     about = json.loads((folder / "session.json").read_text())
     assert [moment["label"] for moment in about["moments"]][:2] == ["start", "prototype 1"]
     assert record(session, tmp_path / "play").name == "recording-002"
+
+
+def test_a_long_session_has_a_short_animation(session: PlaySession, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the speed of the session: of eleven moments every third, each shown three times as long."""
+    start = session.timeline.moments[0]
+    path = [replace(start, frame=np.full((16, 16, 3), 20 * shade, np.uint8), true=None) for shade in range(11)]
+
+    def shown() -> tuple[int, int]:
+        with Image.open(io.BytesIO(pictures.session_animation(path, 10.0))) as animation:
+            return animation.n_frames, animation.info["duration"]  # type: ignore[attr-defined]
+
+    assert shown() == (11, 100)
+    monkeypatch.setattr(pictures, "MOST_PICTURES", 4)
+    assert shown() == (4, 300)
 
 
 def test_nothing_is_recorded_before_a_step_or_without_a_simulator(session: PlaySession, tmp_path: Path) -> None:

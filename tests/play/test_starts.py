@@ -38,6 +38,13 @@ def test_a_picture_of_any_size_is_cut_to_its_middle_square_and_resized(agent: Ag
     torch.testing.assert_close(same.slots, parsed[:, 0])
 
 
+def test_a_picture_is_squeezed_where_the_models_frames_were(agent: Agent) -> None:
+    frame = picture_start(agent.world_model, picture(120, 200), whole=True).frame
+    assert frame.shape == (64, 64, 3)
+    assert frame[30, 2].tolist() == [255, 0, 0]
+    assert frame[30, -3].tolist() == [0, 0, 255]
+
+
 @pytest.mark.parametrize("content", [b"", b"no picture at all", picture(64, 64)[:60]])
 def test_what_is_no_picture_is_refused_in_one_line(agent: Agent, content: bytes) -> None:
     with pytest.raises(DataError, match=r"^cat\.png: got no picture that can be read, expected a PNG") as caught:

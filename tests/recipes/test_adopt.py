@@ -13,9 +13,10 @@ import torch
 from commands import refused, smoke
 
 from playslot_rl.config.compose import compose
+from playslot_rl.data.windows import split_episodes
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.recipes import adopt_trials
-from playslot_rl.recipes.adopt import savi_for, start_for
+from playslot_rl.recipes.adopt import clip_room, savi_for, start_for
 from playslot_rl.recipes.adopt_trials import SHORTEST, scheduled, steps_within, too_short
 from playslot_rl.training.runs import load_savi
 from playslot_rl.training.stage_slots import warm_start
@@ -78,10 +79,12 @@ def test_what_cannot_be_adopted_is_refused_before_anything_is_written(
     run, out = tmp_path / "run", f"out={tmp_path / 'run'}"
     still = write_set(tmp_path / "still", (4, 4), speed=0)
     frames = write_set(tmp_path / "frames", (1, 1), speed=2)
+    short = write_set(tmp_path / "short", (2, 1, 2, 6, 2), speed=2)
     for message, given in {
         r"got 2 cameras .* set data\.camera=": (f"data.root={foreign}", out),
         "frames of observation.images.top that never change": (f"data.root={still}", out),
         "episodes of one frame": (f"data.root={frames}", out),
+        r"got episodes of 2 frames \(median\), expected at least 3": (f"data.root={short}", out),
         r"data\.root: got nothing": (out,),
         r"data\.root: got .*, expected one data set": (f"data.root={still},{frames}", out),
         "env: got button_press, expected video": ("env=button_press", f"data.root={any_set}", out),
@@ -99,6 +102,21 @@ def test_every_preset_has_a_savi_for_every_frame_size(preset: str, size: int) ->
     sizes = savi_for(compose([f"preset={preset}"], "adopt").model.savi, size)
     savi = SAVi(replace(sizes, decoder_channels=tuple(4 for _ in sizes.decoder_channels)), size)
     assert savi.decode(torch.zeros(1, sizes.n_slots, sizes.slot_dim)).frames.shape == (1, 3, size, size)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_clips_fit_into_episodes_of_different_lengths(seed: int) -> None:
+    """Into those held out, too, which are a twentieth of them: often one, and it may be the shortest."""
+    draw = np.random.default_rng(seed)
+    lengths = -(-draw.integers(40, 200, 20) // 8)
+    longest, validation = clip_room(lengths, 3, 0.05, seed)
+    training, held_out = split_episodes(len(lengths), validation, seed)
+    assert lengths[held_out].max() >= longest
+    assert (lengths[training] >= longest).mean() > 0.75
+    few = np.array([1] * 9 + [12] * 11)
+    longest, validation = clip_room(few, 3, 0.05, seed)
+    assert longest == 12
+    assert few[split_episodes(20, validation, seed)[1]].max() == 12
 
 
 def test_a_trial_that_is_too_short_chooses_nothing() -> None:

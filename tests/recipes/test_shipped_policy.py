@@ -53,9 +53,7 @@ def test_it_is_evaluated_into_a_run_of_its_own(shipped: Path, tmp_path: Path) ->
 
 def test_another_task_than_its_own_is_refused(tmp_path: Path) -> None:
     config = compose(["run=pretrained/block_push", "env=button_press", f"out={tmp_path / 'check'}"], "evaluate")
-    with pytest.raises(
-        ConfigError, match="env: got button_press, expected block_push, with which run=pretrained"
-    ):
+    with pytest.raises(ConfigError, match="env: got button_press, expected block_push, with which run=pretrained"):
         evaluate.main(config)
     assert list(tmp_path.iterdir()) == []
 
