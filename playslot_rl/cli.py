@@ -299,6 +299,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _top_parser().print_help()
         return 2
     name = arguments[0]
+    if name in {*COMMANDS, *GROUPS} - {*SEVERAL} and (code := _alone(name)):
+        return code
     if name in GROUPS:
         group = importlib.import_module(f"playslot_rl.recipes.{name}")
         options = group.parser(_Parser).parse_args(arguments[1:])
@@ -308,6 +310,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         _top_parser().parse_args(arguments[:1])
     options = _command_parser(name).parse_intermixed_args(arguments[1:])
     return _guarded(name, lambda: _run(name, options))
+
+
+def _alone(name: str) -> int:
+    """Refuse several processes; 0 where there is one."""
+    from playslot_rl.processes import launched
+
+    if launched().world == 1:
+        return 0
+    return _fail(
+        name,
+        f"got {launched().world} processes, expected one: only {', '.join(SEVERAL)} run on several; start this command "
+        "without torchrun or accelerate launch",
+        1,
+    )
 
 
 def _run(name: str, options: argparse.Namespace) -> int:
@@ -330,11 +346,6 @@ def _run(name: str, options: argparse.Namespace) -> int:
     from playslot_rl.envs.rendering import import_mujoco
 
     if processes.launched().world > 1:
-        if name not in SEVERAL:
-            raise ConfigError(
-                f"got {processes.launched().world} processes, expected one: only {', '.join(SEVERAL)} run on several; "
-                "start this command without torchrun or accelerate launch"
-            )
         processes.start(config.device)
     import_mujoco()  # torchrl imports it too, and would fail without our cure
     recipe = importlib.import_module(f"playslot_rl.recipes.{name.replace('-', '_')}")

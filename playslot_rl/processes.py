@@ -60,8 +60,11 @@ def here() -> Processes:
 
 
 def launched() -> Processes:
-    """What a launcher's environment says, whether or not `start` was called."""
-    return Processes(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
+    """What a launcher's environment says, whether or not `start` was called; no launcher sets what is no number."""
+    try:
+        return Processes(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
+    except ValueError:
+        return Processes()
 
 
 def free_port() -> int:
@@ -166,6 +169,22 @@ def stacked(values: Tensor) -> Tensor:
     with _exchange():
         dist.all_gather(parts, values.contiguous())
     return torch.cat(parts)
+
+
+def agreed(number: int) -> list[int]:
+    """This number of every process, by rank.
+
+    Raises:
+        PeerError: one of them ended.
+    """
+    if _here.world == 1:
+        return [number]
+    import torch.distributed as dist
+
+    found = [0] * _here.world
+    with _exchange():
+        dist.all_gather_object(found, number)
+    return found
 
 
 def copied(tensors: Sequence[Tensor]) -> None:

@@ -174,7 +174,8 @@ def note_read(count: int) -> None:
 class ArrayWriter:
     """Writes an `.npy` file piece by piece along its first axis.
 
-    Plain writes, because a full disk under a memory map is a bus error, not an exception.
+    Plain writes, because a full disk under a memory map is a bus error, not an exception. The file has its length from
+    the beginning, all holes.
     """
 
     def __init__(self, path: Path, shape: Sequence[int], dtype: npt.DTypeLike) -> None:
@@ -182,6 +183,7 @@ class ArrayWriter:
         self.rows = 0
         self._file: IO[bytes] = path.open("wb")
         self._begin = write_header(self._file, self.shape, self.dtype)
+        self._file.truncate(self._begin + int(np.prod(self.shape)) * self.dtype.itemsize)
 
     def write(self, rows: npt.NDArray[np.generic], first: int | None = None) -> None:
         """Write rows (n, *shape[1:]) from row `first` on; None goes on where the last ones ended."""
@@ -194,8 +196,6 @@ class ArrayWriter:
 
     def close(self, *, whole: bool = True) -> None:
         """Finish; all rows must have been written, unless it is not `whole`: the others are zeros."""
-        if not whole:
-            self._file.truncate(self._begin + int(np.prod(self.shape)) * self.dtype.itemsize)
         self._file.close()
         if whole and self.rows != self.shape[0]:
             raise ValueError(f"{self.path}: got {self.rows} rows, expected {self.shape[0]}")

@@ -16,9 +16,12 @@ from filelock import FileLock, Timeout
 from playslot_rl.config.sizes import shown
 from playslot_rl.data.cache import CachePlace, cache_folder, lock_file, settings
 from playslot_rl.errors import DataError
+from playslot_rl.storage.locks import locked
 from playslot_rl.storage.sharing_locks import alone, last_use, remove_unused
 
 KINDS: Final = ("frames", "slots")
+LEFT: Final = ".tmp-"
+"""In the name of a folder that is being made or removed, or that a kill has left (`playslot_rl.storage.folders`)."""
 ENTRY_NAME: Final = "meta.json"
 
 
@@ -47,8 +50,8 @@ class Entry:
     @property
     def name(self) -> str:
         """What `playslot cache clear` calls it."""
-        folder = Path(self.path).name
-        return folder.removeprefix(".").removesuffix(".part") if self.part else folder
+        folder = Path(self.path)
+        return _key(folder) if self.part else folder.name
 
     def line(self) -> str:
         """For people."""
@@ -62,7 +65,7 @@ def entries(cache: CachePlace = "") -> list[Entry]:
     found = []
     for kind in KINDS:
         for folder in (cache_folder(cache) / kind).glob("*"):
-            part = folder.name.startswith(".") and folder.name.endswith(".part")
+            part = folder.name.startswith(".") and (folder.name.endswith(".part") or LEFT in folder.name)
             if folder.is_dir() and (part or not folder.name.startswith(".")):
                 with contextlib.suppress(FileNotFoundError):  # removed meanwhile
                     found.append(_entry(folder, kind, part))
@@ -70,17 +73,24 @@ def entries(cache: CachePlace = "") -> list[Entry]:
 
 
 def _entry(folder: Path, kind: str, part: bool) -> Entry:
-    used, size = last_use(folder), sum(_stored(path) for path in folder.rglob("*") if path.is_file())
+    used, files = last_use(folder), [path for path in folder.rglob("*") if path.is_file()]
     try:
         data = str(json.loads((folder / ENTRY_NAME).read_text()).get("name", ""))
     except (OSError, ValueError, AttributeError):
         data = ""
     with _unmade(folder) if part else alone(folder) as free:
+        # What is being made will fill its holes; what a kill has left will not.
+        size = sum(path.stat().st_size if part and not free else _stored(path) for path in files)
         return Entry(str(folder), kind, data, size, used, not free, part)
 
 
+def _key(part: Path) -> str:
+    """Name of the entry that a folder was to become."""
+    return part.name.removeprefix(".").removesuffix(".part").partition(LEFT)[0]
+
+
 def _stored(path: Path) -> int:
-    """Bytes on disk: an array that is being made has holes."""
+    """Bytes on disk: an array that was being made has holes."""
     status = path.stat()
     return min(status.st_size, status.st_blocks * 512) if hasattr(status, "st_blocks") else status.st_size
 
@@ -88,7 +98,7 @@ def _stored(path: Path) -> int:
 @contextlib.contextmanager
 def _unmade(part: Path) -> Iterator[bool]:
     """Whether nobody makes the entry; inside the block nobody begins to."""
-    lock = FileLock(lock_file(part.with_name(part.name.removeprefix(".").removesuffix(".part"))), timeout=0)
+    lock = FileLock(lock_file(part.with_name(_key(part))), timeout=0)
     try:
         lock.acquire()
     except Timeout:
@@ -113,6 +123,18 @@ def remove(entry: Entry) -> bool:
         if free:
             shutil.rmtree(folder, ignore_errors=True)
         return free and not folder.exists()
+
+
+@contextlib.contextmanager
+def room(cache: CachePlace, needed: int, key: str) -> Iterator[None]:
+    """Make room, and begin an entry in the block, by making its file as large as it will be: two processes do not both
+    take the same room. Arguments and errors: see `make_room`."""
+    if settings(cache).limit is None:
+        yield
+        return
+    with locked(cache_folder(cache) / ".room.lock"):
+        make_room(cache, needed, key)
+        yield
 
 
 def make_room(cache: CachePlace, needed: int, key: str) -> None:

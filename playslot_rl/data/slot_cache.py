@@ -17,8 +17,9 @@ import numpy.typing as npt
 import torch
 
 from playslot_rl.data.cache import ArrayWriter, CachePlace, build_once, cache_folder, load_cached
-from playslot_rl.data.cache_entries import ENTRY_NAME, make_room
+from playslot_rl.data.cache_entries import ENTRY_NAME, room
 from playslot_rl.data.source import ConcatFrames, EpisodeFrames
+from playslot_rl.data.stream import streams_of
 from playslot_rl.frames import normalise
 from playslot_rl.seeding import step_generator
 from playslot_rl.storage.atomic import write_json
@@ -78,8 +79,8 @@ def slot_cache(
         if progress:
             print(f"slots: parsing {int(source.lengths.sum())} frames once", file=sys.stderr, flush=True)
         shape = (count, savi.config.n_slots, savi.config.slot_dim)
-        make_room(cache, int(np.prod(shape)) * 4, key)
-        writer = ArrayWriter(temporary / "slots.npy", shape, np.float32)
+        with room(cache, int(np.prod(shape)) * 4, key):
+            writer = ArrayWriter(temporary / "slots.npy", shape, np.float32)
         for start, slots in zip(source.starts, parse_episodes(source, savi, device), strict=True):
             writer.write(slots, int(start))
         writer.close(whole=whole)
@@ -91,6 +92,17 @@ def slot_cache(
     return slots
 
 
+def _batches(lengths: npt.NDArray[np.int64], most: int | None) -> Iterator[npt.NDArray[np.int64]]:
+    """Numbers of the episodes that are parsed together, at most so many frames of them, but one."""
+    first = 0
+    while first < len(lengths):
+        last = min(first + EPISODES_A_BATCH, len(lengths))
+        if most is not None:
+            last = max(first + 1, first + int(np.searchsorted(np.cumsum(lengths[first:last]), most, side="right")))
+        yield np.arange(first, last)
+        first = last
+
+
 def _in_order(source: EpisodeFrames) -> bool:
     """Whether the episodes fill all rows up to the last one of theirs; of some chosen ones, those between are left."""
     return bool(np.array_equal(source.starts, np.cumsum(source.lengths) - source.lengths))
@@ -100,10 +112,15 @@ def _in_order(source: EpisodeFrames) -> bool:
 def parse_episodes(
     source: EpisodeFrames, savi: SAVi, device: torch.device | str = "cpu"
 ) -> Iterator[npt.NDArray[np.float32]]:
-    """Parse all episodes in order: yields float32 (frames of the episode, N, D)."""
+    """Parse all episodes in order: yields float32 (frames of the episode, N, D).
+
+    Several at a time; of frames that are streamed as many as a quarter of the buffer holds, which may be fewer.
+    """
     savi = savi.to(device).eval()
-    for first in range(0, source.episodes, EPISODES_A_BATCH):
-        episodes = np.arange(first, min(first + EPISODES_A_BATCH, source.episodes))
+    streams = streams_of(source.frames)
+    most = streams[0].buffer // 4 if streams else None
+    for episodes in _batches(source.lengths, most):
+        first = int(episodes[0])
         lengths = source.lengths[episodes]
         # Shorter episodes repeat their last frame; SAVi is causal, so what is kept does not see it.
         steps = np.minimum(np.arange(int(lengths.max())), lengths[:, None] - 1)

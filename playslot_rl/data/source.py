@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from playslot_rl import keys
 from playslot_rl.data.cache import CachePlace, build_on, cache_folder, load_cached, note_read, settings
-from playslot_rl.data.cache_entries import ENTRY_NAME, make_room
+from playslot_rl.data.cache_entries import ENTRY_NAME, room
 from playslot_rl.data.contents import Contents, open_files, stated_size
 from playslot_rl.data.frame_build import FrameArray, build_frames
 from playslot_rl.errors import DataError
@@ -314,7 +314,9 @@ def _frame_cache(files: Contents, camera: str, cache: CachePlace, size: int | No
     key = hashlib.sha256(json.dumps([_FORMAT, fingerprint, camera, size]).encode()).hexdigest()[:24]
 
     def build(part: Path) -> None:
-        make_room(cache, FrameArray(files, camera, size, part).bytes, key)
+        array = FrameArray(files, camera, size, part / "frames.npy")
+        with room(cache, array.bytes, key):
+            array.begin()
         build_frames(files, camera, size, part, settings(cache).workers)
         np.savez(part / "columns.npz", **labels_of(files))  # type: ignore[arg-type]
         tasks = files.episodes[0].tasks

@@ -6,7 +6,8 @@ anew for every epoch. The buffer of step s is a stretch of that order,
     blocks  o(p), ..., o(p + 15),    p = floor(s b / w)
 
 with b windows a batch and w windows a block, so that an epoch draws as many windows as there are; a batch's windows are
-drawn uniformly from the buffer's blocks. All of it is a function of (seed, step): a resumed run reads the same frames.
+drawn uniformly from the buffer's blocks. A buffer that has room for all blocks holds them all. All of it is a function
+of (seed, step): a resumed run reads the same frames.
 
 Shapes: F frames, E episodes, B batch, H W image height and width.
 """
@@ -43,6 +44,8 @@ from playslot_rl.data.stride import ChosenFrames
 IntArray = npt.NDArray[np.int64]
 BLOCKS: Final = 16
 """Blocks of a full buffer."""
+FEW: Final = 4
+"""Blocks below which a buffer hardly shuffles."""
 ORDER_STREAM: Final = 0x57EA
 """Keeps the order of the blocks apart from what else a seed draws."""
 
@@ -50,8 +53,8 @@ ORDER_STREAM: Final = 0x57EA
 class FrameStream:
     """Frames uint8 (F, H, W, 3) that are decoded when they are read.
 
-    Blocks that `hold` names stay in memory once they are read; of other episodes, those read last, a quarter of the
-    buffer.
+    Blocks that `hold` names stay in memory once they are read; of other episodes those read last, up to a quarter of
+    the buffer, or a single one that is longer.
 
     Args:
         contents: the data set; its columns are not kept.
@@ -113,24 +116,33 @@ class FrameStream:
         return frames
 
     def _gather_loose(self, flat: IntArray, places: IntArray, out: Frames) -> None:
-        """Rows of episodes that no held block has: decoded whole, the missing ones together."""
+        """Rows of episodes that no held block has: decoded whole, as many of them together as may stay."""
         if not len(places):
             return
         episode = np.searchsorted(self._starts, flat[places], side="right") - 1
         wanted = np.unique(episode).tolist()
-        missing = [self._spans[number] for number in wanted if number not in self._loose]
-        if missing:
-            frames, begin = self._decode(missing), 0
-            for number in (number for number in wanted if number not in self._loose):
-                self._loose[number] = frames[begin : begin + self._spans[number].length]
-                begin += self._spans[number].length
-        for number in wanted:
+        wanted.sort(key=lambda number: number not in self._loose)  # before those that make way for others
+        while wanted:
+            if wanted[0] not in self._loose:
+                self._decode_loose(wanted)
+            number = wanted.pop(0)
             self._loose.move_to_end(number)
             here = places[episode == number]
             out[here] = self._loose[number][flat[here] - self._starts[number]]
-        kept = sum(len(frames) for frames in self._loose.values())
-        while kept > self.buffer // 4 and len(self._loose) > len(wanted):
+
+    def _decode_loose(self, wanted: Sequence[int]) -> None:
+        """Decode the first of these episodes, and those after it that a quarter of the buffer has room for."""
+        most = self.buffer // 4
+        lengths = np.cumsum([self._spans[number].length for number in wanted])
+        together = wanted[: max(1, int(np.searchsorted(lengths, most, side="right")))]
+        kept = sum(map(len, self._loose.values())) + int(lengths[len(together) - 1])
+        while self._loose and kept > most:
             kept -= len(self._loose.popitem(last=False)[1])
+        frames, begin = self._decode([self._spans[number] for number in together]), 0
+        for number in together:
+            # A copy: one view of what was decoded together would keep all of it.
+            self._loose[number] = frames[begin : begin + self._spans[number].length].copy()
+            begin += self._spans[number].length
 
     def _decode(self, spans: Sequence[Span]) -> Frames:
         first = np.cumsum([0, *(span.length for span in spans)])
@@ -263,12 +275,23 @@ class ShuffleBuffer:
         ]
         self._orders: dict[tuple[int, int], IntArray] = {}
         self._at: list[list[int]] = []
+        for blocks, held in zip(self._blocks, self._held, strict=True):
+            if held < min(FEW, len(blocks)):
+                enough = FEW * round(sizes[blocks].mean())
+                print(
+                    f"note: data.shuffle_buffer={buffer} holds {held} of {len(blocks)} blocks of episodes, and batches "
+                    f"hardly mix: {enough} or more would hold {min(FEW, len(blocks))}",
+                    flush=True,
+                )
 
     def episodes(self, step: int, batch: int) -> IntArray:
         """Indices of the episodes that step `step` may draw from; the buffer moves there."""
         held, coming = [], []
         for group, blocks in enumerate(self._blocks):
             if not len(blocks):
+                continue
+            if self._held[group] == len(blocks):
+                held += blocks.tolist()
                 continue
             first = int(step * batch * self.shares[group] / self._windows[group])
             held += [self._ordered(group, first + i) for i in range(self._held[group])]

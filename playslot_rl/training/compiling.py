@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from torch import nn
 
@@ -41,5 +41,14 @@ def release_parts(modules: Mapping[str, nn.Module]) -> None:
 
 
 def _parts(modules: Mapping[str, nn.Module]) -> list[nn.Module]:
-    children = [part for module in modules.values() for part in module.children()]
+    children = [part for module in modules.values() for part in _called(module)]
     return [part for part in children if any(parameter.requires_grad for parameter in part.parameters())]
+
+
+def _called(module: nn.Module) -> Iterator[nn.Module]:
+    """The parts that are called as they are: lists and dictionaries of parts never are."""
+    for part in module.children():
+        if isinstance(part, nn.ModuleList | nn.ModuleDict):
+            yield from _called(part)
+        else:
+            yield part

@@ -20,7 +20,8 @@ from torch import Tensor, nn
 
 from playslot_rl.config import LoggingConfig, OptimConfig, StageConfig, to_dict
 from playslot_rl.config.roles import fixed_keys
-from playslot_rl.processes import here, spreading, wait
+from playslot_rl.errors import CheckpointError
+from playslot_rl.processes import agreed, here, spreading, wait
 from playslot_rl.progress import StageProgress
 from playslot_rl.seeding import global_seed
 from playslot_rl.storage.resume import TrainingCheckpoints, TrainingState
@@ -103,8 +104,8 @@ def fit(
             ready()
         run.watch.history.rewind(start)
     wait()  # until all have looked, and what is there is there for all
+    run.meet()
     if not run.ended:
-        run.batches.meet()
         progress = StageProgress(part.name, start, config.steps, logging.progress, config.log_every * 10)
         with run.watch.running(logging, start), run.compiled(), progress:
             while not run.ended:
@@ -146,6 +147,21 @@ class _Run:
     @property
     def _averaged(self) -> Mapping[str, Tensor] | None:
         return None if self.average is None else self.average.tensors
+
+    def meet(self) -> None:
+        """Begin together: at the same step, with the first process's weights and buffers.
+
+        Raises:
+            CheckpointError: processes have found checkpoints of different steps.
+        """
+        steps = agreed(self.state.step)
+        if len(set(steps)) > 1:
+            raise CheckpointError(
+                f"{self.folder}: got checkpoints of steps {', '.join(map(str, steps))} on ranks 0 to {len(steps) - 1}, "
+                "expected one: out= has to be a folder that all machines share"
+            )
+        if not self.ended:
+            self.batches.meet()
 
     @contextlib.contextmanager
     def compiled(self) -> Iterator[None]:

@@ -16,10 +16,11 @@ import pytest
 from playslot_rl.cli import main
 from playslot_rl.config import DataConfig
 from playslot_rl.config.sizes import bytes_of
-from playslot_rl.data.cache import Cache, load_cached, part_folder
-from playslot_rl.data.cache_entries import clear, entries, make_room
+from playslot_rl.data.cache import ArrayWriter, Cache, build_once, load_cached, part_folder
+from playslot_rl.data.cache_entries import clear, entries, make_room, room
 from playslot_rl.data.source import open_source
 from playslot_rl.errors import ConfigError, DataError
+from playslot_rl.storage.atomic import temporary_name
 from playslot_rl.storage.sharing_locks import NAME
 
 SIZE = 10_000
@@ -131,6 +132,32 @@ def test_what_a_kill_has_left_is_listed_and_cleared(tmp_path: Path) -> None:
     assert [(entry.name, entry.part, entry.in_use) for entry in found] == [("k", True, False)]
     assert [entry.name for entry in clear(cache=tmp_path).removed] == ["k"]
     assert not part.exists()
+
+
+def test_slots_that_a_kill_has_left_are_listed_counted_and_cleared(tmp_path: Path) -> None:
+    left = temporary_name(tmp_path / "slots" / "k")
+    left.mkdir(parents=True)
+    (left / "slots.npy").write_bytes(bytes(5000))
+    (entry,) = entries(tmp_path)
+    assert (entry.name, entry.kind, entry.part, entry.in_use, entry.bytes) == ("k", "slots", True, False, 5000)
+    make_room(Cache(tmp_path, 6000), 4000, "new")
+    assert not left.exists(), "it made room"
+    left.mkdir()
+    assert [entry.name for entry in clear(cache=tmp_path).removed] == ["k"]
+
+
+def test_what_is_being_made_counts_as_large_as_it_will_be(tmp_path: Path) -> None:
+    def build(folder: Path) -> None:
+        with room(Cache(tmp_path, 10_000), 6000, "one"):
+            writer = ArrayWriter(folder / "slots.npy", (6000,), np.uint8)
+        with pytest.raises(DataError, match=r"data\.cache_limit=.* beside .* in use"):
+            make_room(Cache(tmp_path, 10_000), 6000, "two")
+        writer.write(np.zeros(6000, np.uint8))
+        writer.close()
+
+    build_once(tmp_path / "slots" / "one", build)
+    make_room(Cache(tmp_path, 10_000), 3000, "two")
+    assert names(tmp_path) == ["one"]
 
 
 def test_the_command_lists_and_clears(three: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,7 @@ from foreign import LENGTHS, foreign_frames
 from playslot_rl.config import DataConfig
 from playslot_rl.data.demonstrations import shifted
 from playslot_rl.data.opening import open_configured
-from playslot_rl.data.slot_cache import slot_cache
+from playslot_rl.data.slot_cache import parse_episodes, slot_cache
 from playslot_rl.data.source import concatenate, open_source
 from playslot_rl.data.stream import FrameStream, ShuffleBuffer, open_stream, streams_of
 from playslot_rl.data.stride import every
@@ -22,7 +22,7 @@ from playslot_rl.data.windows import Clips
 from playslot_rl.errors import DataError
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.seeding import StepGenerators
-from playslot_rl.testing import tiny_config
+from playslot_rl.testing import tiny_config, tiny_savi
 
 CAMERA = "observation.images.top"
 
@@ -72,12 +72,33 @@ def test_episodes_outside_the_buffer_are_kept_only_while_they_are_read(
     frames[np.array([0, 1])]
     frames[np.array([2, 4])]
     assert decoded == [[0]]
-    frames[np.array([5, 14])]  # episodes 1 and 2: ten frames, all needed at once
-    assert decoded == [[0], [1, 2]]
-    frames[np.array([6])]
-    assert decoded == [[0], [1, 2]]
+    frames[np.array([5, 14])]  # episodes 1 and 2 are ten frames, too many to be kept together
+    assert decoded == [[0], [1], [2]]
+    assert list(frames._loose) == [2]  # type: ignore[attr-defined]
+    frames[np.array([14])]
+    assert decoded == [[0], [1], [2]]
     frames[np.array([0])]
-    assert decoded == [[0], [1, 2], [0]]
+    assert decoded == [[0], [1], [2], [0]]
+
+
+def test_what_has_made_way_takes_no_memory(foreign_images: Path, tmp_path: Path) -> None:
+    frames = open_stream(foreign_images, cache=tmp_path, buffer=44).frames  # eleven loose frames
+    frames[np.arange(15)]
+    kept = frames._loose.values()  # type: ignore[attr-defined]
+    assert sum(map(len, kept)) <= 11
+    assert all(part.base is None for part in kept), "no view of frames that were decoded beside it"
+
+
+@pytest.mark.parametrize(("buffer", "together"), [(1, [[0], [1], [2]]), (44, [[0, 1], [2]]), (1000, [[0, 1, 2]])])
+def test_slots_of_streamed_episodes_are_parsed_in_as_many_as_are_kept(
+    foreign_images: Path, tmp_path: Path, buffer: int, together: list[list[int]], decoded: list[list[int]]
+) -> None:
+    savi = tiny_savi(initial="learned")
+    want = list(parse_episodes(open_source(foreign_images, cache=tmp_path), savi))
+    found = list(parse_episodes(open_stream(foreign_images, cache=tmp_path, buffer=buffer), savi))
+    for one, other in zip(want, found, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-5)
+    assert decoded == together
 
 
 def test_the_buffer_moves_through_every_block_once_an_epoch() -> None:
@@ -123,8 +144,24 @@ def test_a_resumed_run_reads_the_same_windows(foreign_images: Path, tmp_path: Pa
 
 def test_a_buffer_as_large_as_the_set_draws_as_the_cache_does(foreign_images: Path, tmp_path: Path) -> None:
     sets = [open_source(foreign_images, cache=tmp_path), open_stream(foreign_images, cache=tmp_path, buffer=10_000)]
-    drawn = [Clips(s, 2, 0.0, seed=0).sample(50, StepGenerators(0, 1).numpy("windows")) for s in sets]
-    assert np.array_equal(*drawn)
+    cached, streamed = (Clips(s, 2, 0.0, seed=0) for s in sets)
+    for step in range(20):
+        one, other = (c.sample(50, StepGenerators(0, step).numpy("windows")) for c in (cached, streamed))
+        assert np.array_equal(one, other)
+
+
+def test_a_buffer_that_has_room_for_all_blocks_holds_all_of_them_at_every_step(
+    foreign_images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not a stretch of the endless order, in which blocks come twice across an epoch's border."""
+    stream = open_stream(foreign_images, cache=tmp_path, buffer=20)  # three blocks of five frames, and room for four
+    assert len(streams_of(stream.frames)[0].blocks) == 3
+    buffer = ShuffleBuffer(stream.frames, stream.starts, stream.lengths - 1, np.zeros(3, int), np.ones(1), 0)
+    assert all(buffer.episodes(step, 4).tolist() == [0, 1, 2] for step in range(50))
+    assert capsys.readouterr().out == ""
+    small = open_stream(foreign_images, cache=tmp_path, buffer=5)
+    ShuffleBuffer(small.frames, small.starts, small.lengths - 1, np.zeros(3, int), np.ones(1), 0)
+    assert "note: data.shuffle_buffer=5 holds 1 of 3 blocks of episodes" in capsys.readouterr().out
 
 
 def test_the_step_of_a_generator_does_not_change_what_it_draws() -> None:

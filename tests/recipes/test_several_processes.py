@@ -168,6 +168,32 @@ def test_a_rank_that_dies_ends_the_others_with_its_error_in_one_line(
     assert done.lines() == ["playslot train-slots (rank 1): error: slots: got a rank that fails, expected none"]
 
 
+def _rank_one_is_killed() -> None:
+    """After the first checkpoint, of its fourth step."""
+    real = SlotsStage.loss
+
+    def loss(stage: SlotsStage, step: int, generators: StepGenerators) -> object:
+        if step == 4 and os.environ["RANK"] == "1":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(stage, step, generators)
+
+    SlotsStage.loss = loss  # type: ignore[method-assign, assignment]
+
+
+def test_a_rank_that_is_killed_ends_the_others_within_seconds(
+    launch: Callable[..., Launched], tmp_path: Path, videos: Path
+) -> None:
+    run = tmp_path / "run"
+    done = launch(*slots(run, videos, *LONG), patch=_rank_one_is_killed)
+    deadline = time.monotonic() + SOON_S
+    while not list((run / "slots" / "checkpoints").glob("step_*")):  # of step 4, the last one before
+        assert time.monotonic() < deadline, done.log.read_text()
+        time.sleep(0.02)
+    began = time.monotonic()
+    assert done.end() != 0
+    assert time.monotonic() - began < 20
+
+
 def test_an_error_of_all_ranks_is_said_once(launch: Callable[..., Launched], tmp_path: Path, videos: Path) -> None:
     done = launch(*slots(tmp_path / "run", videos, "slots.batch_size=3"))
     assert done.end() != 0
@@ -181,6 +207,18 @@ def test_a_command_for_one_process_says_so(launch: Callable[..., Launched], tmp_
     assert done.end() != 0
     assert len(done.lines()) == 1
     assert "got 2 processes, expected one" in done.lines()[0]
+
+
+@pytest.mark.parametrize("command", [("doctor",), ("cache", "list"), ("dataset", "info", "."), ("demo",)])
+def test_none_of_the_others_starts_on_several(
+    command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("RANK", "0")
+    assert cli.main(command) == 1
+    said = capsys.readouterr().err
+    assert f"playslot {command[0]}: error: got 2 processes, expected one" in said
+    assert said.count("\n") == 1
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])

@@ -11,9 +11,11 @@ from ranks import log_of
 from tiny_stages import STAGES
 
 from playslot_rl.errors import ConfigError
+from playslot_rl.modules.transformer import TransformerBlock
 from playslot_rl.storage.tensors import load_tensors, module_tensors
 from playslot_rl.training import compiling
 from playslot_rl.training.averages import WeightAverage
+from playslot_rl.training.compiling import compile_parts, release_parts
 from playslot_rl.training.fit import Part, fit
 
 
@@ -108,6 +110,24 @@ def test_the_average_forgets_where_the_weights_began() -> None:
     with average.shown():
         assert torch.equal(weight, average.tensors["w"])
     assert torch.equal(weight, torch.ones(3))
+
+
+@pytest.mark.parametrize("stage", ["slots", "dynamics", "policy"])
+def test_what_is_compiled_are_the_parts_that_are_called(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each block of a list of them, never the list; and none is left compiled."""
+    monkeypatch.setenv("CXX", "g++")
+    modules = STAGES[stage]().stage.modules
+    compile_parts(modules, "compile")
+    inner = [part for module in modules.values() for part in module.modules()]
+    marked = {id(part) for part in inner if part._compiled_call_impl is not None}
+    lists = [part for part in inner if isinstance(part, torch.nn.ModuleList)]
+    assert marked
+    assert not marked & {id(part) for part in lists}
+    covered = {id(part) for whole in inner if id(whole) in marked for part in whole.modules()}
+    blocks = [part for part in inner if isinstance(part, TransformerBlock)]
+    assert {id(part) for part in blocks} <= covered
+    release_parts(modules)
+    assert all(part._compiled_call_impl is None for part in inner)
 
 
 def test_compiling_without_a_compiler_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 from ranks import log_of, run_ranks
 from tiny_stages import DOUBLE, STAGES, in_double
 
+from playslot_rl.errors import CheckpointError
 from playslot_rl.processes import here, wait
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
 from playslot_rl.training.fit import fit
@@ -61,6 +63,36 @@ def several(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     folder: Path = tmp_path_factory.mktemp(f"ranks{request.param}")
     assert run_ranks(request.param, train_all, folder) == [0] * request.param
     return folder
+
+
+def disagree(folder: Path) -> None:
+    """Each rank looks into a folder of its own, of which one holds a training and the other none."""
+    with pytest.raises(CheckpointError, match=r"got checkpoints of steps 10, 0 on ranks 0 to 1, expected one: out="):
+        fit(STAGES["policy"](), folder / str(here().rank), seed=SEED)
+
+
+def test_ranks_that_find_checkpoints_of_different_steps_are_refused(alone: Path, tmp_path: Path) -> None:
+    interrupted(alone / "policy", tmp_path / "0")
+    assert run_ranks(2, disagree, tmp_path) == [0, 0]
+
+
+def accumulated(folder: Path) -> None:
+    part = STAGES["dynamics"]()
+    optim = replace(part.config.optim, accumulate=MICROS[here().world], ema=0.9)
+    fit(replace(part, config=replace(part.config, steps=6, optim=optim)), folder, seed=SEED)
+
+
+MICROS = {1: 1, 2: 3}
+"""By number of ranks."""
+
+
+def test_micro_batches_and_an_average_on_two_ranks_are_those_of_one(tmp_path: Path) -> None:
+    accumulated(tmp_path / "one")
+    assert run_ranks(2, accumulated, tmp_path / "two") == [0, 0]
+    for one, other in zip(log_of(tmp_path / "one"), log_of(tmp_path / "two"), strict=True):
+        assert other["loss" if "loss" in one else "psnr"] == pytest.approx(
+            one["loss" if "loss" in one else "psnr"], rel=10 * CURVE
+        )
 
 
 def difference(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> float:
