@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from playslot_rl.config.plain import check
 from playslot_rl.config.roles import Checked, at_least, between, role, within
 
 Precision = Literal["fp32", "bf16", "auto"]
@@ -111,6 +112,7 @@ class BehaviourStageConfig(StageConfig):
 
     Attributes:
         labelled_demos: demonstrations whose real actions the action decoder may see.
+        parsed: clone from the slots that SAVi parses; false is there to be measured, and leaves the predicted ones.
         imagined: also clone from slots that cOCVP predicts along each demonstration.
         loss: `l2` (paper) or `l1`, of policy, oracle and decoder. Where an expert switches at once between opposite
             actions, the mean that `l2` finds is neither, and the policy dithers; the median is one of them.
@@ -141,6 +143,7 @@ class BehaviourStageConfig(StageConfig):
 
     group = "behaviour."
     labelled_demos: int = field(default=50, metadata=at_least(1))
+    parsed: bool = True
     imagined: bool = True
     loss: Literal["l2", "l1"] = "l2"
     slot_noise: float = field(default=0.0, metadata=at_least(0, "0 (none) or more"))
@@ -158,3 +161,7 @@ class BehaviourStageConfig(StageConfig):
     finetune_lr: float = field(default=2e-4, metadata=within(lambda rate: rate > 0, "above 0"))
     policy_from: str = field(default="", metadata=role("machine", "folder"))
     oracle: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self.parsed or self.imagined, "behaviour.parsed", self.parsed, "true, or behaviour.imagined=true")

@@ -72,6 +72,7 @@ ADDED: Final[Mapping[str, Any]] = {
     "project_out": True,
     "ema": 0.0,
     "motion_weight": 0.0,
+    "parsed": True,
 }
 """Settings that came after the first checkpoints, and what those were trained with."""
 

@@ -49,7 +49,7 @@ def cloning_settings(config: BehaviourStageConfig) -> BehaviourStageConfig:
 
 @dataclass(frozen=True)
 class Seen:
-    """What policy and decoder see of demonstrations: parsed slots, and imagined ones with `config.imagined`.
+    """What policy and decoder see of demonstrations: parsed slots (`config.parsed`), imagined ones (`config.imagined`).
 
     Attributes:
         slots: (I, N, D), the parsed ones first.
@@ -60,18 +60,21 @@ class Seen:
     rows: Tensor
 
     @classmethod
-    def of(cls, demos: Demonstrations, imagined: bool, horizon: int | None) -> Seen:
+    def of(cls, demos: Demonstrations, config: BehaviourStageConfig, horizon: int | None) -> Seen:
         """Look at demonstrations.
 
         Args:
             demos: labelled by the world model.
-            imagined: look at what the predictor imagines, too.
-            horizon: only up to so many steps after the first frame; None for as long as there are.
+            config: at what of them.
+            horizon: at what the predictor imagines only up to so many steps after the first frame; None for as long as
+                there are.
         """
         rows = torch.arange(len(demos.slots), device=demos.slots.device)
-        if not imagined:
+        if not config.imagined:
             return cls(demos.slots, rows)
         far = rows if horizon is None else rows[demos.step <= horizon]
+        if not config.parsed:
+            return cls(demos.imagined[far], far)
         return cls(torch.cat((demos.slots, demos.imagined[far])), torch.cat((rows, far)))
 
 
@@ -108,7 +111,7 @@ class CloneStage:
     ) -> None:
         if policy.whitening is not None:
             policy.whitening.fit(demos.latents)
-        seen = Seen.of(demos, config.imagined, horizon)
+        seen = Seen.of(demos, config, horizon)
         self.stages = {
             "policy": RegressionStage(
                 "policy",
@@ -232,7 +235,7 @@ class DecoderStage(RegressionStage):
                 every = torch.arange(len(demos.slots), device=demos.slots.device)
                 latents, slots, rows = [demos.latents], [demos.slots], [every]
             if config.decoder_inputs != "inverse_dynamics":
-                seen = Seen.of(demos, config.imagined, horizon)
+                seen = Seen.of(demos, config, horizon)
                 said = apply_rows(
                     policy, TensorInputs(seen.slots), torch.arange(len(seen.rows), device=seen.rows.device)
                 )
@@ -290,7 +293,7 @@ class FinetuneStage:
 
         def examples(demos: Demonstrations, noise: float) -> Examples:
             actions = _require_actions(demos)
-            seen = Seen.of(demos, config.imagined, horizon)
+            seen = Seen.of(demos, config, horizon)
             return TensorInputs(seen.slots, noise, "finetune_noise"), actions[seen.rows]
 
         acted = _acted(held_out)

@@ -57,14 +57,22 @@ def train(stage: DecoderStage | FinetuneStage, steps: int, lr: float = 3e-3) -> 
         optimiser.step()
 
 
+def test_a_policy_needs_slots_to_clone_from() -> None:
+    with pytest.raises(ValueError, match=r"behaviour\.parsed: got False, expected true, or behaviour\.imagined=true"):
+        replace(CONFIG, parsed=False, imagined=False)
+
+
 def test_imagined_rows_end_at_the_horizon() -> None:
     demos = demonstrations()
-    seen = Seen.of(demos, imagined=True, horizon=2)
+    seen = Seen.of(demos, CONFIG, horizon=2)
     far = demos.step <= 2
     assert torch.equal(seen.slots, torch.cat((demos.slots, demos.imagined[far])))
     assert torch.equal(seen.rows, torch.cat((torch.arange(len(far)), torch.nonzero(far)[:, 0])))
-    assert len(Seen.of(demos, imagined=True, horizon=None).rows) == 2 * len(far)
-    assert torch.equal(Seen.of(demos, imagined=False, horizon=2).slots, demos.slots)
+    assert len(Seen.of(demos, CONFIG, horizon=None).rows) == 2 * len(far)
+    assert torch.equal(Seen.of(demos, replace(CONFIG, imagined=False), horizon=2).slots, demos.slots)
+    alone = Seen.of(demos, replace(CONFIG, parsed=False), horizon=2)
+    assert torch.equal(alone.slots, demos.imagined[far])
+    assert torch.equal(demos.latents[alone.rows], demos.latents[far])
 
 
 @pytest.mark.parametrize(("source", "pays"), [("slots", True), ("spurious", False)])
