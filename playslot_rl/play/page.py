@@ -335,7 +335,7 @@ class PlayPage:
     async def _on_goal(self) -> None:
         session, planner = self.session, self.session.planner
         if planner is not None and await self._work(lambda: planner.aim(session)):
-            ui.notify(f"goal: moment {session.now.number}; go back, then let the planner steer")
+            ui.notify(f"goal: moment {session.now.depth}; go back, then let the planner steer")
 
     async def _on_masks(self) -> None:
         await self._work(lambda: None)

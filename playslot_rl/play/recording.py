@@ -21,14 +21,16 @@ from playslot_rl.play.pictures import session_animation
 from playslot_rl.play.session import PlaySession
 from playslot_rl.play.timeline import SceneMoment
 from playslot_rl.progress import quiet_datasets
-from playslot_rl.storage.atomic import write_bytes, write_json
+from playslot_rl.storage.atomic import explain_write_errors, write_bytes, write_json
 from playslot_rl.storage.folders import new_folder
+from playslot_rl.storage.locks import locked
 
 Shown = Literal["imagined", "true"]
 
 ANIMATION: Final = "session.gif"
 DATA_SET: Final = "dataset"
 ABOUT: Final = "session.json"
+LOCK: Final = ".lock"
 REPO: Final = "playslot_rl/played"
 
 
@@ -52,8 +54,10 @@ def record(session: PlaySession, parent: Path, shown: Shown = "imagined") -> Pat
         raise DataError("record: got no step yet, expected at least one: press a prototype first")
     if shown == "true" and any(moment.true is None for moment in path):
         raise DataError("record: got a session without a simulator, expected one: record the imagined frames")
-    final = _free(parent)
-    with new_folder(final) as folder:
+    with explain_write_errors(parent):
+        parent.mkdir(parents=True, exist_ok=True)
+    # Another `playslot play` may record into the same folder: one after the other, each its number.
+    with locked(parent / LOCK), new_folder(final := _free(parent)) as folder:
         write_bytes(folder / ANIMATION, session_animation(path, session.start.fps))
         _write_set(folder / DATA_SET, session, path, shown)
         about = {
