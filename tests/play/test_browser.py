@@ -177,4 +177,4 @@ def test_a_user_plays_records_and_leaves(server: tuple[str, Path, subprocess.Pop
     assert process.returncode == 0, err
     assert "Traceback" not in err
     assert out.splitlines()[-1] == "stopped"
-    assert [path.name for path in (folder / "runs" / "play").iterdir()] == ["recording-001"]
+    assert sorted(path.name for path in (folder / "runs" / "play").iterdir()) == [".lock", "recording-001"]

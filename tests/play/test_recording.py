@@ -91,4 +91,4 @@ def test_an_interrupted_recording_leaves_nothing(
     monkeypatch.setattr(recording, "write_json", interrupt)
     with pytest.raises(KeyboardInterrupt):
         record(session, tmp_path / "play")
-    assert list((tmp_path / "play").iterdir()) == []
+    assert [path.name for path in (tmp_path / "play").iterdir()] == [recording.LOCK]
