@@ -176,12 +176,17 @@ class ArrayWriter:
 
     Plain writes, because a full disk under a memory map is a bus error, not an exception. The file has its length from
     the beginning, all holes.
+
+    Args:
+        path: the file.
+        shape: of the array.
+        dtype: of its elements.
+        rows: so many are in the file already, and it is gone on with.
     """
 
-    def __init__(self, path: Path, shape: Sequence[int], dtype: npt.DTypeLike) -> None:
-        self.path, self.shape, self.dtype = path, tuple(shape), np.dtype(dtype)
-        self.rows = 0
-        self._file: IO[bytes] = path.open("wb")
+    def __init__(self, path: Path, shape: Sequence[int], dtype: npt.DTypeLike, rows: int = 0) -> None:
+        self.path, self.shape, self.dtype, self.rows = path, tuple(shape), np.dtype(dtype), rows
+        self._file: IO[bytes] = path.open("r+b" if rows else "wb")
         self._begin = write_header(self._file, self.shape, self.dtype)
         self._file.truncate(self._begin + int(np.prod(self.shape)) * self.dtype.itemsize)
 
@@ -193,6 +198,11 @@ class ArrayWriter:
             self._file.seek(self._begin + first * int(np.prod(self.shape[1:])) * self.dtype.itemsize)
         self._file.write(np.ascontiguousarray(rows, self.dtype).data)
         self.rows += len(rows)
+
+    def sync(self) -> None:
+        """Have what was written on the disk."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
 
     def close(self, *, whole: bool = True) -> None:
         """Finish; all rows must have been written, unless it is not `whole`: the others are zeros."""

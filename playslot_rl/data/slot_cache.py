@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from playslot_rl.data.cache import ArrayWriter, CachePlace, build_once, cache_folder, load_cached
+from playslot_rl.data.cache import ArrayWriter, CachePlace, build_on, cache_folder, load_cached
 from playslot_rl.data.cache_entries import ENTRY_NAME, room
 from playslot_rl.data.source import ConcatFrames, EpisodeFrames
 from playslot_rl.data.stream import streams_of
@@ -34,6 +34,10 @@ _FORMAT = "1"
 _BY_ROW = "2"
 """Where episodes are left out between others: slots stand at their frames' rows, too."""
 EPISODES_A_BATCH = 32
+MARK_EVERY = 16
+"""Batches after which a build says how far it is."""
+BEGUN = "begun.json"
+"""How many episodes are parsed, in an entry that is being made."""
 FRAMES_A_PASS = 4
 """Frames of each episode parsed at a time: bounds the memory of the encoder's activations."""
 
@@ -75,26 +79,40 @@ def slot_cache(
     folder = cache_folder(cache) / "slots" / key
     count = int((source.starts + source.lengths).max())
 
-    def build(temporary: Path) -> None:
-        if progress:
-            print(f"slots: parsing {int(source.lengths.sum())} frames once", file=sys.stderr, flush=True)
+    def build(part: Path) -> None:
         shape = (count, savi.config.n_slots, savi.config.slot_dim)
+        begun = _begun(part)  # episodes that a build which was killed has parsed
+        left = int(source.lengths[begun:].sum())
+        if progress:
+            print(f"slots: parsing {left} frames once", file=sys.stderr, flush=True)
         with room(cache, int(np.prod(shape)) * 4, key):
-            writer = ArrayWriter(temporary / "slots.npy", shape, np.float32)
-        for start, slots in zip(source.starts, parse_episodes(source, savi, device), strict=True):
-            writer.write(slots, int(start))
+            writer = ArrayWriter(part / "slots.npy", shape, np.float32, int(source.lengths[:begun].sum()))
+        for number, episodes in enumerate(_batches(source, begun), 1):
+            for episode, slots in zip(episodes, _parse(source, savi, device, episodes), strict=True):
+                writer.write(slots, int(source.starts[episode]))
+            if number % MARK_EVERY == 0:
+                writer.sync()
+                write_json(part / BEGUN, int(episodes[-1]) + 1)
         writer.close(whole=whole)
         facts = {"name": source.name, "camera": source.camera, "fingerprint": source.fingerprint}
-        write_json(temporary / ENTRY_NAME, {**facts, "savi": savi_fingerprint})
+        write_json(part / ENTRY_NAME, {**facts, "savi": savi_fingerprint})
+        (part / BEGUN).unlink(missing_ok=True)
 
-    build_once(folder, build)
-    slots: npt.NDArray[np.float32] = load_cached(folder, "slots.npy", lambda: build_once(folder, build))
+    build_on(folder, build)
+    slots: npt.NDArray[np.float32] = load_cached(folder, "slots.npy", lambda: build_on(folder, build))
     return slots
 
 
-def _batches(lengths: npt.NDArray[np.int64], most: int | None) -> Iterator[npt.NDArray[np.int64]]:
-    """Numbers of the episodes that are parsed together, at most so many frames of them, but one."""
-    first = 0
+def _begun(part: Path) -> int:
+    mark = part / BEGUN
+    return int(json.loads(mark.read_text())) if mark.is_file() else 0
+
+
+def _batches(source: EpisodeFrames, first: int = 0) -> Iterator[npt.NDArray[np.int64]]:
+    """Numbers of the episodes that are parsed together, from one on that begins a batch; of frames that are streamed as
+    many as a quarter of the buffer holds, which may be fewer."""
+    lengths, streams = source.lengths, streams_of(source.frames)
+    most = streams[0].buffer // 4 if streams else None
     while first < len(lengths):
         last = min(first + EPISODES_A_BATCH, len(lengths))
         if most is not None:
@@ -108,29 +126,29 @@ def _in_order(source: EpisodeFrames) -> bool:
     return bool(np.array_equal(source.starts, np.cumsum(source.lengths) - source.lengths))
 
 
-@torch.no_grad()
 def parse_episodes(
     source: EpisodeFrames, savi: SAVi, device: torch.device | str = "cpu"
 ) -> Iterator[npt.NDArray[np.float32]]:
-    """Parse all episodes in order: yields float32 (frames of the episode, N, D).
+    """Parse all episodes in order: yields float32 (frames of the episode, N, D)."""
+    for episodes in _batches(source):
+        yield from _parse(source, savi, device, episodes)
 
-    Several at a time; of frames that are streamed as many as a quarter of the buffer holds, which may be fewer.
-    """
+
+@torch.no_grad()
+def _parse(
+    source: EpisodeFrames, savi: SAVi, device: torch.device | str, episodes: npt.NDArray[np.int64]
+) -> list[npt.NDArray[np.float32]]:
+    """Parse some episodes together: each float32 (its frames, N, D)."""
     savi = savi.to(device).eval()
-    streams = streams_of(source.frames)
-    most = streams[0].buffer // 4 if streams else None
-    for episodes in _batches(source.lengths, most):
-        first = int(episodes[0])
-        lengths = source.lengths[episodes]
-        # Shorter episodes repeat their last frame; SAVi is causal, so what is kept does not see it.
-        steps = np.minimum(np.arange(int(lengths.max())), lengths[:, None] - 1)
-        rows = source.starts[episodes][:, None] + steps
-        generator = step_generator(0, first, "slot_cache", device)
-        pieces, state = [], None
-        for begin in range(0, rows.shape[1], FRAMES_A_PASS):
-            frames = normalise(source.pixels(rows[:, begin : begin + FRAMES_A_PASS]).to(device))
-            slots, state = savi(frames, state, generator)
-            pieces.append(slots.float().cpu().numpy())
-        parsed = np.concatenate(pieces, axis=1)
-        for i, length in enumerate(lengths):
-            yield parsed[i, :length]
+    lengths = source.lengths[episodes]
+    # Shorter episodes repeat their last frame; SAVi is causal, so what is kept does not see it.
+    steps = np.minimum(np.arange(int(lengths.max())), lengths[:, None] - 1)
+    rows = source.starts[episodes][:, None] + steps
+    generator = step_generator(0, int(episodes[0]), "slot_cache", device)
+    pieces, state = [], None
+    for begin in range(0, rows.shape[1], FRAMES_A_PASS):
+        frames = normalise(source.pixels(rows[:, begin : begin + FRAMES_A_PASS]).to(device))
+        slots, state = savi(frames, state, generator)
+        pieces.append(slots.float().cpu().numpy())
+    parsed = np.concatenate(pieces, axis=1)
+    return [parsed[i, :length] for i, length in enumerate(lengths)]

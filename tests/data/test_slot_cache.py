@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from playslot_rl.data import slot_cache as module
+from playslot_rl.data.cache_entries import entries
 from playslot_rl.data.slot_cache import parse_episodes, slot_cache
 from playslot_rl.data.source import EpisodeFrames, open_source
 from playslot_rl.modules.savi import SAVi
@@ -66,3 +69,40 @@ def test_slots_of_some_episodes_stand_at_their_frames_rows(source: EpisodeFrames
     for episode in range(some.episodes):
         rows = some.episode_rows(episode)
         np.testing.assert_allclose(slots[rows], whole[rows], atol=1e-5, rtol=1e-4)
+
+
+def test_a_killed_build_is_gone_on_with(
+    source: EpisodeFrames, savi: SAVi, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Batch by batch, to the same slots bit for bit; the next command parses the episodes that are missing."""
+    monkeypatch.setattr(module, "EPISODES_A_BATCH", 1)
+    monkeypatch.setattr(module, "MARK_EVERY", 1)
+    whole = np.array(slot_cache(source, savi, "f" * 16, tmp_path / "whole"))
+    real, parsed = module._parse, list[int]()
+
+    def stops_after(most: int) -> None:
+        def parse(*arguments: Any) -> Any:
+            if len(parsed) == most:
+                raise KeyboardInterrupt
+            parsed.append(int(arguments[-1][0]))
+            return real(*arguments)
+
+        monkeypatch.setattr(module, "_parse", parse)
+
+    stops_after(2)
+    with pytest.raises(KeyboardInterrupt):
+        slot_cache(source, savi, "f" * 16, tmp_path)
+    (left,) = [entry for entry in entries(tmp_path) if entry.kind == "slots"]
+    assert (left.part, left.in_use) == (True, False)
+    stops_after(99)
+    assert np.array_equal(slot_cache(source, savi, "f" * 16, tmp_path), whole)
+    assert parsed == [0, 1, 2]
+    (made,) = (tmp_path / "slots").glob("[0-9a-f]*")
+    assert sorted(path.name for path in made.iterdir()) == sorted(
+        path.name for path in _of(tmp_path / "whole").iterdir()
+    )
+
+
+def _of(cache: Path) -> Path:
+    (made,) = (cache / "slots").glob("[0-9a-f]*")
+    return made
