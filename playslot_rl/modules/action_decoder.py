@@ -36,9 +36,6 @@ class ActionDecoder(nn.Module):
         latent_dim: Z.
         action_dim: A.
         slot_dim: D of the slots that it reads beside z where `config.reads_slots`.
-
-    Raises:
-        ValueError: `config.state_dim` is no multiple of `config.state_heads`.
     """
 
     mean: Tensor
@@ -54,8 +51,6 @@ class ActionDecoder(nn.Module):
     ) -> None:
         super().__init__()
         h, width, heads = config.hidden_dim, config.state_dim, config.state_heads
-        if config.reads_slots and width % heads:
-            raise ValueError(f"model.action_decoder.state_dim: got {width}, expected a multiple of {heads} heads")
         self.whitening = Whitening(latent_dim) if config.whiten else None
         if not config.whiten:
             self.register_buffer("mean", torch.zeros(latent_dim))

@@ -144,5 +144,7 @@ def test_a_number_that_training_latents_share_does_not_drown_the_others() -> Non
 
 
 def test_widths_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"model\.action_decoder\.state_dim: got 10, expected a multiple of 4 heads"):
-        ActionDecoder(ActionDecoderConfig(state_dim=10, reads_slots=True), 5, 4, 6)
+    with pytest.raises(
+        ValueError, match=r"model\.action_decoder\.state_dim: got 10, expected a multiple of state_heads, 4"
+    ):
+        ActionDecoderConfig(state_dim=10, reads_slots=True)
