@@ -130,7 +130,7 @@ def demonstration_views(
         slots_print: fingerprint of SAVi's checkpoint.
     """
     from playslot_rl.data.cache import Cache
-    from playslot_rl.data.demonstrations import shifted_copies
+    from playslot_rl.data.shifts import shifted_copies
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.world_model import module_device
 

@@ -21,9 +21,8 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.config import ExperimentConfig, Precision
-from playslot_rl.data.demonstrations import NOTHING_LABELLED, DemonstrationSplit, Transitions, moving_frames
+from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, labelled_rows, moving_frames
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.errors import DataError
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.training.stage_regression import (
@@ -73,9 +72,7 @@ class LatentCloning(ABC):
     def __init__(self, config: ExperimentConfig, demos: DemonstrationSplit, device: torch.device, shift: int) -> None:
         self.config, self.device = config, device
         self.trained = self._seen(demos.trained, shift)
-        self.labelled = np.flatnonzero(self.trained.episode < config.behaviour.labelled_demos)
-        if not len(self.labelled):
-            raise DataError(NOTHING_LABELLED.format(config.behaviour.labelled_demos))
+        self.labelled = labelled_rows(torch.from_numpy(self.trained.episode), config.behaviour.labelled_demos)
         self.held_out = None if demos.held_out is None else self._seen(demos.held_out)
 
     @abstractmethod
@@ -126,7 +123,7 @@ class LatentCloning(ABC):
             loss: `l2` or `l1`.
             batch_size, precision: of its training.
         """
-        inputs, actions = self._decoded(self.trained, torch.from_numpy(self.labelled).to(self.device))
+        inputs, actions = self._decoded(self.trained, self.labelled.to(self.device))
         held_out = None
         if self.held_out is not None:
             held_out = self._decoded(self.held_out, torch.arange(len(self.held_out.actions), device=self.device))

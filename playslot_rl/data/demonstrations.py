@@ -1,9 +1,5 @@
 """Demonstrations as the behaviour stage sees them: slots, inferred latents, predicted slots, and some real actions.
 
-Shifted copies of the videos (every frame of a copy is moved by the same few pixels, edges are repeated) are the usual
-augmentation where a policy is cloned from few demonstrations. SAVi reads videos, so a copy keeps one offset from its
-first frame to its last, and its slots are parsed and cached like those of any other video.
-
 Shapes: M transitions of all demonstrations in a row, N slots, D slot width, Z latent-action width, A action width,
 F frames, H W image height and width.
 """
@@ -13,14 +9,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from playslot_rl.data.source import EpisodeFrames, FrameRows, Frames
+from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.stride import ChosenFrames
 from playslot_rl.data.trimming import moving_rows, slot_motion
 from playslot_rl.errors import DataError
@@ -33,8 +28,6 @@ DRAW_STREAM = 14
 """Keeps the draws of demonstrations apart from what else a seed draws."""
 TEST_STREAM = 0x7E57
 """Seed of the split in training and test episodes."""
-DIRECTIONS = ((1, 1), (-1, -1), (1, -1), (-1, 1), (1, 0), (-1, 0), (0, 1), (0, -1))
-"""Of the copies, (down, right): corners first, so that the first four surround the original."""
 
 
 @dataclass(frozen=True)
@@ -91,16 +84,22 @@ class Demonstrations:
             DataError: there are fewer demonstrations, or trimming has left no row of them.
         """
         require_labelled(demos, len(self.lengths))
-        rows = torch.nonzero(self.episode < demos)[:, 0]
-        if not len(rows):
-            raise DataError(NOTHING_LABELLED.format(demos))
-        return rows
+        return labelled_rows(self.episode, demos)
 
 
-NOTHING_LABELLED = (
-    "behaviour.labelled_demos={0}: got demonstrations in which nothing moves, expected some that do: label "
-    "more of them, or lower behaviour.trim and behaviour.trim_pixels"
-)
+def labelled_rows(episode: Tensor, demos: int) -> Tensor:
+    """Rows (int64) of the first `demos` demonstrations, by the demonstration of each row (M,).
+
+    Raises:
+        DataError: trimming has left none.
+    """
+    rows = torch.nonzero(episode < demos)[:, 0]
+    if not len(rows):
+        raise DataError(
+            f"behaviour.labelled_demos={demos}: got demonstrations in which nothing moves, expected some that do: "
+            "label more of them, or lower behaviour.trim and behaviour.trim_pixels"
+        )
+    return rows
 
 
 def require_labelled(labelled: int, demos: int) -> None:
@@ -388,69 +387,3 @@ def with_copies(demos: Sequence[Demonstrations]) -> Demonstrations:
         motion=torch.cat([copy.motion for copy in demos]),
         lengths=first.lengths,
     )
-
-
-def shift_frames(frames: Frames, offsets: npt.ArrayLike) -> Frames:
-    """Frames (..., H, W, C) moved by pixels (down, right), all by offsets (2,) or each by its own (..., 2).
-
-    Content that enters repeats the edge.
-
-    Example:
-        >>> frames = np.arange(4, dtype=np.uint8).reshape(1, 2, 2, 1)
-        >>> shift_frames(frames, [[0, 1]])[0, ..., 0].tolist()
-        [[0, 0], [2, 2]]
-    """
-    height, width = frames.shape[-3:-1]
-    flat = frames.reshape(-1, *frames.shape[-3:])
-    moves = np.broadcast_to(np.asarray(offsets).reshape(-1, 2), (len(flat), 2))
-    down = (np.arange(height) - moves[:, :1]).clip(0, height - 1)
-    right = (np.arange(width) - moves[:, 1:]).clip(0, width - 1)
-    moved: Frames = flat[np.arange(len(flat))[:, None, None], down[:, :, None], right[:, None, :]]
-    return moved.reshape(frames.shape)
-
-
-@dataclass(frozen=True)
-class ShiftedFrames:
-    """Frames (F, H, W, 3) moved by an offset, computed when they are read.
-
-    Attributes:
-        frames: uint8, memory-mapped.
-        offset: pixels (down, right); content that enters repeats the edge.
-
-    Example:
-        >>> frames = np.arange(4, dtype=np.uint8).reshape(1, 2, 2, 1)
-        >>> ShiftedFrames(frames, (0, 1))[0, ..., 0].tolist()
-        [[0, 0], [2, 2]]
-    """
-
-    frames: FrameRows
-    offset: tuple[int, int]
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(F, H, W, 3)."""
-        return tuple(self.frames.shape)
-
-    @property
-    def dtype(self) -> Any:
-        """uint8."""
-        return self.frames.dtype
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, rows: Any) -> Frames:
-        """Rows by an integer, a slice or an integer array of any shape."""
-        return shift_frames(np.asarray(self.frames[rows]), self.offset)
-
-
-def shifted(source: EpisodeFrames, offset: tuple[int, int]) -> EpisodeFrames:
-    """A data set with every frame moved by `offset` pixels (down, right); labels and row numbers are the same."""
-    name = f"{source.fingerprint}/shifted {offset[0]} {offset[1]}"
-    fingerprint = hashlib.sha256(name.encode()).hexdigest()[:16]
-    return replace(source, frames=ShiftedFrames(source.frames, offset), fingerprint=fingerprint)
-
-
-def shifted_copies(source: EpisodeFrames, shift: int, copies: int) -> Sequence[EpisodeFrames]:
-    """The first `copies` of the eight neighbours at `shift` pixels; none where `shift` is 0."""
-    return [shifted(source, (shift * y, shift * x)) for y, x in DIRECTIONS[: copies if shift else 0]]

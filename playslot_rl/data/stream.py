@@ -27,8 +27,8 @@ import numpy.typing as npt
 
 from playslot_rl.data.cache import CachePlace, cache_folder
 from playslot_rl.data.contents import Contents, Span, open_files, stated_size
-from playslot_rl.data.demonstrations import ShiftedFrames
 from playslot_rl.data.frames import rgb_frames, sized
+from playslot_rl.data.shifts import ShiftedFrames
 from playslot_rl.data.source import (
     ConcatFrames,
     EpisodeFrames,

@@ -18,7 +18,8 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from playslot_rl.config import Precision
-from playslot_rl.data.demonstrations import Transitions, real_actions, shift_frames
+from playslot_rl.data.demonstrations import Transitions, real_actions
+from playslot_rl.data.shifts import shift_frames
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.precision import autocast

@@ -12,8 +12,8 @@ import torch
 from foreign import LENGTHS, foreign_frames
 
 from playslot_rl.config import DataConfig
-from playslot_rl.data.demonstrations import shifted
 from playslot_rl.data.opening import open_configured
+from playslot_rl.data.shifts import shifted
 from playslot_rl.data.slot_cache import parse_episodes, slot_cache
 from playslot_rl.data.source import concatenate, open_source
 from playslot_rl.data.stream import FrameStream, ShuffleBuffer, open_stream, streams_of

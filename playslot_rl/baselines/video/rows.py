@@ -12,6 +12,7 @@ from playslot_rl.baselines.svg.model import SVG
 from playslot_rl.baselines.video.predictor import VideoPredictor
 from playslot_rl.baselines.video.scores import Predict, as_function
 from playslot_rl.baselines.video.slots import SlotVideo
+from playslot_rl.world_model import module_device
 
 
 class Row(NamedTuple):
@@ -50,12 +51,10 @@ def method_rows(model: VideoPredictor, seed: int) -> list[Row]:
 
 
 def _from_prior(model: SVG, seed: int) -> Predict:
-    generators: dict[torch.device, torch.Generator] = {}  # one for all clips, so that each has its own sample
+    generator = torch.Generator(module_device(model)).manual_seed(0)  # one for all clips: each has its own sample
 
     def predict(frames: Tensor, donors: Tensor | None, actions: Tensor | None) -> Tensor:  # noqa: ARG001
-        if frames.device not in generators:
-            generators[frames.device] = torch.Generator(frames.device).manual_seed(0)
-        return model.sample(frames, seed, generators[frames.device])
+        return model.sample(frames, seed, generator)
 
     return predict
 
