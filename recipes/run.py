@@ -159,14 +159,26 @@ def adopt_policy(config: ExperimentConfig, record: StageRecord, steps: int) -> N
         wait()
 
 
-def held_out_text(demos: DemonstrationSplit) -> str:
-    """For a closing line: how many demonstrations measured what was learned from the others."""
-    return "none held out" if demos.held_out is None else f"{demos.held_out.episodes} held out"
+def cloned(
+    name: str, split: DemonstrationSplit, rows: int, whole: int, labelled: int | None = None
+) -> tuple[str, dict[str, Any]]:
+    """What a stage that clones demonstrations says of them: its closing line, less its folder, and for `meta.json`.
 
-
-def kept_text(kept: float) -> str:
-    """For a closing line: the share of the demonstrations' rows that trimming left."""
-    return f"{100 * kept:.0f} % of their rows kept"
+    Args:
+        name: of the stage.
+        split: the demonstrations; those of one frame show nothing and are not counted.
+        rows, whole: how many of their rows trimming left, of how many.
+        labelled: how many of them showed their actions; None: all.
+    """
+    demos, kept = int((split.trained.lengths >= 2).sum()), rows / whole
+    shown = "all" if labelled is None else str(labelled)
+    held_out = "none" if split.held_out is None else str(split.held_out.episodes)
+    line = f"{name}: {demos} demos, {100 * kept:.0f} % of their rows kept, {shown} labelled, {held_out} held out"
+    return line, {
+        "demos": demos,
+        "labelled_demos": demos if labelled is None else labelled,
+        "kept_rows": round(kept, 4),
+    }
 
 
 def parent_run(config: ExperimentConfig, folder: Path) -> str:

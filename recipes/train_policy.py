@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 from playslot_rl.config import BehaviourStageConfig, ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
     adopt_policy,
+    cloned,
     demonstration_views,
-    held_out_text,
-    kept_text,
     open_device,
     open_run,
     parent_run,
@@ -117,17 +116,13 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
             both = FinetuneStage(clone.stages["policy"], agent.action_decoder, demos, behaviour, held_out, horizon)
             yield _part("finetune", both, behaviour, behaviour.finetune_steps, behaviour.finetune_lr)
 
-    kept = len(demos.slots) / len(whole.slots)
-    labelled = f"{behaviour.labelled_demos} labelled"
-    said = f"policy: {len(demos.lengths)} demos, {kept_text(kept)}, {labelled}, {held_out_text(split)}"
+    said, extra = cloned("policy", split, len(demos.slots), len(whole.slots), behaviour.labelled_demos)
     return Training(
         parts(),
         device,
         lambda _: f"{said}, {record.folder}",
         extra={
-            "demos": len(demos.lengths),
-            "labelled_demos": behaviour.labelled_demos,
-            "kept_rows": round(kept, 4),
+            **extra,
             "held_out_demos": 0 if held_out is None else len(held_out.lengths),
             "data_root": record.roots,
         },

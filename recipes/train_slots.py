@@ -12,7 +12,9 @@ def main(config: ExperimentConfig) -> None:
     Raises:
         DataError, OutputError, CheckpointError, TrainingError: see `playslot_rl.errors`.
     """
+    from playslot_rl.evaluation.slots import validation_scores
     from playslot_rl.modules.savi import SAVi
+    from playslot_rl.processes import here
     from playslot_rl.seeding import global_seed
     from playslot_rl.training.fit import Part
     from playslot_rl.training.patience import patience_of
@@ -34,12 +36,13 @@ def main(config: ExperimentConfig) -> None:
         with global_seed(config.seed, 0, "slots"):
             savi = SAVi(config.model.savi, config.env.image_size).to(device)
         patience = patience_of(own.patience, "mse")
+        known = validation_scores(config) if here().first else None
         started: dict[str, str] = {}
         if own.start_from:
             warm_start(savi, load_savi(own.start_from, device), own.start_from)
             started = {"started_from": slots_checkpoint(own.start_from).fingerprint}
         return Training(
-            [Part("slots", SlotsStage(savi, record.clips(own.clip_frames), own), own, patience=patience)],
+            [Part("slots", SlotsStage(savi, record.clips(own.clip_frames), own, known), own, patience=patience)],
             device,
             lambda metrics: f"slots: {metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {record.folder}",
             extra={"episodes": source.episodes, "agent_steps": int((source.lengths - 1).sum()), **started},

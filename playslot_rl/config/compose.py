@@ -12,15 +12,14 @@ import difflib
 import functools
 import json
 import os
-import typing
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.methods import MethodName, canonical_method
-from playslot_rl.config.plain import flatten
+from playslot_rl.config.plain import flatten, type_hints
 from playslot_rl.config.planning import GOALS, PLANNERS, PROPOSALS
 from playslot_rl.config.roles import keys_of
 from playslot_rl.errors import ConfigError
@@ -182,7 +181,7 @@ def _hint(key: str) -> Any:
     for part in key.split("."):
         if not dataclasses.is_dataclass(hint):
             return None
-        hint = typing.get_type_hints(hint).get(part)
+        hint = type_hints(hint).get(part)
     return hint
 
 
@@ -242,7 +241,7 @@ def _presets(groups: tuple[str, ...]) -> dict[str, Any]:
 
     with _explained(), initialize_config_module(CONF_MODULE, version_base="1.3"):
         composed = OmegaConf.to_container(hydra_compose("config", list(groups)), resolve=True)
-    return typing.cast("dict[str, Any]", composed)
+    return cast("dict[str, Any]", composed)
 
 
 def _typed(pairs: Mapping[str, str]) -> dict[str, Any]:
@@ -260,7 +259,7 @@ def _typed(pairs: Mapping[str, str]) -> dict[str, Any]:
                 )
             value = OmegaConf.to_container(OmegaConf.create({"value": override.value()}), resolve=True)
             *path, last = override.key_or_group.split(".")
-            change = {last: typing.cast("dict[str, Any]", value)["value"]}
+            change = {last: cast("dict[str, Any]", value)["value"]}
             for name in reversed(path):
                 change = {name: change}
             typed = _merge(typed, change)

@@ -7,11 +7,10 @@ A key without a role says what is computed: it is stored with a run, handed on, 
 from __future__ import annotations
 
 import dataclasses
-import typing
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final, Literal
 
-from playslot_rl.config.plain import check, to_dict
+from playslot_rl.config.plain import check, to_dict, type_hints
 from playslot_rl.episode_seeds import LARGEST_SEED
 
 Role = Literal["call", "machine", "free", "folder"]
@@ -69,7 +68,7 @@ class Checked:
 
 def keys_of(cls: type, wanted: Role) -> frozenset[str]:
     """Dotted names of the keys and groups of a config class, at any depth, that have a role."""
-    hints, found = typing.get_type_hints(cls), set[str]()
+    hints, found = type_hints(cls), set[str]()
     for field in dataclasses.fields(cls):
         if wanted in field.metadata.get("roles", ()):
             found.add(field.name)

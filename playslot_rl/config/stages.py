@@ -71,6 +71,8 @@ class SlotsStageConfig(StageConfig):
         motion_weight: so many times more than others counts a pixel that moves; 0 counts all alike (paper).
         patience: end before `steps` once the error on held-out clips has not fallen for so many validations, with the
             weights that had the lowest; 0 trains all steps.
+        segmented_episodes: so many episodes of the task are drawn by its simulator, and every validation scores the
+            slots against their segmentation (FG-ARI); 0 does not.
     """
 
     group = "slots."
@@ -78,6 +80,7 @@ class SlotsStageConfig(StageConfig):
     start_from: str = field(default="", metadata=role("folder"))
     motion_weight: float = field(default=0.0, metadata=at_least(0, "0 (all pixels alike) or more"))
     patience: int = field(default=0, metadata=at_least(0, "0 (train all steps) or more"))
+    segmented_episodes: int = field(default=4, metadata=role("free") | at_least(0, "0 (no FG-ARI) or more"))
 
 
 @dataclass(frozen=True)

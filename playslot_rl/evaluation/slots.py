@@ -8,7 +8,7 @@ Shapes: E episodes, T agent steps (T + 1 frames), N slots, H W image size. Label
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,12 +17,15 @@ import numpy.typing as npt
 import torch
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.envs import make_env
+from playslot_rl.envs import PROCEDURAL, RECORDED, make_env
+from playslot_rl.envs.grid_shapes import generate
+from playslot_rl.episode_seeds import episode_seed
 from playslot_rl.evaluation.objects import adjusted_rand_index
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.frames import to_float
 from playslot_rl.modules.savi import SAVi
+from playslot_rl.modules.savi.health import owners
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.training.runs import load_savi, slots_checkpoint
 from playslot_rl.world_model import module_device
@@ -30,9 +33,11 @@ from playslot_rl.world_model import module_device
 DEFAULT_EPISODES: Final = 20
 RESULT: Final = Path("evaluation") / "slots" / "eval_info.json"
 """The result, relative to the folder that is written."""
+Segmented = tuple[npt.NDArray[np.uint8], npt.NDArray[np.int64]]
+"""Frames (T + 1, H, W, 3) and which object each pixel shows (T + 1, H, W)."""
 
 
-def segmented_episode(env: Any, seed: int, steps: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int64]]:
+def segmented_episode(env: Any, seed: int, steps: int) -> Segmented:
     """Frames uint8 (T + 1, H, W, 3) of the scripted expert's episode, and which object each pixel shows (T + 1, H, W).
 
     Args:
@@ -47,40 +52,79 @@ def segmented_episode(env: Any, seed: int, steps: int) -> tuple[npt.NDArray[np.u
     return np.stack(frames), np.stack(labels)
 
 
+def segmented_episodes(config: ExperimentConfig, seeds: Sequence[int]) -> Iterator[Segmented]:
+    """One after the other: the expert's episodes of a simulated task, or GridShapes' clips.
+
+    Args:
+        config: its `env` and `render` say what is seen; `env.max_steps` is T.
+        seeds: of the episodes.
+    """
+    if config.env.name in PROCEDURAL:
+        for seed in seeds:
+            clips = generate([seed], config.env.max_steps, config.env)
+            yield clips.frames[0], clips.masks[0].astype(np.int64)
+        return
+    env = make_env(config.env, config.render).unwrapped
+    try:
+        for seed in seeds:
+            yield segmented_episode(env, seed, config.env.max_steps)
+    finally:
+        env.close()
+
+
 @torch.no_grad()
-def score_slots(savi: SAVi, config: ExperimentConfig, seeds: Sequence[int]) -> dict[str, Any]:
-    """Parse the expert's episodes and compare slots with objects.
+def score_slots(savi: SAVi, episodes: Iterable[Segmented], seeds: Sequence[int]) -> dict[str, float]:
+    """Parse episodes and compare slots with objects.
 
     Args:
         savi: in evaluation mode.
-        config: its `env` and `render` say what is seen; `env.max_steps` is T.
-        seeds: of the episodes.
+        episodes: frames and label images.
+        seeds: one for each, of the initial slots where these are drawn.
 
     Returns:
         Means over episodes: `ari`, `foreground_ari`, `psnr` of the reconstructions (dB), and `slots_per_object`, of
         each object that is seen the number of slots that hold at least a tenth of its pixels, averaged.
     """
-    env, device = make_env(config.env, config.render).unwrapped, module_device(savi)
-    scores = []
-    try:
-        for seed in seeds:
-            frames, truth = segmented_episode(env, seed, config.env.max_steps)
-            real = to_float(frames[None], device)
-            decoded = savi.decode(savi(real, generator=torch.Generator(device).manual_seed(seed))[0])
-            found = decoded.masks[0, :, :, 0].argmax(1).cpu().numpy()
-            error = float((decoded.frames - real).square().mean())
-            scores.append(
-                (
-                    adjusted_rand_index(truth, found),
-                    adjusted_rand_index(truth, found, foreground=True),
-                    -10.0 * float(np.log10(max(error, 1e-12))),
-                    slots_per_object(truth, found, savi.config.n_slots),
-                )
+    device, scores = module_device(savi), []
+    for (frames, truth), seed in zip(episodes, seeds, strict=True):
+        real = to_float(frames[None], device)
+        decoded = savi.decode(savi(real, generator=torch.Generator(device).manual_seed(seed))[0])
+        found = owners(decoded.masks[0]).cpu().numpy()
+        error = float((decoded.frames - real).square().mean())
+        scores.append(
+            (
+                adjusted_rand_index(truth, found),
+                adjusted_rand_index(truth, found, foreground=True),
+                -10.0 * float(np.log10(max(error, 1e-12))),
+                slots_per_object(truth, found, savi.config.n_slots),
             )
-    finally:
-        env.close()
+        )
     names = ("ari", "foreground_ari", "psnr", "slots_per_object")
     return dict(zip(names, np.mean(scores, 0).tolist(), strict=True))
+
+
+def validation_scores(config: ExperimentConfig) -> Callable[[SAVi], dict[str, float]] | None:
+    """What stage 1 asks of its slots at every validation: `foreground_ari` and `slots_per_object`.
+
+    `slots.segmented_episodes` episodes of the task, of seeds that neither a collection nor an evaluation has, are drawn
+    now and kept. None where the task has no segmentation, or nothing can be drawn on this machine, which a line says:
+    a training needs no simulator.
+    """
+    if not config.slots.segmented_episodes or config.env.name in RECORDED:
+        return None
+    seeds = [episode_seed("development", config.seed, i) for i in range(config.slots.segmented_episodes)]
+    try:
+        episodes = list(segmented_episodes(config, seeds))
+    except Exception as error:  # noqa: BLE001  a simulator fails in as many ways as it has drivers
+        said = str(error).partition("\n")[0]
+        print(f"slots: warning: no FG-ARI while training, since {config.env.name} cannot be drawn here ({said})")
+        return None
+
+    def scores(savi: SAVi) -> dict[str, float]:
+        found = score_slots(savi, episodes, seeds)
+        return {name: found[name] for name in ("foreground_ari", "slots_per_object")}
+
+    return scores
 
 
 def slots_per_object(truth: npt.NDArray[np.int64], found: npt.NDArray[np.int64], slots: int) -> float:
@@ -108,7 +152,7 @@ def evaluate_slots(run: str | Path, out: Path, config: ExperimentConfig, device:
         "episodes": len(seeds),
         "seed": config.seed,
         "seeds": seeds,
-        **score_slots(load_savi(run, device), config, seeds),
+        **score_slots(load_savi(run, device), segmented_episodes(config, seeds), seeds),
         "fingerprints": {"slots": slots_checkpoint(run).fingerprint},
         "wall_seconds": round(time.perf_counter() - began, 2),
         "hardware": hardware(),

@@ -14,6 +14,8 @@ SHARED: Final = 0.95
 """Entropy of the masks, as a share of log N, above which no slot has a pixel for itself."""
 FLICKER: Final = 0.1
 """Exchanges of slots a transition, above which slots do not keep their things."""
+SPLIT: Final = 1.5
+"""Slots an object, above which objects are spread over several; only a simulator's segmentation tells."""
 UNSEEN: Final = 0.3
 """Share of the moving pixels' change that is explained, below which what moves is not drawn."""
 
@@ -22,7 +24,8 @@ def slot_warnings(values: Mapping[str, float], savi: SAViConfig) -> dict[str, st
     """Kind -> one line, for each thing that is wrong.
 
     Args:
-        values: of `playslot_rl.modules.savi.health.SlotHealth`; what is not among them is not judged.
+        values: of `playslot_rl.modules.savi.health.SlotHealth`, and of `playslot_rl.evaluation.slots`; what is not
+            among them is not judged.
         savi: sizes and settings, so that no cure is named that is in use already.
     """
     found: dict[str, str] = {}
@@ -38,8 +41,12 @@ def slot_warnings(values: Mapping[str, float], savi: SAViConfig) -> dict[str, st
     elif values.get("slots_in_use", slots) < SINGLE:
         found["single"] = (
             f"one slot holds everything ({values['slots_in_use']:.1f} of {slots} slots in use): it can draw whole "
-            f"frames alone; give it less room by a smaller model.savi.slot_dim (now {savi.slot_dim}) and fewer "
-            f"model.savi.decoder_channels (now {list(savi.decoder_channels)}), or {_leave_plateau(savi)}"
+            f"frames alone; {_less_room(savi)}, or {_leave_plateau(savi)}"
+        )
+    elif values.get("slots_per_object", 1.0) > SPLIT:
+        found["split"] = (
+            f"objects are spread over several slots ({values['slots_per_object']:.1f} each, FG-ARI "
+            f"{values.get('foreground_ari', math.nan):.2f}): {_less_room(savi)}"
         )
     if values.get("flicker", 0.0) > FLICKER and not shared:
         cure = "train for longer (slots.steps)" if savi.transition_start == "identity" else _IDENTITY
@@ -53,6 +60,13 @@ def slot_warnings(values: Mapping[str, float], savi: SAViConfig) -> dict[str, st
 
 
 _IDENTITY: Final = "start the transition as identity, model.savi.transition_start=identity"
+
+
+def _less_room(savi: SAViConfig) -> str:
+    return (
+        f"give slots less room by a smaller model.savi.slot_dim (now {savi.slot_dim}) and fewer "
+        f"model.savi.decoder_channels (now {list(savi.decoder_channels)})"
+    )
 
 
 def _leave_plateau(savi: SAViConfig) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -35,10 +35,18 @@ class SlotsStage:
         savi: trained in place.
         clips: of unlabelled videos.
         config: batch, precision.
+        segmented: further numbers of each validation, from what a simulator knows of the objects; one rank is enough.
     """
 
-    def __init__(self, savi: SAVi, clips: Clips, config: SlotsStageConfig) -> None:
+    def __init__(
+        self,
+        savi: SAVi,
+        clips: Clips,
+        config: SlotsStageConfig,
+        segmented: Callable[[SAVi], Mapping[str, float]] | None = None,
+    ) -> None:
         self.savi, self.clips, self.config, self.device = savi, clips, config, module_device(savi)
+        self.segmented = segmented
         self.criterion = SlotsLoss(savi, config.motion_weight)
 
     @property
@@ -68,7 +76,8 @@ class SlotsStage:
         for part in found:
             health.join(part)
         mse = float(np.mean(errors))
-        return {"mse": mse, "psnr": -10.0 * float(np.log10(max(mse, 1e-12))), **health.values()}
+        known = self.segmented(self.savi) if self.segmented is not None else {}
+        return {"mse": mse, "psnr": -10.0 * float(np.log10(max(mse, 1e-12))), **health.values(), **known}
 
     def warnings(self, step: int, values: Mapping[str, float]) -> Mapping[str, str]:
         """What the last validation says is wrong with the slots, and the known cure; nothing in the first quarter, in

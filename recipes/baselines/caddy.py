@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.baselines.cloning import BEHAVIOUR, cloning, model_of
-from playslot_rl.recipes.run import held_out_text, kept_text, open_device, open_run
+from playslot_rl.recipes.run import cloned, open_device, open_run
 
 if TYPE_CHECKING:
     from playslot_rl.storage.checkpoints import StageCheckpoint
@@ -122,12 +122,10 @@ def _oracle(config: ExperimentConfig, record: StageRecord) -> Training:
 
     own, device, split = config.baselines.caddy_oracle, open_device(config), record.demos
     stage = oracle_stage(config, record.parents[MODEL], split, device)
-    demos, whole = int((split.trained.lengths >= 2).sum()), int((split.trained.lengths - 1).sum())
-    kept = round(len(stage.targets) / whole, 4)
-    said = f"{record.name}: {demos} demos, {kept_text(kept)}, all labelled, {held_out_text(split)}"
+    said, extra = cloned(record.name, split, len(stage.targets), int((split.trained.lengths - 1).sum()))
     return Training(
         [Part(f"{record.name}.policy", stage, own.policy, lr_key=f"baselines.{record.name}.policy.optim.lr")],
         device,
         lambda _: f"{said}, {record.folder}",
-        extra={"demos": demos, "labelled_demos": demos, "kept_rows": kept},
+        extra=extra,
     )

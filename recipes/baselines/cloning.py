@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl.config import ExperimentConfig, StageConfig
 from playslot_rl.config.methods import LATENT_MODELS
-from playslot_rl.recipes.run import adopt_policy, held_out_text, kept_text, require_parent
+from playslot_rl.recipes.run import adopt_policy, cloned, require_parent
 
 if TYPE_CHECKING:
     from playslot_rl.baselines.cloning import LatentCloning
@@ -97,12 +97,11 @@ def cloning(
         )
 
     adopt_policy(config, record, policy.steps)
-    demos, whole = split.trained.episodes, int((split.trained.lengths - 1).sum())
-    kept = round(len(behaviour.trained.actions) / whole, 4)
-    said = f"{name}: {demos} demos, {kept_text(kept)}, {labelled['labelled_demos']} labelled, {held_out_text(split)}"
+    whole = int((split.trained.lengths - 1).sum())
+    said, extra = cloned(name, split, len(behaviour.trained.actions), whole, config.behaviour.labelled_demos)
     return Training(
         parts(),
         behaviour.device,
         lambda _: f"{said}, {record.folder}",
-        extra={"demos": demos, **labelled, "kept_rows": kept},
+        extra={**extra, **labelled},
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import held_out_text, kept_text, open_device, open_run
+from playslot_rl.recipes.run import cloned, open_device, open_run
 
 if TYPE_CHECKING:
     from playslot_rl.data.demonstrations import Transitions
@@ -80,12 +80,11 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
         precision=own.precision,
     )
     patience = Patience(own.patience, f"unexplained{HELD_OUT}") if own.patience and held_out is not None else None
-    demos, kept = int((split.trained.lengths >= 2).sum()), round(len(moves.rows) / whole, 4)
-    said = f"{NAME}: {demos} demos, {kept_text(kept)}, all labelled, {held_out_text(split)}"
+    said, extra = cloned(NAME, split, len(moves.rows), whole)
     return Training(
         [Part(f"baselines.{NAME}", stage, own, patience=patience)],
         device,
         lambda _: f"{said}, ResNet-18 from {pretraining}, {record.folder}",
-        extra={"demos": demos, "labelled_demos": demos, "kept_rows": kept, "pretraining": pretraining},
+        extra={**extra, "pretraining": pretraining},
         identity={"pretraining": pretraining},
     )

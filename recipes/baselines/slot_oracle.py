@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
+    cloned,
     demonstration_views,
-    held_out_text,
-    kept_text,
     open_device,
     open_run,
     parent_run,
@@ -87,11 +86,10 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
     slots, actions = examples(views)
     whole = len(views) * int((split.trained.lengths - 1).sum())
     stage = oracle_stage(oracle, slots, actions, behaviour, examples(others) if others else None)
-    demos, kept = int((split.trained.lengths >= 2).sum()), round(len(slots) / whole, 4)
-    said = f"{record.name}: {demos} demos, {kept_text(kept)}, all labelled, {held_out_text(split)}"
+    said, extra = cloned(record.name, split, len(slots), whole)
     return Training(
         [Part(record.name, stage, config.behaviour, lr_key="behaviour.optim.lr")],
         device,
         lambda _: f"{said}, {record.folder}",
-        extra={"demos": demos, "labelled_demos": demos, "kept_rows": kept},
+        extra=extra,
     )

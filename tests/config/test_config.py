@@ -206,7 +206,7 @@ def test_the_full_encoder_takes_no_strides() -> None:
 
 def test_roles_say_what_each_key_counts_for() -> None:
     looking = {"checkpoint_every", "validate_every", "log_every"}
-    assert keys_of(SlotsStageConfig, "free") == looking | {"compile", "optim.accumulate"}
+    assert keys_of(SlotsStageConfig, "free") == looking | {"compile", "optim.accumulate", "segmented_episodes"}
     assert keys_of(DreamerConfig, "free") == {"minutes", "replay_on_disk", "evaluate_every"} | looking - {
         "validate_every"
     }
@@ -254,7 +254,8 @@ def test_a_config_without_a_role_keeps_all_other_keys() -> None:
     assert {**whole["data"], **left["data"]} == whole["data"]
     assert to_dict(config) == whole
     fixed = fixed_keys(whole)
-    kept = {k: v for k, v in whole["slots"].items() if not k.endswith("_every") and k != "compile"}
+    free = ("compile", "segmented_episodes")
+    kept = {k: v for k, v in whole["slots"].items() if not k.endswith("_every") and k not in free}
     kept["optim"] = {k: v for k, v in kept["optim"].items() if k != "accumulate"}
     assert fixed["slots"] == kept
     assert "minutes" not in fixed["baselines"]["dreamer"]

@@ -11,7 +11,18 @@ import torch
 
 from playslot_rl.config.compose import compose
 from playslot_rl.envs import make_env
-from playslot_rl.evaluation.slots import RESULT, evaluate_slots, segmented_episode, slots_per_object
+from playslot_rl.episode_seeds import episode_seed
+from playslot_rl.evaluation.seeds import first_seed
+from playslot_rl.evaluation.slots import (
+    RESULT,
+    evaluate_slots,
+    score_slots,
+    segmented_episode,
+    segmented_episodes,
+    slots_per_object,
+    validation_scores,
+)
+from playslot_rl.modules.savi import SAVi
 from playslot_rl.training.runs import load_savi
 
 OBJECTS = {
@@ -64,3 +75,33 @@ def test_a_shipped_models_slots_are_scored_and_written(tmp_path: Path) -> None:
     assert json.loads((tmp_path / RESULT).read_text()) == result
     assert result["foreground_ari"] > 0.4
     assert result["psnr"] > 22
+
+
+@pytest.mark.parametrize("name", [*sorted(OBJECTS), "grid_shapes"])
+def test_stage_one_is_told_of_every_tasks_segmentation_and_never_of_an_evaluations(name: str) -> None:
+    config = compose([f"env={name}", "preset=smoke", "slots.segmented_episodes=2", "env.max_steps=2"])
+    scores, savi = validation_scores(config), SAVi(config.model.savi, config.env.image_size)
+    assert scores is not None
+    found = scores(savi)
+    seeds = [episode_seed("development", 0, i) for i in range(2)]
+    again = score_slots(savi, segmented_episodes(config, seeds), seeds)
+    assert found == {key: again[key] for key in ("foreground_ari", "slots_per_object")}
+    assert not set(seeds) & {first_seed(config, 0) + i for i in range(10_000)}
+
+
+def test_recorded_videos_have_no_segmentation() -> None:
+    assert validation_scores(compose(["env=video", "preset=compact"])) is None
+    assert validation_scores(compose(["env=button_press", "preset=compact", "slots.segmented_episodes=0"])) is None
+
+
+def test_a_machine_that_cannot_draw_trains_without(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("no EGL display\nand more")
+
+    monkeypatch.setattr("playslot_rl.evaluation.slots.make_env", fail)
+    assert validation_scores(compose(["env=button_press", "preset=compact"])) is None
+    assert capsys.readouterr().out == (
+        "slots: warning: no FG-ARI while training, since button_press cannot be drawn here (no EGL display)\n"
+    )

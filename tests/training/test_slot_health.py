@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import torch
 from playslot_rl.config import LoggingConfig, OptimConfig, SAViConfig, SlotsStageConfig
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips
+from playslot_rl.modules.savi import SAVi
 from playslot_rl.seeding import step_generator
 from playslot_rl.testing import tiny_savi
 from playslot_rl.training.fit import Part, fit
@@ -33,11 +35,11 @@ def videos() -> EpisodeFrames:
     return EpisodeFrames(frames, starts, lengths, None, None, None, "f", 10.0, "", "camera")
 
 
-def stage(steps: int = 4) -> SlotsStage:
+def stage(steps: int = 4, segmented: Callable[[SAVi], Mapping[str, float]] | None = None) -> SlotsStage:
     config = SlotsStageConfig(
         steps=steps, batch_size=2, clip_frames=4, validate_every=2, checkpoint_every=4, optim=OptimConfig(lr=1e-3)
     )
-    return SlotsStage(tiny_savi(), Clips(videos(), 4, 0.25, 0), config)
+    return SlotsStage(tiny_savi(), Clips(videos(), 4, 0.25, 0), config, segmented)
 
 
 class Blind:
@@ -64,7 +66,7 @@ def train(stage: Stage, config: SlotsStageConfig, folder: Path, backend: Any = "
 
 
 def test_looking_changes_neither_weights_nor_the_error(tmp_path: Path) -> None:
-    seeing, other = stage(), stage()
+    seeing, other = stage(segmented=lambda _: {"foreground_ari": 0.4, "slots_per_object": 2.0}), stage()
     blind = Blind(other)
     assert isinstance(seeing, WatchedStage)
     assert not isinstance(blind, WatchedStage)
@@ -78,6 +80,8 @@ def test_looking_changes_neither_weights_nor_the_error(tmp_path: Path) -> None:
     ]
     assert rows[0] == rows[1]
     assert len(rows[0]) == 2
+    last = History(tmp_path / "seeing" / "metrics.jsonl").read()[-1]
+    assert (last["foreground_ari"], last["slots_per_object"]) == (0.4, 2.0)
 
 
 def test_validations_log_health_and_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -120,6 +124,12 @@ def test_healthy_slots_are_not_warned_of() -> None:
     ("kind", "sick", "text", "cure"),
     [
         ("single", {"slots_in_use": 1.0}, "one slot holds everything (1.0 of 4", "model.savi.slot_dim"),
+        (
+            "split",
+            {"slots_per_object": 2.0, "foreground_ari": 0.54},
+            "objects are spread over several slots (2.0 each, FG-ARI 0.54)",
+            "model.savi.slot_dim",
+        ),
         ("flicker", {"flicker": 0.6}, "slots change places (0.60", "model.savi.transition_start=identity"),
         ("shared", {"mask_entropy": math.log(4)}, "all slots share all pixels", "slots.start_from="),
         (
