@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from playslot_rl.config import RenderConfig
 from playslot_rl.envs.culling import FrustumCuller, Still, only_in_sight
+from playslot_rl.envs.gl_contexts import kept_contexts
 from playslot_rl.errors import RenderError
 
 if TYPE_CHECKING:
@@ -77,11 +78,20 @@ def _make_renderer(mj: Any, model: mujoco.MjModel, side: int) -> Any:
     class QuietRenderer(mj.Renderer):
         """A renderer whose destructor also works where its constructor failed (no traceback after our error)."""
 
-        _gl_context = None
-        _mjr_context = None
+        _gl_context: Any = None
+        _mjr_context: Any = None
+
+        def close(self) -> None:
+            """What was uploaded lies in the context, which the next renderer may get: it goes first."""
+            if self._gl_context is not None and self._mjr_context is not None:
+                with contextlib.suppress(RuntimeError):  # another thread draws in it: freed, with all that is in it
+                    self._gl_context.make_current()
+                    self._mjr_context.free()
+                    self._mjr_context = None
+            super().close()
 
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), kept_contexts():
             warnings.simplefilter("ignore")  # GLFW warns, then fails
             return QuietRenderer(model, height=side, width=side)
     except Exception as error:  # each GL backend raises its own types
@@ -111,7 +121,7 @@ class FrameRenderer:
     """Draws the scene of one MuJoCo model.
 
     Args:
-        model: the model; its off-screen buffer size and, for `fast`, its sample count are changed.
+        model: the model; its off-screen buffer size and, for `fast`, its samples and shadow map are changed.
         camera: the viewpoint; or the name of a camera of the model that is at rest in the world.
         size: side of the frames, pixels.
         config: quality and supersampling.
@@ -137,6 +147,7 @@ class FrameRenderer:
         model.vis.global_.offwidth = model.vis.global_.offheight = side
         if fast:
             model.vis.quality.offsamples = 0
+            model.vis.quality.shadowsize = 0  # a map of 4096x4096 is made even where no shadow is drawn: 0.1 s, 64 MB
         with contextlib.ExitStack() as stack:
             if fast and still is not None and isinstance(camera, str):
                 stack.enter_context(only_in_sight(model, still, model.camera(camera).pos))
