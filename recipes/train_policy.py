@@ -22,6 +22,9 @@ from playslot_rl.recipes.run import (
 )
 
 if TYPE_CHECKING:
+    from playslot_rl.data.demonstrations import Demonstrations
+    from playslot_rl.data.slot_cache import SlotRows
+    from playslot_rl.data.source import EpisodeFrames
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import StageRecord, Training
     from playslot_rl.training.stage import Stage
@@ -91,11 +94,12 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
     with global_seed(config.seed, 0, "policy"):
         agent = Agent.untrained(world, oracle=behaviour.oracle).to(device)
     views, others = demonstration_views(config, split, world.savi, record.prints["slots"])
-    whole = with_copies([label_demonstrations(world, frames, slots, device) for frames, slots in views])
-    demos = whole.trimmed(behaviour.trim, behaviour.trim_margin)
-    held_out = next((label_demonstrations(world, frames, slots, device) for frames, slots in others), None)
-    if held_out is not None:
-        held_out = held_out.trimmed(behaviour.trim, behaviour.trim_margin)
+
+    def label(frames: EpisodeFrames, slots: SlotRows) -> Demonstrations:
+        return label_demonstrations(world, frames, slots, device, behaviour.trim, behaviour.trim_margin)
+
+    demos, whole = with_copies([label(*view) for view in views]), len(views) * int((split.trained.lengths - 1).sum())
+    held_out = next((label(*view) for view in others), None)
     horizon = trained_horizon(record.parents["dynamics"])
     demos.labelled(behaviour.labelled_demos)  # none that say anything are refused before anything is trained
 
@@ -116,7 +120,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
             both = FinetuneStage(clone.stages["policy"], agent.action_decoder, demos, behaviour, held_out, horizon)
             yield _part("finetune", both, behaviour, behaviour.finetune_steps, behaviour.finetune_lr)
 
-    said, extra = cloned("policy", split, len(demos.slots), len(whole.slots), behaviour.labelled_demos)
+    said, extra = cloned("policy", split, len(demos.slots), whole, behaviour.labelled_demos)
     return Training(
         parts(),
         device,

@@ -15,6 +15,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from playslot_rl.data.cache import note_read
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.stride import ChosenFrames
 from playslot_rl.data.trimming import moving_rows, slot_motion
@@ -42,7 +43,6 @@ class Demonstrations:
         actions: real actions (M, A) in [-1, 1], or None.
         episode: number of the demonstration of each transition, int64 (M,); a shifted copy's is its original's.
         step: number of the transition in its demonstration, int64 (M,).
-        motion: RMS change of the slots over the transition (M,), see `slot_motion`.
         lengths: transitions of each demonstration as it was recorded, int64 (E,).
     """
 
@@ -52,7 +52,6 @@ class Demonstrations:
     actions: Tensor | None
     episode: Tensor
     step: Tensor
-    motion: Tensor
     lengths: Tensor
 
     def take(self, rows: Tensor) -> Demonstrations:
@@ -65,16 +64,17 @@ class Demonstrations:
             actions=None if self.actions is None else self.actions[rows],
             episode=self.episode[rows],
             step=self.step[rows],
-            motion=self.motion[rows],
         )
 
-    def trimmed(self, threshold: float, margin: int) -> Demonstrations:
-        """Without the stretches in which nothing moves (`moving_rows`); all of it where `threshold` is 0.
+    def require_actions(self) -> Tensor:
+        """The real actions (M, A).
 
         Raises:
-            DataError: nothing is left.
+            DataError: there are none.
         """
-        return self.take(moving_rows(self.motion, self.step, threshold, margin)) if threshold else self
+        if self.actions is None:
+            raise DataError("action decoder: got demonstrations without actions, expected the feature `action`")
+        return self.actions
 
     def labelled(self, demos: int) -> Tensor:
         """Rows (int64) of the first `demos` demonstrations and their copies, the only ones whose actions the action
@@ -297,8 +297,14 @@ def moving_slots(source: EpisodeFrames, slots: npt.NDArray[np.float32], threshol
         DataError: nothing is left, or no episode has two frames.
     """
     moves = transitions(source)
-    pairs = torch.from_numpy(slots[np.stack((moves.rows, moves.rows + 1), axis=1)])
-    return moves.trimmed(slot_motion(pairs)[:, 0], threshold, margin, "behaviour.trim")
+    if not threshold:
+        return moves
+    motion = []
+    for rows in np.array_split(moves.rows, -(-len(moves.rows) // FRAMES_AT_ONCE)):
+        pairs = slots[np.stack((rows, rows + 1), axis=1)]
+        note_read(pairs.nbytes)
+        motion.append(slot_motion(torch.from_numpy(pairs))[:, 0])
+    return moves.trimmed(torch.cat(motion), threshold, margin, "behaviour.trim")
 
 
 def transitions(source: EpisodeFrames) -> Transitions:
@@ -327,63 +333,106 @@ def real_actions(source: EpisodeFrames, rows: npt.NDArray[np.int64], width: int)
 
 @torch.no_grad()
 def label_demonstrations(
-    model: WorldModel, source: EpisodeFrames, slots: npt.NDArray[np.float32], device: torch.device | str = "cpu"
+    model: WorldModel,
+    source: EpisodeFrames,
+    slots: npt.NDArray[np.float32],
+    device: torch.device | str = "cpu",
+    trim: float = 0.0,
+    margin: int = 0,
 ) -> Demonstrations:
     """Infer the latent actions of demonstration videos, and unfold each in imagination under them.
+
+    Stretches in which nothing moves are left out (`moving_rows`), and never held: the labels of 260,000 transitions of
+    eight slots are 1.1 GB.
 
     Args:
         model: frozen world model, on `device`.
         source: the videos; its actions are carried along where it has some.
         slots: cached slots (F, N, D) of its frames.
         device: where to compute.
+        trim: motion of the slots up to which a transition is still; 0 keeps every one.
+        margin: still ones kept after each stretch of motion.
 
     Raises:
-        DataError: no episode has two frames, mode `ground_truth` without actions, or actions of another width.
+        DataError: no episode has two frames, nothing moves, mode `ground_truth` without actions, or actions of another
+            width.
     """
     moves = transitions(source)
-    kept = np.nonzero(source.lengths >= 2)[0]
-    labels = None if source.actions is None else real_actions(source, moves.rows, model.env.action_dim).to(device)
-    parts: dict[int, tuple[Tensor, ...]] = {}
-    for length in np.unique(source.lengths[kept]):
-        same = kept[source.lengths[kept] == length]
+    rows = moving_slots(source, slots, trim, margin)
+    first, episodes = np.cumsum(moves.lengths) - moves.lengths, np.nonzero(source.lengths >= 2)[0]
+    of_kept = np.full(len(moves.rows), -1)  # where each transition goes; -1: nowhere
+    of_kept[first[rows.episode] + rows.step] = np.arange(len(rows.rows))
+    actions = None if source.actions is None else real_actions(source, rows.rows, model.env.action_dim).to(device)
+    labels = _Labels.empty(len(rows.rows), slots.shape[1:], model.inverse_dynamics.config.latent_dim, device)
+    for steps in np.unique(moves.lengths):
+        same = np.nonzero(moves.lengths == steps)[0]
         for chosen in np.array_split(same, -(-len(same) // BATCH)):
-            rows = source.starts[chosen][:, None] + np.arange(length)
-            parsed = torch.from_numpy(slots[rows]).to(device)
-            actions = None
-            if model.inverse_dynamics.config.mode == "ground_truth":
-                actions = torch.from_numpy(source.require_actions()[rows[:, :-1]]).to(device)
-            latent = model.inverse_dynamics(parsed, actions)
-            rolled = model.predictor.rollout(parsed[:, :1], latent.prototype, latent.variability)
-            imagined, motion = torch.cat((parsed[:, :1], rolled[:, :-1]), dim=1), slot_motion(parsed)
-            for i, episode in enumerate(chosen):
-                parts[int(episode)] = (parsed[i, :-1], imagined[i], latent.mean[i], motion[i])
-    seen, dreamt, latents, motion = (torch.cat(part) for part in zip(*(parts[int(e)] for e in kept), strict=True))
+            frames = source.starts[episodes[chosen]][:, None] + np.arange(steps + 1)
+            places = of_kept[first[chosen][:, None] + np.arange(steps)]
+            labels.fill(torch.from_numpy(places), *_label(model, source, slots, frames, device))
     return Demonstrations(
-        slots=seen,
-        imagined=dreamt,
-        latents=latents,
-        actions=labels,
-        episode=torch.from_numpy(moves.episode).to(device),
-        step=torch.from_numpy(moves.step).to(device),
-        motion=motion,
-        lengths=torch.from_numpy(moves.lengths),
+        slots=labels.slots,
+        imagined=labels.imagined,
+        latents=labels.latents,
+        actions=actions,
+        episode=torch.from_numpy(rows.episode).to(device),
+        step=torch.from_numpy(rows.step).to(device),
+        lengths=torch.from_numpy(rows.lengths),
     )
+
+
+@dataclass(frozen=True)
+class _Labels:
+    """Rows to be filled: pieces that are joined in the end would need twice the memory."""
+
+    slots: Tensor
+    imagined: Tensor
+    latents: Tensor
+
+    @classmethod
+    def empty(cls, count: int, slot: Sequence[int], width: int, device: torch.device | str) -> _Labels:
+        return cls(*(torch.empty(count, *size, device=device) for size in (slot, slot, (width,))))
+
+    def fill(self, places: Tensor, parsed: Tensor, imagined: Tensor, latents: Tensor) -> None:
+        """Those of a batch of episodes (B, T, ...) that have a place (B, T); -1 has none."""
+        kept = (places >= 0).to(parsed.device)
+        at = places[places >= 0].to(parsed.device)
+        self.slots[at], self.imagined[at], self.latents[at] = parsed[kept], imagined[kept], latents[kept]
+
+
+def _label(
+    model: WorldModel,
+    source: EpisodeFrames,
+    slots: npt.NDArray[np.float32],
+    frames: npt.NDArray[np.int64],
+    device: torch.device | str,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Parsed and imagined slots (B, T, N, D) and latents (B, T, Z) of episodes of equal length, frames (B, T + 1)."""
+    read = slots[frames]
+    note_read(read.nbytes)
+    parsed, actions = torch.from_numpy(read).to(device), None
+    if model.inverse_dynamics.config.mode == "ground_truth":
+        actions = torch.from_numpy(source.require_actions()[frames[:, :-1]]).to(device)
+    latent = model.inverse_dynamics(parsed, actions)
+    rolled = model.predictor.rollout(parsed[:, :1], latent.prototype, latent.variability)
+    return parsed[:, :-1], torch.cat((parsed[:, :1], rolled[:, :-1]), dim=1), latent.mean
 
 
 def with_copies(demos: Sequence[Demonstrations]) -> Demonstrations:
     """Demonstrations and shifted copies of them, labelled one by one, as one set.
 
     Args:
-        demos: the originals first; each with the same transitions.
+        demos: the originals first; of each the transitions in which it moves.
     """
-    first = demos[0]
+    first, *copies = demos
+    if not copies:
+        return first
     return Demonstrations(
         slots=torch.cat([copy.slots for copy in demos]),
         imagined=torch.cat([copy.imagined for copy in demos]),
         latents=torch.cat([copy.latents for copy in demos]),
-        actions=None if first.actions is None else first.actions.repeat(len(demos), 1),
-        episode=first.episode.repeat(len(demos)),
-        step=first.step.repeat(len(demos)),
-        motion=torch.cat([copy.motion for copy in demos]),
+        actions=None if first.actions is None else torch.cat([copy.require_actions() for copy in demos]),
+        episode=torch.cat([copy.episode for copy in demos]),
+        step=torch.cat([copy.step for copy in demos]),
         lengths=first.lengths,
     )

@@ -131,7 +131,7 @@ class CloneStage:
                     "set behaviour.oracle=false"
                 )
             acted = _acted(held_out)
-            measured = None if acted is None else (acted.slots, _require_actions(acted))
+            measured = None if acted is None else (acted.slots, acted.require_actions())
             self.stages["oracle"] = oracle_stage(oracle, demos.slots, demos.actions, config, measured)
 
     @property
@@ -164,12 +164,6 @@ def _checks(demos: Demonstrations, ending: str = "") -> dict[str, Examples]:
 def _acted(demos: Demonstrations | None) -> Demonstrations | None:
     """Held-out demonstrations whose actions can measure, if there are any."""
     return None if demos is None or demos.actions is None else demos
-
-
-def _require_actions(demos: Demonstrations) -> Tensor:
-    if demos.actions is None:
-        raise DataError("action decoder: got demonstrations without actions, expected the feature `action`")
-    return demos.actions
 
 
 class DecoderStage(RegressionStage):
@@ -229,7 +223,7 @@ class DecoderStage(RegressionStage):
         horizon: int | None = None,
     ) -> None:
         def examples(demos: Demonstrations, noise: float) -> tuple[Tensor, Examples]:
-            actions = _require_actions(demos)
+            actions = demos.require_actions()
             latents, slots, rows = [], [], []
             if config.decoder_inputs != "policy":
                 every = torch.arange(len(demos.slots), device=demos.slots.device)
@@ -292,7 +286,7 @@ class FinetuneStage:
         networks = [self.both, *([_Both(policy, decoder, blind=True)] if decoder.reads_slots else [])]
 
         def examples(demos: Demonstrations, noise: float) -> Examples:
-            actions = _require_actions(demos)
+            actions = demos.require_actions()
             seen = Seen.of(demos, config, horizon)
             return TensorInputs(seen.slots, noise, "finetune_noise"), actions[seen.rows]
 

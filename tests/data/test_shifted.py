@@ -71,7 +71,7 @@ def test_copies_carry_the_labels_of_their_originals(source: EpisodeFrames) -> No
         slots = torch.full((count, 1, 1), value)
         return Demonstrations(
             slots=slots, imagined=slots, latents=slots[:, 0], actions=actions, episode=torch.from_numpy(moves.episode),
-            step=torch.from_numpy(moves.step), motion=slots[:, 0, 0], lengths=torch.from_numpy(moves.lengths),
+            step=torch.from_numpy(moves.step), lengths=torch.from_numpy(moves.lengths),
         )  # fmt: skip
 
     demos = with_copies([labelled(0.0), labelled(1.0), labelled(2.0)])

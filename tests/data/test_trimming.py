@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -85,29 +84,45 @@ def test_slots_and_frames_that_move_together_are_trimmed_alike() -> None:
     assert len(moving_frames(source, 0.0, 1).rows) == 9, "0 keeps every row"
 
 
-@pytest.fixture
-def demos() -> Demonstrations:
-    """Two demonstrations whose actions are not numbers, labelled by an untrained world model."""
+def labels(source: EpisodeFrames, trim: float = 0.0) -> Demonstrations:
+    """Demonstrations whose actions are not numbers, labelled by an untrained world model."""
+    return label_demonstrations(tiny_agent().world_model, source, slots_of(source), trim=trim, margin=1)
+
+
+def test_trimming_never_reads_an_action_and_keeps_rows_together() -> None:
     source = video([[1, 1, 0, 0, 0], [0, 0, 1, 0]])
-    return label_demonstrations(tiny_agent().world_model, source, slots_of(source))
-
-
-def test_trimming_never_reads_an_action_and_keeps_rows_together(demos: Demonstrations) -> None:
+    demos, kept = labels(source), labels(source, 0.01)
     assert demos.actions is not None
     assert bool(demos.actions.isnan().all())
-    kept = demos.trimmed(0.01, 1)
     assert kept.episode.tolist() == [0, 0, 0, 1, 1]
     rows = torch.tensor([0, 1, 2, 7, 8])
-    for name in ("slots", "imagined", "latents", "step", "motion"):
+    for name in ("slots", "imagined", "latents", "step"):
         assert torch.equal(getattr(kept, name), getattr(demos, name)[rows]), name
     assert kept.actions is not None
     assert len(kept.actions) == 5
-    assert kept.lengths.tolist() == [5, 4]
-    assert demos.trimmed(0.0, 1) is demos
+    assert kept.lengths.tolist() == demos.lengths.tolist() == [5, 4]
+    assert len(demos.slots) == 9
     assert kept.labelled(1).tolist() == [0, 1, 2]
 
 
-def test_shifted_copies_are_trimmed_each_by_its_own_motion(demos: Demonstrations) -> None:
-    still = replace(demos, motion=torch.zeros_like(demos.motion))
-    both = with_copies([demos, still]).trimmed(0.01, 1)
-    assert torch.equal(both.slots, demos.trimmed(0.01, 1).slots)
+def test_shifted_copies_are_trimmed_each_by_its_own_motion() -> None:
+    demos, less = labels(video([[1, 1, 0, 0, 0], [0, 0, 1, 0]]), 0.01), labels(video([[0, 1, 0, 0, 0]]), 0.01)
+    both = with_copies([demos, less])
+    assert torch.equal(both.slots, torch.cat((demos.slots, less.slots)))
+    assert both.episode.tolist() == [0, 0, 0, 1, 1, 0, 0]
+    assert both.step.tolist() == [0, 1, 2, 2, 3, 1, 2]
+    assert both.actions is not None
+    assert len(both.actions) == 7
+    assert with_copies([demos]) is demos
+
+
+def test_labels_are_filled_in_whatever_the_lengths_and_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = video([[1, 1, 0], [0, 1, 0, 0, 1], [1, 0, 1], [1]])
+    whole = labels(source, 0.01)
+    monkeypatch.setattr("playslot_rl.data.demonstrations.BATCH", 1)
+    monkeypatch.setattr("playslot_rl.data.demonstrations.FRAMES_AT_ONCE", 2)
+    alone = labels(source, 0.01)
+    for name in ("slots", "imagined", "latents"):
+        torch.testing.assert_close(getattr(whole, name), getattr(alone, name))
+    assert whole.episode.tolist() == alone.episode.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3]
+    assert bool((whole.imagined[whole.step == 0] == whole.slots[whole.step == 0]).all()), "the first is the parsed one"

@@ -37,7 +37,7 @@ def demonstrations(actions: str = "slots", seed: int = 0) -> Demonstrations:
     return Demonstrations(
         slots=slots, imagined=draw(3, D), latents=latents, actions=read.tanh(),
         episode=torch.arange(DEMOS).repeat_interleave(STEPS), step=torch.arange(STEPS).repeat(DEMOS),
-        motion=torch.ones(DEMOS * STEPS), lengths=torch.full((DEMOS,), STEPS),
+        lengths=torch.full((DEMOS,), STEPS),
     )  # fmt: skip
 
 

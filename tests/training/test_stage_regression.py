@@ -61,7 +61,7 @@ def _demos(seed: int, count: int = 30) -> Demonstrations:
     return Demonstrations(
         slots=torch.randn(count, 4, 32), imagined=torch.randn(count, 4, 32), latents=torch.randn(count, 8),
         actions=torch.rand(count, 4), episode=torch.zeros(count, dtype=torch.long), step=torch.arange(count),
-        motion=torch.ones(count), lengths=torch.tensor([count]),
+        lengths=torch.tensor([count]),
     )  # fmt: skip
 
 

@@ -87,7 +87,7 @@ def demonstrations() -> Demonstrations:
     slots, latents = torch.randn(30, 3, 16, generator=draw), torch.randn(30, 4, generator=draw)
     episode, step = torch.arange(30) // 6, torch.arange(30) % 6
     imagined, actions = slots + 0.1, torch.rand(30, 2, generator=draw) * 2 - 1
-    return Demonstrations(slots, imagined, latents, actions, episode, step, torch.ones(30), torch.full((5,), 6))
+    return Demonstrations(slots, imagined, latents, actions, episode, step, torch.full((5,), 6))
 
 
 def slots() -> Part:

@@ -169,7 +169,7 @@ def test_a_worker_that_dies_is_replaced_and_its_part_played_again() -> None:
 
 
 def test_workers_that_hang_end_the_training_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(players, "START_S", 8.0)
+    monkeypatch.setattr(players, "START_S", 1.0)
     learner: Any = ToyLearner()
     crew = Players(learner, partial(HangingPool, *TASK), 1, CollectorConfig(timeout_s=0.5, restarts=0))
     try:
