@@ -127,7 +127,7 @@ class LatentCloning(ABC):
         held_out = None
         if self.held_out is not None:
             held_out = self._decoded(self.held_out, torch.arange(len(self.held_out.actions), device=self.device))
-        self.decoder.standardise(inputs.values)
+        self.decoder.standardise(inputs.whole())
         return RegressionStage(
             "action_decoder",
             ActionDecoderLoss(self.decoder, loss),

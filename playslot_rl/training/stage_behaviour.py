@@ -52,11 +52,11 @@ class Seen:
     """What policy and decoder see of demonstrations: parsed slots (`config.parsed`), imagined ones (`config.imagined`).
 
     Attributes:
-        slots: (I, N, D), the parsed ones first.
+        slots: (I, N, D) in parts, the parsed ones first.
         rows: the transition of each, int64 (I,).
     """
 
-    slots: Tensor
+    slots: tuple[Tensor, ...]
     rows: Tensor
 
     @classmethod
@@ -71,11 +71,12 @@ class Seen:
         """
         rows = torch.arange(len(demos.slots), device=demos.slots.device)
         if not config.imagined:
-            return cls(demos.slots, rows)
+            return cls((demos.slots,), rows)
         far = rows if horizon is None else rows[demos.step <= horizon]
+        imagined = demos.imagined if len(far) == len(rows) else demos.imagined[far]
         if not config.parsed:
-            return cls(demos.imagined[far], far)
-        return cls(torch.cat((demos.slots, demos.imagined[far])), torch.cat((rows, far)))
+            return cls((imagined,), far)
+        return cls((demos.slots, imagined), torch.cat((rows, far)))
 
 
 class CloneStage:
@@ -233,7 +234,7 @@ class DecoderStage(RegressionStage):
                 said = apply_rows(
                     policy, TensorInputs(seen.slots), torch.arange(len(seen.rows), device=seen.rows.device)
                 )
-                latents, slots, rows = [*latents, said], [*slots, seen.slots], [*rows, seen.rows]
+                latents, slots, rows = [*latents, said], [*slots, *seen.slots], [*rows, seen.rows]
             z = torch.cat(latents)
             state = [TensorInputs(torch.cat(slots), noise, "decoder_noise")] if decoder.reads_slots else []
             return z, (PairedInputs(TensorInputs(z), *state), actions[torch.cat(rows)])

@@ -48,20 +48,25 @@ class TensorInputs:
     """Rows of a tensor (M, ...), with Gaussian noise in training.
 
     Args:
-        values: on the device that computes.
+        values: on the device that computes; or several tensors (M_i, ...) that are read as one, which nobody holds.
         noise: standard deviation; 0 adds none.
         stream: name of the noise's generator.
     """
 
-    def __init__(self, values: Tensor, noise: float = 0.0, stream: str = "noise") -> None:
-        self.values, self.noise, self.stream = values, noise, stream
+    def __init__(self, values: Tensor | tuple[Tensor, ...], noise: float = 0.0, stream: str = "noise") -> None:
+        self.parts = (values,) if isinstance(values, Tensor) else values
+        self.noise, self.stream = noise, stream
 
     def __len__(self) -> int:
-        return len(self.values)
+        return sum(len(part) for part in self.parts)
+
+    def whole(self) -> Tensor:
+        """All rows, as one tensor."""
+        return torch.cat(self.parts)
 
     def draw(self, rows: Tensor, generators: StepGenerators) -> Tensor:
         """Rows, with noise."""
-        values = self.values[rows]
+        values = self.plain(rows)
         if self.noise == 0:
             return values
         generator = generators.torch(self.stream, values.device)
@@ -71,7 +76,15 @@ class TensorInputs:
 
     def plain(self, rows: Tensor) -> Tensor:
         """Rows, without noise."""
-        return self.values[rows]
+        first = self.parts[0]
+        if len(self.parts) == 1:
+            return first[rows]
+        values, start = first.new_empty(len(rows), *first.shape[1:]), 0
+        for part in self.parts:
+            own = (rows >= start) & (rows < start + len(part))
+            values[own] = part[rows[own] - start]
+            start += len(part)
+        return values
 
 
 class PairedInputs:
