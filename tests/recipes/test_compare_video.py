@@ -270,3 +270,20 @@ def test_no_predictor_attends_to_more_frames_than_its_training_clips_show(finish
         method = name.removesuffix("-s0")
         at = stored["model"] if method.startswith("playslot") else stored["baselines"][method]
         assert at["predictor"]["context"] == 3
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_two_trainings_of_two_processes_each_run_side_by_side(finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = ["compare-video", "env=button_press", "preset=smoke", f"data.root={finished}/data/random",
+               "methods=slotformer,playslot", f"run={finished}/world_model", f"out={out}", "threads=1", "device=cpu",
+               "processes=2"]  # fmt: skip
+    done = playslot(*command, "hydra.launcher=joblib", "hydra.launcher.n_jobs=2")
+    assert (done.code, done.err) == (0, ""), (out / "jobs" / "launcher.log").read_text()
+    assert {job["status"] for job in result(out)["jobs"]} == {"done"}
+    alone = tmp_path / "alone"
+    smoke(*(word.replace(str(out), str(alone)) for word in command if word != "processes=2"))
+    for one, two in zip(result(alone)["summary"], result(out)["summary"], strict=True):
+        assert one["title"] == two["title"]
+        assert one["psnr"] == pytest.approx(two["psnr"], abs=1e-3)
