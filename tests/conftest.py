@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import signal
 from collections.abc import Iterator
@@ -56,6 +57,25 @@ def _no_waiting_for_the_disk() -> Iterator[None]:
     """Tests kill processes, never the machine: what was written survives them without an fsync, which is dear."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda _: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _models_compiled_once() -> Iterator[None]:
+    """Meta-World compiles its XML for every environment, a fifth of a second; here from the second on it is a copy."""
+    import mujoco
+
+    compiled, models = mujoco.MjModel.from_xml_path, dict[str, mujoco.MjModel]()
+
+    def once(filename: str, assets: object = None) -> mujoco.MjModel:
+        if assets is not None:
+            return compiled(filename, assets)
+        if filename not in models:
+            models[filename] = compiled(filename)
+        return copy.copy(models[filename])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mujoco.MjModel, "from_xml_path", once)
         yield
 
 
