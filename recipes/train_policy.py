@@ -79,7 +79,8 @@ def behaviour_networks(config: ExperimentConfig) -> dict[str, Any]:
 
 def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Training:
     """The frozen world model's view of the demonstrations; fresh policy, oracle and decoder on top of it."""
-    from playslot_rl.data.demonstrations import label_demonstrations, require_labelled, with_copies
+    from playslot_rl.data.demonstrations import require_labelled
+    from playslot_rl.data.labels import label_demonstrations, with_copies
     from playslot_rl.seeding import global_seed
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training

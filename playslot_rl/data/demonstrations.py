@@ -7,7 +7,6 @@ F frames, H W image height and width.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,9 +20,7 @@ from playslot_rl.data.stride import ChosenFrames
 from playslot_rl.data.trimming import moving_rows, slot_motion
 from playslot_rl.errors import DataError
 from playslot_rl.frames import to_float
-from playslot_rl.world_model import WorldModel
 
-BATCH = 64
 FRAMES_AT_ONCE = 1024
 DRAW_STREAM = 14
 """Keeps the draws of demonstrations apart from what else a seed draws."""
@@ -329,110 +326,3 @@ def real_actions(source: EpisodeFrames, rows: npt.NDArray[np.int64], width: int)
         DataError: the data set has none, or of another width.
     """
     return torch.from_numpy(np.array(source.require_actions(width)[rows])).clamp(-1, 1)
-
-
-@torch.no_grad()
-def label_demonstrations(
-    model: WorldModel,
-    source: EpisodeFrames,
-    slots: npt.NDArray[np.float32],
-    device: torch.device | str = "cpu",
-    trim: float = 0.0,
-    margin: int = 0,
-) -> Demonstrations:
-    """Infer the latent actions of demonstration videos, and unfold each in imagination under them.
-
-    Stretches in which nothing moves are left out (`moving_rows`), and never held: the labels of 260,000 transitions of
-    eight slots are 1.1 GB.
-
-    Args:
-        model: frozen world model, on `device`.
-        source: the videos; its actions are carried along where it has some.
-        slots: cached slots (F, N, D) of its frames.
-        device: where to compute.
-        trim: motion of the slots up to which a transition is still; 0 keeps every one.
-        margin: still ones kept after each stretch of motion.
-
-    Raises:
-        DataError: no episode has two frames, nothing moves, mode `ground_truth` without actions, or actions of another
-            width.
-    """
-    moves = transitions(source)
-    rows = moving_slots(source, slots, trim, margin)
-    first, episodes = np.cumsum(moves.lengths) - moves.lengths, np.nonzero(source.lengths >= 2)[0]
-    of_kept = np.full(len(moves.rows), -1)  # where each transition goes; -1: nowhere
-    of_kept[first[rows.episode] + rows.step] = np.arange(len(rows.rows))
-    actions = None if source.actions is None else real_actions(source, rows.rows, model.env.action_dim).to(device)
-    labels = _Labels.empty(len(rows.rows), slots.shape[1:], model.inverse_dynamics.config.latent_dim, device)
-    for steps in np.unique(moves.lengths):
-        same = np.nonzero(moves.lengths == steps)[0]
-        for chosen in np.array_split(same, -(-len(same) // BATCH)):
-            frames = source.starts[episodes[chosen]][:, None] + np.arange(steps + 1)
-            places = of_kept[first[chosen][:, None] + np.arange(steps)]
-            labels.fill(torch.from_numpy(places), *_label(model, source, slots, frames, device))
-    return Demonstrations(
-        slots=labels.slots,
-        imagined=labels.imagined,
-        latents=labels.latents,
-        actions=actions,
-        episode=torch.from_numpy(rows.episode).to(device),
-        step=torch.from_numpy(rows.step).to(device),
-        lengths=torch.from_numpy(rows.lengths),
-    )
-
-
-@dataclass(frozen=True)
-class _Labels:
-    """Rows to be filled: pieces that are joined in the end would need twice the memory."""
-
-    slots: Tensor
-    imagined: Tensor
-    latents: Tensor
-
-    @classmethod
-    def empty(cls, count: int, slot: Sequence[int], width: int, device: torch.device | str) -> _Labels:
-        return cls(*(torch.empty(count, *size, device=device) for size in (slot, slot, (width,))))
-
-    def fill(self, places: Tensor, parsed: Tensor, imagined: Tensor, latents: Tensor) -> None:
-        """Those of a batch of episodes (B, T, ...) that have a place (B, T); -1 has none."""
-        kept = (places >= 0).to(parsed.device)
-        at = places[places >= 0].to(parsed.device)
-        self.slots[at], self.imagined[at], self.latents[at] = parsed[kept], imagined[kept], latents[kept]
-
-
-def _label(
-    model: WorldModel,
-    source: EpisodeFrames,
-    slots: npt.NDArray[np.float32],
-    frames: npt.NDArray[np.int64],
-    device: torch.device | str,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Parsed and imagined slots (B, T, N, D) and latents (B, T, Z) of episodes of equal length, frames (B, T + 1)."""
-    read = slots[frames]
-    note_read(read.nbytes)
-    parsed, actions = torch.from_numpy(read).to(device), None
-    if model.inverse_dynamics.config.mode == "ground_truth":
-        actions = torch.from_numpy(source.require_actions()[frames[:, :-1]]).to(device)
-    latent = model.inverse_dynamics(parsed, actions)
-    rolled = model.predictor.rollout(parsed[:, :1], latent.prototype, latent.variability)
-    return parsed[:, :-1], torch.cat((parsed[:, :1], rolled[:, :-1]), dim=1), latent.mean
-
-
-def with_copies(demos: Sequence[Demonstrations]) -> Demonstrations:
-    """Demonstrations and shifted copies of them, labelled one by one, as one set.
-
-    Args:
-        demos: the originals first; of each the transitions in which it moves.
-    """
-    first, *copies = demos
-    if not copies:
-        return first
-    return Demonstrations(
-        slots=torch.cat([copy.slots for copy in demos]),
-        imagined=torch.cat([copy.imagined for copy in demos]),
-        latents=torch.cat([copy.latents for copy in demos]),
-        actions=None if first.actions is None else torch.cat([copy.require_actions() for copy in demos]),
-        episode=torch.cat([copy.episode for copy in demos]),
-        step=torch.cat([copy.step for copy in demos]),
-        lengths=first.lengths,
-    )

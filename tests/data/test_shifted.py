@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from playslot_rl.data.demonstrations import Demonstrations, first_demonstrations, transitions, with_copies
+from playslot_rl.data.demonstrations import Demonstrations, first_demonstrations, transitions
+from playslot_rl.data.labels import with_copies
 from playslot_rl.data.shifts import DIRECTIONS, shift_frames, shifted, shifted_copies
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames, concatenate, open_source

@@ -9,13 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from playslot_rl.data.demonstrations import (
-    Demonstrations,
-    label_demonstrations,
-    moving_frames,
-    moving_slots,
-    with_copies,
-)
+from playslot_rl.data.demonstrations import Demonstrations, moving_frames, moving_slots
+from playslot_rl.data.labels import label_demonstrations, with_copies
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.trimming import moving_rows, slot_motion
 from playslot_rl.errors import DataError
@@ -119,7 +114,7 @@ def test_shifted_copies_are_trimmed_each_by_its_own_motion() -> None:
 def test_labels_are_filled_in_whatever_the_lengths_and_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     source = video([[1, 1, 0], [0, 1, 0, 0, 1], [1, 0, 1], [1]])
     whole = labels(source, 0.01)
-    monkeypatch.setattr("playslot_rl.data.demonstrations.BATCH", 1)
+    monkeypatch.setattr("playslot_rl.data.labels.BATCH", 1)
     monkeypatch.setattr("playslot_rl.data.demonstrations.FRAMES_AT_ONCE", 2)
     alone = labels(source, 0.01)
     for name in ("slots", "imagined", "latents"):
