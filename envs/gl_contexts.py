@@ -89,16 +89,13 @@ def _enter(context: Any) -> None:
 def _give_back(context: Any) -> None:
     from mujoco.egl import EGL
 
-    try:
-        _enter(context)
-    except RuntimeError:
-        context.free()
-        return
-    EGL.eglReleaseThread()
     if len(_free) < KEPT:
-        _free.append((os.getpid(), context))
-    else:
-        context.free()
+        with contextlib.suppress(RuntimeError):
+            _enter(context)
+            EGL.eglReleaseThread()
+            _free.append((os.getpid(), context))
+            return
+    context.free()
 
 
 @functools.cache

@@ -160,17 +160,18 @@ def adopt_policy(config: ExperimentConfig, record: StageRecord, steps: int) -> N
 
 
 def cloned(
-    name: str, split: DemonstrationSplit, rows: int, whole: int, labelled: int | None = None
+    name: str, split: DemonstrationSplit, rows: int, labelled: int | None = None, views: int = 1
 ) -> tuple[str, dict[str, Any]]:
     """What a stage that clones demonstrations says of them: its closing line, less its folder, and for `meta.json`.
 
     Args:
         name: of the stage.
         split: the demonstrations; those of one frame show nothing and are not counted.
-        rows, whole: how many of their rows trimming left, of how many.
+        rows: how many of their rows trimming left.
         labelled: how many of them showed their actions; None: all.
+        views: shifted copies that were cloned with them, and they themselves.
     """
-    demos, kept = int((split.trained.lengths >= 2).sum()), rows / whole
+    demos, kept = int((split.trained.lengths >= 2).sum()), rows / (views * int((split.trained.lengths - 1).sum()))
     shown = "all" if labelled is None else str(labelled)
     held_out = "none" if split.held_out is None else str(split.held_out.episodes)
     line = f"{name}: {demos} demos, {100 * kept:.0f} % of their rows kept, {shown} labelled, {held_out} held out"

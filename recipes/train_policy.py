@@ -99,7 +99,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
     def label(frames: EpisodeFrames, slots: SlotRows) -> Demonstrations:
         return label_demonstrations(world, frames, slots, device, behaviour.trim, behaviour.trim_margin)
 
-    demos, whole = with_copies([label(*view) for view in views]), len(views) * int((split.trained.lengths - 1).sum())
+    demos = with_copies([label(*view) for view in views])
     held_out = next((label(*view) for view in others), None)
     horizon = trained_horizon(record.parents["dynamics"])
     demos.labelled(behaviour.labelled_demos)  # none that say anything are refused before anything is trained
@@ -121,7 +121,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
             both = FinetuneStage(clone.stages["policy"], agent.action_decoder, demos, behaviour, held_out, horizon)
             yield _part("finetune", both, behaviour, behaviour.finetune_steps, behaviour.finetune_lr)
 
-    said, extra = cloned("policy", split, len(demos.slots), whole, behaviour.labelled_demos)
+    said, extra = cloned("policy", split, len(demos.slots), behaviour.labelled_demos, len(views))
     return Training(
         parts(),
         device,

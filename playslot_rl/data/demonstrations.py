@@ -7,6 +7,7 @@ F frames, H W image height and width.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +23,8 @@ from playslot_rl.errors import DataError
 from playslot_rl.frames import to_float
 
 FRAMES_AT_ONCE = 1024
+MotionOf = Callable[[npt.NDArray[np.int64]], Tensor]
+"""The motion (M,) of the transitions from some rows (M,)."""
 DRAW_STREAM = 14
 """Keeps the draws of demonstrations apart from what else a seed draws."""
 TEST_STREAM = 0x7E57
@@ -263,11 +266,16 @@ class Transitions:
     step: npt.NDArray[np.int64]
     lengths: npt.NDArray[np.int64]
 
-    def trimmed(self, motion: Tensor, threshold: float, margin: int, key: str) -> Transitions:
-        """Without the stretches in which nothing moves (`moving_rows`); all of them where `threshold` is 0."""
+    def trimmed(self, motion: MotionOf, threshold: float, margin: int, key: str) -> Transitions:
+        """Without the stretches in which nothing moves (`moving_rows`); all of them where `threshold` is 0.
+
+        `motion` is asked for some rows at a time: what it reads of a large data set would not fit.
+        """
         if not threshold:
             return self
-        kept = moving_rows(motion, torch.from_numpy(self.step), threshold, margin, key).numpy()
+        parts = np.array_split(self.rows, -(-len(self.rows) // FRAMES_AT_ONCE))
+        moved = torch.cat([motion(rows) for rows in parts])
+        kept = moving_rows(moved, torch.from_numpy(self.step), threshold, margin, key).numpy()
         return replace(self, rows=self.rows[kept], episode=self.episode[kept], step=self.step[kept])
 
 
@@ -277,31 +285,27 @@ def moving_frames(source: EpisodeFrames, threshold: float, margin: int) -> Trans
     Raises:
         DataError: nothing is left, or no episode has two frames.
     """
-    moves = transitions(source)
-    if not threshold:
-        return moves
-    motion = []
-    for rows in np.array_split(moves.rows, -(-len(moves.rows) // FRAMES_AT_ONCE)):
+
+    def motion(rows: npt.NDArray[np.int64]) -> Tensor:
         here, after = (to_float(np.asarray(source.frames[at]), "cpu") for at in (rows, rows + 1))
-        motion.append((after - here).square().mean(dim=(-3, -2, -1)).sqrt())
-    return moves.trimmed(torch.cat(motion), threshold, margin, "behaviour.trim_pixels")
+        return (after - here).square().mean(dim=(-3, -2, -1)).sqrt()
+
+    return transitions(source).trimmed(motion, threshold, margin, "behaviour.trim_pixels")
 
 
-def moving_slots(source: EpisodeFrames, slots: npt.NDArray[np.float32], threshold: float, margin: int) -> Transitions:
-    """Transitions of a data set in which its slots (F, N, D) move: `slot_motion` above `threshold`.
+def moving_slots(moves: Transitions, slots: npt.NDArray[np.float32], threshold: float, margin: int) -> Transitions:
+    """Those transitions in which the slots (F, N, D) move: `slot_motion` above `threshold`.
 
     Raises:
-        DataError: nothing is left, or no episode has two frames.
+        DataError: nothing is left.
     """
-    moves = transitions(source)
-    if not threshold:
-        return moves
-    motion = []
-    for rows in np.array_split(moves.rows, -(-len(moves.rows) // FRAMES_AT_ONCE)):
+
+    def motion(rows: npt.NDArray[np.int64]) -> Tensor:
         pairs = slots[np.stack((rows, rows + 1), axis=1)]
         note_read(pairs.nbytes)
-        motion.append(slot_motion(torch.from_numpy(pairs))[:, 0])
-    return moves.trimmed(torch.cat(motion), threshold, margin, "behaviour.trim")
+        return slot_motion(torch.from_numpy(pairs))[:, 0]
+
+    return moves.trimmed(motion, threshold, margin, "behaviour.trim")
 
 
 def transitions(source: EpisodeFrames) -> Transitions:

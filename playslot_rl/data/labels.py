@@ -49,7 +49,7 @@ def label_demonstrations(
             width.
     """
     moves = transitions(source)
-    moving = moving_slots(source, slots, trim, margin)
+    moving = moving_slots(moves, slots, trim, margin)
     first, episodes = np.cumsum(moves.lengths) - moves.lengths, np.nonzero(source.lengths >= 2)[0]
     of_kept = np.full(len(moves.rows), -1)  # where each transition goes; -1: nowhere
     of_kept[first[moving.episode] + moving.step] = np.arange(len(moving.rows))

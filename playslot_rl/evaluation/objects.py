@@ -24,6 +24,7 @@ from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_se
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.evaluation.video import video_metrics
 from playslot_rl.frames import to_float
+from playslot_rl.modules.savi.health import owners
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.training.runs import world_model_checkpoints
 from playslot_rl.world_model import WorldModel, module_device
@@ -85,7 +86,7 @@ def parse_clips(model: WorldModel, frames: npt.NDArray[np.uint8]) -> Parsed:
 
     return Parsed(
         slots=slots,
-        labels=decoded.masks[:, :, :, 0].argmax(2).cpu().numpy(),
+        labels=owners(decoded.masks).cpu().numpy(),
         reconstructed=decoded.frames,
         prototypes=per_slot(latent.prototype),
         latents=per_slot(latent.mean),

@@ -18,6 +18,7 @@ from torch import Tensor
 from playslot_rl import keys
 from playslot_rl.acting.imagination import ImaginationSession
 from playslot_rl.frames import to_uint8
+from playslot_rl.modules.savi.health import owners
 from playslot_rl.play.planner_driver import PlannerDriver
 from playslot_rl.play.starts import Start
 from playslot_rl.play.steering import Driver, PolicyDriver, require_prototypes, variability_directions
@@ -295,7 +296,7 @@ class PlaySession:
         """The frame of a state, which becomes the present moment's look."""
         decoded = self.world_model.savi.decode(state[keys.SLOTS][0])
         frame: Frame = to_uint8(decoded.frames)
-        owner = np.asarray(present)[decoded.masks[:, 0].argmax(0).cpu().numpy()]
+        owner = np.asarray(present)[owners(decoded.masks).cpu().numpy()]
         objects = decoded.rgb.clamp(0, 1) * decoded.masks + (1 - decoded.masks)
         self._look = (number, Look(frame, owner, to_uint8(objects)))
         return frame

@@ -122,7 +122,7 @@ def _oracle(config: ExperimentConfig, record: StageRecord) -> Training:
 
     own, device, split = config.baselines.caddy_oracle, open_device(config), record.demos
     stage = oracle_stage(config, record.parents[MODEL], split, device)
-    said, extra = cloned(record.name, split, len(stage.targets), int((split.trained.lengths - 1).sum()))
+    said, extra = cloned(record.name, split, len(stage.targets))
     return Training(
         [Part(f"{record.name}.policy", stage, own.policy, lr_key=f"baselines.{record.name}.policy.optim.lr")],
         device,

@@ -97,8 +97,7 @@ def cloning(
         )
 
     adopt_policy(config, record, policy.steps)
-    whole = int((split.trained.lengths - 1).sum())
-    said, extra = cloned(name, split, len(behaviour.trained.actions), whole, config.behaviour.labelled_demos)
+    said, extra = cloned(name, split, len(behaviour.trained.actions), config.behaviour.labelled_demos)
     return Training(
         parts(),
         behaviour.device,

@@ -60,7 +60,7 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
     def moving(source: EpisodeFrames) -> Transitions:
         return moving_frames(source, behaviour.trim_pixels, behaviour.trim_margin)
 
-    moves, whole = moving(split.trained), int((split.trained.lengths - 1).sum())
+    moves = moving(split.trained)
     inputs, actions = demonstrated_frames(split.trained, moves, width, device, own.shift)
     held_out = split.held_out
     with global_seed(config.seed, 0, NAME):
@@ -80,7 +80,7 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
         precision=own.precision,
     )
     patience = Patience(own.patience, f"unexplained{HELD_OUT}") if own.patience and held_out is not None else None
-    said, extra = cloned(NAME, split, len(moves.rows), whole)
+    said, extra = cloned(NAME, split, len(moves.rows))
     return Training(
         [Part(f"baselines.{NAME}", stage, own, patience=patience)],
         device,

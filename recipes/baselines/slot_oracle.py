@@ -59,7 +59,7 @@ def main(config: ExperimentConfig) -> None:
 def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Training:
     import torch
 
-    from playslot_rl.data.demonstrations import moving_slots, real_actions
+    from playslot_rl.data.demonstrations import moving_slots, real_actions, transitions
     from playslot_rl.modules.policy import LatentPolicy
     from playslot_rl.seeding import global_seed
     from playslot_rl.training.fit import Part
@@ -76,17 +76,16 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
     behaviour = config.behaviour
 
     def examples(views: list[ParsedVideos]) -> tuple[Tensor, Tensor]:
-        moving = [moving_slots(*view, behaviour.trim, behaviour.trim_margin) for view in views]
-        rows = [moves.rows for moves in moving]
+        trim, margin = behaviour.trim, behaviour.trim_margin
+        rows = [moving_slots(transitions(frames), cached, trim, margin).rows for frames, cached in views]
         slots = [torch.from_numpy(cached[at]) for (_, cached), at in zip(views, rows, strict=True)]
         actions = [real_actions(frames, at, width) for (frames, _), at in zip(views, rows, strict=True)]
         return torch.cat(slots).to(device), torch.cat(actions).to(device)
 
     views, others = demonstration_views(config, split, savi, record.prints["slots"])
     slots, actions = examples(views)
-    whole = len(views) * int((split.trained.lengths - 1).sum())
     stage = oracle_stage(oracle, slots, actions, behaviour, examples(others) if others else None)
-    said, extra = cloned(record.name, split, len(slots), whole)
+    said, extra = cloned(record.name, split, len(slots), views=len(views))
     return Training(
         [Part(record.name, stage, config.behaviour, lr_key="behaviour.optim.lr")],
         device,

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from playslot_rl.data.demonstrations import Demonstrations, moving_frames, moving_slots
+from playslot_rl.data.demonstrations import Demonstrations, moving_frames, moving_slots, transitions
 from playslot_rl.data.labels import label_demonstrations, with_copies
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.trimming import moving_rows, slot_motion
@@ -71,7 +71,7 @@ def test_a_threshold_that_leaves_nothing_is_refused() -> None:
 def test_slots_and_frames_that_move_together_are_trimmed_alike() -> None:
     source = video([[1, 1, 0, 0, 0], [0, 0, 1, 0]])
     by_frames = moving_frames(source, 0.01, 1)
-    by_slots = moving_slots(source, slots_of(source), 0.01, 1)
+    by_slots = moving_slots(transitions(source), slots_of(source), 0.01, 1)
     assert by_frames.rows.tolist() == by_slots.rows.tolist() == [0, 1, 2, 8, 9]
     assert by_frames.episode.tolist() == [0, 0, 0, 1, 1]
     assert by_frames.step.tolist() == [0, 1, 2, 2, 3]
