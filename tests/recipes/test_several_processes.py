@@ -168,30 +168,32 @@ def test_a_rank_that_dies_ends_the_others_with_its_error_in_one_line(
     assert done.lines() == ["playslot train-slots (rank 1): error: slots: got a rank that fails, expected none"]
 
 
-def _rank_one_is_killed() -> None:
-    """After the first checkpoint, of its fourth step."""
-    real = SlotsStage.loss
+def _rank_one_is_killed(run: Path, killed: Path) -> Callable[[], None]:
+    """After the first checkpoint is written, which rank 0 does while the other goes on; says when in `killed`."""
 
-    def loss(stage: SlotsStage, step: int, generators: StepGenerators) -> object:
-        if step == 4 and os.environ["RANK"] == "1":
-            os.kill(os.getpid(), signal.SIGKILL)
-        return real(stage, step, generators)
+    def patch() -> None:
+        real = SlotsStage.loss
 
-    SlotsStage.loss = loss  # type: ignore[method-assign, assignment]
+        def loss(stage: SlotsStage, step: int, generators: StepGenerators) -> object:
+            if step == 4 and os.environ["RANK"] == "1":
+                while not list((run / "slots" / "checkpoints").glob("step_*")):
+                    time.sleep(0.02)
+                killed.write_text(str(time.monotonic()))
+                os.kill(os.getpid(), signal.SIGKILL)
+            return real(stage, step, generators)
+
+        SlotsStage.loss = loss  # type: ignore[method-assign, assignment]
+
+    return patch
 
 
 def test_a_rank_that_is_killed_ends_the_others_within_seconds(
     launch: Callable[..., Launched], tmp_path: Path, videos: Path
 ) -> None:
-    run = tmp_path / "run"
-    done = launch(*slots(run, videos, *LONG), patch=_rank_one_is_killed)
-    deadline = time.monotonic() + SOON_S
-    while not list((run / "slots" / "checkpoints").glob("step_*")):  # of step 4, the last one before
-        assert time.monotonic() < deadline, done.log.read_text()
-        time.sleep(0.02)
-    began = time.monotonic()
+    run, killed = tmp_path / "run", tmp_path / "killed"
+    done = launch(*slots(run, videos, *LONG), patch=_rank_one_is_killed(run, killed))
     assert done.end() != 0
-    assert time.monotonic() - began < 20
+    assert time.monotonic() - float(killed.read_text()) < 20
 
 
 def test_an_error_of_all_ranks_is_said_once(launch: Callable[..., Launched], tmp_path: Path, videos: Path) -> None:
