@@ -21,6 +21,14 @@ def quantise(pixels: Tensor) -> Tensor:
     return pixels if pixels.dtype == torch.uint8 else pixels.detach().clamp(0, 1).mul(255).round().to(torch.uint8)
 
 
+def psnr(mse: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio (dB) of mean squared errors on frames in [0, 1], of any shape.
+
+    1e-8 is added to each, as the authors do: equal frames have 80 dB.
+    """
+    return -10 * (mse + 1e-8).log10()
+
+
 def to_float(frames: npt.NDArray[np.uint8], device: torch.device | str = "cpu") -> Tensor:
     """Pictures (..., H, W, 3) uint8 to what networks take: (..., 3, H, W) float32."""
     return normalise(torch.from_numpy(np.array(frames)).to(device).movedim(-1, -3))

@@ -20,7 +20,7 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.stride import ChosenFrames
 from playslot_rl.data.trimming import moving_rows, slot_motion
 from playslot_rl.errors import DataError
-from playslot_rl.frames import to_float
+from playslot_rl.frames import normalise
 
 FRAMES_AT_ONCE = 1024
 MotionOf = Callable[[npt.NDArray[np.int64]], Tensor]
@@ -287,8 +287,8 @@ def moving_frames(source: EpisodeFrames, threshold: float, margin: int) -> Trans
     """
 
     def motion(rows: npt.NDArray[np.int64]) -> Tensor:
-        here, after = (to_float(np.asarray(source.frames[at]), "cpu") for at in (rows, rows + 1))
-        return (after - here).square().mean(dim=(-3, -2, -1)).sqrt()
+        pairs = normalise(source.pixels(np.stack((rows, rows + 1), axis=1)))
+        return (pairs[:, 1] - pairs[:, 0]).square().mean(dim=(-3, -2, -1)).sqrt()
 
     return transitions(source).trimmed(motion, threshold, margin, "behaviour.trim_pixels")
 

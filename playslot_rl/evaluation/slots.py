@@ -23,7 +23,7 @@ from playslot_rl.episode_seeds import episode_seed
 from playslot_rl.evaluation.objects import adjusted_rand_index
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
 from playslot_rl.evaluation.success import hardware
-from playslot_rl.frames import to_float
+from playslot_rl.frames import psnr, to_float
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.modules.savi.health import owners
 from playslot_rl.storage.atomic import write_json
@@ -90,12 +90,11 @@ def score_slots(savi: SAVi, episodes: Iterable[Segmented], seeds: Sequence[int])
         real = to_float(frames[None], device)
         decoded = savi.decode(savi(real, generator=torch.Generator(device).manual_seed(seed))[0])
         found = owners(decoded.masks[0]).cpu().numpy()
-        error = float((decoded.frames - real).square().mean())
         scores.append(
             (
                 adjusted_rand_index(truth, found),
                 adjusted_rand_index(truth, found, foreground=True),
-                -10.0 * float(np.log10(max(error, 1e-12))),
+                float(psnr((decoded.frames - real).square().mean())),
                 slots_per_object(truth, found, savi.config.n_slots),
             )
         )

@@ -10,6 +10,8 @@ from typing import Final, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from playslot_rl.frames import psnr
+
 BORDER: Final = 5
 """Pixels a side whose SSIM window, 11 wide, leaves the frame: not counted, as the authors' `piqa` does not."""
 
@@ -57,9 +59,8 @@ def frame_scores(predicted: Tensor, target: Tensor, lpips: nn.Module | None = No
         ValueError: the shapes differ, are not those of clips, or frames are too small for SSIM's window.
 
     Note:
-        The PSNR of each frame is taken before the mean, as in the paper; that of the mean error would be lower. 1e-8
-        is added to its error, as the authors do, and SSIM leaves the borders out, which torchmetrics' own mean does
-        not.
+        The PSNR of each frame is taken before the mean, as in the paper; that of the mean error would be lower. SSIM
+        leaves the borders out, which torchmetrics' own mean does not.
     """
     if predicted.shape != target.shape or predicted.ndim != 5:
         raise ValueError(
@@ -71,15 +72,15 @@ def frame_scores(predicted: Tensor, target: Tensor, lpips: nn.Module | None = No
 
     shape = predicted.shape[:2]
     a, r = predicted.clamp(0, 1).flatten(0, 1).float(), target.clamp(0, 1).flatten(0, 1).float()
-    psnr = -10 * ((a - r).square().mean(dim=(1, 2, 3)) + 1e-8).log10()
+    decibels = psnr((a - r).square().mean(dim=(1, 2, 3)))
     _, full = structural_similarity_index_measure(a, r, data_range=1.0, reduction="none", return_full_image=True)
     inner = slice(BORDER, -BORDER)
     ssim = full[..., inner, inner].mean(dim=(1, 2, 3))
     distance = None if lpips is None else lpips(a, r, normalize=True).flatten().reshape(shape)
-    return FrameScores(psnr.reshape(shape), ssim.reshape(shape), distance)
+    return FrameScores(decibels.reshape(shape), ssim.reshape(shape), distance)
 
 
 def video_metrics(predicted: Tensor, target: Tensor) -> VideoMetrics:
     """Means of `frame_scores`, which says what they take and refuse."""
-    psnr, ssim, _ = frame_scores(predicted, target)
-    return VideoMetrics(float(psnr.mean()), float(ssim.mean()), psnr.mean(0).tolist(), ssim.mean(0).tolist())
+    decibels, ssim, _ = frame_scores(predicted, target)
+    return VideoMetrics(float(decibels.mean()), float(ssim.mean()), decibels.mean(0).tolist(), ssim.mean(0).tolist())

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from playslot_rl.frames import psnr
 from playslot_rl.shares import averaged
 
 
@@ -23,6 +24,6 @@ def total_loss(losses: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
     return torch.stack(parts).sum()
 
 
-def psnr(mse: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio in dB of a mean squared error on frames in [0, 1]; that of the global batch."""
-    return -10 * averaged(mse.detach()).clamp(min=1e-12).log10()
+def batch_psnr(mse: Tensor) -> Tensor:
+    """`playslot_rl.frames.psnr` of a mean squared error, that of the global batch."""
+    return psnr(averaged(mse.detach()))

@@ -18,7 +18,7 @@ from torchrl.objectives import LossModule
 from playslot_rl import keys
 from playslot_rl.config import DynamicsStageConfig
 from playslot_rl.frames import normalise
-from playslot_rl.losses.common import psnr
+from playslot_rl.losses.common import batch_psnr
 from playslot_rl.modules.inverse_dynamics import InverseDynamics, LatentActions
 from playslot_rl.modules.predictors import Predictor
 from playslot_rl.modules.quantizer import usage
@@ -161,7 +161,7 @@ class DynamicsLoss(LossModule):
                 "loss_vq": config.vq_weight * latent.vq_loss,
                 "mse_image": mse_image.detach(),
                 "mse_slot": mse_slot.detach(),
-                "psnr": psnr(mse_image),
+                "psnr": batch_psnr(mse_image),
                 "usage": used,
                 "perplexity": perplexity,
             },

@@ -26,7 +26,7 @@ from torchrl.objectives import LossModule
 
 from playslot_rl import keys
 from playslot_rl.frames import normalise
-from playslot_rl.losses.common import psnr
+from playslot_rl.losses.common import batch_psnr
 from playslot_rl.modules.savi import Decoded, SAVi
 from playslot_rl.modules.savi.health import moves
 
@@ -90,7 +90,7 @@ class SlotsLoss(LossModule):
         if self.motion_weight:
             weight = 1.0 + self.motion_weight * moving(frames)
             loss = ((weight * error.mean(2)).sum((1, 2, 3)) / weight.sum((1, 2, 3))).mean()
-        return TensorDict({"loss_reconstruction": loss, "psnr": psnr(mse)}, [])
+        return TensorDict({"loss_reconstruction": loss, "psnr": batch_psnr(mse)}, [])
 
     def reconstruct(
         self, tensordict: TensorDictBase, generator: torch.Generator | None = None

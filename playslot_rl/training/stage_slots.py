@@ -15,7 +15,7 @@ from playslot_rl.colours import segmentation
 from playslot_rl.config import SlotsStageConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.errors import CheckpointError
-from playslot_rl.frames import to_uint8
+from playslot_rl.frames import psnr, to_uint8
 from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.modules.savi import Decoded, SAVi
 from playslot_rl.modules.savi.health import SlotHealth
@@ -77,7 +77,7 @@ class SlotsStage:
             health.join(part)
         mse = float(np.mean(errors))
         known = self.segmented(self.savi) if self.segmented is not None else {}
-        return {"mse": mse, "psnr": -10.0 * float(np.log10(max(mse, 1e-12))), **health.values(), **known}
+        return {"mse": mse, "psnr": float(psnr(torch.tensor(mse))), **health.values(), **known}
 
     def warnings(self, step: int, values: Mapping[str, float]) -> Mapping[str, str]:
         """What the last validation says is wrong with the slots, and the known cure; nothing in the first quarter, in

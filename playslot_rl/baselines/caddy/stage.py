@@ -25,7 +25,7 @@ from playslot_rl.baselines.caddy.model import CADDY
 from playslot_rl.baselines.caddy.perceptual import load_perceptual
 from playslot_rl.config.video import CADDYConfig
 from playslot_rl.data.windows import Clips, IntArray
-from playslot_rl.frames import normalise
+from playslot_rl.frames import normalise, psnr
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.precision import autocast
 from playslot_rl.processes import spread
@@ -95,7 +95,7 @@ class CADDYStage:
         error, p = torch.cat(errors), torch.cat(real)
         used, perplexity = usage(p.argmax(dim=-1), self.config.actions)
         return {
-            "psnr": float(-10 * (error + 1e-8).log10().mean()),
+            "psnr": float(psnr(error).mean()),
             "mse": float(error.mean()),
             "usage": float(used),
             "perplexity": float(perplexity),

@@ -14,15 +14,12 @@ from playslot_rl.baselines.svg.loss import draw_steps, gaussian_kl, svg_objectiv
 from playslot_rl.baselines.svg.model import SVG
 from playslot_rl.config.video import SVGConfig
 from playslot_rl.data.windows import Clips, IntArray
-from playslot_rl.frames import normalise
+from playslot_rl.frames import normalise, psnr
 from playslot_rl.precision import autocast
 from playslot_rl.processes import spread
 from playslot_rl.seeding import StepGenerators, step_generator
 from playslot_rl.shares import own_rows
 from playslot_rl.world_model import module_device
-
-MSE_FLOOR = 1e-8
-"""Added to a frame's error before the logarithm: identical frames have 80 dB."""
 
 
 class SVGStage:
@@ -71,9 +68,9 @@ class SVGStage:
         inferred, drawn, divergence = zip(*spread(self.clips.validation_batches(), look), strict=True)
         mse = torch.cat(inferred)
         return {
-            "psnr": _psnr(mse),
+            "psnr": float(psnr(mse).mean()),
             "mse": float(mse.mean()),
-            "psnr_prior": _psnr(torch.cat(drawn)),
+            "psnr_prior": float(psnr(torch.cat(drawn)).mean()),
             "kl": float(torch.cat(divergence).mean()),
         }
 
@@ -85,8 +82,3 @@ def _errors(predicted: Tensor, frames: Tensor) -> Tensor:
     """Mean squared error of each predicted frame (B, T - S), against the last ones of the clips."""
     target = frames[:, -predicted.shape[1] :]
     return (predicted.clamp(0, 1) - target).square().mean(dim=(-3, -2, -1))
-
-
-def _psnr(mse: Tensor) -> float:
-    """Mean PSNR in dB of frames with these errors."""
-    return float((-10 * (mse + MSE_FLOOR).log10()).mean())
