@@ -283,8 +283,10 @@ class FinetuneStage:
         horizon: int | None = None,
     ) -> None:
         policy = clone.criterion.network
-        self.clone, self.both = clone, _Both(policy, decoder)
-        networks = [self.both, *([_Both(policy, decoder, blind=True)] if decoder.reads_slots else [])]
+        self.clone, self.policy, self.decoder = clone, policy, decoder
+        # As they act: in imagination the decoder is given no slots, in simulation those that it trusts.
+        seeing = decoder.reads_slots and bool(decoder.trusts_slots)
+        networks = [*([_Both(policy, decoder)] if seeing else []), _Both(policy, decoder, blind=True)]
 
         def examples(demos: Demonstrations, noise: float) -> Examples:
             actions = demos.require_actions()
@@ -308,7 +310,7 @@ class FinetuneStage:
     @property
     def modules(self) -> Mapping[str, nn.Module]:
         """Policy and action decoder."""
-        return {"policy": self.both.policy, "action_decoder": self.both.decoder}
+        return {"policy": self.policy, "action_decoder": self.decoder}
 
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         """Errors of actions and of latents."""

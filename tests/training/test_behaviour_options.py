@@ -122,6 +122,17 @@ def test_fine_tuning_learns_actions_and_goes_on_cloning() -> None:
     assert after["unexplained"] < after["unexplained_held_out"]
 
 
+def test_slots_that_are_not_trusted_are_not_tuned_on() -> None:
+    policy, decoder = networks()
+    decoder.trusts_slots.fill_(False)
+    demos, config = demonstrations("slots"), replace(CONFIG, imagined=False)
+    clone = CloneStage(policy, None, demos, cloning_settings(config))
+    before = deepcopy(decoder.state_dict())
+    train(FinetuneStage(clone.stages["policy"], decoder, demos, config), 3)
+    changed = {name.partition(".")[0] for name, value in decoder.state_dict().items() if not value.equal(before[name])}
+    assert changed == {"layers"}
+
+
 def test_what_decides_the_policy_says_nothing_of_labels_and_decoder() -> None:
     other = replace(
         CONFIG, labelled_demos=3, decoder_state=False, decoder_steps=7, finetune_steps=9, policy_from="elsewhere"
