@@ -256,7 +256,8 @@ class DecoderStage(RegressionStage):
 
 
 class FinetuneStage:
-    """Policy and decoder together on real actions, L_a(D_a(f_pi(S_t), S_t)), while the policy goes on cloning: + L_pi.
+    """Policy and decoder together on real actions, L_a(D_a(f_pi(S_t))), while the policy goes on cloning: + L_pi; where
+    the decoder trusts slots, L_a(D_a(f_pi(S_t), S_t)) too.
 
     Note: not in the paper, whose decoder is trained beside a finished policy. The cloning term keeps the policy's
     latents what the predictor understands.
