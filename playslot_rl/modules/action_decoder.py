@@ -68,6 +68,11 @@ class ActionDecoder(nn.Module):
         """Whether `forward` wants slots."""
         return self.encoder is not None
 
+    @property
+    def acts_on_slots(self) -> bool:
+        """Whether it reads slots and has learned enough from them to be trusted: without, it acts on z alone."""
+        return self.reads_slots and bool(self.trusts_slots)
+
     @torch.no_grad()
     def standardise(self, z: Tensor) -> None:
         """Take mean and scale, or the whitening, from latent actions (M, Z).
@@ -85,7 +90,7 @@ class ActionDecoder(nn.Module):
     def forward(self, z: Tensor, slots: Tensor | None = None) -> Tensor:
         """Latent actions (..., Z), and slots (..., N, D) if it reads them and there are some, to actions (..., A)."""
         inputs = (z - self.mean) / self.scale if self.whitening is None else self.whitening(z)
-        if self.encoder is None or slots is None or not (self.training or bool(self.trusts_slots)):
+        if self.encoder is None or slots is None or not (self.training or self.acts_on_slots):
             return torch.tanh(self.layers(inputs))
         state = self.encoder(slots)
         if self.training and self.dropout:

@@ -285,9 +285,8 @@ class FinetuneStage:
     ) -> None:
         policy = clone.criterion.network
         self.clone, self.policy, self.decoder = clone, policy, decoder
-        # As they act: in imagination the decoder is given no slots, in simulation those that it trusts.
-        seeing = decoder.reads_slots and bool(decoder.trusts_slots)
-        networks = [*([_Both(policy, decoder)] if seeing else []), _Both(policy, decoder, blind=True)]
+        # In imagination the decoder is given no slots.
+        networks = [*([_Both(policy, decoder)] if decoder.acts_on_slots else []), _Both(policy, decoder, blind=True)]
 
         def examples(demos: Demonstrations, noise: float) -> Examples:
             actions = demos.require_actions()

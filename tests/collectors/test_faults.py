@@ -158,7 +158,7 @@ def test_second_process_is_refused_and_a_dead_ones_lock_is_free(
         began = time.monotonic()
         with pytest.raises(OutputError, match="got another process collecting into it"):
             small(out, 3)
-        assert time.monotonic() - began < 60
+        assert time.monotonic() - began < 5.0
         assert journal.missing() == []
         first.kill()
     small(out, 3)

@@ -80,7 +80,7 @@ def test_a_run_killed_by_the_system_ends_with_the_same_weights(tmp_path: Path) -
     command = [sys.executable, str(script), str(tmp_path / "killed"), "12", "0.1"]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(command, env=environment)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 60
     while not (tmp_path / "killed" / "checkpoints" / "step_00000003").exists():
         assert time.monotonic() < deadline
         assert process.poll() is None
