@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -147,16 +148,12 @@ def demonstration_views(
     return [(demos.trained, parse(demos.parsed)), *shifted_views], held_out
 
 
-def adopt_policy(config: ExperimentConfig, record: StageRecord, steps: int) -> None:
-    """Take over the finished policy training of the run `behaviour.policy_from` names, if it is the same one."""
-    from playslot_rl.processes import here, wait
+def adopted_policy(config: ExperimentConfig, record: StageRecord, steps: int) -> Callable[[], None] | None:
+    """What takes over the finished policy training of the run `behaviour.policy_from` names, if it is the same one."""
     from playslot_rl.training.runs import adopt_training
 
-    if config.behaviour.policy_from:
-        record.begin()
-        if here().first:
-            adopt_training(config.behaviour.policy_from, record.run, record.name, steps)
-        wait()
+    source = config.behaviour.policy_from
+    return partial(adopt_training, source, record.run, record.name, steps) if source else None
 
 
 def cloned(

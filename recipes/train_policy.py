@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import BehaviourStageConfig, ExperimentConfig, to_dict
 from playslot_rl.recipes.run import (
-    adopt_policy,
+    adopted_policy,
     cloned,
     demonstration_views,
     open_device,
@@ -60,12 +60,7 @@ def main(config: ExperimentConfig) -> None:
         ready=partial(use_world_model, run, parent),
     )
 
-    def prepare() -> Training:
-        training = _training(config, record, parent)
-        adopt_policy(config, record, config.behaviour.steps)
-        return training
-
-    run_stage(record, prepare)
+    run_stage(record, lambda: _training(config, record, parent))
 
 
 def behaviour_networks(config: ExperimentConfig) -> dict[str, Any]:
@@ -131,6 +126,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
             "held_out_demos": 0 if held_out is None else len(held_out.lengths),
             "data_root": record.roots,
         },
+        adopt=adopted_policy(config, record, behaviour.steps),
     )
 
 

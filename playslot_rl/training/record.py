@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import torch
 from torch import nn
@@ -21,6 +22,7 @@ from playslot_rl.data.weighted import weighted
 from playslot_rl.data.windows import Clips
 from playslot_rl.errors import CheckpointError, DataError
 from playslot_rl.processes import here, wait
+from playslot_rl.storage.atomic import explain_write_errors
 from playslot_rl.storage.checkpoints import (
     StageCheckpoint,
     checkpoint_folder,
@@ -30,8 +32,13 @@ from playslot_rl.storage.checkpoints import (
     save_stage,
     training_command,
 )
+from playslot_rl.storage.locks import locked
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.runs import store_config
+
+LOCK: Final = "training.lock"
+PATIENCE: Final = 10.0
+"""Seconds in which the children of a killed training end."""
 
 
 def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrames:
@@ -73,7 +80,7 @@ class StageRecord:
         parents: checkpoints it is trained on, by stage.
         role: of the data set, in the checkpoint, too: videos (`train`) or demonstrations (`demos`); empty for what
             learns by acting.
-        ready: called by `begin`; puts what the stage builds on into the run.
+        ready: called before the first step; puts what the stage builds on into the run.
     """
 
     name: str
@@ -172,17 +179,43 @@ class StageRecord:
                 data["data.shuffle_buffer"] = self.config.data.shuffle_buffer
         return {**self._of_stored(*self.counts), **data, **self.prints, **self.identity}
 
-    def begin(self) -> None:
-        """Make the folder a run, with the command's config and what the stage builds on.
+    @contextmanager
+    def training(self) -> Iterator[Callable[[], None]]:
+        """Keep other commands from training this stage of this run inside the block.
 
-        Called before the first step, when nothing speaks against it; until then nothing is written.
+        Yields:
+            What to call before the first step, when nothing speaks against it: it makes the folder a run, with the
+            command's config and what the stage builds on. Until then nothing is written but the lock, and that only
+            in a folder that is there.
 
         Raises:
-            OutputError: the folder cannot be written.
+            OutputError: another command trains it, or the folder cannot be written.
         """
-        if here().first:
-            store_config(self.config, self.run)
-            self.ready()
+        busy = (
+            f"out={self.run}: got a run whose {self.name} another command is training, expected none: wait for it, "
+            "or use another out="
+        )
+        with ExitStack() as held:
+
+            def hold() -> None:
+                with explain_write_errors(self.folder):
+                    self.folder.mkdir(parents=True, exist_ok=True)
+                held.enter_context(locked(self.folder / LOCK, busy, PATIENCE))
+
+            begun = self.folder.is_dir()
+            if begun and here().first:
+                hold()
+
+            def begin() -> None:
+                nonlocal begun
+                if here().first:
+                    if not begun:
+                        hold()
+                    begun = True
+                    store_config(self.config, self.run)
+                    self.ready()
+
+            yield begin
 
     def save(
         self,
@@ -240,6 +273,7 @@ class Training:
         line: the closing line, from the metrics.
         extra: more plain values for `meta.json`.
         identity: further plain values that a half-finished stage must share.
+        adopt: takes over another run's training before the first step; called by the first of several processes.
     """
 
     parts: Iterable[Part]
@@ -247,6 +281,7 @@ class Training:
     line: Callable[[Mapping[str, float]], str]
     extra: Mapping[str, Any] = field(default_factory=dict)
     identity: Mapping[str, Any] = field(default_factory=dict)
+    adopt: Callable[[], None] | None = None
 
 
 def run_stage(record: StageRecord, prepare: Callable[[], Training]) -> StageCheckpoint:
@@ -258,13 +293,23 @@ def run_stage(record: StageRecord, prepare: Callable[[], Training]) -> StageChec
 
     Raises:
         CheckpointError: it was begun or finished otherwise.
-        OutputError, TrainingError, KeyboardInterrupt: as `fit`.
+        OutputError: another command trains it, or as `fit`.
+        TrainingError, KeyboardInterrupt: as `fit`.
     """
     done = record.finished()
     wait()  # until all have looked
     if done is not None:
         return done
-    training = prepare()
+    with record.training() as begin:
+        return _train(record, prepare(), begin)
+
+
+def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -> StageCheckpoint:
+    if training.adopt is not None:
+        begin()
+        if here().first:
+            training.adopt()
+        wait()
     modules: dict[str, nn.Module] = {}
     metrics: dict[str, float] = {}
     steps, seconds = 0, 0.0
@@ -276,7 +321,7 @@ def run_stage(record: StageRecord, prepare: Callable[[], Training]) -> StageChec
             device=training.device,
             logging=record.config.logging,
             identity={**record.resumes(), **training.identity},
-            ready=record.begin,
+            ready=begin,
         )
         prefix = f"{part.folder}_" if part.folder else ""
         metrics |= {f"{prefix}{key}": value for key, value in state.metrics.items()}

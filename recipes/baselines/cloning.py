@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl.config import ExperimentConfig, StageConfig
 from playslot_rl.config.methods import LATENT_MODELS
-from playslot_rl.recipes.run import adopt_policy, cloned, require_parent
+from playslot_rl.recipes.run import adopted_policy, cloned, require_parent
 
 if TYPE_CHECKING:
     from playslot_rl.baselines.cloning import LatentCloning
@@ -96,11 +96,11 @@ def cloning(
             identity=labelled,
         )
 
-    adopt_policy(config, record, policy.steps)
     said, extra = cloned(name, split, len(behaviour.trained.actions), config.behaviour.labelled_demos)
     return Training(
         parts(),
         behaviour.device,
         lambda _: f"{said}, {record.folder}",
         extra={**extra, **labelled},
+        adopt=adopted_policy(config, record, policy.steps),
     )

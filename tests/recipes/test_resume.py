@@ -14,11 +14,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
-from commands import ONE_CORE, assert_one_line, contents, refused, smoke, weights
+from commands import ONE_CORE, assert_one_line, contents, playslot, refused, smoke, weights
 from torch import Tensor
 
 from playslot_rl import cli
 from playslot_rl.seeding import StepGenerators
+from playslot_rl.storage.locks import locked
+from playslot_rl.training import record
 from playslot_rl.training.stage_slots import SlotsStage
 
 LONG = {
@@ -108,6 +110,58 @@ def test_an_interrupt_is_one_line_and_the_same_command_carries_on(
         patch.setattr(SlotsStage, "loss", pressed)
         refused(*command, message="slots interrupted; the same command carries on from step 3 ", code=130)
     smoke(*command)
+    assert weights(run, "slots") == weights(shared_run, "slots")
+
+
+TRAININGS = {
+    "slots": ("train-slots",),
+    "dynamics": ("train-dynamics",),
+    "policy": ("train-policy",),
+    **{
+        method: ("train-baseline", f"method={method}")
+        for method in ("slot_oracle", "resnet_oracle", "lapo", "caddy_policy", "dreamer", "sold")
+    },
+}
+
+
+@pytest.mark.parametrize("stage", TRAININGS)
+def test_a_stage_that_another_command_trains_is_refused(
+    shared_run: Path, videos: Path, demos: Path, tmp_path: Path, stage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(record, "PATIENCE", 0.0)
+    run = tmp_path / "run"
+    folder = run / {"lapo": "lapo_model", "caddy_policy": "caddy"}.get(stage, stage)  # what each trains first
+    folder.mkdir(parents=True)
+    data = demos if stage not in ("slots", "dynamics") else videos
+    own = () if stage in ("slots", "resnet_oracle", "lapo", "dreamer") else (f"run={shared_run}",)
+    (run / "config.json").write_bytes((shared_run / "config.json").read_bytes())
+    before = contents(run).keys()
+    with locked(folder / record.LOCK):
+        busy = f"got a run whose {folder.name} another command is training, expected none: wait for it"
+        refused(*TRAININGS[stage], "preset=smoke", *own, f"out={run}", f"data.root={data}", message=busy)
+    assert contents(run).keys() == before | {f"{folder.name}/{record.LOCK}"}
+
+
+def test_a_new_run_is_one_commands_too(
+    shared_run: Path, videos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second command comes while the first trains; the first does not notice."""
+    run, original, said = tmp_path / "run", SlotsStage.loss, []
+    command = ("train-slots", f"out={run}", f"data.root={videos}")
+    monkeypatch.setattr(record, "PATIENCE", 0.0)
+
+    def second(self: SlotsStage, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+        if step == 4:
+            said.append(cli.main([*command, "preset=smoke", "seed=1", *ONE_CORE]))
+        return original(self, step, generators)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SlotsStage, "loss", second)
+        done = playslot(*command, "preset=smoke", *ONE_CORE)
+    assert (said, done.code) == ([1], 0)
+    assert_one_line(done.err, "train-slots")
+    assert "another command is training" in done.err
+    assert json.loads((run / "config.json").read_text())["seed"] == 0
     assert weights(run, "slots") == weights(shared_run, "slots")
 
 

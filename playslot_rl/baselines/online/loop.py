@@ -67,12 +67,17 @@ def train_online(
     Raises:
         TrainingError: a loss or weight is not finite; the last good checkpoint stays.
         CheckpointError: the folder was begun with another config, or its checkpoint is damaged.
-        OutputError: full disk; the last good checkpoint stays.
+        OutputError: another command trains it, or a full disk; the last good checkpoint stays.
         KeyboardInterrupt: Ctrl-C; its message says where the same command carries on.
     """
-    run = _Run(learner, online, record, title, device, prior_steps)
-    record.begin()
-    start, logging = run.state.step, record.config.logging
+    with record.training() as begin:
+        run = _Run(learner, online, record, title, device, prior_steps)
+        begin()
+        return _train(run, record)
+
+
+def _train(run: _Run, record: StageRecord) -> tuple[OnlineState, int]:
+    online, start, logging = run.online, run.state.step, record.config.logging
     run.watch.history.rewind(start)
     if not run.finished:
         progress = StageProgress(record.name, start, online.steps, logging.progress, online.evaluate_every)
