@@ -112,7 +112,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
                 agent.action_decoder.trusts_slots.fill_(trial.slots_pay())
         decoder = DecoderStage(agent.action_decoder, agent.policy, demos, behaviour, held_out, horizon)
         yield _part("decoder", decoder, behaviour, behaviour.decoder_steps, behaviour.decoder_lr)
-        if behaviour.finetune_steps:
+        if behaviour.finetune_steps and behaviour.labelled_demos >= behaviour.finetune_labels:
             both = FinetuneStage(clone.stages["policy"], agent.action_decoder, demos, behaviour, held_out, horizon)
             yield _part("finetune", both, behaviour, behaviour.finetune_steps, behaviour.finetune_lr)
 

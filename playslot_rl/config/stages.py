@@ -139,6 +139,7 @@ class BehaviourStageConfig(StageConfig):
         decoder_lr: its base learning rate; the rest of `optim` is shared.
         finetune_steps: optimiser steps after that, of policy and decoder together, on the labelled rows' actions; the
             policy goes on cloning all rows meanwhile. 0 has none (paper).
+        finetune_labels: labelled demonstrations from which on that is done: with five the closed loop loses by it.
         finetune_lr: their base learning rate.
         policy_from: run whose finished policy training is taken over where it is the same one but for labels and
             decoder; another, or none, is trained here.
@@ -162,6 +163,7 @@ class BehaviourStageConfig(StageConfig):
     decoder_steps: int = field(default=2000, metadata=at_least(1))
     decoder_lr: float = field(default=2e-4, metadata=within(lambda rate: rate > 0, "above 0"))
     finetune_steps: int = field(default=0, metadata=at_least(0, "0 (none) or more"))
+    finetune_labels: int = field(default=10, metadata=at_least(1))
     finetune_lr: float = field(default=2e-4, metadata=within(lambda rate: rate > 0, "above 0"))
     policy_from: str = field(default="", metadata=role("machine", "folder"))
     oracle: bool = True

@@ -62,6 +62,7 @@ ADDED: Final[Mapping[str, Any]] = {
     "whiten": False,
     "decoder_state": False,
     "finetune_steps": 0,
+    "finetune_labels": 10,
     "finetune_lr": 2e-4,
     "state_dim": 64,
     "state_layers": 2,

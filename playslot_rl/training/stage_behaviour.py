@@ -43,7 +43,7 @@ def cloning_settings(config: BehaviourStageConfig) -> BehaviourStageConfig:
     """
     plain = BehaviourStageConfig()
     decoding = ("labelled_demos", "decoder_inputs", "decoder_state", "decoder_steps", "decoder_lr")
-    later = (*decoding, "finetune_steps", "finetune_lr", "policy_from")
+    later = (*decoding, "finetune_steps", "finetune_labels", "finetune_lr", "policy_from")
     return replace(config, **{name: getattr(plain, name) for name in later})
 
 

@@ -41,6 +41,17 @@ def test_the_recorded_demonstrations_beyond_those_trained_on_measure(shared_run:
     assert "held-out demonstrations" in (shared_run / "report.md").read_text()
 
 
+def test_few_labels_are_not_fine_tuned_on(shared_run: Path, demos: Path, tmp_path: Path) -> None:
+    tuned = {}
+    for labels in (3, 2):  # from three on
+        run = tmp_path / str(labels)
+        smoke("train-policy", f"run={shared_run}", f"data.demos={demos}", f"out={run}", "behaviour.finetune_labels=3",
+              f"behaviour.labelled_demos={labels}", f"behaviour.policy_from={shared_run}")  # fmt: skip
+        meta = json.loads((run / "policy" / "checkpoint" / "meta.json").read_text())
+        tuned[labels] = "finetune_unexplained" in meta["metrics"]
+    assert tuned == {3: True, 2: False}
+
+
 @pytest.mark.parametrize("protocol", ["simulation", "imagination"])
 def test_eval_info_has_the_promised_keys(shared_run: Path, protocol: str) -> None:
     info = json.loads((shared_run / "evaluation" / protocol / "eval_info.json").read_text())

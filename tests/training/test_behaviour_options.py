@@ -135,7 +135,13 @@ def test_slots_that_are_not_trusted_are_not_tuned_on() -> None:
 
 def test_what_decides_the_policy_says_nothing_of_labels_and_decoder() -> None:
     other = replace(
-        CONFIG, labelled_demos=3, decoder_state=False, decoder_steps=7, finetune_steps=9, policy_from="elsewhere"
+        CONFIG,
+        labelled_demos=3,
+        decoder_state=False,
+        decoder_steps=7,
+        finetune_steps=9,
+        finetune_labels=2,
+        policy_from="elsewhere",
     )
     assert cloning_settings(other) == cloning_settings(CONFIG)
     for change in ({"trim": 0.5}, {"whiten": True}, {"steps": 3}, {"optim": OptimConfig(lr=1.0)}, {"imagined": False}):
