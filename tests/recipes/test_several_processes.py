@@ -223,7 +223,7 @@ def test_none_of_the_others_starts_on_several(
     assert said.count("\n") == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL])
 def test_what_was_stopped_carries_on(
     launch: Callable[..., Launched], tmp_path: Path, videos: Path, number: signal.Signals
 ) -> None:
