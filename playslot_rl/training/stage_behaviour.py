@@ -36,15 +36,20 @@ times over, would cost more than the training between two validations.
 """
 
 
+AFTER_CLONING: Final = (
+    "labelled_demos", "decoder_inputs", "decoder_state", "decoder_steps", "decoder_lr", "finetune_steps",
+    "finetune_labels", "finetune_lr", "policy_from",
+)  # fmt: skip
+"""Settings of what comes after the policy."""
+
+
 def cloning_settings(config: BehaviourStageConfig) -> BehaviourStageConfig:
     """The settings that decide the policy itself; labels and decoder, which come after it, are at their defaults.
 
     The same policy serves any number of labels, so that a half-finished or copied training is told by these alone.
     """
     plain = BehaviourStageConfig()
-    decoding = ("labelled_demos", "decoder_inputs", "decoder_state", "decoder_steps", "decoder_lr")
-    later = (*decoding, "finetune_steps", "finetune_labels", "finetune_lr", "policy_from")
-    return replace(config, **{name: getattr(plain, name) for name in later})
+    return replace(config, **{name: getattr(plain, name) for name in AFTER_CLONING})
 
 
 @dataclass(frozen=True)

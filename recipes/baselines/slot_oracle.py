@@ -37,18 +37,21 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.baselines.oracles.slot import NAME
     from playslot_rl.training.record import StageRecord, run_stage
     from playslot_rl.training.runs import slots_checkpoint, stage_model, use_world_model
+    from playslot_rl.training.stage_behaviour import AFTER_CLONING
 
     run = open_run(config)
     parent = parent_run(config, run)
     slots = slots_checkpoint(parent)
     require_parent(config, run, slots, "image_size")
     model = replace(config.model, savi=stage_model(slots)[0].savi)
+    stored = to_dict(config.behaviour)
     record = StageRecord(
         NAME,
         run,
         config,
-        stored={"env": to_dict(config.env), "model": to_dict(model), NAME: to_dict(config.behaviour)},
+        stored={"env": to_dict(config.env), "model": to_dict(model), NAME: stored},
         counts=("model.policy",),
+        settings=tuple(f"{NAME}.{key}" for key in stored if key not in AFTER_CLONING),
         parents={"slots": slots},
         role="demos",
         ready=partial(use_world_model, run, parent),

@@ -61,6 +61,16 @@ def test_a_baseline_is_a_run_that_says_what_it_saw(trained: dict[str, Path], met
     assert ("pretraining" in meta) == (method == "resnet_oracle")
 
 
+def test_a_finished_slot_oracle_does_not_ask_for_what_it_has_none_of(
+    trained: dict[str, Path], shared_run: Path
+) -> None:
+    run = trained["slot_oracle"]
+    again = _command("slot_oracle", shared_run, run, "demos=4")
+    done = smoke(*again, "behaviour.finetune_steps=7", "behaviour.decoder_steps=9", "behaviour.labelled_demos=1")
+    assert "slot_oracle: finished before" in done.out
+    refused(*again, "behaviour.whiten=false", message="slot_oracle.whiten: got False, expected True")
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_it_is_evaluated_as_playslot_is(trained: dict[str, Path], shared_run: Path, method: str) -> None:
     run = trained[method]
