@@ -16,8 +16,8 @@ from torch import Tensor
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
 from playslot_rl.acting.agent import imagine
-from playslot_rl.acting.planners import Planner, Search, latent_statistics, shifted
-from playslot_rl.acting.planners.costs import GoalCost, goal_distance, parse_goal
+from playslot_rl.acting.planners import Cost, Planner, Search, latent_statistics, shifted
+from playslot_rl.acting.planners.costs import GoalCost, NearProposal, goal_distance, parse_goal
 from playslot_rl.acting.planners.size import SearchSize
 from playslot_rl.config.planning import PlanConfig
 from playslot_rl.seeding import step_generator
@@ -131,7 +131,10 @@ class PlanningActor(Actor):
             last = tensordict.get(keys.PLANNED_LATENTS)[row]
             starts = torch.cat([proposal, shifted(last, self.size.every, self.whitening.mean)[None]])
         shape = (self.size.horizon, *self.agent.world_model.latent_shape)
-        search = Search(cost, shape, self.whitening, starts, self.config.bound, self.config.seconds)
+        priced: Cost = cost
+        if self.config.prior and len(proposal):
+            priced = NearProposal(cost, proposal[0], self.whitening, self.config.prior)
+        search = Search(priced, shape, self.whitening, starts, self.config.bound, self.config.seconds)
         plan = self.planner(search, step_generator(seed, step, f"plan-{self.seed}", self.device))
         future = torch.cat([cost.slots[-1:], cost.imagine(plan.latents[None])[0]])
         offered = float(cost(proposal)[0]) if len(proposal) else float("nan")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import pytest
 import torch
@@ -70,6 +71,18 @@ def test_every_planner_acts_and_its_first_plan_is_no_worse_than_the_proposal(
             assert bool((moment[keys.PLAN_COST] <= moment[keys.PROPOSAL_COST]).all())
         else:
             assert bool(moment[keys.PROPOSAL_COST].isnan().all())
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+def test_the_more_a_plan_has_to_stay_near_the_policys_the_nearer_it_is(agent: Agent, name: str) -> None:
+    def strayed(prior: float) -> float:
+        of = actor(agent, name, True, replace(PLAN, prior=prior))
+        (seen,) = acted(of, [7], 1)
+        proposal = imagine(agent, seen.select(keys.SLOTS), SIZE.horizon).latents
+        return float((of.whitening(seen[keys.PLANNED_LATENTS]) - of.whitening(proposal)).square().mean())
+
+    assert strayed(0) > 1e-3
+    assert strayed(1e9) < 1e-9
 
 
 def test_it_plans_every_second_step_and_executes_the_plan_between(agent: Agent) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from playslot_rl.acting.planners.cem import CEMPlanner
 from playslot_rl.acting.planners.gradient import GradientPlanner
 from playslot_rl.acting.planners.mppi import MPPIPlanner
-from playslot_rl.acting.planners.planner import Plan, Planner, Search, latent_statistics, shifted
+from playslot_rl.acting.planners.planner import Cost, Plan, Planner, Search, latent_statistics, shifted
 from playslot_rl.acting.planners.prototypes import PrototypePlanner
 from playslot_rl.acting.planners.size import SearchSize
 from playslot_rl.config.planning import PlanConfig, PlannerName
@@ -17,6 +17,7 @@ from playslot_rl.world_model import WorldModel
 
 __all__ = [
     "CEMPlanner",
+    "Cost",
     "GradientPlanner",
     "MPPIPlanner",
     "Plan",

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from playslot_rl.acting.planners.planner import latent_statistics
+from playslot_rl.acting.planners.planner import Cost, latent_statistics
 from playslot_rl.config.planning import CostName
 from playslot_rl.frames import normalise
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
@@ -175,6 +175,37 @@ class GoalCost:
         if self.along == 0:
             return last
         return (1 - self.along) * last + self.along * self.distance(future).mean(1)
+
+
+class NearProposal:
+    """A cost, and what straying from a proposed plan costs beside it, in whitened coordinates of the latent actions.
+
+        J'(z) = J(z) + w / HZ sum_t |W^-1 (z_t - z^_t)|^2
+
+    As in model-based offline planning (Argenson and Dulac-Arnold, ICLR 2021) the search stays where the demonstrations
+    were: latents far from the policy's lead to futures that the model guesses and to actions that the decoder guesses,
+    and a search finds the guesses that please it. The proposal itself costs what it did.
+
+    Args:
+        cost: J.
+        proposal: z^, (H, [N,] Z).
+        whitening: W, of the latent actions.
+        weight: w, at least 0.
+
+    Examples:
+        >>> near = NearProposal(lambda z: torch.zeros(len(z)), torch.zeros(2, 1), Whitening(1), 3.0)
+        >>> near(torch.tensor([[[0.0], [0.0]], [[2.0], [0.0]]])).tolist()
+        [0.0, 6.0]
+    """
+
+    def __init__(self, cost: Cost, proposal: Tensor, whitening: Whitening, weight: float) -> None:
+        self.cost, self.whitening, self.weight = cost, whitening, weight
+        self.proposal = whitening(proposal)
+
+    def __call__(self, latents: Tensor) -> Tensor:
+        """Latent actions (M, H, [N,] Z) to costs (M,), differentiable."""
+        strayed = (self.whitening(latents) - self.proposal).square()
+        return self.cost(latents) + self.weight * strayed.flatten(1).mean(1)
 
 
 @torch.no_grad()

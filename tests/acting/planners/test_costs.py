@@ -14,6 +14,7 @@ from playslot_rl.acting.planners.costs import (
     DynamicsDistance,
     GoalCost,
     ImageDistance,
+    NearProposal,
     SlotDistance,
     assignment,
     parse_goal,
@@ -188,3 +189,17 @@ def test_our_search_takes_a_latent_per_slot() -> None:
 
 def test_an_untrained_agent_has_statistics(agent: Agent) -> None:
     assert latent_statistics(agent).scale.tolist() == pytest.approx([1.0] * 8, abs=0.01)
+
+
+def test_straying_from_a_proposal_costs_its_square_in_whitened_coordinates() -> None:
+    """By hand: two directions of deviations 2 and 1/2, strayed from by one deviation each in one of two steps."""
+    whitened = Whitening(2)
+    whitened.scale.copy_(torch.tensor([2.0, 0.5]))
+    proposal = drawn(2, 2)
+    cost = NearProposal(lambda latents: latents.sum((1, 2)), proposal, whitened, 0.3)
+    strayed = proposal + torch.tensor([[2.0, -0.5], [0.0, 0.0]])
+    tried = torch.stack([proposal, strayed]).requires_grad_()
+    costs = cost(tried)
+    torch.testing.assert_close(costs, tried.sum((1, 2)) + torch.tensor([0.0, 0.3 * (1 + 1) / 4]))
+    (gradient,) = torch.autograd.grad(costs.sum(), tried)
+    assert bool((gradient[1, 0] != 1).all())
