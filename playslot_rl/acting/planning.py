@@ -57,7 +57,7 @@ class PlanningActor(Actor):
         agent: in evaluation mode.
         planner: the search.
         plan: cost, history and bounds.
-        size: horizon, and how much of it is executed.
+        size: horizon, how much of it is executed, and the price of straying from the policy's plan.
         goals: images to reach.
         policy: begin with the latent policy's rollout.
         seed: of the candidates, beside that of the episode.
@@ -132,8 +132,8 @@ class PlanningActor(Actor):
             starts = torch.cat([proposal, shifted(last, self.size.every, self.whitening.mean)[None]])
         shape = (self.size.horizon, *self.agent.world_model.latent_shape)
         priced: Cost = cost
-        if self.config.prior and len(proposal):
-            priced = NearProposal(cost, proposal[0], self.whitening, self.config.prior)
+        if self.size.prior and len(proposal):
+            priced = NearProposal(cost, proposal[0], self.whitening, self.size.prior)
         search = Search(priced, shape, self.whitening, starts, self.config.bound, self.config.seconds)
         plan = self.planner(search, step_generator(seed, step, f"plan-{self.seed}", self.device))
         future = torch.cat([cost.slots[-1:], cost.imagine(plan.latents[None])[0]])

@@ -50,7 +50,7 @@ class PlanConfig(Checked):
         correlation: of the noise of neighbouring steps.
         temperature: of MPPI, in units of the deviation of the costs.
         learning_rate: of the gradient planner.
-        prior: weight of staying near the policy's plan, with `proposal=policy`; 0: where the plan leads decides alone.
+        prior: with `proposal=policy`, what straying from the policy's plan costs, in whitened coordinates; 0: nothing.
         history: frames of the past that the predictor sees, at most its context.
         looks: times that SAVi is shown the goal image, as the frames after the first.
         ahead: environment steps to the goal, with goals `ahead`.
@@ -80,7 +80,7 @@ class PlanConfig(Checked):
     correlation: float = field(default=0.5, metadata=within(lambda value: 0 <= value < 1, "0 to under 1"))
     temperature: float = field(default=0.2, metadata=_POSITIVE)
     learning_rate: float = field(default=0.1, metadata=_POSITIVE)
-    prior: float = field(default=0.0, metadata=at_least(0, "0 or more"))
+    prior: float | None = field(default=None, metadata=at_least(0, "0 or more"))
     history: int = field(default=1, metadata=at_least(1, "at least 1 frame"))
     looks: int = field(default=2, metadata=at_least(1, "at least 1"))
     ahead: int = field(default=25, metadata=at_least(1, "at least 1 environment step"))

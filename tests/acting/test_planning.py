@@ -24,6 +24,8 @@ from playslot_rl.world_model import Agent
 
 PLAN = PlanConfig(horizon=4, every=2, candidates=8, iterations=2, elites=3, descents=2)
 SIZE = search_size(PLAN, "solved", 5)
+ROUNDING = 1e-5
+"""A plan that is the proposal itself costs the same but for the size of the batch that it was computed in."""
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +70,7 @@ def test_every_planner_acts_and_its_first_plan_is_no_worse_than_the_proposal(
         assert bool((moment[keys.ACTION].abs() <= 1).all())
         assert moment[keys.PREDICTED_SLOTS].shape == (2, 5, 4, 32)
         if policy:
-            assert bool((moment[keys.PLAN_COST] <= moment[keys.PROPOSAL_COST]).all())
+            assert bool((moment[keys.PLAN_COST] <= moment[keys.PROPOSAL_COST] * (1 + ROUNDING)).all())
         else:
             assert bool(moment[keys.PROPOSAL_COST].isnan().all())
 
@@ -76,13 +78,20 @@ def test_every_planner_acts_and_its_first_plan_is_no_worse_than_the_proposal(
 @pytest.mark.parametrize("name", PLANNERS)
 def test_the_more_a_plan_has_to_stay_near_the_policys_the_nearer_it_is(agent: Agent, name: str) -> None:
     def strayed(prior: float) -> float:
-        of = actor(agent, name, True, replace(PLAN, prior=prior))
+        plan = replace(PLAN, prior=prior)
+        of = PlanningActor(agent, actor(agent, name).planner, plan, search_size(plan, "solved", 5), goals, True).eval()
         (seen,) = acted(of, [7], 1)
         proposal = imagine(agent, seen.select(keys.SLOTS), SIZE.horizon).latents
         return float((of.whitening(seen[keys.PLANNED_LATENTS]) - of.whitening(proposal)).square().mean())
 
     assert strayed(0) > 1e-3
     assert strayed(1e9) < 1e-9
+
+
+def test_a_policy_means_the_goals_that_it_was_cloned_for() -> None:
+    assert search_size(PLAN, "solved", 5).prior > 0
+    assert search_size(PLAN, "ahead", 5).prior == 0
+    assert [search_size(replace(PLAN, prior=0.0), goals, 5).prior for goals in ("solved", "ahead")] == [0, 0]
 
 
 def test_it_plans_every_second_step_and_executes_the_plan_between(agent: Agent) -> None:

@@ -46,7 +46,8 @@ def test_a_table_of_everything_and_what_stands_behind_it(run: Path) -> None:
             assert info["planning"]["horizon"] == 3
             assert len(info["per_episode"]) == info["episodes"] == len(info["seeds"])
             assert (run / "planning" / goals / name / "plan.png").read_bytes().startswith(b"\x89PNG")
-        assert part["rows"]["cem-policy"]["plan_cost_first"] <= part["rows"]["cem-policy"]["proposal_cost_first"]
+        costs = [part["rows"]["cem-policy"][f"{whose}_cost_first"] for whose in ("plan", "proposal")]
+        assert costs[0] <= costs[1] * (1 + 1e-5)  # equal but for rounding where the plan is the proposal
     again = smoke(
         "plan", f"run={run}", "planner=cem", "goals=ahead", "episodes=1", "evaluation.references=false", *SMALL
     )
