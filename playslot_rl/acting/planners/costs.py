@@ -204,7 +204,7 @@ class NearProposal:
 
     def __call__(self, latents: Tensor) -> Tensor:
         """Latent actions (M, H, [N,] Z) to costs (M,), differentiable."""
-        strayed = (self.whitening(latents) - self.proposal).square()
+        strayed: Tensor = (self.whitening(latents) - self.proposal).square()
         return self.cost(latents) + self.weight * strayed.flatten(1).mean(1)
 
 
