@@ -199,12 +199,11 @@ class NearProposal:
     """
 
     def __init__(self, cost: Cost, proposal: Tensor, whitening: Whitening, weight: float) -> None:
-        self.cost, self.whitening, self.weight = cost, whitening, weight
-        self.proposal = whitening(proposal)
+        self.cost, self.proposal, self.whitening, self.weight = cost, proposal, whitening, weight
 
     def __call__(self, latents: Tensor) -> Tensor:
         """Latent actions (M, H, [N,] Z) to costs (M,), differentiable."""
-        strayed: Tensor = (self.whitening(latents) - self.proposal).square()
+        strayed = self.whitening.turn(latents - self.proposal).square()
         return self.cost(latents) + self.weight * strayed.flatten(1).mean(1)
 
 
