@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.fixture
+def forking() -> Iterator[None]:
+    """As on the page alone: importing TorchRL, as other pages do, would have a DataLoader's workers import all anew."""
+    before = multiprocessing.get_start_method(allow_none=True)
+    multiprocessing.set_start_method("fork", force=True)
+    yield
+    multiprocessing.set_start_method(before, force=True)
+
+
 def given(page: str, block: int) -> dict[str, Any]:
     """Names that a block takes as the reader's own."""
     import torch
@@ -61,6 +72,7 @@ def test_every_page_with_python_is_run() -> None:
     }
 
 
+@pytest.mark.usefixtures("forking")
 @pytest.mark.parametrize("page", [page for page in PAGES if page.name != "hub.md"], ids=lambda page: page.name)
 def test_the_python_blocks_of_a_page_run(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import torch
