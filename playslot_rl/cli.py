@@ -218,8 +218,9 @@ SEVERAL: Final = ("train-slots", "train-dynamics", "train-policy", "train-baseli
 ANEW: Final = ("inspect", "plan", "play", "bench", "doctor", "dataset", "cache")
 """Commands that start over when they are typed again."""
 INTERRUPTED: Final = 130
+OWN_PATIENCE_S: Final = 1.0
 PEER_PATIENCE_S: Final = 5.0
-"""How long a process that lost another one waits for that one's own error to be printed."""
+"""How long a process waits for another one's line: with an error of its own, and where it lost the other one."""
 
 GROUPS: Final = {
     "dataset": "data sets: info, verify, repair, merge, split, viz, push, pull",
@@ -379,18 +380,21 @@ def _debugging() -> bool:
     return os.environ.get(DEBUG, "") not in ("", "0")
 
 
-def _fail(name: str, message: str, code: int, patience_s: float = 1.0) -> int:
+def _fail(name: str, message: str, code: int, patience_s: float = OWN_PATIENCE_S) -> int:
     """Print one line. Of several processes the first one with an error of its own does: what all of them got is said by
-    rank 0, and the others are ended by the launcher while they wait.
+    rank 0, and the others are ended by the launcher while they wait, or find it said.
     """
-    from playslot_rl.processes import launched
+    from playslot_rl.processes import claim, launched
 
     rank = launched().rank
     if rank:
         if code == INTERRUPTED:
             return code
         name = f"{name} (rank {rank})"
-    if launched().world > 1 and (rank or patience_s > 1):
-        time.sleep(patience_s)
+    if launched().world > 1:
+        if rank or patience_s > OWN_PATIENCE_S:
+            time.sleep(patience_s)
+        if not claim("error"):
+            return code
     print(f"playslot {name}: error: {message}", file=sys.stderr, flush=True)
     return code

@@ -205,6 +205,21 @@ def copied(tensors: Sequence[Tensor]) -> None:
         tensor.detach().copy_(whole)
 
 
+def claim(what: str) -> bool:
+    """Whether this process is the first one to ask for `what`: always, where it is the only one or has met no others.
+
+    Nobody is waited for. Where the process that keeps the list has ended, this one is not the first.
+    """
+    if _here.world == 1:
+        return True
+    from torch.distributed.distributed_c10d import _get_default_store
+
+    try:
+        return _get_default_store().add(f"playslot/{what}", 1) == 1
+    except RuntimeError:
+        return False
+
+
 @contextlib.contextmanager
 def spreading() -> Iterator[None]:
     """Inside the block `spread` shares its items out."""

@@ -12,7 +12,7 @@ from ranks import log_of, run_ranks
 from tiny_stages import DOUBLE, STAGES, in_double
 
 from playslot_rl.errors import CheckpointError
-from playslot_rl.processes import here, wait
+from playslot_rl.processes import agreed, claim, here, wait
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
 from playslot_rl.training.fit import fit
 
@@ -74,6 +74,17 @@ def disagree(folder: Path) -> None:
 def test_ranks_that_find_checkpoints_of_different_steps_are_refused(alone: Path, tmp_path: Path) -> None:
     interrupted(alone / "policy", tmp_path / "0")
     assert run_ranks(2, disagree, tmp_path) == [0, 0]
+
+
+def claims() -> None:
+    assert sum(agreed(claim("error"))) == 1
+    assert sum(agreed(claim("error"))) == 0
+    assert sum(agreed(claim("another"))) == 1
+
+
+def test_one_rank_has_what_all_of_them_claim() -> None:
+    assert run_ranks(3, claims) == [0, 0, 0]
+    assert [claim("error"), claim("error")] == [True, True]  # a process alone
 
 
 def accumulated(folder: Path) -> None:
