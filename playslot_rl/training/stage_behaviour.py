@@ -207,14 +207,16 @@ class DecoderStage(RegressionStage):
         second = labelled.episode >= half
         if second.all() or not second.any():
             return None
-        own = replace(config, labelled_demos=half)
-        return cls(deepcopy(decoder), policy, labelled, own, labelled.take(second), horizon)
+        tried = deepcopy(decoder)
+        tried.trusts_slots.fill_(True)
+        return cls(tried, policy, labelled, replace(config, labelled_demos=half), labelled.take(second), horizon)
 
     def slots_pay(self) -> bool:
         """Whether the decoder does better on `held_out` with slots than without; mean absolute error of the actions."""
         inputs, actions = self.checks[f"unexplained{HELD_OUT}"]
         z, slots = inputs.plain(torch.arange(len(inputs), device=actions.device))
         decoder = self.criterion.network.eval()
+        decoder.trusts_slots.fill_(True)  # a trial that was begun before may have stored otherwise
         with torch.no_grad():
             seeing, blind = ((decoder(z, seen) - actions).abs().mean() for seen in (slots, None))
         return bool(seeing < blind)

@@ -83,6 +83,7 @@ def test_imagined_rows_end_at_the_horizon() -> None:
 @pytest.mark.parametrize(("source", "pays"), [("slots", True), ("spurious", False)])
 def test_slots_are_trusted_where_they_pay(source: str, pays: bool) -> None:
     policy, decoder = networks()
+    decoder.trusts_slots.fill_(False)  # as the recipe leaves it until the trial has told
     demos = demonstrations(source)
     trial = DecoderStage.trial(decoder, policy, demos, replace(CONFIG, decoder_inputs="inverse_dynamics"))
     half = torch.nonzero(demos.episode < 3)[:, 0]
