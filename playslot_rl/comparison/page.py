@@ -88,13 +88,11 @@ def _online(result: Result) -> list[str]:
 
 
 def budgeted(row: Result, result: Result) -> str:
-    """A method that acts is only as good as its time: `DreamerV3, 1 h 00 min on 2 cores`."""
-    spent = row["train_seconds"]
-    return (
-        row["title"]
-        if spent is None
-        else f"{row['title']}, {format_seconds(spent)} on {result['hardware']['cores']} cores"
-    )
+    """A method that acts is only as good as its time: `DreamerV3, 1 h 00 min on 2 cores`; the cores are its threads."""
+    spent, cores = row["train_seconds"], result["threads"] or result["hardware"]["cores"]
+    if spent is None:
+        return str(row["title"])
+    return f"{row['title']}, {format_seconds(spent)} on {cores} core{'s' if cores > 1 else ''}"
 
 
 def cell(row: Result, seeds: int) -> str:

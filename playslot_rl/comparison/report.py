@@ -250,6 +250,7 @@ class Comparison:
             "latent_models": self._latent_models(),
             "learn_from_demos": config.collect.learn_from_demos,
             "frame_skip": config.env.frame_skip,
+            "threads": config.threads,
             "seconds": round(self._spent + time.monotonic() - self._began, 1),
             "command": made["command"],
             "commit": made["commit"],

@@ -38,7 +38,7 @@ def comparison(out: Path, rows: list[dict[str, Any]], summary: list[dict[str, An
         "labels": sorted({row["labels"] for row in rows if row["labels"]}), "seeds": [0, 1],
         "episodes": 10, "evaluation_seed": 100,
         "max_steps": 20, "frame_skip": 5, "learn_from_demos": True, "latent_models": {},
-        "jobs": 7, "rows": rows, "summary": summary, "seconds": 99.0, "command": "playslot compare",
+        "threads": 0, "jobs": 7, "rows": rows, "summary": summary, "seconds": 99.0, "command": "playslot compare",
         "commit": "c", "hardware": {"machine": "x86_64", "cores": 2, "gpu": None},
         "references": {"expert": reference, "random": {"success_rate": 0.0, "ci95": [0.0, 0.3]}},
         "world_model": {

@@ -61,6 +61,7 @@ def test_the_page_has_the_table_the_footnotes_and_the_failure(ended: dict[str, A
     assert "| PlaySlot, simulation | 70 % (40 to 89; seeds 60 to 80) | – |" in page
     assert "| Slot Oracle, simulation | 100 % (72 to 100; 1 of 2 seeds) | 100 % (72 to 100; 1 of 2 seeds) |" in page
     assert "| DreamerV3, 30 s on 2 cores | 10,000 | 70 % (40 to 89; 1 of 2 seeds) |" in page
+    assert "| DreamerV3, 30 s on 1 core |" in comparison_page({**ended, "threads": 1})
     assert "PlaySlot saw the real actions of 5 of 10 demonstrations" in page
     assert "Slot Oracle saw the real actions of 10 of 10, 50 of 50 demonstrations" in page
     assert "ResNet Oracle starts from scratch weights" in page
