@@ -36,9 +36,10 @@ times over, would cost more than the training between two validations.
 """
 
 PAYS: Final = 0.85
-"""Largest error of a decoder with slots, over one without, at which the slots are trusted. Acting leaves the demonstrations'
-states, where what few labels have taught about slots does harm: on easy BlockPush 0.93 (25 labels) costs eight points of
-success, 0.78 (100 labels) brings four (docs/trials.md).
+"""Largest error of a decoder with slots, over one without, at which the slots are trusted.
+
+Acting leaves the demonstrations' states, where what few labels have taught about slots does harm: on easy BlockPush 0.93
+(25 labels) costs eight points of success, 0.78 (100 labels) brings four (docs/trials.md).
 """
 
 AFTER_CLONING: Final = (
@@ -217,13 +218,11 @@ class DecoderStage(RegressionStage):
         return cls(tried, policy, labelled, replace(config, labelled_demos=half), labelled.take(second), horizon)
 
     def slots_pay(self) -> bool:
-        """Whether the decoder does better on `held_out` with slots than without, clearly (`PAYS`); mean absolute error of
-        the actions.
-        """
+        """Whether the actions' mean absolute error on `held_out` is clearly (`PAYS`) less with slots than without."""
         inputs, actions = self.checks[f"unexplained{HELD_OUT}"]
         z, slots = inputs.plain(torch.arange(len(inputs), device=actions.device))
         decoder = self.criterion.network.eval()
-        decoder.trusts_slots.fill_(True)  # a trial that was begun before may have stored otherwise
+        decoder.get_buffer("trusts_slots").fill_(True)  # a trial that was begun before may have stored otherwise
         with torch.no_grad():
             seeing, blind = ((decoder(z, seen) - actions).abs().mean() for seen in (slots, None))
         return bool(seeing <= PAYS * blind)

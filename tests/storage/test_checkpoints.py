@@ -191,6 +191,24 @@ def test_a_world_model_from_before_predictors_had_a_kind_is_cocvps() -> None:
     assert first_difference(old, wanted) == ("model.predictor.kind", "cocvp", "ocvp_seq")
 
 
+def test_a_policy_from_before_whitening_and_decoders_that_read_slots_loads(
+    run: Path, source_run: tuple[Path, Agent]
+) -> None:
+    later = {"policy": ("whiten",), "action_decoder": ("whiten", "reads_slots")}
+    for stage in ("slots", "dynamics", "policy"):
+        path = checkpoint_folder(run, stage) / "config.json"
+        model = json.loads(path.read_text())["model"]
+        for part, names in later.items():
+            for name in (*names, *(key for key in list(model[part]) if key.startswith("state_"))):
+                del model[part][name]
+        edit(path, model=model)
+    old, trained = load_agent(run), source_run[1].eval()
+    slots = torch.randn(2, *trained.world_model.slot_shape)
+    z = old.policy(slots)
+    torch.testing.assert_close(z, trained.policy(slots))
+    torch.testing.assert_close(old.action_decoder(z, slots), trained.action_decoder(z))
+
+
 def test_a_config_of_another_version_is_refused(run: Path) -> None:
     edit(checkpoint_folder(run, "slots") / "config.json", model={"savi": {"slot_dimension": 3}})
     with pytest.raises(CheckpointError, match="unknown key"):

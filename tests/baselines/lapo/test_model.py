@@ -112,7 +112,11 @@ def test_latents_of_transitions_are_in_the_order_of_their_rows(models: tuple[Inv
     latents = infer_latents(inverse, source, moves)
     assert latents.shape == (len(moves.rows), 8)
     frames = source.pixels(np.array([moves.rows[7], moves.rows[7] + 1]))
-    torch.testing.assert_close(latents[7:8], inverse(frames[:1], frames[1:]).z, atol=1e-5, rtol=0)
+    inferred = inverse(frames[:1], frames[1:])
+    torch.testing.assert_close(latents[7:8], inferred.z, atol=1e-5, rtol=0)
+    before = infer_latents(inverse, source, moves, quantised=False)  # baselines.lapo.targets=continuous
+    torch.testing.assert_close(before[7:8], inferred.before, atol=1e-5, rtol=0)
+    assert not torch.allclose(before, latents)
 
 
 def test_the_actor_decodes_the_policys_latent() -> None:
