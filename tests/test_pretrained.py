@@ -18,7 +18,7 @@ from playslot_rl.training.runs import load_agent, load_world_model, pretrained_f
 
 ENVS = ("button_press", "block_push_easy", "block_push")
 STAGES = ("slots", "dynamics", "policy")
-LEAST = {"button_press": 0.8, "block_push_easy": 0.6, "block_push": 0.15}
+LEAST = {"button_press": 0.8, "block_push_easy": 0.7, "block_push": 0.3}
 """Success rate in simulation below which a shipped policy is broken; on 20 episodes, so well below its own."""
 LIMIT = 14 * 1000**2
 
