@@ -47,14 +47,14 @@ def test_a_run_becomes_a_folder_and_stays_as_it_was(run: Path, tmp_path: Path) -
     config = read_config(tmp_path / "policies" / "press")
     stored = json.loads((run / "policy" / "checkpoint" / "meta.json").read_text())
     assert config.source["fingerprints"] == {**stored["parents"], "policy": stored["fingerprint"]}
-    assert (config.source["demos"], config.source["labelled_demos"]) == (150, 5)
+    assert (config.source["demos"], config.source["labelled_demos"]) == (150, 10)
     assert config.source["shipped_world_model"]
     assert config.camera == "observation.images.front"
 
 
 def test_a_shipped_policy_becomes_a_folder_too(tmp_path: Path) -> None:
     assert playslot("export", "run=pretrained/button_press", f"out={tmp_path / 'press'}").code == 0
-    assert read_config(tmp_path / "press").source["labelled_demos"] == 5
+    assert read_config(tmp_path / "press").source["labelled_demos"] == 10
 
 
 def test_the_card_tells_task_data_results_limits_and_versions(run: Path, tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_the_card_tells_task_data_results_limits_and_versions(run: Path, tmp_pat
     assert "| task | Press the red button. |" in card
     assert "4 numbers in [-1, 1]: hand displacement x, y, z and gripper effort" in card
     assert "`observation.images.front`, 64 x 64 RGB" in card
-    assert "real actions of 5 demonstrations" in card
+    assert "real actions of 10 demonstrations" in card
     meta = json.loads((run / "policy" / "checkpoint" / "meta.json").read_text())
     assert meta["data"]["demos"] in card, "fingerprint of the demonstrations"
     assert "| this policy, in simulation (closed loop) | 98 % | 90 to 100 % | 14.5 | 50 | 0 |" in card
@@ -112,7 +112,7 @@ def test_the_commands_of_the_card_are_accepted_and_bring_back_the_config(run: Pa
     lines = [shlex.split(line)[1:] for line in block.splitlines()]
     assert [line[0] for line in lines] == ["collect", "train-policy", "evaluate"]
     recorded, trained = (compose(line[1:], "collect") for line in lines[:2])
-    assert (recorded.episodes, recorded.collect.noise, recorded.policy) == (150, 0.25, "expert")
+    assert (recorded.episodes, recorded.collect.noise, recorded.policy) == (160, 0.25, "expert")  # ten held out
     assert (trained.behaviour.steps, trained.seed, trained.run) == (77, 0, "pretrained")
     assert (trained.preset, trained.env.name) == ("compact", "button_press")
 

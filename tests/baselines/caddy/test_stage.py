@@ -116,7 +116,7 @@ def test_training_lowers_the_loss_and_the_held_out_error() -> None:
         before = stage.validate(0)
     stage.model.train()
     losses = []
-    for step in range(22):
+    for step in range(60):
         optimizer.zero_grad()
         parts = stage.loss(step, StepGenerators(0, step))
         parts["loss"].backward()
