@@ -72,7 +72,7 @@ class LatentCloning(ABC):
     def __init__(self, config: ExperimentConfig, demos: DemonstrationSplit, device: torch.device, shift: int) -> None:
         self.config, self.device = config, device
         self.trained = self._seen(demos.trained, shift)
-        self.labelled = labelled_rows(torch.from_numpy(self.trained.episode), config.behaviour.labelled_demos)
+        self.labelled = labelled_rows(self.trained.episode, config.behaviour.labelled_demos)
         self.held_out = None if demos.held_out is None else self._seen(demos.held_out)
 
     @abstractmethod

@@ -87,13 +87,13 @@ class Demonstrations:
         return labelled_rows(self.episode, demos)
 
 
-def labelled_rows(episode: Tensor, demos: int) -> Tensor:
+def labelled_rows(episode: Tensor | npt.NDArray[np.int64], demos: int) -> Tensor:
     """Rows (int64) of the first `demos` demonstrations, by the demonstration of each row (M,).
 
     Raises:
         DataError: trimming has left none.
     """
-    rows = torch.nonzero(episode < demos)[:, 0]
+    rows = torch.nonzero(torch.as_tensor(episode < demos))[:, 0]
     if not len(rows):
         raise DataError(
             f"behaviour.labelled_demos={demos}: got demonstrations in which nothing moves, expected some that do: "

@@ -38,10 +38,11 @@ def main(config: ExperimentConfig) -> None:
     acts = config.method == POLICY
     record = _policy_record(config, run, parents) if acts else _oracle_record(config, run, parents)
     record.data.require_actions(config.env.action_dim)
-    if acts:
-        require_labelled(config.behaviour.labelled_demos, record.data.episodes)  # before anything is computed
+    labelled = config.behaviour.labelled_demos if acts else None
+    if labelled is not None:
+        require_labelled(labelled, record.data.episodes)  # before anything is computed
     world = config.baselines.caddy_policy.world if acts else config.baselines.caddy_oracle.world
-    parents[MODEL] = model_of(config, run, MODEL, world, train_model)
+    parents[MODEL] = model_of(config, run, MODEL, world, train_model, record.demos, labelled)
     run_stage(record, lambda: (_policy if acts else _oracle)(config, record))
 
 

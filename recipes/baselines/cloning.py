@@ -13,6 +13,7 @@ from playslot_rl.recipes.run import adopted_policy, cloned, require_parent
 
 if TYPE_CHECKING:
     from playslot_rl.baselines.cloning import LatentCloning
+    from playslot_rl.data.demonstrations import DemonstrationSplit
     from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import StageRecord, Training
@@ -27,6 +28,8 @@ def model_of(
     stage: str,
     world: str,
     train: Callable[[ExperimentConfig, Path], StageCheckpoint],
+    demos: DemonstrationSplit,
+    labelled: int | None = None,
     sizes: Mapping[str, Any] | None = None,
 ) -> StageCheckpoint:
     """The model that a method builds on: of another run, or trained on `data.root` into its own.
@@ -37,16 +40,21 @@ def model_of(
         stage: the model's, one of `LATENT_MODELS`.
         world: the other run; empty trains.
         train: trains the model into a run, or finds it there.
+        demos: what the method will clone; looked at before a model is trained for it.
+        labelled: how many of them show their actions; None: all.
         sizes: parts of the config that another run's model must share.
 
     Raises:
         CheckpointError: no finished model there, one of other frames or sizes, or `run` has another one of its own.
-        DataError, OutputError, TrainingError: see `playslot_rl.errors`.
+        DataError: nothing moves in `demos`, in the labelled ones, or in those that are held out.
+        OutputError, TrainingError: see `playslot_rl.errors`.
     """
     from playslot_rl.errors import CheckpointError
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, require_whole
 
     if not world:
+        if not (checkpoint_folder(run, stage) / "meta.json").is_file():
+            _require_moving(config, demos, labelled)
         return train(config, run)
     folder = checkpoint_folder(Path(world), stage)
     if not (folder / "meta.json").is_file():
@@ -59,6 +67,17 @@ def model_of(
     require_parent(config, run, model, "image_size")
     require_config(model, sizes or {})
     return model
+
+
+def _require_moving(config: ExperimentConfig, demos: DemonstrationSplit, labelled: int | None) -> None:
+    from playslot_rl.data.demonstrations import labelled_rows, moving_frames
+
+    threshold, margin = config.behaviour.trim_pixels, config.behaviour.trim_margin
+    for source in (demos.trained, demos.held_out):
+        if source is not None:
+            moves = moving_frames(source, threshold, margin)
+            if labelled is not None and source is demos.trained:
+                labelled_rows(moves.episode, labelled)
 
 
 def cloning(

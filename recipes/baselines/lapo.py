@@ -59,7 +59,8 @@ def main(config: ExperimentConfig) -> None:
     )
     record.data.require_actions(config.env.action_dim)
     require_labelled(config.behaviour.labelled_demos, record.data.episodes)  # before anything is computed
-    parents[MODEL] = model_of(config, run, MODEL, own.world, train_model, {NAME: sizes_of(own)})
+    labelled, sizes = config.behaviour.labelled_demos, {NAME: sizes_of(own)}
+    parents[MODEL] = model_of(config, run, MODEL, own.world, train_model, record.demos, labelled, sizes)
     run_stage(record, lambda: _training(config, record))
 
 

@@ -103,6 +103,16 @@ def test_another_number_of_demonstrations_or_another_seed_is_refused(
     refused(*_command(method, shared_run, trained[method], "demos=4", "seed=1"), message="seed: got 1, expected 0")
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_threshold_that_leaves_nothing_is_refused_before_anything_is_trained(
+    shared_run: Path, tmp_path: Path, method: str
+) -> None:
+    key = "behaviour.trim" if method == "slot_oracle" else "behaviour.trim_pixels"
+    refused(*_command(method, shared_run, tmp_path / "x", f"{key}=1"),
+            message=rf"{key}: got 1, which leaves none of \d+ transitions, expected less than")  # fmt: skip
+    assert not (tmp_path / "x").exists()
+
+
 def test_imagination_is_refused(trained: dict[str, Path]) -> None:
     refused("evaluate", f"run={trained['lapo']}", "protocol=imagination",
             message="protocol: got imagination for method=lapo, expected simulation")  # fmt: skip
