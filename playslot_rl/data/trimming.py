@@ -36,8 +36,8 @@ def moving_rows(motion: Tensor, step: Tensor, threshold: float, margin: int, key
     moving = motion > threshold
     if not bool(moving.any()):
         raise DataError(
-            f"{key}: got {threshold:g}, which leaves none of {len(motion)} transitions, expected less than their "
-            f"largest motion, {float(motion.max()):.3g}: lower it, or, if these are the held-out ones, change data.held_out"
+            f"{key}: got {threshold:g}, which leaves none of {len(motion)} transitions, expected less than "
+            f"their largest motion, {float(motion.max()):.3g}: lower it, or change data.held_out if they are held out"
         )
     kept = moving.clone()
     for after in range(1, min(margin, len(moving) - 1) + 1):
