@@ -72,7 +72,14 @@ def _run(folder: Path, config: ExperimentConfig) -> Path:
         path.write_text(json.dumps(result))
     for stage in ("slots", "policy"):
         (run / stage / "checkpoint").mkdir(parents=True)
-        meta = {"steps": 5, "seconds": 3.0, "metrics": {"psnr": 20.0}, "demos": 9, "labelled_demos": 4}
+        meta = {
+            "steps": 5,
+            "seconds": 3.0,
+            "metrics": {"psnr": 20.0},
+            "demos": 9,
+            "labelled_demos": 4,
+            "kept_rows": 0.41,
+        }
         (run / stage / "checkpoint" / "meta.json").write_text(json.dumps(meta))
         rows = [{"step": s, "split": "train", "loss": 1 / (s + 1)} for s in range(5)]
         (run / stage / "metrics.jsonl").write_text("\n".join(map(json.dumps, rows)) + '\n{"step": 5, "lo')
@@ -109,6 +116,7 @@ def test_report_of_a_whole_run_is_self_contained(tmp_path: Path, monkeypatch: py
         assert re.search(f"<h2>.*{title}", html), title
     assert "98 %" in html
     assert "9 demonstration videos, the real actions of 4 of them" in text
+    assert "Still stretches left out: 41 % of the demonstrations' rows were learned from" in text
     assert "broken: no such thing" in text
     assert "Stage dynamics is not finished" in text
     named = re.findall(r"\]\((figures/[a-z_]+\.png)\)", text)
