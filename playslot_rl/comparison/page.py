@@ -122,7 +122,7 @@ def _footnotes(result: Result) -> list[str]:
     kept = [f"{title} {_kept(shares)}" for title in _titles(done) if (shares := _shares(done, title))]
     notes += [f"Rows learned from; still stretches of the videos are left out: {'; '.join(kept)}."] if kept else []
     samples = _one_each(done, "samples", "{title} {value}")
-    counted = "Training of the policy, optimiser steps times batch (a decoder and fine-tuning, which follow, not counted)"
+    counted = "Training of the policy, optimiser steps times batch (decoder and fine-tuning, which follow, not counted)"
     notes += [f"{counted}: {'; '.join(samples)}."] if samples else []
     notes.append(_times(done, result))
     notes += _shared(result)
