@@ -30,7 +30,6 @@ def main(config: ExperimentConfig) -> None:
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
     from playslot_rl.baselines.caddy.load import MODEL, POLICY
-    from playslot_rl.data.demonstrations import require_labelled
     from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.record import run_stage
 
@@ -39,8 +38,6 @@ def main(config: ExperimentConfig) -> None:
     record = _policy_record(config, run, parents) if acts else _oracle_record(config, run, parents)
     record.data.require_actions(config.env.action_dim)
     labelled = config.behaviour.labelled_demos if acts else None
-    if labelled is not None:
-        require_labelled(labelled, record.data.episodes)  # before anything is computed
     world = config.baselines.caddy_policy.world if acts else config.baselines.caddy_oracle.world
     parents[MODEL] = model_of(config, run, MODEL, world, train_model, record.demos, labelled)
     run_stage(record, lambda: (_policy if acts else _oracle)(config, record))

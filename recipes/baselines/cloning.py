@@ -46,12 +46,15 @@ def model_of(
 
     Raises:
         CheckpointError: no finished model there, one of other frames or sizes, or `run` has another one of its own.
-        DataError: nothing moves in `demos`, in the labelled ones, or in those that are held out.
+        DataError: fewer than `labelled`, or nothing moves in `demos`, in the labelled ones, or in those held out.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
+    from playslot_rl.data.demonstrations import require_labelled
     from playslot_rl.errors import CheckpointError
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, require_whole
 
+    if labelled is not None:
+        require_labelled(labelled, demos.trained.episodes)
     if not world:
         if not (checkpoint_folder(run, stage) / "meta.json").is_file():
             _require_moving(config, demos, labelled)
@@ -73,11 +76,11 @@ def _require_moving(config: ExperimentConfig, demos: DemonstrationSplit, labelle
     from playslot_rl.data.demonstrations import labelled_rows, moving_frames
 
     threshold, margin = config.behaviour.trim_pixels, config.behaviour.trim_margin
-    for source in (demos.trained, demos.held_out):
-        if source is not None:
-            moves = moving_frames(source, threshold, margin)
-            if labelled is not None and source is demos.trained:
-                labelled_rows(moves.episode, labelled)
+    moves = moving_frames(demos.trained, threshold, margin)
+    if labelled is not None:
+        labelled_rows(moves.episode, labelled)
+    if demos.held_out is not None:
+        moving_frames(demos.held_out, threshold, margin)
 
 
 def cloning(

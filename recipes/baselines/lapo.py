@@ -28,7 +28,6 @@ def main(config: ExperimentConfig) -> None:
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
     from playslot_rl.baselines.lapo.load import MODEL, NAME, sizes_of
-    from playslot_rl.data.demonstrations import require_labelled
     from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.record import StageRecord, run_stage
     from playslot_rl.training.runs import adopt_stage
@@ -58,7 +57,6 @@ def main(config: ExperimentConfig) -> None:
         ready=lambda: adopt_stage(parents[MODEL], run),
     )
     record.data.require_actions(config.env.action_dim)
-    require_labelled(config.behaviour.labelled_demos, record.data.episodes)  # before anything is computed
     labelled, sizes = config.behaviour.labelled_demos, {NAME: sizes_of(own)}
     parents[MODEL] = model_of(config, run, MODEL, own.world, train_model, record.demos, labelled, sizes)
     run_stage(record, lambda: _training(config, record))

@@ -69,7 +69,8 @@ def test_the_page_has_the_table_the_footnotes_and_the_failure(ended: dict[str, A
     assert "**lapo-d10-s0: failed.** loss is nan at step 3" in page
     assert "DreamerV3: 10,000 environment steps, which are 2,000 agent steps of 5; mean over the seeds" in page
     assert "of training on 700 videos without actions" in page
-    assert "decoder and fine-tuning, which follow, not counted): Slot Oracle 1,600." in page
+    samples = "optimiser steps times batch (decoder and fine-tuning, which follow, not counted): Slot Oracle 1,600."
+    assert f"Training of the policy, {samples}" in page
     assert "Failures: 1 of 7 jobs" in page
     assert "Not finished" not in page
     assert "over the Slot Oracle's: 70 % at 10 demonstrations" in page
