@@ -45,6 +45,11 @@ def autocast(device_type: str, precision: Precision) -> torch.autocast:
     return torch.autocast(device_type, torch.bfloat16, enabled=resolve_precision(precision, device_type) == "bf16")
 
 
+def full_precision(device_type: str) -> torch.autocast:
+    """Inside an `autocast`, surrounds what small differences pass through: it is computed in its inputs' precision."""
+    return torch.autocast(device_type, enabled=False)
+
+
 @functools.cache
 def _warn_of_emulation(device_type: str) -> None:
     warnings.warn(

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from playslot_rl.frames import psnr
-from playslot_rl.shares import averaged
+from playslot_rl.shares import averaged, own_noise
 
 
 def total_loss(losses: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
@@ -22,6 +22,31 @@ def total_loss(losses: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
     if not parts:
         raise ValueError(f"losses: got keys {sorted(losses.keys())}, expected some named loss_*")
     return torch.stack(parts).sum()
+
+
+def draw_frames(batch: int, frames: int, count: int, generator: torch.Generator | None) -> Tensor | None:
+    """Which frames of each clip are decoded for an image loss.
+
+    Args:
+        batch: clips B.
+        frames: of each clip, T.
+        count: k; 0, or as many as there are, means all.
+        generator: draws them, uniformly without replacement, for each clip; None is torch's own, on the CPU.
+
+    Returns:
+        Numbers from 0 (B, k), int64, on the generator's device, or None for all.
+    """
+    if not 0 < count < frames:
+        return None
+    device = "cpu" if generator is None else generator.device
+    drawn = own_noise((batch, frames), lambda shape: torch.rand(shape, generator=generator, device=device))
+    return drawn.argsort(dim=1)[:, :count]
+
+
+def of_frames(values: Tensor, chosen: Tensor) -> Tensor:
+    """The frames (B, k, ...) of values (B, T, ...) that were drawn: `chosen` (B, k)."""
+    chosen = chosen.to(values.device)
+    return values[torch.arange(len(values), device=values.device)[:, None], chosen]
 
 
 def batch_psnr(mse: Tensor) -> Tensor:

@@ -18,12 +18,11 @@ from torchrl.objectives import LossModule
 from playslot_rl import keys
 from playslot_rl.config import DynamicsStageConfig
 from playslot_rl.frames import normalise
-from playslot_rl.losses.common import batch_psnr
+from playslot_rl.losses.common import batch_psnr, draw_frames, of_frames
 from playslot_rl.modules.inverse_dynamics import InverseDynamics, LatentActions
 from playslot_rl.modules.predictors import Predictor
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.shares import own_noise
 
 
 class DynamicsLoss(LossModule):
@@ -139,15 +138,9 @@ class DynamicsLoss(LossModule):
 
     def _image(self, predicted: Tensor, pixels: Tensor, generator: torch.Generator | None) -> Tensor:
         """Image error of predictions (B, T-1, N, D) against the frames (B, T-1, 3, H, W) that follow."""
-        batch, steps = predicted.shape[:2]
-        count = self.config.decoded_frames
-        if 0 < count < steps:
-            device = predicted.device if generator is None else generator.device
-            drawn = own_noise((batch, steps), lambda shape: torch.rand(shape, generator=generator, device=device))
-            order = drawn.argsort(dim=1)
-            chosen = order[:, :count].to(predicted.device)
-            rows = torch.arange(batch, device=predicted.device)[:, None]
-            predicted, pixels = predicted[rows, chosen], pixels[rows.to(pixels.device), chosen.to(pixels.device)]
+        chosen = draw_frames(*predicted.shape[:2], self.config.decoded_frames, generator)
+        if chosen is not None:
+            predicted, pixels = of_frames(predicted, chosen), of_frames(pixels, chosen)
         frames = normalise(pixels.to(predicted.device))
         return (self.savi.decode(predicted).frames - frames).square().mean()
 

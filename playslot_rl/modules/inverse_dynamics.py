@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from playslot_rl.config import InverseDynamicsConfig
 from playslot_rl.modules.quantizer import ActionQuantizer
 from playslot_rl.modules.transformer import SlotTokenEncoder
+from playslot_rl.precision import full_precision
 from playslot_rl.shares import own_noise
 
 
@@ -105,7 +106,9 @@ class InverseDynamics(nn.Module):
     def scene_dynamics(self, slots: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the scene dynamics of each frame: slots (..., N, D) -> two of (..., [N,] Z)."""
         h = self.encoder(slots)
-        return self.to_mean(h), F.softplus(self.to_variance(h)) + 1e-6
+        with full_precision(slots.device.type):  # z is a difference of two means that are nearly equal
+            h = h.to(slots.dtype)
+            return self.to_mean(h), F.softplus(self.to_variance(h)) + 1e-6
 
     def forward(
         self, slots: Tensor, actions: Tensor | None = None, generator: torch.Generator | None = None
@@ -148,6 +151,7 @@ class InverseDynamics(nn.Module):
             # Without a codebook z enters through the variability's projection alone.
             code = torch.zeros(z.shape[:-1], dtype=torch.long, device=z.device)
             return LatentActions(z, mean, torch.zeros_like(z), z, code, z.new_zeros(()))
-        p, code, loss = self.quantizer(z)
+        with full_precision(z.device.type):
+            p, code, loss = self.quantizer(z)
         v = z - p.detach() if mode == "hybrid" else torch.zeros_like(z)
         return LatentActions(z, mean, p, v, code, loss)

@@ -19,6 +19,29 @@ from torch import Tensor, nn
 KeysValues = tuple[Tensor, Tensor]
 """Cached keys and values of the past tokens, each (B, heads, S_past, head_dim)."""
 
+PLAIN_TOKENS = 256
+"""Up to so many keys a CPU multiplies matrices: its fused kernel, made for long sequences, is up to five times slower
+on two threads (docs/performance.md)."""
+
+
+def attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
+    """softmax(q k^T / sqrt(d) + bias) v by whichever way is quicker for the device and the number of keys.
+
+    Args:
+        q: queries (B, heads, S, d).
+        k, v: keys and values (B, heads, L, d).
+        mask: bool, True where attention is allowed, or a bias of the logits, broadcastable to (B, heads, S, L).
+
+    Returns:
+        (B, heads, S, d).
+    """
+    if q.device.type != "cpu" or k.shape[2] > PLAIN_TOKENS:
+        return F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+    logits = q * q.shape[-1] ** -0.5 @ k.transpose(-1, -2)
+    if mask is not None:
+        logits = logits.masked_fill(~mask, -torch.inf) if mask.dtype == torch.bool else logits + mask
+    return torch.softmax(logits, dim=-1) @ v
+
 
 class TransformerBlock(nn.Module):
     """One pre-norm block.
@@ -72,7 +95,7 @@ class TransformerBlock(nn.Module):
             k, v = torch.cat((past[0], k), dim=2), torch.cat((past[1], v), dim=2)
         if mask is not None and wanted != slice(None) and mask.shape[-2] > 1:
             mask = mask[..., wanted, :]
-        y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+        y = attention(q, k, v, mask)
         x = x[:, wanted] + self.to_out(y.transpose(1, 2).flatten(2))
         return x + self.mlp(self.norm_mlp(x)), (k, v)
 

@@ -22,6 +22,7 @@ from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.predictors.cocvp import COCVP
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.modules.savi.decoder import BroadcastDecoder
+from playslot_rl.precision import autocast
 from playslot_rl.training.fit import build_adam, clip_gradients, trainable_parameters
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ class Variant:
     Attributes:
         case: what is computed.
         collapse: collapsed first layer of the decoder.
-        precision: of the convolutions; `auto` is what this processor is fastest in.
+        precision: of convolutions and transformers; `auto` is what this processor is fastest in.
         channels_last: memory format of the convolutions' maps.
         allocator: keep freed memory (`playslot_rl.allocator`).
         cached: rollout with cached keys and values.
@@ -207,9 +208,10 @@ def dynamics_loss(
     generator: torch.Generator,
 ) -> Tensor:
     """Stage 2's loss, as `DynamicsLoss` with the default weights."""
-    latent = inverse(slots, generator=generator)
-    rollout = predictor.rollout if variant.cached else predictor.rollout_full
-    predicted = rollout(slots[:, :seed_frames], latent.prototype, latent.variability)
+    with autocast(slots.device.type, variant.precision):
+        latent = inverse(slots, generator=generator)
+        rollout = predictor.rollout if variant.cached else predictor.rollout_full
+        predicted = rollout(slots[:, :seed_frames], latent.prototype, latent.variability)
     slot_error = (predicted - slots[:, 1:]).square().mean()
     decoded, targets = predicted, frames[:, 1:]
     if variant.decoded_frames:

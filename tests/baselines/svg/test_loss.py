@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 from torch.distributions import Independent, Normal, kl_divergence
 
-from playslot_rl.baselines.svg.loss import draw_steps, gaussian_kl, svg_objective
+from playslot_rl.baselines.svg.loss import gaussian_kl, svg_objective
 from playslot_rl.baselines.svg.model import SVG
 from playslot_rl.baselines.svg.recurrent import Gaussian
+from playslot_rl.losses.common import draw_frames
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -57,7 +58,7 @@ def test_the_loss_is_a_sum_over_steps_of_means_over_pixels_and_sums_over_latents
 
 @pytest.mark.parametrize("decoded", [0, 2])
 def test_gradients_reach_every_parameter(model: SVG, frames: Tensor, decoded: int) -> None:
-    steps = draw_steps(2, 5, decoded, generator())
+    steps = draw_frames(2, 5, decoded, generator())
     svg_objective(model(frames, 3, generator(), steps), frames, kl_weight=1.0)["loss"].backward()
     without = [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()]
     assert without == []
@@ -92,7 +93,7 @@ def test_the_average_over_many_draws_is_the_full_loss(model: SVG, frames: Tensor
         full, numbers, parts = svg_objective(out, frames, 0.1)["loss"], generator(5), []
         clip = torch.arange(2)[:, None]
         for _ in range(2000):
-            steps = draw_steps(2, 5, 2, numbers)
+            steps = draw_frames(2, 5, 2, numbers)
             assert steps is not None
             chosen = out._replace(predicted=out.predicted[clip, steps], steps=steps)
             parts.append(svg_objective(chosen, frames, 0.1)["loss"])
@@ -105,7 +106,7 @@ def test_the_average_over_many_draws_is_the_full_loss(model: SVG, frames: Tensor
 def test_every_step_of_every_clip_is_drawn_equally_often_and_at_most_once() -> None:
     numbers, counts = generator(), torch.zeros(3, 5)
     for _ in range(1000):
-        steps = draw_steps(3, 5, 2, numbers)
+        steps = draw_frames(3, 5, 2, numbers)
         assert steps is not None
         counts += torch.zeros(3, 5).scatter_add_(1, steps, torch.ones(3, 2))
         assert bool((steps[:, 0] != steps[:, 1]).all())
@@ -114,4 +115,4 @@ def test_every_step_of_every_clip_is_drawn_equally_often_and_at_most_once() -> N
 
 @pytest.mark.parametrize("count", [0, 5, 6])
 def test_all_steps_are_decoded_where_nothing_else_is_asked_for(count: int) -> None:
-    assert draw_steps(3, 5, count, generator()) is None
+    assert draw_frames(3, 5, count, generator()) is None
