@@ -1,4 +1,4 @@
-"""Which arithmetic a training's convolutions use, and the context that surrounds them.
+"""Which arithmetic a training's convolutions and transformers use, and the context that surrounds them.
 
 `bf16` pays only where the processor multiplies it itself (AVX-512 BF16 or AMX, any GPU since NVIDIA's Ampere).
 Elsewhere every product is emulated: SAVi's step at `compact` takes 6 s instead of 0.6 s on an EPYC that has AVX2

@@ -44,7 +44,8 @@ class StageConfig(Checked):
         steps: optimiser steps.
         batch_size: windows per step.
         optim: optimiser.
-        precision: `bf16` autocasts the convolutions; `auto` does so where the processor multiplies bf16 itself.
+        precision: `bf16` autocasts SAVi's convolutions and the other networks; `auto` does so where the processor
+            multiplies bf16 itself.
         checkpoint_every: steps between checkpoints.
         validate_every: steps between validations.
         log_every: steps between log lines.
@@ -67,7 +68,6 @@ class SlotsStageConfig(StageConfig):
 
     Attributes:
         clip_frames: frames per clip.
-        decoded_frames: frames of each clip that are decoded for the loss, drawn at random; 0 decodes all (paper).
         start_from: run (or `pretrained/ENV`) whose SAVi this one starts from; empty starts from scratch (paper).
         motion_weight: so many times more than others counts a pixel that moves; 0 counts all alike (paper).
         patience: end before `steps` once the error on held-out clips has not fallen for so many validations, with the
@@ -78,7 +78,6 @@ class SlotsStageConfig(StageConfig):
 
     group = "slots."
     clip_frames: int = 8
-    decoded_frames: int = field(default=0, metadata=at_least(0, "0 (all frames) or more"))
     start_from: str = field(default="", metadata=role("folder"))
     motion_weight: float = field(default=0.0, metadata=at_least(0, "0 (all pixels alike) or more"))
     patience: int = field(default=0, metadata=at_least(0, "0 (train all steps) or more"))

@@ -8,9 +8,6 @@ With a motion weight lambda, pixels that move count 1 + lambda times, in each cl
 
 where m_{b,t,p} is 1 where the pixel changes from the frame before or to the one after, else 0.
 
-With k decoded frames, t runs over k of the clip's T frames, drawn uniformly without replacement: with lambda = 0 an
-unbiased estimate. All frames are parsed.
-
 Note: the paper has lambda = 0. Where small things move over a ground that stays, they are a few hundredths of the plain
 error, and SAVi learns the ground alone for a long time.
 
@@ -29,7 +26,7 @@ from torchrl.objectives import LossModule
 
 from playslot_rl import keys
 from playslot_rl.frames import normalise
-from playslot_rl.losses.common import batch_psnr, draw_frames, of_frames
+from playslot_rl.losses.common import batch_psnr
 from playslot_rl.modules.savi import Decoded, SAVi
 from playslot_rl.modules.savi.health import moves
 
@@ -43,7 +40,6 @@ class SlotsLoss(LossModule):
     Args:
         savi: the model that is trained.
         motion_weight: lambda.
-        decoded_frames: k; 0 decodes all of them.
 
     Examples:
         >>> import torch
@@ -71,9 +67,9 @@ class SlotsLoss(LossModule):
     default_keys = _AcceptedKeys
     out_keys = ("loss_reconstruction", "psnr")
 
-    def __init__(self, savi: SAVi, motion_weight: float = 0.0, decoded_frames: int = 0) -> None:
+    def __init__(self, savi: SAVi, motion_weight: float = 0.0) -> None:
         super().__init__()
-        self.savi, self.motion_weight, self.decoded_frames = savi, motion_weight, decoded_frames
+        self.savi, self.motion_weight = savi, motion_weight
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -85,19 +81,14 @@ class SlotsLoss(LossModule):
 
         Args:
             tensordict: PIXELS (B, T, 3, H, W).
-            generator: of sampled initial slots, and of the frames to decode.
+            generator: of sampled initial slots.
         """
-        frames, slots = self._parse(tensordict, generator)
-        moved = moving(frames) if self.motion_weight else None
-        chosen = draw_frames(*frames.shape[:2], self.decoded_frames, generator)
-        if chosen is not None:
-            frames, slots = of_frames(frames, chosen), of_frames(slots, chosen)
-            moved = None if moved is None else of_frames(moved, chosen)
-        error = (self.savi.decode(slots).frames - frames).square()
+        frames, decoded = self.reconstruct(tensordict, generator)
+        error = (decoded.frames - frames).square()
         mse = error.mean()
         loss = mse
-        if moved is not None:
-            weight = 1.0 + self.motion_weight * moved
+        if self.motion_weight:
+            weight = 1.0 + self.motion_weight * moving(frames)
             loss = ((weight * error.mean(2)).sum((1, 2, 3)) / weight.sum((1, 2, 3))).mean()
         return TensorDict({"loss_reconstruction": loss, "psnr": batch_psnr(mse)}, [])
 
@@ -105,12 +96,9 @@ class SlotsLoss(LossModule):
         self, tensordict: TensorDictBase, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Decoded]:
         """Frames (B, T, 3, H, W) in [0, 1] and what SAVi makes of them; arguments as of `forward`."""
-        frames, slots = self._parse(tensordict, generator)
-        return frames, self.savi.decode(slots)
-
-    def _parse(self, tensordict: TensorDictBase, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
         frames = normalise(tensordict.get(self.tensor_keys.pixels))
-        return frames, self.savi(frames, generator=generator)[0]
+        slots, _ = self.savi(frames, generator=generator)
+        return frames, self.savi.decode(slots)
 
 
 def moving(frames: Tensor) -> Tensor:
