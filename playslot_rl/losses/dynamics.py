@@ -138,7 +138,8 @@ class DynamicsLoss(LossModule):
 
     def _image(self, predicted: Tensor, pixels: Tensor, generator: torch.Generator | None) -> Tensor:
         """Image error of predictions (B, T-1, N, D) against the frames (B, T-1, 3, H, W) that follow."""
-        chosen = draw_frames(*predicted.shape[:2], self.config.decoded_frames, generator)
+        batch, steps = predicted.shape[:2]
+        chosen = draw_frames(batch, steps, self.config.decoded_frames, generator)
         if chosen is not None:
             predicted, pixels = of_frames(predicted, chosen), of_frames(pixels, chosen)
         frames = normalise(pixels.to(predicted.device))
