@@ -19,13 +19,15 @@ from torch import Tensor, nn
 KeysValues = tuple[Tensor, Tensor]
 """Cached keys and values of the past tokens, each (B, heads, S_past, head_dim)."""
 
-PLAIN_TOKENS = 256
-"""Up to so many keys a CPU multiplies matrices: its fused kernel, made for long sequences, is up to five times slower
-on two threads (docs/performance.md)."""
+PRODUCTS_UP_TO = 256
+"""Keys up to which bf16 attention is computed by matrix products on a CPU, where torch's fused kernel, made for long
+sequences, is slower. In fp32 it is not on one thread, and its sums do not depend on how many rows a process has, which
+those of products do: results of several processes would drift from those of one.
+"""
 
 
 def attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
-    """softmax(q k^T / sqrt(d) + bias) v by whichever way is quicker for the device and the number of keys.
+    """softmax(q k^T / sqrt(d) + bias) v by whichever way is quicker for the device, the precision and the keys.
 
     Args:
         q: queries (B, heads, S, d).
@@ -35,8 +37,13 @@ def attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Te
     Returns:
         (B, heads, S, d).
     """
-    if q.device.type != "cpu" or k.shape[2] > PLAIN_TOKENS:
-        return F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+    short = q.device.type == "cpu" and q.dtype == torch.bfloat16 and k.shape[2] <= PRODUCTS_UP_TO
+    by = products if short else F.scaled_dot_product_attention
+    return by(q, k, v, mask)
+
+
+def products(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
+    """`attention` by matrix products."""
     logits = q * q.shape[-1] ** -0.5 @ k.transpose(-1, -2)
     if mask is not None:
         logits = logits.masked_fill(~mask, -torch.inf) if mask.dtype == torch.bool else logits + mask

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from playslot_rl.modules import transformer
-from playslot_rl.modules.transformer import PLAIN_TOKENS, attention
+from playslot_rl.modules.transformer import PRODUCTS_UP_TO, attention, products
 
 MASKS = {
     "none": None,
@@ -24,23 +24,28 @@ def test_short_sequences_have_the_fused_kernels_values_and_gradients(name: str) 
     given = [torch.randn(shape, dtype=torch.float64, requires_grad=True) for shape in shapes]
     weight = torch.randn(2, 3, 5, 4, dtype=torch.float64)
     found = []
-    for function in (attention, F.scaled_dot_product_attention):
+    for function in (products, F.scaled_dot_product_attention):
         out = function(*given, MASKS[name])
         found.append((out, *torch.autograd.grad((out * weight).sum(), given)))
     for got, expected in zip(*found, strict=True):
         torch.testing.assert_close(got, expected)
 
 
-@pytest.mark.parametrize("extra", [0, 1])
-def test_only_long_sequences_go_to_the_fused_kernel(extra: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("dtype", "keys", "fused_calls"),
+    [(torch.bfloat16, PRODUCTS_UP_TO, 0), (torch.bfloat16, PRODUCTS_UP_TO + 1, 1), (torch.float32, 4, 1)],
+)
+def test_only_short_sequences_in_bf16_leave_the_fused_kernel(
+    dtype: torch.dtype, keys: int, fused_calls: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     fused = F.scaled_dot_product_attention
     called = []
 
-    def spy(*given: torch.Tensor, attn_mask: torch.Tensor | None = None) -> torch.Tensor:
+    def spy(*given: torch.Tensor | None) -> torch.Tensor:
         called.append(given)
-        return fused(*given, attn_mask=attn_mask)
+        return fused(*given)
 
     monkeypatch.setattr(transformer.F, "scaled_dot_product_attention", spy)
-    q, k, v = (torch.randn(1, 1, size, 4) for size in (2, PLAIN_TOKENS + extra, PLAIN_TOKENS + extra))
+    q, k, v = (torch.randn(1, 1, size, 4, dtype=dtype) for size in (2, keys, keys))
     torch.testing.assert_close(attention(q, k, v), fused(q, k, v))
-    assert len(called) == extra
+    assert len(called) == fused_calls
