@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from playslot_rl.config import EnvConfig, ModelConfig, OptimConfig, Precision, PredictorConfig, SAViConfig
+from playslot_rl.losses.common import draw_frames, of_frames
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.predictors.cocvp import COCVP
 from playslot_rl.modules.savi import SAVi
@@ -214,10 +215,10 @@ def dynamics_loss(
         predicted = rollout(slots[:, :seed_frames], latent.prototype, latent.variability)
     slot_error = (predicted - slots[:, 1:]).square().mean()
     decoded, targets = predicted, frames[:, 1:]
-    if variant.decoded_frames:
-        order = torch.rand(decoded.shape[:2], generator=generator).argsort(dim=1)[:, : variant.decoded_frames]
-        rows = torch.arange(len(decoded))[:, None]
-        decoded, targets = decoded[rows, order], targets[rows, order]
+    batch, steps = decoded.shape[:2]
+    chosen = draw_frames(batch, steps, variant.decoded_frames, generator)
+    if chosen is not None:
+        decoded, targets = of_frames(decoded, chosen), of_frames(targets, chosen)
     image_error = (savi.decode(decoded).frames - targets).square().mean()
     total: Tensor = image_error + slot_error + 0.25 * latent.vq_loss
     return total

@@ -163,7 +163,7 @@ def _parts(config: ExperimentConfig, stage: str, agent: Agent) -> tuple[nn.Modul
 
     if stage == "slots":
         clip = (config.slots.clip_frames, *frames)
-        return SlotsLoss(model.savi, config.slots.motion_weight), lambda n: batch(n, (keys.PIXELS, clip))
+        return SlotsLoss(model.savi), lambda n: batch(n, (keys.PIXELS, clip))
     if stage == "dynamics":
         T = config.dynamics.seed_frames + config.dynamics.predicted_frames
         criterion = DynamicsLoss(model.inverse_dynamics, model.predictor, model.savi, config.dynamics)

@@ -10,12 +10,12 @@ Shapes: B batch, T frames of a clip, H W image height and width, Z latent, k dec
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from playslot_rl.baselines.svg.model import TeacherForced
 from playslot_rl.baselines.svg.recurrent import Gaussian
 from playslot_rl.frames import normalise
+from playslot_rl.losses.common import of_frames
 
 
 def gaussian_kl(posterior: Gaussian, prior: Gaussian) -> Tensor:
@@ -42,8 +42,7 @@ def svg_objective(out: TeacherForced, frames: Tensor, kl_weight: float) -> dict[
         `mse` of a predicted frame and `kl` of a step in nats, without beta.
     """
     steps = frames.shape[1] - 1
-    clip = torch.arange(len(frames), device=frames.device)[:, None]
-    target = normalise(frames[clip, out.steps + 1])
+    target = normalise(of_frames(frames, out.steps + 1))
     mse = (out.predicted - target).square().mean()
     kl = gaussian_kl(out.posterior, out.prior).mean()
     image, divergence = steps * mse, kl_weight * steps * kl
