@@ -1,4 +1,4 @@
-"""`playslot evaluate run=DIR protocol=simulation|imagination|slots episodes=N seed=S`: success of a trained policy.
+"""`playslot evaluate run=DIR protocol=simulation|imagination|replay|slots episodes=N seed=S`: success of a policy.
 
 Writes `DIR/evaluation/PROTOCOL/eval_info.json` and renews `DIR/report.md` and `DIR/report.html`.
 """

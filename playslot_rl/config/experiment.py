@@ -186,7 +186,8 @@ class ExperimentConfig(Checked):
         workers: collector processes; 0 means one per core.
         out: folder to write.
         run: run folder to read (and to write where `out` is empty); `pretrained` names the shipped model.
-        protocol: evaluation protocol: a policy in `simulation` or `imagination`, or the `slots` it builds on.
+        protocol: evaluation protocol: a policy in `simulation` or `imagination`, its decoder in a `replay` of the
+            expert's videos, or the `slots` it builds on.
         device: torch device; empty means a GPU if there is one.
         threads: torch threads; 0 leaves torch's choice.
         method: what `train-baseline` trains (a name of `playslot_rl.config.methods`).
@@ -202,7 +203,9 @@ class ExperimentConfig(Checked):
     workers: int = field(default=0, metadata=role("call", "machine") | at_least(0, "0 (one per core) or more"))
     out: str = field(default="", metadata=role("call", "machine", "folder"))
     run: str = field(default="", metadata=role("call", "machine", "folder"))
-    protocol: Literal["simulation", "imagination", "slots"] = field(default="simulation", metadata=role("call"))
+    protocol: Literal["simulation", "imagination", "replay", "slots"] = field(
+        default="simulation", metadata=role("call")
+    )
     device: str = field(default="", metadata=role("call", "machine"))
     threads: int = field(default=0, metadata=role("machine"))
     minutes: float = field(default=60.0, metadata=role("call", "machine", "free") | within(lambda v: v > 0, "above 0"))

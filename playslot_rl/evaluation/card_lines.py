@@ -56,6 +56,13 @@ MEASURES: Final[Mapping[str, Measure]] = {
         "0 or less: the scene alone says as much",
         (0.1, 0.0),
     ),
+    "lag": Measure(
+        ACTIONS,
+        "lag: the better probe of the latent one transition later, above that of the action's own (R²)",
+        "0 or less: an action shows at once",
+        "0.1 or more: the robot follows late, and a latent shows the action before it",
+        (0.0, 0.1),
+    ),
     "shuffled_probe": Measure(
         ACTIONS,
         "control: latents paired with other actions (R²)",

@@ -124,17 +124,27 @@ def _scores(parsed: Parsed, noisy: npt.NDArray[np.float32], seed: int) -> dict[s
         "frame": parsed.slots[parsed.rows].reshape(len(parsed.rows), -1),
         "noise": noisy,
     }
-    return {name: probe_actions(x, parsed.actions, parsed.episodes, tested=parsed.tested) for name, x in seen.items()}
+    scores = {name: probe_actions(x, parsed.actions, parsed.episodes, tested=parsed.tested) for name, x in seen.items()}
+    before = np.nonzero(parsed.episodes[1:] == parsed.episodes[:-1])[0]
+    if len(before):  # an episode's last transition has none after it
+        late, episodes, tested = parsed.latents[before + 1], parsed.episodes[before], parsed.tested[before]
+        if tested.any() and not tested.all():
+            scores["late"] = probe_actions(late, parsed.actions[before], episodes, tested=tested)
+    return scores
 
 
 def _probe_lines(scores: dict[str, Any]) -> dict[str, Line]:
-    best = {name: max(score["linear"]["mean_r2"], score["mlp"]["mean_r2"]) for name, score in scores.items()}
-    own = scores["latent"]
+    known = {name: score for name, score in scores.items() if score["linear"]["mean_r2"] is not None}
+    best = {name: max(score["linear"]["mean_r2"], score["mlp"]["mean_r2"]) for name, score in known.items()}
+    own, late = scores["latent"], "every episode has one transition, or all that go on have the same action"
     held = f"{own['test']} transitions of {own['test_episodes']} held-out episodes, fitted on {own['train']} others"
     return {
         "linear_probe": line("linear_probe", own["linear"]["mean_r2"], held),
         "mlp_probe": line("mlp_probe", own["mlp"]["mean_r2"], held),
         "above_frame": line("above_frame", best["latent"] - best["frame"], f"the frame alone: {best['frame']:.2f}"),
+        "lag": line("lag", best["late"] - best["latent"], f"one later: {best['late']:.2f}")
+        if "late" in best
+        else line("lag", None, late),
         "shuffled_probe": line("shuffled_probe", best["shuffled"], "the better of both probes"),
         "noise_probe": line("noise_probe", best["noise"], "the better of both probes"),
     }

@@ -1,5 +1,6 @@
-"""Success in simulation (closed loop) and in imagination (open loop), on a fixed list of seeds, one episode each; and
-that of the references on the same seeds: random actions, the scripted expert, and the slot oracle.
+"""Success in simulation (closed loop) and in imagination (open loop), on a fixed list of seeds, one episode each; that
+of the expert's videos replayed through the latents; and that of the references on the same seeds: random actions, the
+scripted expert, and the slot oracle.
 
 TorchRL's `Evaluator` counts the first N *finished* episodes, which favours short ones and overstates success; the plain
 loop here runs each seed once. That it acts as the TorchRL environments do is tested.
@@ -14,6 +15,7 @@ import platform
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ import torch
 from playslot_rl.acting.actor import Actor, ExpertActor, RandomActor
 from playslot_rl.acting.agent import ImaginationActor, oracle_actor, playslot_actor
 from playslot_rl.acting.episodes import Outcome, TaskPool, run_episodes
+from playslot_rl.acting.replay import ReplayActor, perform
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.methods import method_stage
 from playslot_rl.errors import CheckpointError, ConfigError
@@ -32,7 +35,8 @@ from playslot_rl.storage.atomic import write_json
 from playslot_rl.threads import available_cores
 from playslot_rl.world_model import Agent
 
-PROTOCOLS = ("simulation", "imagination")
+POLICY_PROTOCOLS = ("simulation", "imagination")
+PROTOCOLS = (*POLICY_PROTOCOLS, "replay")
 DEFAULT_EPISODES = 50
 
 
@@ -88,7 +92,7 @@ def check_protocol(protocol: str) -> None:
     """Refuse an unknown protocol.
 
     Raises:
-        ConfigError: it is neither `simulation` nor `imagination`.
+        ConfigError: it is none of `PROTOCOLS`.
     """
     if protocol not in PROTOCOLS:
         raise ConfigError(f"protocol: got {protocol!r}, expected one of {', '.join(PROTOCOLS)}")
@@ -111,7 +115,8 @@ def evaluate(
         agent: world model, policy, action decoder and, for the reference, slot oracle.
         config: environment, renderer, `evaluation`, and the data sets whose seeds must not come up.
         protocol: `simulation` (closed loop) or `imagination` (open loop: one frame is parsed, policy and cOCVP unfold
-            `max_steps` steps in latent space, and the decoded actions are then executed).
+            `max_steps` steps in latent space, and the decoded actions are then executed), or `replay` (open loop: the
+            latents are those of the expert's video of the same episode; the policy is not asked).
         episodes: number of seeds.
         seed: selects the block of evaluation seeds.
         facts: what to say about the run.
@@ -127,11 +132,19 @@ def evaluate(
     """
     check_protocol(protocol)
     agent.eval()
-    actor = playslot_actor(agent) if protocol == "simulation" else ImaginationActor(agent, config.env.max_steps)
     oracle = None if agent.oracle is None else oracle_actor(agent)
-    return measure(
-        actor, config, protocol, episodes, seed, facts=facts or RunFacts(), run=run, pool=pool, oracle=oracle
-    )
+    # The expert plays an episode while the pool's own environments wait at its first frame.
+    with TaskPool(config.env, config.render) as stage:
+        actor: Actor
+        if protocol == "simulation":
+            actor = playslot_actor(agent)
+        elif protocol == "imagination":
+            actor = ImaginationActor(agent, config.env.max_steps)
+        else:
+            actor = ReplayActor(agent, partial(perform, stage))
+        return measure(
+            actor, config, protocol, episodes, seed, facts=facts or RunFacts(), run=run, pool=pool, oracle=oracle
+        )
 
 
 def measure(
@@ -231,7 +244,7 @@ def evaluate_actor(run: Path, actor: Actor, config: ExperimentConfig, pool: Task
     """Evaluate a baseline's actor in closed loop, as `evaluate_run` does an agent; the same file, the same keys.
 
     Raises:
-        ConfigError: protocol `imagination`, which only PlaySlot has.
+        ConfigError: protocol `imagination` or `replay`, which only PlaySlot has.
         CheckpointError: the run has no trained policy of `config.method`.
         OutputError: the file cannot be written.
     """
@@ -241,7 +254,7 @@ def evaluate_actor(run: Path, actor: Actor, config: ExperimentConfig, pool: Task
 
 
 def check_baseline_protocol(config: ExperimentConfig) -> None:
-    """Refuse to evaluate a baseline in imagination.
+    """Refuse to evaluate a baseline other than in simulation.
 
     Raises:
         ConfigError: it was asked for.
@@ -249,7 +262,7 @@ def check_baseline_protocol(config: ExperimentConfig) -> None:
     if config.protocol != "simulation":
         raise ConfigError(
             f"protocol: got {config.protocol} for method={config.method}, expected simulation: "
-            "only PlaySlot acts in imagination"
+            "only PlaySlot has latent actions of a world model"
         )
 
 

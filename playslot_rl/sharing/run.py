@@ -14,7 +14,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.contents import read_info
 from playslot_rl.errors import CheckpointError, ConfigError, DataError
-from playslot_rl.evaluation.success import PROTOCOLS, run_facts
+from playslot_rl.evaluation.success import POLICY_PROTOCOLS, run_facts
 from playslot_rl.sharing.card import Result, make_card
 from playslot_rl.sharing.folder import SharedPolicyConfig, save_pretrained
 from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
@@ -85,7 +85,7 @@ def read_results(run: Path, source: dict[str, Any]) -> list[Result]:
         CheckpointError: a file is damaged.
     """
     results = []
-    for protocol in PROTOCOLS:
+    for protocol in POLICY_PROTOCOLS:
         path = run / "evaluation" / protocol / "eval_info.json"
         if not path.is_file():
             continue

@@ -12,7 +12,7 @@ from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.evaluation.slots import RESULT as SLOTS_RESULT
-from playslot_rl.evaluation.success import PROTOCOLS
+from playslot_rl.evaluation.success import POLICY_PROTOCOLS, PROTOCOLS
 from playslot_rl.visualization.charts import DARK, LIGHT, Theme, loss_chart, loss_names, success_chart
 from playslot_rl.visualization.document import Block, Missing, Picture, Section, Table, Text
 from playslot_rl.visualization.grid import png
@@ -93,7 +93,11 @@ def read_evaluations(run: Path) -> dict[str, dict[str, Any]]:
 
 # --- success ------------------------------------------------------------------------------------------------------
 
-WAYS = {"simulation": "PlaySlot, in simulation", "imagination": "PlaySlot, in imagination"}
+WAYS = {
+    "simulation": "PlaySlot, in simulation",
+    "imagination": "PlaySlot, in imagination",
+    "replay": "expert's videos, latents decoded",
+}
 REFERENCES = {"slot_oracle": "slot oracle", "expert": "scripted expert", "random": "random actions"}
 
 
@@ -116,8 +120,13 @@ def success_section(given: ReportInput) -> Section:
             "Simulation: the agent sees every frame. Imagination: it sees the first frame only, unfolds "
             f"{given.config.env.max_steps} steps in latent space, and the decoded actions are then executed."
         )
+        if "replay" in results:
+            ways += (
+                " Expert's videos: their latents instead of the policy's, decoded and executed without looking; "
+                "what fails is lost by the decoder."
+            )
         blocks.append(chart("success", lambda theme: success_chart(drawn, theme), f"Success rates. {alt}.", ways))
-    for protocol in PROTOCOLS:
+    for protocol in POLICY_PROTOCOLS:
         if protocol not in results:
             command = given.command("evaluate", f"protocol={protocol}")
             blocks.append(Missing(f"Success in {protocol} has not been measured.", command))

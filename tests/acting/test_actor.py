@@ -14,6 +14,7 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import Actor, ExpertActor, RandomActor, ReactiveActor, latent_actor
 from playslot_rl.acting.agent import ImaginationActor, oracle_actor, playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop
+from playslot_rl.acting.replay import Performance, ReplayActor
 from playslot_rl.config.compose import compose
 from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.world_model import Agent, oracle_module
@@ -72,9 +73,17 @@ def sold() -> Actor:
     return SOLDActor(savi, SOLDNetworks(config, savi.config.slot_dim, 4, 5).actor, window=2, action_dim=4)
 
 
+def performance(seeds: Sequence[int]) -> Performance:
+    """Videos that hang on their seed alone."""
+    drawn = [torch.Generator().manual_seed(seed) for seed in seeds]
+    frames = [torch.randint(256, (21, 3, 64, 64), generator=g, dtype=torch.uint8) for g in drawn]
+    return Performance(torch.stack(frames), torch.zeros(len(seeds), 20, 4))
+
+
 ACTORS: dict[str, Callable[[], Actor]] = {
     "playslot": lambda: playslot_actor(agent()),
     "imagination": lambda: ImaginationActor(agent(), STEPS),
+    "replay": lambda: ReplayActor(agent(), performance),
     "slot_oracle": lambda: oracle_actor(agent()),
     "resnet_oracle": resnet,
     "lapo": lapo,

@@ -85,6 +85,20 @@ def test_latents_that_are_the_action_are_recovered_and_wrong_pairs_are_not(model
     assert lines["above_frame"].verdict == "good"
 
 
+def test_a_robot_that_follows_late_shows_its_action_in_the_next_latent(model: WorldModel, card: Card) -> None:
+    parsed = card.parsed
+    assert parsed.actions is not None
+    mixed = parsed.actions @ np.random.default_rng(0).normal(size=(4, 8)).astype(np.float32)
+    lag = {
+        name: by_key(action_lines(model, replace(parsed, latents=latents), 0)[0])["lag"]
+        for name, latents in (("at once", mixed), ("late", np.roll(mixed, 1, axis=0)))
+    }
+    assert lag["at once"].verdict == "good"
+    assert lag["late"].verdict == "bad"
+    assert lag["late"].value is not None
+    assert lag["late"].value > 0.9
+
+
 def test_latents_of_noise_recover_nothing(model: WorldModel, card: Card) -> None:
     noise = np.random.default_rng(1).normal(size=card.parsed.latents.shape).astype(np.float32)
     lines = by_key(action_lines(model, replace(card.parsed, latents=noise), 0)[0])

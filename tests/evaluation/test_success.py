@@ -20,7 +20,7 @@ from playslot_rl.acting.episodes import TaskPool, run_episodes
 from playslot_rl.config import EvaluationConfig, ExperimentConfig
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation import success
-from playslot_rl.evaluation.success import RunFacts, evaluate, evaluate_run, run_facts
+from playslot_rl.evaluation.success import PROTOCOLS, RunFacts, evaluate, evaluate_run, run_facts
 from playslot_rl.testing import tiny_config
 from playslot_rl.world_model import Agent, WorldModel, latent_policy_module
 
@@ -86,7 +86,7 @@ def test_imagining_equals_the_modules_called_by_hand_past_the_context_too(contex
         torch.testing.assert_close(imagined.actions, agent.action_decoder(imagined.latents))
 
 
-@pytest.mark.parametrize("protocol", ["simulation", "imagination"])
+@pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_result_has_the_agreed_keys(protocol: str, config: ExperimentConfig, agent: Agent, pool: TaskPool) -> None:
     result = evaluate(agent, config, protocol, 2, 1, facts=FACTS, pool=pool)
     assert result["protocol"] == protocol
