@@ -240,7 +240,7 @@ KEYS_HELP: Final = """common keys (any key of playslot_rl/config works, with dot
   run=DIR               run folder to go on from, with its stored config; `pretrained` is the shipped model
   demos=N               train-policy, train-baseline: the first N demonstrations; compare: a list of numbers
   labels=N,...          compare: numbers of labelled demonstrations
-  protocol=simulation   evaluation protocol: simulation or imagination (or slots: scores against the segmentation)
+  protocol=simulation   evaluation protocol: simulation, imagination, replay (latents of the expert's videos) or slots
 
 environment variables: PLAYSLOT_DEBUG=1 shows tracebacks, PLAYSLOT_CACHE=DIR moves the caches,
 MUJOCO_GL chooses the GL backend (egl by default on Linux)."""
