@@ -9,7 +9,7 @@ import importlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from playslot_rl.config import EnvConfig, ExperimentConfig
 from playslot_rl.config.compose import shipped
@@ -21,7 +21,6 @@ from playslot_rl.recipes.run import existing_run, open_run, parent_run, stored_r
 
 SAME_TASK: Final = ("name", "image_size", "action_dim")
 """Of an environment: what it shares with the one a policy was trained for."""
-PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")
 
 
 def main(config: ExperimentConfig, report: bool = True) -> None:
@@ -95,7 +94,7 @@ def evaluate_baseline(config: ExperimentConfig, run: Path) -> None:
 
 def main_if_needed(config: ExperimentConfig) -> None:
     """Evaluate under both protocols and renew the report, leaving out what this policy was measured on before."""
-    from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts, task_facts
+    from playslot_rl.evaluation.success import DEFAULT_EPISODES, POLICY_PROTOCOLS, run_facts, task_facts
 
     run = check_run(config)
     if config.env.name in PROCEDURAL:
@@ -107,7 +106,7 @@ def main_if_needed(config: ExperimentConfig) -> None:
         "fingerprints": run_facts(run).fingerprints,
         **task_facts(config, config.seed),
     }
-    due = [protocol for protocol in PROTOCOLS if not measured(run, protocol, facts)]
+    due = [protocol for protocol in POLICY_PROTOCOLS if not measured(run, protocol, facts)]
     for protocol in due:
         main(replace(config, protocol=protocol), report=False)
     if due or not (run / "report.html").is_file():

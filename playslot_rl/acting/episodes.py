@@ -171,6 +171,21 @@ def run_episodes(
     return outcomes
 
 
+def record(
+    pool: TaskPool, actor: Actor, seeds: Sequence[int], look_on: LookOn | None = None
+) -> tuple[Frames, list[Outcome]]:
+    """Frames (E, T + 1, H, W, 3) of whole episodes, past success too, and their outcomes."""
+    size = pool.env.image_size
+    frames = np.zeros((len(seeds), pool.env.max_steps + 1, size, size, 3), np.uint8)
+
+    def keep(moment: Moment) -> None:
+        frames[moment.episodes, moment.step] = moment.frames
+        if look_on is not None:
+            look_on(moment)
+
+    return frames, run_episodes(pool, actor, seeds, keep, stop=False)
+
+
 class _LockStep:
     """Some episodes side by side."""
 

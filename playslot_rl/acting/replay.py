@@ -13,14 +13,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import ExpertActor, PlannedActor
-from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
+from playslot_rl.acting.episodes import Moment, TaskPool, record
 from playslot_rl.frames import normalise
 from playslot_rl.world_model import Agent
 
@@ -44,16 +43,13 @@ def perform(pool: TaskPool, seeds: Sequence[int]) -> Performance:
         pool: environments; none of them in an episode that goes on.
         seeds: of the episodes, none of which starts solved.
     """
-    env = pool.env
-    frames = np.zeros((len(seeds), env.max_steps + 1, env.image_size, env.image_size, 3), np.uint8)
-    actions = torch.zeros(len(seeds), env.max_steps, env.action_dim)
+    actions = torch.zeros(len(seeds), pool.env.max_steps, pool.env.action_dim)
 
-    def film(moment: Moment) -> None:
-        frames[list(moment.episodes), moment.step] = moment.frames
+    def note(moment: Moment) -> None:
         if moment.seen is not None:
             actions[list(moment.episodes), moment.step] = moment.seen[keys.ACTION].float().cpu()
 
-    run_episodes(pool, ExpertActor(), seeds, film, stop=False)
+    frames, _ = record(pool, ExpertActor(), seeds, note)
     return Performance(torch.from_numpy(frames).movedim(-1, -3), actions.clamp(-1, 1))
 
 

@@ -125,26 +125,25 @@ def _scores(parsed: Parsed, noisy: npt.NDArray[np.float32], seed: int) -> dict[s
         "noise": noisy,
     }
     scores = {name: probe_actions(x, parsed.actions, parsed.episodes, tested=parsed.tested) for name, x in seen.items()}
-    before = np.nonzero(parsed.episodes[1:] == parsed.episodes[:-1])[0]
-    if len(before):  # an episode's last transition has none after it
-        late, episodes, tested = parsed.latents[before + 1], parsed.episodes[before], parsed.tested[before]
-        if tested.any() and not tested.all():
-            scores["late"] = probe_actions(late, parsed.actions[before], episodes, tested=tested)
+    before = np.nonzero(parsed.episodes[1:] == parsed.episodes[:-1])[0]  # an episode's last one has none after it
+    episodes, tested = parsed.episodes[before], parsed.tested[before]
+    if tested.any() and not tested.all():
+        late = probe_actions(parsed.latents[before + 1], parsed.actions[before], episodes, tested=tested)
+        scores |= {"late": late} if late["linear"]["mean_r2"] is not None else {}
     return scores
 
 
 def _probe_lines(scores: dict[str, Any]) -> dict[str, Line]:
-    known = {name: score for name, score in scores.items() if score["linear"]["mean_r2"] is not None}
-    best = {name: max(score["linear"]["mean_r2"], score["mlp"]["mean_r2"]) for name, score in known.items()}
-    own, late = scores["latent"], "every episode has one transition, or all that go on have the same action"
+    best = {name: max(score["linear"]["mean_r2"], score["mlp"]["mean_r2"]) for name, score in scores.items()}
+    own, lag = scores["latent"], line("lag", None, "no transitions that others follow, or their actions do not vary")
+    if "late" in best:
+        lag = line("lag", best["late"] - best["latent"], f"one later: {best['late']:.2f}")
     held = f"{own['test']} transitions of {own['test_episodes']} held-out episodes, fitted on {own['train']} others"
     return {
         "linear_probe": line("linear_probe", own["linear"]["mean_r2"], held),
         "mlp_probe": line("mlp_probe", own["mlp"]["mean_r2"], held),
         "above_frame": line("above_frame", best["latent"] - best["frame"], f"the frame alone: {best['frame']:.2f}"),
-        "lag": line("lag", best["late"] - best["latent"], f"one later: {best['late']:.2f}")
-        if "late" in best
-        else line("lag", None, late),
+        "lag": lag,
         "shuffled_probe": line("shuffled_probe", best["shuffled"], "the better of both probes"),
         "noise_probe": line("noise_probe", best["noise"], "the better of both probes"),
     }

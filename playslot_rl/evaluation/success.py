@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
@@ -35,7 +35,7 @@ from playslot_rl.storage.atomic import write_json
 from playslot_rl.threads import available_cores
 from playslot_rl.world_model import Agent
 
-POLICY_PROTOCOLS = ("simulation", "imagination")
+POLICY_PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")
 PROTOCOLS = (*POLICY_PROTOCOLS, "replay")
 DEFAULT_EPISODES = 50
 

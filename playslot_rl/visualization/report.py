@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from playslot_rl.acting.actor import ExpertActor
-from playslot_rl.acting.episodes import TaskPool
+from playslot_rl.acting.episodes import TaskPool, record
 from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.envs.grid_shapes import generate
@@ -36,7 +36,6 @@ from playslot_rl.visualization.document import (
 )
 from playslot_rl.visualization.grid import film_strip, png
 from playslot_rl.visualization.latents import latent_section
-from playslot_rl.visualization.rollouts import record
 from playslot_rl.visualization.sections import (
     STAGES,
     ReportInput,

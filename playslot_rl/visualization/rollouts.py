@@ -5,7 +5,7 @@ Shapes: E episodes, T agent steps, H W image height and width.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,9 +15,8 @@ from PIL import Image
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import Actor
 from playslot_rl.acting.agent import ImaginationActor, playslot_actor
-from playslot_rl.acting.episodes import Moment, Outcome, TaskPool, run_episodes
+from playslot_rl.acting.episodes import Moment, Outcome, TaskPool, record
 from playslot_rl.evaluation.video import VideoMetrics, video_metrics
 from playslot_rl.frames import to_float, to_uint8
 from playslot_rl.visualization.grid import film_strip, side_by_side
@@ -44,21 +43,6 @@ class Rollouts:
     def metrics(self) -> VideoMetrics:
         """PSNR and SSIM of the imagined against the executed frames, without the parsed first one."""
         return video_metrics(to_float(self.clips[:, 0, 1:]), to_float(self.clips[:, 1, 1:]))
-
-
-def record(
-    pool: TaskPool, actor: Actor, seeds: Sequence[int], look_on: Callable[[Moment], None] | None = None
-) -> tuple[Frames, list[Outcome]]:
-    """Frames (E, T + 1, H, W, 3) of whole episodes, past success too, and their outcomes."""
-    size = pool.env.image_size
-    frames = np.zeros((len(seeds), pool.env.max_steps + 1, size, size, 3), np.uint8)
-
-    def keep(moment: Moment) -> None:
-        frames[moment.episodes, moment.step] = moment.frames
-        if look_on is not None:
-            look_on(moment)
-
-    return frames, run_episodes(pool, actor, seeds, keep, stop=False)
 
 
 @torch.no_grad()
