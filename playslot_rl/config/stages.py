@@ -70,6 +70,8 @@ class SlotsStageConfig(StageConfig):
         clip_frames: frames per clip.
         start_from: run (or `pretrained/ENV`) whose SAVi this one starts from; empty starts from scratch (paper).
         motion_weight: so many times more than others counts a pixel that moves; 0 counts all alike (paper).
+        zoom_steps: in so many first steps clips are magnified (`playslot_rl.data.zoom`); 0 has none (paper).
+        zoom: how many times.
         patience: end before `steps` once the error on held-out clips has not fallen for so many validations, with the
             weights that had the lowest; 0 trains all steps.
         segmented_episodes: so many episodes of the task are drawn by its simulator, and every validation scores the
@@ -80,6 +82,8 @@ class SlotsStageConfig(StageConfig):
     clip_frames: int = 8
     start_from: str = field(default="", metadata=role("folder"))
     motion_weight: float = field(default=0.0, metadata=at_least(0, "0 (all pixels alike) or more"))
+    zoom_steps: int = field(default=0, metadata=at_least(0, "0 (none) or more"))
+    zoom: float = field(default=2.0, metadata=between(1, 8, "1 (as they are) to 8 times"))
     patience: int = field(default=0, metadata=at_least(0, "0 (train all steps) or more"))
     segmented_episodes: int = field(default=4, metadata=role("free") | at_least(0, "0 (no FG-ARI) or more"))
 

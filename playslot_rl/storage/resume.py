@@ -73,6 +73,8 @@ ADDED: Final[Mapping[str, Any]] = {
     "project_out": True,
     "ema": 0.0,
     "motion_weight": 0.0,
+    "zoom_steps": 0,
+    "zoom": 2.0,
     "parsed": True,
 }
 """Settings that came after the first checkpoints, and what those were trained with."""

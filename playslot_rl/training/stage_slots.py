@@ -14,6 +14,7 @@ from playslot_rl import keys
 from playslot_rl.colours import segmentation
 from playslot_rl.config import SlotsStageConfig
 from playslot_rl.data.windows import Clips, IntArray
+from playslot_rl.data.zoom import corners, magnified
 from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import psnr, to_uint8
 from playslot_rl.losses.slots import SlotsLoss
@@ -54,11 +55,21 @@ class SlotsStage:
         """SAVi."""
         return {"savi": self.savi}
 
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """Reconstruction error of one batch of clips."""
-        rows = own_rows(self.clips.sample(self.config.batch_size, generators.numpy("windows")))
-        self.savi.precision = self.config.precision
-        out = self.criterion(self._batch(rows), generator=generators.torch("slots"))
+    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+        """Reconstruction error of one batch of clips, magnified in the first `zoom_steps`.
+
+        Note: the paper shows frames as they are. One colour explains most pixels of a plain ground, and Slot Attention
+        averages over all of them, so that small things hardly change what it sees; magnified they do, and slots that
+        have learned to take large things apart go on with small ones.
+        """
+        own, count = self.config, self.config.batch_size
+        rows = own_rows(self.clips.sample(count, generators.numpy("windows")))
+        batch = self._batch(rows)
+        if step < own.zoom_steps:
+            at = own_rows(corners(count, self.savi.image_size, own.zoom, generators.numpy("zoom")))
+            batch[keys.PIXELS] = magnified(batch[keys.PIXELS], own.zoom, at)
+        self.savi.precision = own.precision
+        out = self.criterion(batch, generator=generators.torch("slots"))
         return {"loss": out["loss_reconstruction"], "psnr": out["psnr"]}
 
     def validate(self, step: int) -> Mapping[str, float]:

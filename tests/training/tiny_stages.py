@@ -92,7 +92,8 @@ def demonstrations() -> Demonstrations:
 
 def slots() -> Part:
     savi = tiny_savi(initial="gaussian")
-    return Part("slots", SlotsStage(savi, clips(32, 4), SlotsStageConfig(**SETTINGS, clip_frames=4)), _plain())
+    own = SlotsStageConfig(**SETTINGS, clip_frames=4, zoom_steps=8)
+    return Part("slots", SlotsStage(savi, clips(32, 4), own), own)
 
 
 def dynamics(multi: bool = False, mode: Any = "hybrid", kind: Any = "cocvp", teacher: int = 5) -> Part:
@@ -224,9 +225,10 @@ def _plain() -> StageConfig:
     return StageConfig(**SETTINGS)
 
 
-DOUBLE = ("resnet", "svg", "caddy", "lapo")
+DOUBLE = ("slots", "resnet", "svg", "caddy", "lapo")
 """In double precision: BatchNorm divides by small spreads, Adam by small gradients, and together they turn the rounding
-of a batch's mean into another curve within a few steps, as another number of threads does.
+of a batch's mean into another curve within a few steps, as another number of threads does. Slots that still share all
+pixels do likewise.
 """
 STAGES: dict[str, Callable[[], Part]] = {
     "slots": slots,
