@@ -45,28 +45,43 @@ def _train(job: VideoJob, config: ExperimentConfig, processes: int) -> None:
 
 
 def _chosen(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> ExperimentConfig:
-    """The config with the learning rate that was best after short trials, and the steps that fit the budget."""
-    from playslot_rl.comparison.video_plan import asked_of, in_steps, training_of, with_training
-    from playslot_rl.storage.atomic import write_json
+    """The config with the learning rate that was best after short trials, and the steps that fit the budget.
 
-    asked, own, path = asked_of(record), training_of(config, job.method), job.choice
-    stored = json.loads(path.read_text()) if path.is_file() else {}
-    if stored.get("fingerprint") != record["fingerprint"]:
-        tried = list[dict[str, Any]]()
-        if len(asked.rates) > 1 or asked.budget_minutes:
-            processes = int(record["processes"])
-            tried = [_trial(job, config, rate, asked.trial_steps, processes) for rate in asked.rates]
-        ended = [trial for trial in tried if trial["psnr"] is not None]
-        if tried and not ended:
-            raise TrainingError(f"compare_video.rates={','.join(map(str, asked.rates))}: {tried[0]['error']}")
-        best = max(ended, key=lambda trial: float(trial["psnr"])) if tried else {"rate": asked.rates[0]}
-        seconds = min((float(trial["seconds_a_step"]) for trial in ended), default=0.0)
-        steps = max(1, round(60 * asked.budget_minutes / seconds)) if asked.budget_minutes and seconds else own.steps
-        stored = {"fingerprint": record["fingerprint"], "rate": best["rate"], "steps": steps, "tried": tried}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(path, stored)
+    The method's job that comes first makes the trials; those of its other seeds wait for them.
+    """
+    from playslot_rl.comparison.video_plan import in_steps, training_of, with_training
+    from playslot_rl.storage.atomic import write_json
+    from playslot_rl.storage.locks import locked
+
+    path = job.choice
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with locked(path.with_suffix(".lock")):
+        stored = json.loads(path.read_text()) if path.is_file() else {}
+        if stored.get("fingerprint") != record["choice"]:
+            stored = {"fingerprint": record["choice"], **_tried(job, config, record)}
+            write_json(path, stored)
+    own = training_of(config, job.method)
     optim = replace(own.optim, lr=own.optim.lr * float(stored["rate"]))
     return in_steps(with_training(config, job.method, optim=optim), job.method, int(stored["steps"]))
+
+
+def _tried(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> dict[str, Any]:
+    """The factor of the learning rate, the steps, and the trials that led to them."""
+    from playslot_rl.comparison.video_plan import TRIAL_SEED, asked_of, training_of
+
+    asked, steps = asked_of(record), int(training_of(config, job.method).steps)
+    if len(asked.rates) == 1 and not asked.budget_minutes:
+        return {"rate": asked.rates[0], "steps": steps, "tried": []}
+    config, processes = replace(config, seed=TRIAL_SEED), int(record["processes"])
+    tried = [_trial(job, config, rate, asked.trial_steps, processes) for rate in asked.rates]
+    ended = [trial for trial in tried if trial["psnr"] is not None]
+    if not ended:
+        raise TrainingError(f"compare_video.rates={','.join(map(str, asked.rates))}: {tried[0]['error']}")
+    best = max(ended, key=lambda trial: float(trial["psnr"]))
+    seconds = min(float(trial["seconds_a_step"]) for trial in ended)
+    if asked.budget_minutes and seconds:
+        steps = max(1, round(60 * asked.budget_minutes / seconds))
+    return {"rate": best["rate"], "steps": steps, "tried": tried}
 
 
 def _trial(job: VideoJob, config: ExperimentConfig, rate: float, steps: int, processes: int) -> dict[str, Any]:

@@ -43,21 +43,20 @@ def main(config: ExperimentConfig) -> None:
 
 def _collect(config: ExperimentConfig, folder: Path) -> DataConfig:
     """Record what is missing; returns where the data are."""
-    if config.env.name not in PROCEDURAL:
-        config = replace(config, data=collect_demos(config, folder))
+    config = replace(config, data=collect_demos(config, folder))
     return config.data if config.data.root else collect_videos(config, folder)
 
 
 def collect_demos(config: ExperimentConfig, folder: Path) -> DataConfig:
     """Record demonstrations into `FOLDER/data/expert` unless `data.demos` names some; returns where the data are.
 
-    `collect.validation_episodes` more than `collect.expert_episodes` are recorded and held out; a data set begun
-    without them stays as it is.
+    Where nothing can be acted on there are none. `collect.validation_episodes` more than `collect.expert_episodes` are
+    recorded and held out; a data set begun without them stays as it is.
     """
     from playslot_rl.collectors import collect
     from playslot_rl.collectors.collection import begun_episodes
 
-    if config.data.demos:
+    if config.data.demos or config.env.name in PROCEDURAL:
         return config.data
     demos, want = folder / "data" / "expert", config.collect
     held_out = 0 if begun_episodes(demos) == want.expert_episodes else want.validation_episodes

@@ -21,6 +21,8 @@ VARIED = ("model.inverse_dynamics.", "model.predictor.", "dynamics.")
 """Where the settings are that change what PlaySlot predicts, on a SAVi that is there."""
 PHASES = ("teacher_steps", "warmup_steps", "anneal_steps", "growth_steps", "validate_every")
 """Settings of a training that are parts of its steps."""
+TRIAL_SEED = 0
+"""Of the trials of learning rates, whatever the seeds of the trainings that take the rate from them."""
 NOT_OF_A_JOB = ("methods", "seeds", "vary", "values", "objects", "processes", "launcher", "hydra")
 """Settings of the whole comparison: another choice of them leaves a job as it is."""
 
@@ -44,8 +46,7 @@ class VideoJob:
     @property
     def name(self) -> str:
         """Such as `svg-s0`, or `playslot-mode-hybrid-s0`: a folder's, and a word to Hydra, which `=` would end."""
-        variant = re.sub(r"[^\w.]+", "-", self.variant).strip("-")
-        return "-".join(part for part in (self.method, variant, f"s{self.seed}") if part)
+        return f"{self._method_name}-s{self.seed}"
 
     @property
     def value(self) -> str:
@@ -83,9 +84,14 @@ class VideoJob:
         return 0
 
     @property
+    def _method_name(self) -> str:
+        variant = re.sub(r"[^\w.]+", "-", self.variant).strip("-")
+        return "-".join(part for part in (self.method, variant) if part)
+
+    @property
     def trials(self) -> Path:
-        """Folder of the trials of learning rates."""
-        return self.out / "trials" / self.name
+        """Folder of the trials of learning rates, one for all seeds."""
+        return self.out / "trials" / self._method_name
 
     @property
     def choice(self) -> Path:
@@ -273,11 +279,15 @@ def video_job_record(
     """
     own = to_dict(config.compare_video)
     asked = {key: own[key] for key in own if key not in NOT_OF_A_JOB}
-    result = without(config, "machine")
-    result.pop("compare_video", None)
-    result["baselines"] = result["baselines"].get(job.method, {})  # another method's settings are none of this job's
     content = {key: value for key, value in asked.items() if key != "test"}  # of a data set the content counts
-    identity = json.dumps([result, content, dict(parents), lpips], sort_keys=True)
+
+    def fingerprint(seed: int) -> str:
+        result = without(replace(config, seed=seed), "machine")
+        result.pop("compare_video", None)
+        result["baselines"] = result["baselines"].get(job.method, {})  # another method's are none of this job's
+        identity = json.dumps([result, content, dict(parents), lpips], sort_keys=True)
+        return hashlib.sha256(identity.encode()).hexdigest()[:16]
+
     return {
         "kind": "video",
         "name": job.name,
@@ -287,7 +297,8 @@ def video_job_record(
         "out": absolute(str(job.out)),
         "asked": asked,
         "processes": config.compare_video.processes,
-        "fingerprint": hashlib.sha256(identity.encode()).hexdigest()[:16],
+        "fingerprint": fingerprint(config.seed),
+        "choice": fingerprint(TRIAL_SEED),
         "config": to_dict(config),
     }
 

@@ -33,8 +33,9 @@ def magnified(frames: Tensor, zoom: float, at: npt.NDArray[np.int64]) -> Tensor:
     size = frames.shape[-1]
     side = _side(size, zoom)
     squares = [clip[..., y : y + side, x : x + side] for clip, (y, x) in zip(frames, at.tolist(), strict=True)]
-    large = F.interpolate(torch.stack(squares).flatten(0, 1), size=(size, size), mode="nearest")
-    return large.unflatten(0, frames.shape[:2])
+    large: Tensor = F.interpolate(torch.stack(squares).flatten(0, 1), size=(size, size), mode="nearest")
+    magnified: Tensor = large.unflatten(0, frames.shape[:2])
+    return magnified
 
 
 def _side(size: int, zoom: float) -> int:

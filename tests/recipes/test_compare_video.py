@@ -186,7 +186,8 @@ def test_the_command_line_of_a_launcher_takes_every_name() -> None:
 def test_numbers_of_objects_have_one_table(tmp_path: Path) -> None:
     out = tmp_path / "out"
     smoke(
-        "compare-video", "env=grid_shapes", "methods=playslot,playslot_m,svg", "objects=1,2", "slots.start_from=",
+        "compare-video", "env=grid_shapes", "methods=playslot,playslot_m,svg", "objects=1,2",
+        "collect.learn_from_demos=true",  # as all larger presets have it
         "compare_video.rates=[1.0]", f"out={out}",
     )  # fmt: skip
     found = result(out)["objects"]
@@ -255,6 +256,22 @@ def test_a_trial_is_the_training_in_small() -> None:
     caddy = in_steps(config, "caddy", 2).baselines.caddy
     assert (caddy.warmup_steps, caddy.anneal_steps, caddy.growth_steps) == (1, 2, 1)
     assert in_steps(config, "svg", 100).baselines.svg.optim.warmup_steps < config.baselines.svg.optim.warmup_steps
+
+
+def test_seeds_share_the_trials_whichever_comes_first(finished: Path, tmp_path: Path) -> None:
+    tried = {}
+    for seeds in ("0,1", "1"):
+        out = tmp_path / seeds
+        smoke(
+            "compare-video", "env=button_press", "preset=smoke", f"data.root={finished}/data/random",
+            "methods=slotformer",
+            f"run={finished}/world_model", f"seeds={seeds}", f"out={out}",
+        )  # fmt: skip
+        assert [path.name for path in (out / "trials").iterdir()] == ["slotformer"]
+        jobs = result(out)["jobs"]
+        assert [job["seed"] for job in jobs] == [int(seed) for seed in seeds.split(",")]
+        tried[seeds] = [[(trial["rate"], trial["psnr"]) for trial in job["tried"]] for job in jobs]
+    assert tried["0,1"] == tried["1"] * 2
 
 
 def test_clips_are_drawn_alike() -> None:
