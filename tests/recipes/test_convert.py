@@ -1,4 +1,4 @@
-"""`playslot convert`: Sketchy's layout in, two LeRobot data sets out, which train."""
+"""`playslot convert`: Sketchy's layout in, two LeRobot data sets out, which train and are compared on."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from commands import ONE_CORE, playslot, refused
 from sketchy_layout import name_of, write_sketchy
 
 
-def test_a_converted_data_set_trains_on_both_cameras(tmp_path: Path) -> None:
+def test_a_converted_data_set_trains_and_compares_on_both_cameras(tmp_path: Path) -> None:
     source, out = write_sketchy(tmp_path / "download"), tmp_path / "set"
     done = playslot("convert", "env=sketchy", f"data.root={source}", f"out={out}", *ONE_CORE)
     assert done.code == 0, done.err
@@ -19,6 +19,13 @@ def test_a_converted_data_set_trains_on_both_cameras(tmp_path: Path) -> None:
     done = playslot("train-slots", *train, "slots.steps=2", "model.savi.n_slots=3", *ONE_CORE)
     assert done.code == 0, done.err
     refused("convert", "env=sketchy", f"data.root={source}", f"out={out}", message="choose another out=")
+    done = playslot(
+        "compare-video", *train[:-1], f"compare_video.test={out / 'eval'}", f"run={tmp_path / 'run'}",
+        "methods=slotformer", "compare_video.predicted=2", "compare_video.rates=[1.0]", f"out={tmp_path / 'video'}",
+        "model.savi.n_slots=3", *ONE_CORE,
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    assert "| SlotFormer |" in (tmp_path / "video" / "video.md").read_text()
 
 
 def test_what_cannot_be_converted_is_one_line(tmp_path: Path) -> None:
