@@ -20,13 +20,14 @@ UNSEEN: Final = 0.3
 """Share of the moving pixels' change that is explained, below which what moves is not drawn."""
 
 
-def slot_warnings(values: Mapping[str, float], savi: SAViConfig) -> dict[str, str]:
+def slot_warnings(values: Mapping[str, float], savi: SAViConfig, zoomed: bool = False) -> dict[str, str]:
     """Kind -> one line, for each thing that is wrong.
 
     Args:
         values: of `playslot_rl.modules.savi.health.SlotHealth`, and of `playslot_rl.evaluation.slots`; what is not
             among them is not judged.
         savi: sizes and settings, so that no cure is named that is in use already.
+        zoomed: the training shows magnified frames first.
     """
     found: dict[str, str] = {}
     slots, entropy = savi.n_slots, values.get("mask_entropy", 0.0)
@@ -36,12 +37,12 @@ def slot_warnings(values: Mapping[str, float], savi: SAViConfig) -> dict[str, st
     if shared:
         found["shared"] = (
             f"all slots share all pixels (mask entropy {entropy:.2f} of at most {math.log(slots):.2f}): the scene is "
-            f"not taken apart yet; {_leave_plateau(savi)}"
+            f"not taken apart yet; {_leave_plateau(savi, zoomed)}"
         )
     elif values.get("slots_in_use", slots) < SINGLE:
         found["single"] = (
             f"one slot holds everything ({values['slots_in_use']:.1f} of {slots} slots in use): it can draw whole "
-            f"frames alone; {_less_room(savi)}, or {_leave_plateau(savi)}"
+            f"frames alone; {_less_room(savi)}, or {_leave_plateau(savi, zoomed)}"
         )
     elif values.get("slots_per_object", 1.0) > SPLIT:
         found["split"] = (
@@ -54,7 +55,7 @@ def slot_warnings(values: Mapping[str, float], savi: SAViConfig) -> dict[str, st
     if values.get("moving_explained", 1.0) < UNSEEN:
         found["unseen"] = (
             f"what moves is hardly drawn ({100 * values['moving_explained']:.0f} % of the moving pixels' change "
-            f"explained): {_leave_plateau(savi)}"
+            f"explained): {_leave_plateau(savi, zoomed)}"
         )
     return found
 
@@ -69,11 +70,10 @@ def _less_room(savi: SAViConfig) -> str:
     )
 
 
-def _leave_plateau(savi: SAViConfig) -> str:
+def _leave_plateau(savi: SAViConfig, zoomed: bool) -> str:
     learned = "" if savi.decoder_position == "learned" or savi.decoder != "pixel_shuffle" else _LEARNED
-    return (
-        f"{learned}train for longer (slots.steps), or start from one that can do it (slots.start_from=pretrained/ENV)"
-    )
+    large = "show more magnified frames first" if zoomed else "show magnified frames first (slots.zoom_steps=1500)"
+    return f"{learned}{large}, or start from one that can do it (slots.start_from=pretrained/ENV)"
 
 
 _LEARNED: Final = "let the decoder learn its position map (model.savi.decoder_position=learned), "

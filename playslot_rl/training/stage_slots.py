@@ -56,16 +56,17 @@ class SlotsStage:
         return {"savi": self.savi}
 
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
-        """Reconstruction error of one batch of clips, magnified in the first `zoom_steps`.
+        """Reconstruction error of one batch of clips; in the first `zoom_steps` of their first frames, magnified.
 
-        Note: the paper shows frames as they are. One colour explains most pixels of a plain ground, and Slot Attention
+        Note: the paper shows clips as they are. One colour explains most pixels of a plain ground, and Slot Attention
         averages over all of them, so that small things hardly change what it sees; magnified they do, and slots that
-        have learned to take large things apart go on with small ones.
+        have learned to take large things apart go on with small ones. One frame is enough for that.
         """
         own, count = self.config, self.config.batch_size
         rows = own_rows(self.clips.sample(count, generators.numpy("windows")))
-        batch = self._batch(rows)
-        if step < own.zoom_steps:
+        zoomed = step < own.zoom_steps
+        batch = self._batch(rows[:, :1] if zoomed else rows)
+        if zoomed:
             at = own_rows(corners(count, self.savi.image_size, own.zoom, generators.numpy("zoom")))
             batch[keys.PIXELS] = magnified(batch[keys.PIXELS], own.zoom, at)
         self.savi.precision = own.precision
@@ -91,10 +92,11 @@ class SlotsStage:
         return {"mse": mse, "psnr": float(psnr(torch.tensor(mse))), **health.values(), **known}
 
     def warnings(self, step: int, values: Mapping[str, float]) -> Mapping[str, str]:
-        """What the last validation says is wrong with the slots, and the known cure; nothing in the first quarter, in
-        which slots have not taken the scene apart yet.
+        """What the last validation says is wrong with the slots, and the known cure; nothing in the first quarter or
+        while frames are magnified, in which slots have not taken the scene apart yet.
         """
-        return slot_warnings(values, self.savi.config) if 4 * step >= self.config.steps else {}
+        known = 4 * step >= self.config.steps and step > self.config.zoom_steps
+        return slot_warnings(values, self.savi.config, self.config.zoom_steps > 0) if known else {}
 
     def pictures(self, step: int) -> Mapping[str, npt.NDArray[np.uint8]]:
         """The first held-out clip, (3 H, T W, 3): frames, reconstructions, segmentation."""

@@ -153,6 +153,8 @@ def test_a_cure_in_use_is_not_named_again() -> None:
     assert set(found) == {"flicker", "unseen"}
     assert "identity" not in found["flicker"]
     assert "decoder_position" not in found["unseen"]
+    assert "slots.zoom_steps=" in found["unseen"]
+    assert "slots.zoom_steps=" not in slot_warnings(HEALTHY | {"moving_explained": 0.0}, BLOCKS, zoomed=True)["unseen"]
 
 
 def test_the_first_quarter_is_not_warned_of() -> None:

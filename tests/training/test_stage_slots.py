@@ -32,8 +32,9 @@ def is_a_clip(batch: Tensor) -> bool:
     return bool((frames == batch[0, 0]).flatten(1).all(1).any())
 
 
-def test_clips_are_magnified_in_the_first_steps_and_then_as_they_are() -> None:
+def test_single_frames_are_magnified_in_the_first_steps_and_then_clips_are_as_they_are() -> None:
     assert [is_a_clip(shown(step)) for step in range(4)] == [False, False, True, True]
+    assert [shown(step).shape[1] for step in range(4)] == [1, 1, 4, 4]
     large = shown(0)
     assert torch.equal(large[..., ::2, ::2], large[..., 1::2, 1::2])  # every pixel of a half-size square, four times
 
