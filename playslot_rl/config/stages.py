@@ -70,7 +70,7 @@ class SlotsStageConfig(StageConfig):
         clip_frames: frames per clip.
         start_from: run (or `pretrained/ENV`) whose SAVi this one starts from; empty starts from scratch (paper).
         motion_weight: so many times more than others counts a pixel that moves; 0 counts all alike (paper).
-        zoom_steps: in so many first steps single frames are shown, magnified (`playslot_rl.data.zoom`); 0: none (paper).
+        zoom_steps: in so many first steps single frames, magnified, are shown (`playslot_rl.data.zoom`); 0 has none.
         zoom: how many times.
         patience: end before `steps` once the error on held-out clips has not fallen for so many validations, with the
             weights that had the lowest; 0 trains all steps.
