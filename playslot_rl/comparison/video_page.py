@@ -53,9 +53,10 @@ def video_page(result: Mapping[str, Any]) -> str:
         "What a model is told of the true future is a column: latents are inferred from it, as in the paper."
     )
     parts = [f"# {result['env']}: video prediction", lead, "![PSNR and SSIM over the step](video.png)"]
-    for label, shown in itertools.product(result["tested_on"], result["seed_frames"]):
-        parts += [f"## {_heading(label, shown)}", _scores(result, label, shown)]
-        parts.append(f"![True frames, and each model's]({sheet_name(label, shown)}.png)")
+    for label in result["tested_on"]:
+        parts += [f"## {label} clips" if label else "## Scores", _scores(result, label)]
+        for shown in result["seed_frames"]:
+            parts.append(f"![{_heading(label, shown)}: true, and each model's]({sheet_name(label, shown)}.png)")
     parts += ["## Training", _trainings(result), "## Footnotes", "\n".join(f"- {note}" for note in _notes(result))]
     return "\n\n".join(parts) + "\n"
 
@@ -89,17 +90,29 @@ def _heading(label: str, shown: int) -> str:
     return f"{label} clips, {frames}" if label else frames
 
 
-def _scores(result: Mapping[str, Any], label: str, shown: int) -> str:
-    rows = [row for row in result["summary"] if (row["clips_of"], row["seed_frames"]) == (label, shown)]
+def _scores(result: Mapping[str, Any], label: str) -> str:
+    """A line a model, the numbers of seed frames side by side."""
+    lines: dict[str, dict[int, Mapping[str, Any]]] = {}
+    rows = [row for row in result["summary"] if row["clips_of"] == label]
     rows.sort(
         key=lambda row: (row["method"] is not None, result["methods"].index(row["method"]) if row["method"] else 0)
     )
-    body = []
     for row in rows:
         title = f"{row['title']}, {row['row']}" if row["row"] else row["title"]
-        scores = (_cell(row, name) for name in ("psnr", "ssim", "lpips"))
-        body.append([title, *scores, row["sees"], _papers(result, row)])
-    headers = ["", "PSNR, dB", "SSIM", "LPIPS", "told of the true future", "the paper's PSNR / SSIM"]
+        lines.setdefault(title, {})[row["seed_frames"]] = row
+    columns = list(itertools.product(result["seed_frames"], ("psnr", "ssim", "lpips")))
+    if result["lpips"] != "available":
+        columns = [(shown, name) for shown, name in columns if name != "lpips"]
+    units = {"psnr": "PSNR after {}, dB", "ssim": "SSIM after {}", "lpips": "LPIPS after {}"}
+    body = []
+    for title, by_seed_frames in lines.items():
+        scores = [_cell(by_seed_frames.get(shown), name) for shown, name in columns]
+        first = next(iter(by_seed_frames.values()))
+        body.append([title, *scores, first["sees"], _papers(result, by_seed_frames.get(6, first))])
+    headers = ["", *(units[name].format(shown) for shown, name in columns), "told of the true future"]
+    headers.append("the paper's PSNR / SSIM after 6")
+    if all(line[-1] == "–" for line in body):
+        headers, body = headers[:-1], [line[:-1] for line in body]
     return table(headers, body)
 
 
@@ -109,8 +122,8 @@ def _papers(result: Mapping[str, Any], row: Mapping[str, Any]) -> str:
     return PAPER.get(result["env"], {}).get(row["method"], "–") if asked else "–"
 
 
-def _cell(row: Mapping[str, Any], name: str) -> str:
-    if row[name] is None:
+def _cell(row: Mapping[str, Any] | None, name: str) -> str:
+    if row is None or row[name] is None:
         return "not available"
     digits = 2 if name == "psnr" else 3
     low, high = row[f"{name}_ci95"]
@@ -151,7 +164,7 @@ def _notes(result: Mapping[str, Any]) -> list[str]:
             "is what no model on its slots can."
         ),
         "Latents of another clip: what a model loses by them is what its control brings.",
-        f"LPIPS: {result['lpips']}.",
+        "LPIPS: available." if result["lpips"] == "available" else f"LPIPS: not available, {result['lpips']}.",
     ]
     if any(row["method"] and _papers(result, row) != "–" for row in result["summary"]):
         notes.append(

@@ -72,7 +72,8 @@ def test_a_training_says_what_it_cost_and_whether_it_was_done(finished: Path) ->
 def test_page_plot_and_sheets_are_there(finished: Path) -> None:
     page = (finished / "video.md").read_text()
     assert "| SVG-LP |" in page
-    assert "LPIPS: AlexNet's weights are not at hand" in page
+    assert "LPIPS: not available, AlexNet's weights are not at hand" in page
+    assert "| PSNR after 2, dB | SSIM after 2 | PSNR after 1, dB | SSIM after 1 | told of the true future |" in page
     for name in ("video.png", "video.svg", "frames_2.png", "frames_1.png"):
         assert (finished / name).stat().st_size > 1000
 
