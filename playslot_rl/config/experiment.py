@@ -24,7 +24,8 @@ class DataConfig(Checked):
     """Where data come from.
 
     Attributes:
-        root: LeRobot v3.0 data set(s) of unlabelled videos; several are separated by commas.
+        root: LeRobot v3.0 data set(s) of unlabelled videos; several are separated by commas. With `stream` also
+            `hf://datasets/USER/NAME[@REVISION]`, read where it lies (`playslot_rl.data.remote`).
         demos: data set of demonstrations; empty means `root`.
         held_out: how many of its last episodes are neither trained on nor shown to the world model: they measure.
         draw: seed of the draw that decides which demonstrations are the first ones, of those that are not held out;

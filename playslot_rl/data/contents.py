@@ -10,54 +10,31 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from playslot_rl.data.problems import Problems
+from playslot_rl.data.tables import UNREADABLE, Array, Episode, episodes_of, read_columns, read_table, read_tasks
 from playslot_rl.errors import DataError
+
+if TYPE_CHECKING:
+    from playslot_rl.data.remote import Remote
 
 INFO_NAME: Final = "meta/info.json"
 STATS_NAME: Final = "meta/stats.json"
-TASKS_NAME: Final = "meta/tasks.parquet"
 RECORD_NAME: Final = "meta/playslot.json"
+SCHEME: Final = "hf://"
+"""Begins the name of a data set on the Hub (`playslot_rl.data.remote`)."""
 DATA_PATH: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH: Final = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 PLACE: Final = ("index", "episode_index", "task_index")
 """Columns that say where a row stands in its data set: they change when data sets are merged or split."""
 REQUIRED: Final = ("timestamp", "frame_index", *PLACE)
-
-EPISODES_AT_ONCE: Final = 64
-"""Of the metadata with statistics, some 150 columns."""
-UNREADABLE: Final = "unreadable parquet"
-
-Array = npt.NDArray[Any]
-Stats = dict[str, dict[str, Array]]
-
-
-@dataclass(frozen=True)
-class Episode:
-    """One row of `meta/episodes`.
-
-    Attributes:
-        index: `episode_index`.
-        length: frames.
-        tasks: in words.
-        row: all its values but the statistics.
-        stats: feature -> statistic -> array, float64.
-    """
-
-    index: int
-    length: int
-    tasks: tuple[str, ...]
-    row: dict[str, Any]
-    stats: Stats
 
 
 @dataclass(frozen=True)
@@ -87,6 +64,7 @@ class Contents:
         data_files: readable parquet files of rows, in order.
         file_rows: rows of each.
         columns: every feature that is no camera, (F, ...), rows in the order of the files; numbers, or objects.
+        remote: where the files of rows and videos are, if only the metadata lie in `root`.
     """
 
     root: Path
@@ -96,6 +74,20 @@ class Contents:
     data_files: list[Path]
     file_rows: list[int]
     columns: dict[str, Array] = field(repr=False)
+    remote: Remote | None = None
+
+    @property
+    def name(self) -> str:
+        """The data set, for people."""
+        return str(self.root) if self.remote is None else self.remote.address
+
+    def holds(self, path: Path) -> bool:
+        """Whether the data set has a file."""
+        return path.is_file() if self.remote is None else self.remote.holds(path)
+
+    def opened(self, path: Path) -> Any:
+        """A file, as pyarrow and PyAV take one: a path, or an open binary file where it is remote."""
+        return path if self.remote is None else self.remote.open(path)
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
@@ -133,9 +125,9 @@ class Contents:
         if not wanted and len(self.cameras) == 1:
             return self.cameras[0]
         if not wanted:
-            raise DataError(f"{self.root}: got {len(self.cameras)} cameras ({names}), expected one: set data.camera=")
+            raise DataError(f"{self.name}: got {len(self.cameras)} cameras ({names}), expected one: set data.camera=")
         if wanted not in self.cameras:
-            raise DataError(f"data.camera={wanted}: {self.root} has no such camera, expected one of: {names}")
+            raise DataError(f"data.camera={wanted}: {self.name} has no such camera, expected one of: {names}")
         return wanted
 
     @cached_property
@@ -168,7 +160,7 @@ class Contents:
     def file_hash(self, camera: str) -> str:
         """Hash of the metadata, the rows and the camera's videos as they are stored: 16 hex digits."""
         digest = hashlib.sha256()
-        paths = [self.root / INFO_NAME, *_episode_files(self.root), *_data_files(self.root)]
+        paths = [self.root / INFO_NAME, *episode_files(self.root), *_data_files(self.root)]
         paths += sorted((self.root / "videos" / camera).rglob("*.mp4"))
         for path in paths:
             digest.update(str(path.relative_to(self.root)).encode())
@@ -182,7 +174,8 @@ def _data_files(root: Path) -> list[Path]:
     return sorted((root / "data").glob("*/*.parquet"))
 
 
-def _episode_files(root: Path) -> list[Path]:
+def episode_files(root: Path) -> list[Path]:
+    """Parquet files of the episodes' metadata, in order."""
     return sorted((root / "meta" / "episodes").glob("*/*.parquet"))
 
 
@@ -243,24 +236,24 @@ def read_contents(root: str | Path, problems: Problems, *, statistics: bool = Tr
         DataError: as `read_info`; without it nothing else can be understood.
     """
     folder = Path(root)
-    info = read_info(folder)
-    tasks = _read_tasks(folder, problems)
-    episodes: list[Episode] = []
-    for path in _episode_files(folder):
-        table = _read_table(path, problems, lambda name: statistics or not name.startswith("stats/"))
-        if table is not None:
-            episodes += _episodes(path, table, problems)
-    episodes.sort(key=lambda episode: episode.index)
-    names = [name for name, feature in info["features"].items() if feature["dtype"] not in ("image", "video")]
-    files, parts = [], []
-    for path in _data_files(folder):
-        rows = _columns(path, names, info["features"], problems)
-        if rows is not None:
-            files.append(path)
-            parts.append(rows)
-    counts = [len(rows["index"]) for rows in parts]
-    columns = {name: np.concatenate([rows[name] for rows in parts] or [np.zeros(0, np.int64)]) for name in names}
+    info, episodes, tasks = read_metadata(folder, problems, statistics=statistics)
+    files, counts, columns = read_columns(_data_files(folder), info, problems)
     return Contents(folder, info, episodes, tasks, files, counts, columns)
+
+
+def read_metadata(
+    folder: Path, problems: Problems, *, statistics: bool = True
+) -> tuple[dict[str, Any], list[Episode], dict[int, str]]:
+    """`info`, `episodes` and `tasks` of a data set's `Contents`; arguments and errors of `read_contents`."""
+    info = read_info(folder)
+    tasks = read_tasks(folder, problems)
+    episodes: list[Episode] = []
+    for path in episode_files(folder):
+        table = read_table(path, problems, lambda name: statistics or not name.startswith("stats/"))
+        if table is not None:
+            episodes += episodes_of(path, table, problems)
+    episodes.sort(key=lambda episode: episode.index)
+    return info, episodes, tasks
 
 
 def open_files(root: str | Path) -> Contents:
@@ -272,6 +265,11 @@ def open_files(root: str | Path) -> Contents:
     folder, expected = Path(root).expanduser(), "expected a LeRobot"
     if not str(root):
         raise DataError(f"data.root is empty, {expected} data set's folder: set data.root=")
+    if str(root).startswith(SCHEME):
+        raise DataError(
+            f"{root}: got a data set on the Hub, expected a folder, or data.stream=true where videos are trained on: "
+            "pull it by `playslot dataset pull USER/NAME DIR`"
+        )
     if not folder.is_dir():
         raise DataError(f"data.root={root}: no such folder, {expected} data set: run `playslot collect` first")
     if not (folder / INFO_NAME).is_file():
@@ -282,7 +280,7 @@ def open_files(root: str | Path) -> Contents:
         "it was never finalised, or is truncated: collect it again (the same `playslot collect` command carries on), "
         "or call finalize() on the LeRobotDataset that wrote it"
     )
-    if not _data_files(folder) or not _episode_files(folder):
+    if not _data_files(folder) or not episode_files(folder):
         raise DataError(f"{root}: got no rows under data/ and meta/episodes/, expected parquet files; {unfinished}")
     unreadable = problems.of(UNREADABLE)
     if unreadable:
@@ -297,118 +295,3 @@ def open_files(root: str | Path) -> Contents:
     if not contents.rows:
         raise DataError(f"{root}: got an empty data set, expected episodes: collect some first")
     return contents
-
-
-def _read_table(path: Path, problems: Problems, wanted: Callable[[str], bool] = bool) -> Any:
-    """The wanted columns of a parquet file as a table, or None (noted) where it has no footer."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        file = pq.ParquetFile(path)
-        return file.read(columns=[name for name in file.schema_arrow.names if wanted(name)])
-    except (pa.ArrowException, OSError) as error:
-        reason = " ".join(str(error).split())[:120]
-        problems.error(
-            UNREADABLE,
-            f"{path}: cannot be read ({reason}): got a parquet file without a footer, expected a whole one",
-        )
-        return None
-
-
-def _to_array(column: Any, shape: Sequence[int]) -> Array:
-    """A table's column as (n, *shape); the shape (1,) gives (n,). Text and records come as objects.
-
-    Raises:
-        ValueError: it has missing values, or another shape.
-    """
-    import pyarrow as pa
-
-    array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
-    if isinstance(array, pa.ChunkedArray):
-        array = pa.concat_arrays([chunk.storage for chunk in array.chunks])
-    rows = len(array)
-    if array.null_count:
-        raise ValueError(f"{array.null_count} missing values")
-    while isinstance(array, pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
-        if pa.types.is_struct(array.type.value_type):
-            break
-        array = array.flatten()
-    if pa.types.is_nested(array.type):
-        objects = np.empty(rows, object)
-        objects[:] = array.to_pylist()
-        return objects
-    values: Array = array.to_numpy(zero_copy_only=False)
-    return values.reshape(rows, *(() if tuple(shape) in ((), (1,)) else shape))
-
-
-def _columns(
-    path: Path, names: Sequence[str], features: dict[str, dict[str, Any]], problems: Problems
-) -> dict[str, Array] | None:
-    table = _read_table(path, problems, names.__contains__)
-    if table is None:
-        return None
-    rows = {}
-    for name in names:
-        if name not in table.column_names:
-            problems.error("missing column", f"{path}: got no column {name}, expected every feature of {INFO_NAME}")
-            return None
-        try:
-            rows[name] = _to_array(table.column(name), features[name]["shape"])
-        except ValueError as error:
-            expected = tuple(features[name]["shape"])
-            problems.error(
-                "wrong shape", f"{path}: got column {name} with {error}, expected values of shape {expected}"
-            )
-            return None
-    return rows
-
-
-def _read_tasks(root: Path, problems: Problems) -> dict[int, str]:
-    path = root / TASKS_NAME
-    if not path.is_file():
-        problems.error("missing tasks", f"{path}: got no such file, expected the tasks in words")
-        return {}
-    table = _read_table(path, problems)
-    if table is None:
-        return {}
-    words = next((name for name in table.column_names if name in ("task", "__index_level_0__")), None)
-    if words is None or "task_index" not in table.column_names:
-        problems.error("missing tasks", f"{path}: got columns {table.column_names}, expected task and task_index")
-        return {}
-    numbers = table.column("task_index").to_pylist()
-    return dict(zip((int(n) for n in numbers), map(str, table.column(words).to_pylist()), strict=True))
-
-
-def stored_episodes(contents: Contents) -> Iterator[Episode]:
-    """The rows of `meta/episodes` with their statistics, one after the other as they are stored; unreadable ones, which
-    `read_contents` notes, are left out.
-    """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    for path in _episode_files(contents.root):
-        try:
-            with pq.ParquetFile(path) as file:
-                for group in range(file.num_row_groups):
-                    table = file.read_row_group(group)
-                    for first in range(0, len(table), EPISODES_AT_ONCE):
-                        yield from _episodes(path, table.slice(first, EPISODES_AT_ONCE), Problems())
-        except (pa.ArrowException, OSError):
-            continue
-
-
-def _episodes(path: Path, table: Any, problems: Problems) -> list[Episode]:
-    found = []
-    for row in table.to_pylist():
-        stats: Stats = {}
-        for key in [key for key in row if key.startswith("stats/")]:
-            value, (_, feature, name) = row.pop(key), key.split("/", 2)
-            if value is not None:
-                stats.setdefault(feature, {})[name] = np.asarray(value, np.float64)
-        try:
-            tasks = tuple(str(task) for task in row["tasks"] or ())
-            found.append(Episode(int(row["episode_index"]), int(row["length"]), tasks, row, stats))
-        except (KeyError, TypeError, ValueError) as error:
-            problems.error("damaged episode row", f"{path}: got {error!r}, expected episode_index, length and tasks")
-    return found

@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.data.contents import Array, Contents, Span, stated_size
+from playslot_rl.data.contents import Contents, Span, stated_size
 from playslot_rl.data.problems import Problems
+from playslot_rl.data.tables import Array
 from playslot_rl.errors import DataError
 
 ROWS_A_PIECE = 256
@@ -108,7 +109,7 @@ def _image_frames(
             begin, row = row, row + rows
             if not wanted[begin:row].any():
                 continue
-            for first, cells in _stored_images(path, camera, wanted[begin:row], problems):
+            for first, cells in _stored_images(contents, path, camera, wanted[begin:row], problems):
                 numbers = (first + np.flatnonzero(wanted[begin + first : begin + first + len(cells)])).tolist()
                 chosen = cells.take(pa.array([number - first for number in numbers], pa.int64())).to_pylist()
                 for number, result in zip(numbers, pool.map(decode, chosen), strict=True):
@@ -123,12 +124,12 @@ def _image_frames(
 
 
 def _stored_images(
-    path: Path, camera: str, wanted: npt.NDArray[np.bool_], problems: Problems
+    contents: Contents, path: Path, camera: str, wanted: npt.NDArray[np.bool_], problems: Problems
 ) -> Iterator[tuple[int, Any]]:
     """Pieces of a file's column with the number of their first row; row groups without a wanted row are not read."""
     import pyarrow.parquet as pq
 
-    with pq.ParquetFile(path) as file:
+    with pq.ParquetFile(contents.opened(path)) as file:
         if camera not in file.schema_arrow.names:
             problems.error("missing column", f"{path}: got no column {camera}, expected the camera's frames")
             return
@@ -177,14 +178,14 @@ def _video_frames(
         files.setdefault(path, []).append((float(begin), rows[episode.index]))
     size = stated_size(contents.features[camera])
     for path, places in files.items():
-        if not path.is_file():
+        if not contents.holds(path):
             problems.error("missing video", f"{path}: got no such file, expected the frames of {len(places)} episodes")
             continue
         places.sort(key=lambda place: place[0])
         numbers = (span.start + i for _, span in places for i in range(span.length))
         times = [begin + i / contents.fps for begin, span in places for i in range(span.length)]
         try:
-            for row, frame in zip(numbers, _frames_at(path, times, 0.25 / contents.fps), strict=False):
+            for row, frame in zip(numbers, _frames_at(contents, path, times, 0.25 / contents.fps), strict=False):
                 got = (frame.height, frame.width)
                 if got != size:
                     problems.error(DAMAGED, f"{path}: {camera}: got frames of {got}, expected {size} as stated")
@@ -194,7 +195,7 @@ def _video_frames(
             problems.error(DAMAGED, str(error))
 
 
-def _frames_at(path: Path, times: Sequence[float], tolerance: float) -> Iterator[Any]:
+def _frames_at(contents: Contents, path: Path, times: Sequence[float], tolerance: float) -> Iterator[Any]:
     """Frames of a video at ascending times, seconds.
 
     Raises:
@@ -206,7 +207,7 @@ def _frames_at(path: Path, times: Sequence[float], tolerance: float) -> Iterator
     for seek in (True, False) if times[0] > tolerance else (False,):
         number, reason = 0, "it ends too early"
         try:
-            for now, frame in _decoded_from(path, times[0] if seek else 0.0):
+            for now, frame in _decoded_from(contents.opened(path), times[0] if seek else 0.0):
                 if number == len(times) or now > times[number] + tolerance:
                     break
                 if now >= times[number] - tolerance:
@@ -223,11 +224,11 @@ def _frames_at(path: Path, times: Sequence[float], tolerance: float) -> Iterator
         )
 
 
-def _decoded_from(path: Path, begin: float) -> Iterator[tuple[float, Any]]:
+def _decoded_from(source: Any, begin: float) -> Iterator[tuple[float, Any]]:
     """Time, seconds, and frame of a video from the last key frame up to `begin` on."""
     import av
 
-    with av.open(str(path)) as container:
+    with av.open(str(source) if isinstance(source, Path) else source) as container:
         stream: Any = container.streams.video[0]
         stream.thread_type = "AUTO"
         if begin > 0:

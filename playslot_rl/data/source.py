@@ -294,7 +294,7 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
 def wrong_size(files: Contents, camera: str, got: tuple[int, int], expected: int) -> DataError:
     """Frames of another size than the model's."""
     return DataError(
-        f"{files.root}: got frames of {got[0]}x{got[1]} from {camera}, expected {expected}x{expected}: "
+        f"{files.name}: got frames of {got[0]}x{got[1]} from {camera}, expected {expected}x{expected}: "
         "set env.image_size, resize them by data.resize=true, or record at that size"
     )
 
@@ -328,6 +328,8 @@ def _frame_cache(files: Contents, camera: str, cache: CachePlace, size: int | No
 
 def files_fingerprint(files: Contents, camera: str, cache: Path) -> str:
     """Content hash of a data set, remembered by the names, sizes and times of its files: hashing videos is slow."""
+    if files.remote is not None:
+        return files.remote.fingerprint(camera)
     listing = sorted(
         (str(path.relative_to(files.root)), path.stat().st_size, path.stat().st_mtime_ns)
         for folder in ("meta", "data", "videos")

@@ -28,6 +28,7 @@ import numpy.typing as npt
 from playslot_rl.data.cache import CachePlace, cache_folder
 from playslot_rl.data.contents import Contents, Span, open_files, stated_size
 from playslot_rl.data.frames import rgb_frames, sized
+from playslot_rl.data.remote import is_remote, open_remote
 from playslot_rl.data.shifts import ShiftedFrames
 from playslot_rl.data.source import (
     ConcatFrames,
@@ -177,14 +178,14 @@ def open_stream(
     """Open a LeRobot v3.0 data set without a frame cache.
 
     Args:
-        root, camera, cache, image_size, resize: as of `playslot_rl.data.source.open_source`; the cache only remembers
-            the data set's fingerprint.
+        root, camera, cache, image_size, resize: as of `playslot_rl.data.source.open_source`, or the address of a data
+            set on the Hub; the cache only remembers its fingerprint, or its metadata.
         buffer: frames of the shuffle buffer.
 
     Raises:
         DataError: as `open_source`; a frame that cannot be decoded is found when it is read.
     """
-    files = open_files(root)
+    files = open_remote(str(root), cache_folder(cache)) if is_remote(root) else open_files(root)
     camera = files.camera(camera)
     stated = stated_size(files.features[camera])
     if image_size is not None and not resize and stated != (image_size, image_size):

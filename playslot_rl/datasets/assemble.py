@@ -25,14 +25,11 @@ from playslot_rl.data.contents import (
     INFO_NAME,
     RECORD_NAME,
     STATS_NAME,
-    TASKS_NAME,
     VIDEO_PATH,
-    Array,
     Contents,
-    Episode,
     Span,
-    Stats,
 )
+from playslot_rl.data.tables import TASKS_NAME, Array, Episode, Stats
 from playslot_rl.datasets.statistics import aggregate, of_numbers
 from playslot_rl.datasets.video_copy import VideoCopier
 from playslot_rl.errors import DataError

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from playslot_rl.data.contents import UNREADABLE, Contents, Episode, Span, Stats, read_contents
+from playslot_rl.data.contents import Contents, Span, read_contents
 from playslot_rl.data.problems import Problems
+from playslot_rl.data.tables import UNREADABLE, Episode, Stats
 from playslot_rl.datasets.assemble import Choice, assemble
 from playslot_rl.datasets.fingerprint import CameraScan, scan_frames
 from playslot_rl.datasets.statistics import differing

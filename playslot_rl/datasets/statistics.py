@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.data.contents import Array, Stats
+from playslot_rl.data.tables import Array, Stats
 
 QUANTILES: Final = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 BASIC: Final = ("min", "max", "mean", "std", "count")

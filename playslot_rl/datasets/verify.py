@@ -17,17 +17,14 @@ from playslot_rl.data.contents import (
     RECORD_NAME,
     REQUIRED,
     STATS_NAME,
-    TASKS_NAME,
-    Array,
     Contents,
-    Episode,
     Span,
-    Stats,
+    episode_files,
     is_depth,
     read_contents,
-    stored_episodes,
 )
 from playslot_rl.data.problems import Problems
+from playslot_rl.data.tables import TASKS_NAME, Array, Episode, Stats, stored_episodes
 from playslot_rl.datasets.fingerprint import CameraScan, fingerprint_of, scan_frames
 from playslot_rl.datasets.statistics import Aggregate, differing, of_numbers, rounded
 from playslot_rl.errors import DataError
@@ -305,7 +302,7 @@ def check_statistics(contents: Contents, scans: Mapping[str, CameraScan], proble
         return exact, theirs
 
     # One episode after the other, as they are stored: those of all at once are some 40 KB each.
-    for episode in stored_episodes(contents):
+    for episode in stored_episodes(episode_files(contents.root)):
         number = numbers.get(episode.index)
         if number not in left:
             continue

@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from playslot_rl.errors import HubError
-from playslot_rl.hub.errors import checked_token, mask, masked_logs, translate
+from playslot_rl.hub.errors import translate
 from playslot_rl.hub.layout import CARD_NAME, same_content, size_of
+from playslot_rl.storage.secrets import checked_token, mask, masked_logs
 
 if TYPE_CHECKING:
     from huggingface_hub import RepoFile

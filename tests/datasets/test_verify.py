@@ -204,17 +204,17 @@ def test_statistics_are_those_of_lerobot(images: Path) -> None:
 
 
 def test_statistics_are_read_a_few_episodes_at_a_time(images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from playslot_rl.data import contents
+    from playslot_rl.data import tables
 
     sizes: list[tuple[int, bool]] = []
-    real = contents._episodes
+    real = tables.episodes_of
 
     def episodes(path: Path, table: Any, problems: Any) -> Any:
         sizes.append((len(table), any(name.startswith("stats/") for name in table.column_names)))
         return real(path, table, problems)
 
-    monkeypatch.setattr(contents, "_episodes", episodes)
-    monkeypatch.setattr(contents, "EPISODES_AT_ONCE", 2)
+    monkeypatch.setattr(tables, "episodes_of", episodes)
+    monkeypatch.setattr(tables, "EPISODES_AT_ONCE", 2)
     assert verify(images).ok
     with_statistics = [size for size, there in sizes if there]
     assert sum(with_statistics) == 3

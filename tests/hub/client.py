@@ -8,6 +8,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
+import hashlib
+import io
 import json
 import logging
 import os
@@ -64,12 +66,36 @@ def _faults(patches: dict[str, Any]) -> Iterator[None]:
         module.http_get, shutil.disk_usage = http_get, disk_usage
 
 
+def _command(words: list[str]) -> int:
+    from playslot_rl.cli import main as playslot
+
+    with contextlib.redirect_stdout(sys.stderr):  # stdout carries the answers
+        return playslot(words)
+
+
+def _stream(root: str, cache: str) -> dict[str, Any]:
+    from playslot_rl.data.stream import open_stream
+
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        source = open_stream(root, cache=cache, buffer=1000)
+        frames = source.frames[:]
+    actions = None if source.actions is None else source.actions.tolist()
+    return {
+        "frames": hashlib.sha256(frames.tobytes()).hexdigest(), "shape": frames.shape, "actions": actions,
+        "lengths": source.lengths.tolist(), "fingerprint": source.fingerprint, "said": said.getvalue(),
+    }  # fmt: skip
+
+
 def _run(request: dict[str, Any]) -> dict[str, Any]:
     from playslot_rl.hub.policy import pull_policy, push_policy
     from playslot_rl.hub.pull import pull
     from playslot_rl.hub.push import push
 
     arguments = dict(request["arguments"])
+    if request["call"] == "command":
+        return {"status": _command(arguments["words"])}
+    if request["call"] == "stream":
+        return _stream(**arguments)
     for name in {"root", "folder"} & arguments.keys():
         arguments[name] = Path(arguments[name])
     if request["call"] == "pull_policy":

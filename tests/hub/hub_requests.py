@@ -35,7 +35,8 @@ ROUTES: list[tuple[str, re.Pattern[str], str]] = [
         ("GET", r"/api/((?:datasets|models)/[^/]+/[^/]+)", "info"),
         ("GET", r"/api/((?:datasets|models)/[^/]+/[^/]+)/revision/(.+)", "info"),
         ("GET", r"/api/((?:datasets|models)/[^/]+/[^/]+)/refs", "refs"),
-        ("GET", r"/api/((?:datasets|models)/[^/]+/[^/]+)/tree/([^/]+)", "tree"),
+        ("GET", r"/api/((?:datasets|models)/[^/]+/[^/]+)/tree/([^/]+)(?:/(.+))?", "tree"),
+        ("POST", r"/api/((?:datasets|models)/[^/]+/[^/]+)/paths-info/([^/]+)", "paths"),
         ("POST", r"/api/((?:datasets|models)/[^/]+/[^/]+)/preupload/([^/]+)", "preupload"),
         ("POST", r"/api/((?:datasets|models)/[^/]+/[^/]+)/commit/([^/]+)", "commit"),
         ("POST", r"/api/((?:datasets|models)/[^/]+/[^/]+)/branch/([^/]+)", "branch"),
@@ -60,7 +61,7 @@ def named(place: str) -> str:
 
 def parts(matched: re.Match[str]) -> list[str]:
     """What an address names: the repository first."""
-    groups = [unquote(group) for group in matched.groups()]
+    groups = [unquote(group) for group in matched.groups() if group is not None]
     return [named(groups[0]), *groups[1:]] if groups else []
 
 
@@ -222,19 +223,21 @@ class Handler(BaseHTTPRequestHandler):
         return {"branches": listed("heads", repository.branches), "tags": listed("tags", repository.tags),
                 "converts": []}  # fmt: skip
 
-    def _on_tree(self, name: str, revision: str) -> Any:
+    def _on_tree(self, name: str, revision: str, folder: str = "") -> Any:
         repository = self._repository(name)
         files = repository.commits[self._commit(repository, revision)]
-        if parse_qs(urlsplit(self.path).query).get("recursive", ["false"])[0].lower() != "true":
-            raise RefusedError(400, "only recursive listings")
+        deep = parse_qs(urlsplit(self.path).query).get("recursive", ["false"])[0].lower() == "true"
         folders = sorted({parent for path in files for parent in _parents(path)})
         entries: list[dict[str, Any]] = [{"type": "directory", "path": f, "size": 0, "oid": "0" * 40} for f in folders]
-        for path, data in sorted(files.items()):
-            entry = {"type": "file", "path": path, "size": len(data), "oid": blob_id(data)}
-            if is_large(path):
-                entry["lfs"] = {"oid": hashlib.sha256(data).hexdigest(), "size": len(data), "pointerSize": 130}
-            entries.append(entry)
-        return entries
+        entries += [_entry(path, data) for path, data in sorted(files.items())]
+        below = f"{folder}/" if folder else ""
+        return [e for e in entries if e["path"].startswith(below) and (deep or "/" not in e["path"][len(below) :])]
+
+    def _on_paths(self, name: str, revision: str) -> Any:
+        repository = self._repository(name)
+        files = repository.commits[self._commit(repository, revision)]
+        asked = json.loads(self.body)["paths"]
+        return [_entry(path, files[path]) for path in ([asked] if isinstance(asked, str) else asked) if path in files]
 
     # --- writing ----------------------------------------------------------------------------------------------------
 
@@ -331,14 +334,22 @@ class Handler(BaseHTTPRequestHandler):
         etag = hashlib.sha256(data).hexdigest() if is_large(path) else blob_id(data)
         headers = {"ETag": f'"{etag}"', "X-Repo-Commit": commit, "Accept-Ranges": "bytes",
                    "Content-Type": "application/octet-stream"}  # fmt: skip
-        wanted = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
+        wanted = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
         if wanted is None:
             return self._send(200, data, headers)
         begin = int(wanted[1])
-        headers["Content-Range"] = f"bytes {begin}-{len(data) - 1}/{len(data)}"
-        return self._send(206, data[begin:], headers)
+        end = min(int(wanted[2] or len(data)), len(data) - 1)
+        headers["Content-Range"] = f"bytes {begin}-{end}/{len(data)}"
+        return self._send(206, data[begin : end + 1], headers)
 
 
 def _parents(path: str) -> list[str]:
     parts = path.split("/")[:-1]
     return ["/".join(parts[: i + 1]) for i in range(len(parts))]
+
+
+def _entry(path: str, data: bytes) -> dict[str, Any]:
+    entry: dict[str, Any] = {"type": "file", "path": path, "size": len(data), "oid": blob_id(data)}
+    if is_large(path):
+        entry["lfs"] = {"oid": hashlib.sha256(data).hexdigest(), "size": len(data), "pointerSize": 130}
+    return entry

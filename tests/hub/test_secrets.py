@@ -18,8 +18,8 @@ import pytest
 from fake_hub import PLAIN_TOKEN, WRITE_TOKEN, FakeHub, Fault, Repository
 
 from playslot_rl.errors import DataError, HubError
-from playslot_rl.hub.errors import MASK, checked_token, mask, masked_logs
 from playslot_rl.hub.session import open_repository
+from playslot_rl.storage.secrets import MASK, checked_token, mask, masked_logs
 
 pytestmark = pytest.mark.slow  # together they take a minute; make test-all runs them
 

@@ -1,0 +1,243 @@
+"""Data sets that are read where they lie: `data.root=hf://datasets/USER/NAME[@REVISION]`, with `data.stream=true`.
+
+The metadata are fetched, once for each commit; frames are read by ranges of the files that hold them, as they are
+wanted, and never written. What changes on the Hub after a command has begun is another commit, and not seen.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import hashlib
+import io
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from playslot_rl import keys
+from playslot_rl.data.cache import build_once
+from playslot_rl.data.contents import DATA_PATH, INFO_NAME, SCHEME, Contents, read_metadata
+from playslot_rl.data.problems import Problems
+from playslot_rl.data.tables import Array, Episode, read_columns
+from playslot_rl.errors import DataError
+from playslot_rl.storage.secrets import checked_token, masked_logs
+
+LOADED: Final = "v3.0"
+"""The tag that LeRobot loads; main where there is none."""
+BUFFER: Final = 1 << 20
+"""Bytes that are asked of the client at once; it reads ahead by more."""
+_LOOK = "pull it and run `playslot dataset verify`"
+_ADDRESS = re.compile(r"hf://datasets/([\w.-]+/[\w.-]+?)(?:@([^@\s]+))?/?")
+
+
+def is_remote(root: str | Path) -> bool:
+    """Whether a data set's name is an address on the Hub."""
+    return str(root).startswith(SCHEME)
+
+
+@dataclass(frozen=True)
+class Remote:
+    """The files of one commit of a data set on the Hub.
+
+    Attributes:
+        address: as it was typed.
+        place: of the commit, as `huggingface_hub.HfFileSystem` names it.
+        root: folder of the metadata on this machine; the paths of all files begin with it.
+        hashes: of every file of the data set, by its path below the root.
+        token: sent with every request; None sends none.
+    """
+
+    address: str
+    place: str
+    root: Path
+    hashes: Mapping[str, str] = field(repr=False)
+    token: str | None = field(repr=False)
+
+    def open(self, path: Path) -> io.BufferedReader:
+        """A file, to be read by ranges of a few megabytes; each reader has its own.
+
+        Raises:
+            DataError: the Hub does not answer.
+        """
+        from huggingface_hub import HfFileSystem
+
+        name = f"{self.place}/{path.relative_to(self.root).as_posix()}"
+        with asking(self.address, self.token):
+            system = HfFileSystem(token=self.token or False)
+            return io.BufferedReader(_Ranges(self.address, self.token, system.open(name, "rb")), BUFFER)
+
+    def holds(self, path: Path) -> bool:
+        """Whether the commit has the file."""
+        return path.relative_to(self.root).as_posix() in self.hashes
+
+    def fingerprint(self, camera: str) -> str:
+        """Hash of the names and hashes of what `Contents.file_hash` reads: 16 hex digits. It is another one."""
+        videos = f"videos/{camera}/"
+        told = (INFO_NAME, "meta/episodes/", "data/", videos)
+        wanted = sorted((path, value) for path, value in self.hashes.items() if path.startswith(told))
+        return hashlib.sha256(json.dumps(wanted).encode()).hexdigest()[:16]
+
+
+class _Ranges(io.RawIOBase):
+    """A file of the Hub whose errors are one line."""
+
+    def __init__(self, address: str, token: str | None, file: Any) -> None:
+        self._address, self._token, self._file = address, token, file
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        return int(self._file.seek(offset, whence))
+
+    def tell(self) -> int:
+        return int(self._file.tell())
+
+    def readinto(self, buffer: Any) -> int:
+        with asking(self._address, self._token):
+            piece = self._file.read(len(buffer))
+        buffer[: len(piece)] = piece
+        return len(piece)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+@contextlib.contextmanager
+def asking(address: str, token: str | None) -> Iterator[None]:
+    """Say what goes wrong at the Hub inside in one line, without the token. The client has tried again by then.
+
+    Raises:
+        DataError: no such data set or revision, no access, offline, or no answer.
+    """
+    failure = None
+    try:
+        with masked_logs(token):
+            yield
+        return
+    except Exception as error:
+        said = _said(error)
+        if said is None:
+            raise
+        failure = DataError(f"{address}: {said}")
+    # The client's error holds the server's answer, which may repeat the token it was sent: it does not go along.
+    try:
+        raise failure
+    finally:
+        failure.__context__ = None
+
+
+def _said(error: Exception) -> str | None:
+    """What an error of the client means; None if it is no error of the client."""
+    import httpx
+    from huggingface_hub import errors
+
+    again = "check the network and run the same command again, it carries on"
+    if isinstance(error, errors.OfflineModeIsEnabled):
+        return "got offline mode (HF_HUB_OFFLINE is set), expected access to the Hub: unset it"
+    if isinstance(error, errors.RevisionNotFoundError):
+        return "got no such revision, expected a branch, a tag or a commit: see its page on the Hub"
+    if isinstance(error, errors.HfHubHTTPError):
+        status = int(error.response.status_code)
+        if status not in (401, 403, 404):
+            return f"got status {status} from the Hub, expected its files: {again}"
+        cure = "check the name; if it is private, run `hf auth login` once, or set HF_TOKEN"
+        return f"got status {status}, expected a data set that can be read: {cure}"
+    if isinstance(error, httpx.TransportError | ConnectionError | TimeoutError):
+        return f"got no connection ({type(error).__name__}), expected the Hub: {again}"
+    return f"got no file {error}, expected it there: {_LOOK}" if isinstance(error, FileNotFoundError) else None
+
+
+def open_remote(address: str, cache: Path) -> Contents:
+    """The metadata of a data set on the Hub, and where its frames are.
+
+    Where frames are pictures they lie among the rows, and the rows' other columns (`action`, `next.success`, `seed`)
+    are not read, since that would read everything; of a set of videos they are.
+
+    Args:
+        address: `hf://datasets/USER/NAME[@REVISION]`; without a revision the tag that LeRobot loads, else main.
+        cache: folder of the cache, where the metadata are kept.
+
+    Raises:
+        DataError: no such address, data set or revision; no answer; another format version, damaged metadata.
+        OutputError: full disk.
+    """
+    remote = _commit_of(address, cache)
+    problems = Problems()
+    info, episodes, tasks = read_metadata(remote.root, problems, statistics=False)
+    rows = _rows_of_files(remote, info, episodes)
+    index = np.repeat([episode.index for episode in episodes], [episode.length for episode in episodes])
+    columns: dict[str, Array] = {"episode_index": index}
+    if not any(feature["dtype"] == "image" for feature in info["features"].values()):
+        columns |= read_columns(list(rows), info, problems, remote.open)[2]
+    elif keys.FEATURE_ACTION in info["features"]:
+        print(f"note: {address}: its frames lie among its rows, whose actions are therefore not read", flush=True)
+    if problems.errors or not episodes or len(columns["episode_index"]) != len(index):
+        said = problems.errors[0] if problems.errors else f"{len(episodes)} episodes and other rows"
+        raise DataError(f"{address}: {said}: {_LOOK}")
+    return Contents(remote.root, info, episodes, tasks, list(rows), list(rows.values()), columns, remote)
+
+
+def _commit_of(address: str, cache: Path) -> Remote:
+    """Which commit an address means, with its metadata on this machine."""
+    from huggingface_hub import HfApi, RepoFile, errors, get_token
+
+    matched = _ADDRESS.fullmatch(address)
+    if matched is None:
+        raise DataError(
+            f"{address}: got no data set's address, expected hf://datasets/USER/NAME, or with @REVISION after it"
+        )
+    name, revision = matched[1], matched[2]
+    token = checked_token(get_token())
+    api = HfApi(token=token or False, library_name="playslot_rl")
+    with asking(address, token):
+        try:
+            info = api.dataset_info(name, revision=revision or LOADED)
+        except errors.RevisionNotFoundError:
+            if revision:
+                raise
+            info = api.dataset_info(name)
+        commit = str(info.sha)
+        listed = api.list_repo_tree(name, repo_type="dataset", revision=commit, recursive=True)
+        files = {entry.path: entry for entry in listed if isinstance(entry, RepoFile)}
+    if INFO_NAME not in files:
+        raise DataError(f"{address}: got no {INFO_NAME}, expected a LeRobot v3.0 data set: check the name")
+    hashes = {path: file.lfs.sha256 if file.lfs else file.blob_id for path, file in files.items()}
+
+    def fetch(folder: Path) -> None:
+        wanted = [glob.escape(path) for path in files if path.startswith("meta/")]
+        with asking(address, token):
+            api.snapshot_download(name, repo_type="dataset", revision=commit, local_dir=folder, allow_patterns=wanted)
+
+    root = build_once(cache / "remote" / f"{name.replace('/', '--')}-{commit[:16]}", fetch)
+    return Remote(address, f"datasets/{name}@{commit}", root, hashes, token)
+
+
+def _rows_of_files(remote: Remote, info: Mapping[str, Any], episodes: Sequence[Episode]) -> dict[Path, int]:
+    """How many rows each data file has, in order, as the episodes' metadata tell it."""
+    template, found, row = info.get("data_path") or DATA_PATH, dict[Path, int](), 0
+    for episode in episodes:
+        try:
+            place = {key: int(episode.row[f"data/{key}"]) for key in ("chunk_index", "file_index")}
+            path, begin = remote.root / template.format(**place), int(episode.row["dataset_from_index"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(
+                f"{remote.address}: got {error!r} for episode {episode.index}, expected its place in data/: {_LOOK}"
+            ) from error
+        if begin != row or path < next(reversed(found), path) or not remote.holds(path):
+            raise DataError(
+                f"{remote.address}: got episode {episode.index} from row {begin} of "
+                f"{path.relative_to(remote.root)}, expected row {row} of a file that is there: {_LOOK}"
+            )
+        found[path] = found.get(path, 0) + episode.length
+        row += episode.length
+    return found

@@ -1,0 +1,188 @@
+"""Parquet files of a LeRobot v3.0 data set as arrays and episodes; what cannot be read is noted and left out.
+
+Shapes: F rows (frames).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.data.problems import Problems
+
+TASKS_NAME: Final = "meta/tasks.parquet"
+EPISODES_AT_ONCE: Final = 64
+"""Of the metadata with statistics, some 150 columns."""
+UNREADABLE: Final = "unreadable parquet"
+
+Array = npt.NDArray[Any]
+Stats = dict[str, dict[str, Array]]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One row of `meta/episodes`.
+
+    Attributes:
+        index: `episode_index`.
+        length: frames.
+        tasks: in words.
+        row: all its values but the statistics.
+        stats: feature -> statistic -> array, float64.
+    """
+
+    index: int
+    length: int
+    tasks: tuple[str, ...]
+    row: dict[str, Any]
+    stats: Stats
+
+
+def read_columns(
+    paths: Sequence[Path], info: dict[str, Any], problems: Problems, opened: Callable[[Path], Any] = Path
+) -> tuple[list[Path], list[int], dict[str, Array]]:
+    """The readable ones of some data files, rows of each, and every feature that is no camera.
+
+    Args:
+        paths: of the files.
+        info: `meta/info.json`.
+        problems: notes what cannot be read.
+        opened: a file as pyarrow takes one.
+    """
+    features = info["features"]
+    names = [name for name, feature in features.items() if feature["dtype"] not in ("image", "video")]
+    files, parts = [], []
+    for path in paths:
+        rows = _columns(path, names, features, problems, opened)
+        if rows is not None:
+            files.append(path)
+            parts.append(rows)
+    counts = [len(rows["index"]) for rows in parts]
+    columns = {name: np.concatenate([rows[name] for rows in parts] or [np.zeros(0, np.int64)]) for name in names}
+    return files, counts, columns
+
+
+def read_table(
+    path: Path, problems: Problems, wanted: Callable[[str], bool] = bool, opened: Callable[[Path], Any] = Path
+) -> Any:
+    """The wanted columns of a parquet file as a table, or None (noted) where it has no footer."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        file = pq.ParquetFile(opened(path))
+        return file.read(columns=[name for name in file.schema_arrow.names if wanted(name)])
+    except (pa.ArrowException, OSError) as error:
+        reason = " ".join(str(error).split())[:120]
+        problems.error(
+            UNREADABLE,
+            f"{path}: cannot be read ({reason}): got a parquet file without a footer, expected a whole one",
+        )
+        return None
+
+
+def _to_array(column: Any, shape: Sequence[int]) -> Array:
+    """A table's column as (n, *shape); the shape (1,) gives (n,). Text and records come as objects.
+
+    Raises:
+        ValueError: it has missing values, or another shape.
+    """
+    import pyarrow as pa
+
+    array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    if isinstance(array, pa.ChunkedArray):
+        array = pa.concat_arrays([chunk.storage for chunk in array.chunks])
+    rows = len(array)
+    if array.null_count:
+        raise ValueError(f"{array.null_count} missing values")
+    while isinstance(array, pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
+        if pa.types.is_struct(array.type.value_type):
+            break
+        array = array.flatten()
+    if pa.types.is_nested(array.type):
+        objects = np.empty(rows, object)
+        objects[:] = array.to_pylist()
+        return objects
+    values: Array = array.to_numpy(zero_copy_only=False)
+    return values.reshape(rows, *(() if tuple(shape) in ((), (1,)) else shape))
+
+
+def _columns(
+    path: Path,
+    names: Sequence[str],
+    features: dict[str, dict[str, Any]],
+    problems: Problems,
+    opened: Callable[[Path], Any],
+) -> dict[str, Array] | None:
+    table = read_table(path, problems, names.__contains__, opened)
+    if table is None:
+        return None
+    rows = {}
+    for name in names:
+        if name not in table.column_names:
+            problems.error("missing column", f"{path}: got no column {name}, expected every feature of meta/info.json")
+            return None
+        try:
+            rows[name] = _to_array(table.column(name), features[name]["shape"])
+        except ValueError as error:
+            expected = tuple(features[name]["shape"])
+            problems.error(
+                "wrong shape", f"{path}: got column {name} with {error}, expected values of shape {expected}"
+            )
+            return None
+    return rows
+
+
+def read_tasks(root: Path, problems: Problems) -> dict[int, str]:
+    path = root / TASKS_NAME
+    if not path.is_file():
+        problems.error("missing tasks", f"{path}: got no such file, expected the tasks in words")
+        return {}
+    table = read_table(path, problems)
+    if table is None:
+        return {}
+    words = next((name for name in table.column_names if name in ("task", "__index_level_0__")), None)
+    if words is None or "task_index" not in table.column_names:
+        problems.error("missing tasks", f"{path}: got columns {table.column_names}, expected task and task_index")
+        return {}
+    numbers = table.column("task_index").to_pylist()
+    return dict(zip((int(n) for n in numbers), map(str, table.column(words).to_pylist()), strict=True))
+
+
+def episodes_of(path: Path, table: Any, problems: Problems) -> list[Episode]:
+    found = []
+    for row in table.to_pylist():
+        stats: Stats = {}
+        for key in [key for key in row if key.startswith("stats/")]:
+            value, (_, feature, name) = row.pop(key), key.split("/", 2)
+            if value is not None:
+                stats.setdefault(feature, {})[name] = np.asarray(value, np.float64)
+        try:
+            tasks = tuple(str(task) for task in row["tasks"] or ())
+            found.append(Episode(int(row["episode_index"]), int(row["length"]), tasks, row, stats))
+        except (KeyError, TypeError, ValueError) as error:
+            problems.error("damaged episode row", f"{path}: got {error!r}, expected episode_index, length and tasks")
+    return found
+
+
+def stored_episodes(paths: Sequence[Path]) -> Iterator[Episode]:
+    """The rows of `meta/episodes` with their statistics, one after the other as they are stored; unreadable ones, which
+    `read_contents` notes, are left out.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    for path in paths:
+        try:
+            with pq.ParquetFile(path) as file:
+                for group in range(file.num_row_groups):
+                    table = file.read_row_group(group)
+                    for first in range(0, len(table), EPISODES_AT_ONCE):
+                        yield from episodes_of(path, table.slice(first, EPISODES_AT_ONCE), Problems())
+        except (pa.ArrowException, OSError):
+            continue
