@@ -20,7 +20,7 @@ from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import shipped
 from playslot_rl.config.methods import METHODS, MethodName, method_stage
 from playslot_rl.config.roles import without
-from playslot_rl.config.weights import data_roots
+from playslot_rl.config.weights import SCHEME, data_roots
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
 
@@ -225,8 +225,8 @@ def job_config(config: ExperimentConfig, job: Job, world: str) -> ExperimentConf
 
 
 def absolute(path: str) -> str:
-    """A path from the root; nothing and shipped models (`pretrained/ENV`) as they are."""
-    return path if not path or shipped(path) else str(Path(path).expanduser().resolve())
+    """A path from the root; nothing, shipped models (`pretrained/ENV`) and addresses on the Hub as they are."""
+    return path if not path or shipped(path) or path.startswith(SCHEME) else str(Path(path).expanduser().resolve())
 
 
 def absolute_roots(text: str) -> str:

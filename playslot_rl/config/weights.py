@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from playslot_rl.errors import ConfigError
+
+SCHEME: Final = "hf://"
+"""Begins the name of a data set on the Hub (`playslot_rl.data.remote`)."""
 
 
 class DataRoot(NamedTuple):

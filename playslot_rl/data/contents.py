@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from playslot_rl.config.weights import SCHEME
 from playslot_rl.data.problems import Problems
 from playslot_rl.data.tables import UNREADABLE, Array, Episode, episodes_of, read_columns, read_table, read_tasks
 from playslot_rl.errors import DataError
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 INFO_NAME: Final = "meta/info.json"
 STATS_NAME: Final = "meta/stats.json"
 RECORD_NAME: Final = "meta/playslot.json"
-SCHEME: Final = "hf://"
-"""Begins the name of a data set on the Hub (`playslot_rl.data.remote`)."""
 DATA_PATH: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH: Final = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"

@@ -20,8 +20,9 @@ from typing import Any, Final
 import numpy as np
 
 from playslot_rl import keys
+from playslot_rl.config.weights import SCHEME
 from playslot_rl.data.cache import build_once
-from playslot_rl.data.contents import DATA_PATH, INFO_NAME, SCHEME, Contents, read_metadata
+from playslot_rl.data.contents import DATA_PATH, INFO_NAME, Contents, read_metadata
 from playslot_rl.data.problems import Problems
 from playslot_rl.data.tables import Array, Episode, read_columns
 from playslot_rl.errors import DataError

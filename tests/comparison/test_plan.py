@@ -7,7 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from playslot_rl.comparison.plan import Job, check_comparison, check_demos, job_config, job_record, jobs, latent_models
+from playslot_rl.comparison.plan import (
+    Job,
+    absolute_roots,
+    check_comparison,
+    check_demos,
+    job_config,
+    job_record,
+    jobs,
+    latent_models,
+)
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import compose
@@ -133,3 +142,8 @@ def test_too_few_demonstrations_are_refused() -> None:
     check_demos(compared("demos=10,20"), 20, "data.demos=x")
     with pytest.raises(ConfigError, match=r"demos: got 20, expected at most the 19 demonstrations of data\.demos=x"):
         check_demos(compared("demos=10,20"), 19, "data.demos=x")
+
+
+def test_roots_are_absolute_but_for_addresses_and_weights_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert absolute_roots("a:2,hf://datasets/u/n@main") == f"{tmp_path / 'a'}:2,hf://datasets/u/n@main:1"

@@ -84,6 +84,9 @@ def test_a_training_reads_from_the_hub(made: tuple[Path, str], hub: FakeHub, cli
     assert client("command", words=[*words, "slots.steps=2", f"out={tmp_path / 'run'}"])["status"] == 0
     assert (tmp_path / "run" / "slots" / "checkpoint" / "meta.json").is_file()
     assert client("command", words=[*words, "slots.steps=2", f"out={tmp_path / 'run'}"])["status"] == 0
+    words = ["train-dynamics", *words[1:], f"run={tmp_path / 'run'}", "dynamics.steps=2"]
+    assert client("command", words=words)["status"] == 0
+    assert (tmp_path / "run" / "dynamics" / "checkpoint" / "meta.json").is_file()
 
 
 @pytest.mark.parametrize(
