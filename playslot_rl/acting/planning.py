@@ -12,7 +12,7 @@ from functools import partial
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
@@ -21,7 +21,6 @@ from playslot_rl.acting.planners import Cost, Planner, Search, latent_statistics
 from playslot_rl.acting.planners.costs import GoalCost, NearProposal, goal_distance, parse_goal
 from playslot_rl.acting.planners.size import SearchSize
 from playslot_rl.config.planning import PlanConfig
-from playslot_rl.modules.predictors.predictor import AutoregressivePredictor
 from playslot_rl.modules.whitening import Whitening
 from playslot_rl.seeding import step_generator
 from playslot_rl.world_model import Agent, action_decoder_module, frame_parser_module
@@ -171,6 +170,28 @@ class PlanningActor(Actor):
         return policy_plan(self.agent, slots, h)
 
 
+class Shaken(nn.Module):
+    """A latent policy with noise on what it chooses.
+
+    Args:
+        policy: slots (..., N, D) to latent actions (..., Z).
+        whitening: of the latent actions.
+        spread: standard deviation of the noise, in whitened coordinates.
+        generator: draws it.
+    """
+
+    def __init__(self, policy: nn.Module, whitening: Whitening, spread: float, generator: torch.Generator) -> None:
+        super().__init__()
+        self.policy, self.whitening, self.spread, self.generator = policy, whitening, spread, generator
+
+    def forward(self, slots: Tensor) -> Tensor:
+        """Slots (..., N, D) to latent actions (..., Z)."""
+        chosen = self.whitening(self.policy(slots))
+        noise = torch.randn(chosen.shape, generator=self.generator, device=self.generator.device)
+        shaken: Tensor = self.whitening.inverse(chosen + self.spread * noise)
+        return shaken
+
+
 def shaken_plans(
     agent: Agent,
     whitening: Whitening,
@@ -180,36 +201,9 @@ def shaken_plans(
     spread: float,
     generator: torch.Generator,
 ) -> Tensor:
-    """Rollouts of the latent policy with noise on what it chooses, imagined from slots (N, D).
-
-    Args:
-        agent: in evaluation mode, with cOCVP.
-        whitening: of the latent actions.
-        slots: where they begin.
-        horizon: H.
-        count: M.
-        spread: standard deviation of the noise at every step, in whitened coordinates.
-        generator: draws it.
-
-    Returns:
-        Latent actions (M, H, Z). The policy has answered to where its own shaken steps led.
-    """
-    model, predictor = agent.world_model, agent.world_model.predictor
-    if not isinstance(predictor, AutoregressivePredictor):
-        raise TypeError(f"planner=mbop: got the predictor {type(predictor).__name__}, expected cOCVP")
-    context, split = model.config.predictor.context, model.inverse_dynamics.split
-    frames, latents, past = [slots.expand(count, 1, *slots.shape)], list[Tensor](), None
-    for step in range(horizon):
-        chosen = whitening(agent.policy(frames[-1]))
-        noise = torch.randn(chosen.shape, generator=generator, device=generator.device)
-        latents.append(whitening.inverse(chosen + spread * noise))
-        if step < context:
-            following, past = predictor.step(frames[-1], *split(latents[-1]), past=past)
-        else:
-            window = torch.cat(frames[-context:], 1), *split(torch.cat(latents[-context:], 1))
-            following = predictor(*window)[:, -1:]
-        frames.append(following)
-    return torch.cat(latents, 1)
+    """Rollouts of the shaken latent policy from slots (N, D), imagined: latent actions (count, H, Z)."""
+    first = TensorDict({keys.SLOTS: slots.expand(count, *slots.shape)}, [count])
+    return imagine(agent, first, horizon, policy=Shaken(agent.policy, whitening, spread, generator)).latents
 
 
 def policy_plan(agent: Agent, slots: Tensor, horizon: int) -> Tensor:
