@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import PlannedActor, SlotActor
@@ -64,13 +64,7 @@ class Imagination(NamedTuple):
 
 
 @torch.no_grad()
-def imagine(
-    agent: Agent,
-    first: TensorDictBase,
-    steps: int,
-    generator: torch.Generator | None = None,
-    policy: nn.Module | None = None,
-) -> Imagination:
+def imagine(agent: Agent, first: TensorDictBase, steps: int, generator: torch.Generator | None = None) -> Imagination:
     """Unfold the policy in latent space, by a rollout of the imagination environment: nothing is observed afterwards.
 
     The latents are decoded alone: a decoder that reads slots learned from those that it sees when it acts, and imagined
@@ -81,12 +75,11 @@ def imagine(
         first: batch size [E], on the agent's device: SLOTS (E, N, D), or PIXELS (E, 3, H, W) to parse.
         steps: T.
         generator: of sampled initial slots (SAVi with `initial: gaussian`).
-        policy: slots (..., N, D) to latent actions (..., Z); None is the agent's own.
     """
     env = ImaginationEnv(agent.world_model, first.batch_size, generator=generator)
     start = env.reset(first)
-    acts = latent_policy_module(agent.policy if policy is None else policy)
-    rollout = env.rollout(steps, acts, tensordict=start, auto_reset=False, break_when_any_done=False)
+    policy = latent_policy_module(agent.policy)
+    rollout = env.rollout(steps, policy, tensordict=start, auto_reset=False, break_when_any_done=False)
     slots = torch.cat([start[keys.SLOTS].unsqueeze(1), rollout["next", keys.SLOTS]], 1)
     latents = rollout[keys.LATENT_ACTION]
     return Imagination(slots, latents, agent.action_decoder(latents))

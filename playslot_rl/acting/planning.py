@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
@@ -21,7 +20,6 @@ from playslot_rl.acting.planners import Cost, Planner, Search, latent_statistics
 from playslot_rl.acting.planners.costs import GoalCost, NearProposal, goal_distance, parse_goal
 from playslot_rl.acting.planners.size import SearchSize
 from playslot_rl.config.planning import PlanConfig
-from playslot_rl.modules.whitening import Whitening
 from playslot_rl.seeding import step_generator
 from playslot_rl.world_model import Agent, action_decoder_module, frame_parser_module
 
@@ -136,8 +134,7 @@ class PlanningActor(Actor):
         priced: Cost = cost
         if self.size.prior and len(proposal):
             priced = NearProposal(cost, proposal[0], self.whitening, self.size.prior)
-        shaken = partial(shaken_plans, self.agent, self.whitening, cost.slots[-1], shape[0]) if self.policy else None
-        search = Search(priced, shape, self.whitening, starts, self.config.bound, self.config.seconds, shaken)
+        search = Search(priced, shape, self.whitening, starts, self.config.bound, self.config.seconds)
         plan = self.planner(search, step_generator(seed, step, f"plan-{self.seed}", self.device))
         future = torch.cat([cost.slots[-1:], cost.imagine(plan.latents[None])[0]])
         offered = float(cost(proposal)[0]) if len(proposal) else float("nan")
@@ -168,42 +165,6 @@ class PlanningActor(Actor):
         if not self.policy:
             return slots.new_empty(0, h, *self.agent.world_model.latent_shape)
         return policy_plan(self.agent, slots, h)
-
-
-class Shaken(nn.Module):
-    """A latent policy with noise on what it chooses.
-
-    Args:
-        policy: slots (..., N, D) to latent actions (..., Z).
-        whitening: of the latent actions.
-        spread: standard deviation of the noise, in whitened coordinates.
-        generator: draws it.
-    """
-
-    def __init__(self, policy: nn.Module, whitening: Whitening, spread: float, generator: torch.Generator) -> None:
-        super().__init__()
-        self.policy, self.whitening, self.spread, self.generator = policy, whitening, spread, generator
-
-    def forward(self, slots: Tensor) -> Tensor:
-        """Slots (..., N, D) to latent actions (..., Z)."""
-        chosen = self.whitening(self.policy(slots))
-        noise = torch.randn(chosen.shape, generator=self.generator, device=self.generator.device)
-        shaken: Tensor = self.whitening.inverse(chosen + self.spread * noise)
-        return shaken
-
-
-def shaken_plans(
-    agent: Agent,
-    whitening: Whitening,
-    slots: Tensor,
-    horizon: int,
-    count: int,
-    spread: float,
-    generator: torch.Generator,
-) -> Tensor:
-    """Rollouts of the shaken latent policy from slots (N, D), imagined: latent actions (count, H, Z)."""
-    first = TensorDict({keys.SLOTS: slots.expand(count, *slots.shape)}, [count])
-    return imagine(agent, first, horizon, policy=Shaken(agent.policy, whitening, spread, generator)).latents
 
 
 def policy_plan(agent: Agent, slots: Tensor, horizon: int) -> Tensor:

@@ -8,13 +8,11 @@ from typing import Final, Literal, get_args
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import Checked, at_least, between, within
 
-PlannerName = Literal["cem", "mppi", "gradient", "prototypes", "mbop"]
+PlannerName = Literal["cem", "mppi", "gradient", "prototypes"]
 ProposalName = Literal["none", "policy"]
 CostName = Literal["slots", "dynamics", "image"]
 GoalName = Literal["solved", "ahead"]
 PLANNERS: Final[tuple[PlannerName, ...]] = get_args(PlannerName)
-PROPOSED: Final[tuple[PlannerName, ...]] = ("mbop",)
-"""Planners whose candidates are the policy's: they have no row without `proposal=policy`."""
 PROPOSALS: Final[tuple[ProposalName, ...]] = get_args(ProposalName)
 GOALS: Final[tuple[GoalName, ...]] = get_args(GoalName)
 
@@ -30,8 +28,8 @@ class PlanConfig(Checked):
     (`playslot_rl.acting.planners.size`).
 
     Attributes:
-        planner: `cem`, `mppi`, `gradient` (through the differentiable rollout), `prototypes` (categorical CEM),
-            `mbop` (rollouts of the shaken policy, with `proposal=policy` alone); a row of the table each.
+        planner: `cem`, `mppi`, `gradient` (through the differentiable rollout), `prototypes` (categorical CEM); a row
+            of the table each.
         proposal: `none` plans alone, `policy` begins with the latent policy's imagined rollout.
         goals: `solved`: the frame in which the expert solves the held-out episode, from its first frame; `ahead`:
             stable-worldmodel's protocol, the frame 25 environment steps ahead in the expert's episode.
@@ -47,7 +45,6 @@ class PlanConfig(Checked):
         seconds: wall clock of each decision in place of `iterations`; 0: iterations decide, and runs repeat.
         spread: first standard deviation, in units of the training latents'.
         start_spread: the same round a plan to begin with.
-        shake: first standard deviation of the noise on the policy's latents, of `mbop`.
         floor: least standard deviation.
         bound: the search stays within so many standard deviations.
         correlation: of the noise of neighbouring steps.
@@ -78,7 +75,6 @@ class PlanConfig(Checked):
     seconds: float = field(default=0.0, metadata=at_least(0, "0 (iterations decide) or more"))
     spread: float = field(default=1.0, metadata=_POSITIVE)
     start_spread: float = field(default=0.2, metadata=_POSITIVE)
-    shake: float = field(default=0.5, metadata=_POSITIVE)
     floor: float = field(default=0.05, metadata=_POSITIVE)
     bound: float = field(default=3.0, metadata=_POSITIVE)
     correlation: float = field(default=0.5, metadata=within(lambda value: 0 <= value < 1, "0 to under 1"))
@@ -97,8 +93,6 @@ class PlanConfig(Checked):
         for name, values in (("planner", self.planner), ("proposal", self.proposal), ("plan.goals", self.goals)):
             check(len(values) > 0, name, values, "at least one")
             check(len(set(values)) == len(values), name, values, "each one once")
-        alone = self.proposal == ("none",) and set(self.planner) <= set(PROPOSED)
-        check(not alone, "proposal", self.proposal, f"policy or all with planner={','.join(self.planner)}")
         if self.elites is not None and self.candidates is not None:
             check(
                 self.elites <= self.candidates, "plan.elites", self.elites, f"at most the {self.candidates} candidates"

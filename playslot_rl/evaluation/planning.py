@@ -25,7 +25,7 @@ from playslot_rl.acting.planners.costs import GoalCost, goal_distance, parse_goa
 from playslot_rl.acting.planners.size import search_size
 from playslot_rl.acting.planning import PlanningActor
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.planning import PROPOSED, CostName, GoalName
+from playslot_rl.config.planning import CostName, GoalName
 from playslot_rl.evaluation.goals import Frames, GoalEpisode, GoalPool, Trace
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.success import summary
@@ -82,8 +82,6 @@ def ways_of_acting(
     for name in plan.planner:
         planner = build_planner(name, plan, size, agent.world_model)
         for proposal in plan.proposal:
-            if name in PROPOSED and proposal == "none":
-                continue
             row, policy = (name, False) if proposal == "none" else (f"{name}-{proposal}", True)
             actors[row] = PlanningActor(agent, planner, plan, size, image_of, policy, config.seed)
     return {name: actor.eval() for name, actor in actors.items()}

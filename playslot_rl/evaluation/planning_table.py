@@ -15,9 +15,7 @@ GOALS: Mapping[str, str] = {
 def title(name: str) -> str:
     """What a row is called: `cem-policy` is "CEM from the policy"."""
     planner, _, proposal = name.partition("-")
-    words = {"cem": "CEM", "mppi": "MPPI", "gradient": "gradient", "prototypes": "prototypes", "mbop": "MBOP"}.get(
-        planner
-    )
+    words = {"cem": "CEM", "mppi": "MPPI", "gradient": "gradient", "prototypes": "prototypes"}.get(planner)
     if words is None:
         return TITLES.get(name, name)
     return f"{words} from the policy" if proposal else f"{words} alone"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from playslot_rl.acting.planners.cem import CEMPlanner
 from playslot_rl.acting.planners.gradient import GradientPlanner
-from playslot_rl.acting.planners.mbop import MBOPPlanner
 from playslot_rl.acting.planners.mppi import MPPIPlanner
 from playslot_rl.acting.planners.planner import Cost, Plan, Planner, Search, latent_statistics, shifted
 from playslot_rl.acting.planners.prototypes import PrototypePlanner
@@ -20,7 +19,6 @@ __all__ = [
     "CEMPlanner",
     "Cost",
     "GradientPlanner",
-    "MBOPPlanner",
     "MPPIPlanner",
     "Plan",
     "Planner",
@@ -53,8 +51,6 @@ def build_planner(name: PlannerName, plan: PlanConfig, size: SearchSize, world_m
             raise ConfigError(f"planner=prototypes: got a world model of mode {mode}, which has none; use planner=cem")
         prototypes = world_model.inverse_dynamics.prototypes
         return PrototypePlanner(prototypes, n.candidates, n.iterations, n.elites, c.floor)
-    if name == "mbop":
-        return MBOPPlanner(n.candidates, n.iterations, c.temperature, c.shake, c.floor)
     noise = (c.spread, c.start_spread, c.floor)
     if name == "mppi":
         return MPPIPlanner(n.candidates, n.iterations, c.temperature, *noise, correlation=c.correlation)

@@ -28,9 +28,6 @@ from playslot_rl.world_model import Agent
 
 Cost = Callable[[Tensor], Tensor]
 """Latent actions (M, H, [N,] Z) to what each plan costs (M,), lower is better."""
-ShakenPolicy = Callable[[int, float, torch.Generator], Tensor]
-"""Number M of rollouts, standard deviation of the noise in whitened coordinates, generator: latent actions (M, H, Z) of
-a policy that is shaken at every imagined step."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,6 @@ class Search:
         bound: the search stays where every whitened coordinate is in [-bound, bound]; beyond, the model is guessing.
         seconds: of wall clock that the search may take, at least one iteration; 0: the planner's iterations decide,
             and the plan is a function of its inputs.
-        policy: rolls a latent policy out from here; None where there is none.
     """
 
     cost: Cost
@@ -54,7 +50,6 @@ class Search:
     starts: Tensor
     bound: float = 3.0
     seconds: float = 0.0
-    policy: ShakenPolicy | None = None
 
     def rounds(self, iterations: int) -> Iterator[int]:
         """Number the iterations: so many, or as many as begin within the time."""

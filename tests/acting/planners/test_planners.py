@@ -13,7 +13,6 @@ from torch import Tensor
 from playslot_rl.acting.planners import (
     CEMPlanner,
     GradientPlanner,
-    MBOPPlanner,
     MPPIPlanner,
     Planner,
     PrototypePlanner,
@@ -34,7 +33,6 @@ PLANNERS: dict[str, Planner] = {
     "mppi": MPPIPlanner(),
     "gradient": GradientPlanner(),
     "prototypes": PrototypePlanner(PROTOTYPES),
-    "mbop": MBOPPlanner(),
 }
 
 
@@ -45,13 +43,7 @@ def bowl(z: Tensor) -> Tensor:
 def search(cost: Callable[[Tensor], Tensor] = bowl, starts: Tensor | None = None, scale: float = 1.0) -> Search:
     whitening = Whitening(Z)
     whitening.scale.fill_(scale)
-    starts = torch.empty(0, H, Z) if starts is None else starts
-    return Search(cost, (H, Z), whitening, starts, policy=shaken)
-
-
-def shaken(count: int, spread: float, drawn_by: torch.Generator) -> Tensor:
-    """A policy that means half of the goal."""
-    return 0.5 * GOAL + spread * torch.randn(count, H, Z, generator=drawn_by)
+    return Search(cost, (H, Z), whitening, torch.empty(0, H, Z) if starts is None else starts)
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -80,7 +72,7 @@ def test_the_same_generator_gives_the_same_plan_and_the_global_one_is_left_alone
     one, same, other = (PLANNERS[name](search(), generator(seed)) for seed in (3, 3, 4))
     assert torch.equal(torch.random.get_rng_state(), before)
     assert torch.equal(one.latents, same.latents)
-    if name in ("cem", "mppi", "mbop"):  # the others find the same best sequence, or descend from the same start
+    if name in ("cem", "mppi"):  # the others find the same best sequence, or descend from the same start
         assert not torch.equal(one.latents, other.latents)
 
 
@@ -91,25 +83,6 @@ def test_a_plan_to_begin_with_is_never_made_worse(name: str) -> None:
         start = GOAL + 0.1 * torch.randn(1, H, Z, generator=generator(seed))
         plan = PLANNERS[name](search(rough, start), generator(seed))
         assert plan.cost <= float(rough(start)[0])
-
-
-def test_mbop_returns_the_best_of_rollouts_their_average_and_the_plans_to_begin_with() -> None:
-    seen: list[Tensor] = []
-
-    def watched(z: Tensor) -> Tensor:
-        seen.append(z)
-        return bowl(z)
-
-    plan = MBOPPlanner(candidates=16, iterations=3)(search(watched, GOAL[None] + 1), generator())
-    assert [len(tried) for tried in seen] == [2, 16, 1, 16, 1, 16, 1]
-    assert plan.cost == float(bowl(torch.cat(seen)).min())
-    for drawn, mean in zip(seen[1::2], seen[2::2], strict=True):
-        torch.testing.assert_close(mean[0], (path_weights(bowl(drawn), 0.2)[:, None, None] * drawn).sum(0))
-
-
-def test_mbop_needs_a_policy() -> None:
-    with pytest.raises(ValueError, match=r"planner=mbop: got no policy.*use proposal=policy"):
-        MBOPPlanner()(replace(search(), policy=None), generator())
 
 
 def test_elites_stay_candidates() -> None:
