@@ -112,8 +112,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "plan": Command(
         "reach goal images by searching over latent actions, beside random actions and the latent policy",
         "Model-predictive control in imagination, executed in the simulator by the action decoder. planner= is cem, "
-        "mppi, gradient, prototypes or all; proposal= is none, policy (begin with the latent policy's rollout), videos "
-        "(with the cheapest window of the latent actions in the videos of data.root=) or all. "
+        "mppi, gradient, prototypes or all; proposal= is none, policy (begin with the latent policy's rollout) or all. "
         "Goals are frames of the expert's held-out episodes: the solved one (plan.goals=solved) and the one 25 "
         "environment steps ahead (plan.goals=ahead, stable-worldmodel's protocol); both by default. Writes "
         "RUN/planning/GOALS/METHOD/eval_info.json with pictures, and the table RUN/planning/planning.md.",

@@ -15,12 +15,10 @@ from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import shipped
 from playslot_rl.config.planning import GoalName
 from playslot_rl.envs import gym_id
-from playslot_rl.errors import CheckpointError, ConfigError, DataError
+from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes.evaluate import check_environment, check_run, take_shipped, trained_environment
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from playslot_rl.evaluation.goals import GoalEpisode, GoalPool
     from playslot_rl.world_model import Agent
 
@@ -44,8 +42,6 @@ def main(config: ExperimentConfig) -> None:
         sizes = {goals: search_size(config.plan, goals, frame_skip) for goals in config.plan.goals}
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    if config.plan.proposal == ("videos",) and not config.data.root:
-        raise ConfigError("proposal=videos: got no videos, expected data.root=SET, which plans are taken from")
     if config.method != "playslot":
         raise CheckpointError(f"run={config.run}: got a run of method={config.method}, expected one of playslot's own")
     if shipped(config.run):
@@ -66,44 +62,17 @@ def main(config: ExperimentConfig) -> None:
             f"run={config.run}: got a world model of mode {mode}, expected one that infers latents, which costs "
             "compare: train one with model.inverse_dynamics.mode=hybrid"
         )
-    videos = _latents_of_videos(config, agent, facts.fingerprints["slots"])
     folder, parts = run / "planning", {}
     for goals, size in sizes.items():
         with GoalPool(config.env, config.render) as pool:
             common = {"demos": facts.demos, "labelled_demos": facts.labelled_demos, **_facts(config, run)}
             common |= {"fingerprints": facts.fingerprints, "commit": facts.commit, "size": asdict(size)}
-            parts[goals] = _measure(config, agent, pool, goals, folder / goals, common, videos)
+            parts[goals] = _measure(config, agent, pool, goals, folder / goals, common)
     report = {"run": config.run, "command": "playslot " + " ".join(sys.argv[1:]), "settings": to_dict(config.plan)}
     report |= {"goals": parts, **_facts(config, run)}
     write_json(folder / "planning.json", report)
     write_text(folder / "planning.md", table(report))
     print(table(report) + f"\nwritten to {folder / 'planning.md'}", flush=True)
-
-
-def _latents_of_videos(config: ExperimentConfig, agent: Agent, slots_print: str) -> list[Tensor] | None:
-    """What InvDyn infers in the videos of `data.root`, (T, [N,] Z) an episode, if they are asked for and named.
-
-    Raises:
-        DataError: they cannot be read, or have frames of another size.
-    """
-    from playslot_rl.data.cache import Cache
-    from playslot_rl.data.labels import episode_latents
-    from playslot_rl.data.slot_cache import slot_cache
-    from playslot_rl.recipes.inspect import open_set
-    from playslot_rl.world_model import module_device
-
-    if "videos" not in config.plan.proposal:
-        return None
-    if not config.data.root:
-        print("note: no row from the videos: data.root= names none", flush=True)
-        return None
-    model, device = agent.world_model, module_device(agent.world_model)
-    source = open_set(config, model)
-    slots = slot_cache(source, model.savi, slots_print, Cache.of(config.data), device, config.logging.progress)
-    latents = episode_latents(model, source, slots, device)
-    if not latents:
-        raise DataError(f"data.root={config.data.root}: got no video of two frames, expected some with motion")
-    return latents
 
 
 def _facts(config: ExperimentConfig, run: Path) -> dict[str, Any]:
@@ -114,13 +83,7 @@ def _facts(config: ExperimentConfig, run: Path) -> dict[str, Any]:
 
 
 def _measure(
-    config: ExperimentConfig,
-    agent: Agent,
-    pool: GoalPool,
-    goals: GoalName,
-    folder: Path,
-    common: dict[str, Any],
-    videos: list[Tensor] | None,
+    config: ExperimentConfig, agent: Agent, pool: GoalPool, goals: GoalName, folder: Path, common: dict[str, Any]
 ) -> dict[str, Any]:
     """All ways of acting towards one kind of goal: a part of the report."""
     from playslot_rl.evaluation.goals import make_goals
@@ -138,7 +101,7 @@ def _measure(
     write_bytes(folder / "cost.png", solution_chart(solution, LIGHT))
     steps = whole if goals == "solved" else max(2, round(plan.budget / config.env.frame_skip))
     every, found = common["size"]["every"], {}
-    for name, actor in ways_of_acting(config, agent, goals, episodes, videos).items():
+    for name, actor in ways_of_acting(config, agent, goals, episodes).items():
         played = play(pool, actor, episodes, goals, steps, every, draw=False)
         found[name] = {
             "method": name,

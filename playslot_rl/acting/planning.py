@@ -18,7 +18,6 @@ from playslot_rl.acting.actor import Actor
 from playslot_rl.acting.agent import imagine
 from playslot_rl.acting.planners import Cost, Planner, Search, latent_statistics, shifted
 from playslot_rl.acting.planners.costs import GoalCost, NearProposal, goal_distance, parse_goal
-from playslot_rl.acting.planners.library import Library
 from playslot_rl.acting.planners.size import SearchSize
 from playslot_rl.config.planning import PlanConfig
 from playslot_rl.seeding import step_generator
@@ -48,8 +47,7 @@ class PlanningActor(Actor):
 
     A plan begins where the last one ends: shifted by what was executed, the mean latent action at its end. With
     `policy` the latent policy's imagined rollout from the present slots is a plan to begin with too, so that what is
-    found costs no more in imagination than what the policy would do; with a `library` it is the cheapest of some
-    windows of videos.
+    found costs no more in imagination than what the policy would do.
 
     The plan, its imagined slots PREDICTED_SLOTS (n, H + 1, N, D), its cost and the seconds it took stay in the memory,
     for who looks on. Candidates are drawn by the episode's seed and the step, so that episodes side by side do not
@@ -63,7 +61,6 @@ class PlanningActor(Actor):
         goals: images to reach.
         policy: begin with the latent policy's rollout.
         seed: of the candidates, beside that of the episode.
-        library: windows of videos to begin with, instead of the policy's rollout.
     """
 
     def __init__(
@@ -75,11 +72,10 @@ class PlanningActor(Actor):
         goals: Goals,
         policy: bool = False,
         seed: int = 0,
-        library: Library | None = None,
     ) -> None:
         super().__init__(_MEMORY)
         self.agent, self.planner, self.config, self.size = agent, planner, plan, size
-        self.goals, self.policy, self.seed, self.library = goals, policy, seed, library
+        self.goals, self.policy, self.seed = goals, policy, seed
         self.whitening = latent_statistics(agent)
         self.parser = frame_parser_module(agent.world_model.savi)
         self.decoder = action_decoder_module(agent.action_decoder)
@@ -129,7 +125,7 @@ class PlanningActor(Actor):
         begin = time.perf_counter()
         step, seed = int(tensordict.get(keys.STEP_COUNT)[row]), int(tensordict.get(keys.EPISODE_SEED)[row])
         cost = self._cost(tensordict, row, step)
-        proposal = self._proposal(cost, seed, step)
+        proposal = self._proposal(cost.slots[-1])
         starts = proposal
         if step:
             last = tensordict.get(keys.PLANNED_LATENTS)[row]
@@ -163,11 +159,9 @@ class PlanningActor(Actor):
         distance = goal_distance(self.agent, self.config.cost, goal, image, self.config.match)
         return GoalCost(model, seen, past, distance, self.config.along)
 
-    def _proposal(self, cost: GoalCost, seed: int, step: int) -> Tensor:
-        """The policy's plan, or the videos': latent actions (1, H, [N,] Z), or none (0, H, [N,] Z)."""
-        h, slots = self.size.horizon, cost.slots[-1]
-        if self.library is not None:
-            return self.library.cheapest(cost, step_generator(seed, step, f"windows-{self.seed}", self.device))
+    def _proposal(self, slots: Tensor) -> Tensor:
+        """The policy's plan from slots (N, D): latent actions (1, H, Z), or none (0, H, Z)."""
+        h = self.size.horizon
         if not self.policy:
             return slots.new_empty(0, h, *self.agent.world_model.latent_shape)
         return policy_plan(self.agent, slots, h)

@@ -9,7 +9,7 @@ from playslot_rl.config.plain import check
 from playslot_rl.config.roles import Checked, at_least, between, within
 
 PlannerName = Literal["cem", "mppi", "gradient", "prototypes"]
-ProposalName = Literal["none", "policy", "videos"]
+ProposalName = Literal["none", "policy"]
 CostName = Literal["slots", "dynamics", "image"]
 GoalName = Literal["solved", "ahead"]
 PLANNERS: Final[tuple[PlannerName, ...]] = get_args(PlannerName)
@@ -30,8 +30,7 @@ class PlanConfig(Checked):
     Attributes:
         planner: `cem`, `mppi`, `gradient` (through the differentiable rollout), `prototypes` (categorical CEM); a row
             of the table each.
-        proposal: `none` plans alone, `policy` begins with the latent policy's imagined rollout, `videos` with the
-            cheapest of `windows` windows of the latent actions in the videos of `data.root`.
+        proposal: `none` plans alone, `policy` begins with the latent policy's imagined rollout.
         goals: `solved`: the frame in which the expert solves the held-out episode, from its first frame; `ahead`:
             stable-worldmodel's protocol, the frame 25 environment steps ahead in the expert's episode.
         cost: distance of `slots`, of scene `dynamics` (InvDyn's means), or of the decoded `image`.
@@ -51,8 +50,7 @@ class PlanConfig(Checked):
         correlation: of the noise of neighbouring steps.
         temperature: of MPPI, in units of the deviation of the costs.
         learning_rate: of the gradient planner.
-        windows: of the videos, tried at every decision.
-        prior: what straying from the policy's plan, or from the videos', costs, in whitened coordinates; 0: nothing.
+        prior: with `proposal=policy`, what straying from the policy's plan costs, in whitened coordinates; 0: nothing.
         history: frames of the past that the predictor sees, at most its context.
         looks: times that SAVi is shown the goal image, as the frames after the first.
         ahead: environment steps to the goal, with goals `ahead`.
@@ -82,7 +80,6 @@ class PlanConfig(Checked):
     correlation: float = field(default=0.5, metadata=within(lambda value: 0 <= value < 1, "0 to under 1"))
     temperature: float = field(default=0.2, metadata=_POSITIVE)
     learning_rate: float = field(default=0.1, metadata=_POSITIVE)
-    windows: int = field(default=256, metadata=at_least(1, "at least 1"))
     prior: float | None = field(default=None, metadata=at_least(0, "0 or more"))
     history: int = field(default=1, metadata=at_least(1, "at least 1 frame"))
     looks: int = field(default=2, metadata=at_least(1, "at least 1"))

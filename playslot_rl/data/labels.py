@@ -95,22 +95,6 @@ def _label(
     return parsed[:, :-1], torch.cat((parsed[:, :1], rolled[:, :-1]), dim=1), latent.mean
 
 
-@torch.no_grad()
-def episode_latents(
-    model: WorldModel, source: EpisodeFrames, slots: npt.NDArray[np.float32], device: torch.device | str = "cpu"
-) -> list[Tensor]:
-    """Latent actions (T, [N,] Z) that InvDyn infers in each video of at least two frames.
-
-    Args:
-        model: frozen world model, on `device`, of a mode that infers latents.
-        source: the videos; no label is read.
-        slots: cached slots (F, N, D) of their frames.
-        device: where to compute.
-    """
-    rows = [source.episode_rows(episode) for episode in np.nonzero(source.lengths >= 2)[0].tolist()]
-    return [model.inverse_dynamics(torch.from_numpy(slots[own][None]).to(device)).mean[0] for own in rows]
-
-
 def with_copies(demos: Sequence[Demonstrations]) -> Demonstrations:
     """Demonstrations and shifted copies of them, labelled one by one, as one set.
 

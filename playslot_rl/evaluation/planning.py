@@ -22,7 +22,6 @@ from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.episodes import Moment, Outcome, run_episodes
 from playslot_rl.acting.planners import build_planner
 from playslot_rl.acting.planners.costs import GoalCost, goal_distance, parse_goal
-from playslot_rl.acting.planners.library import Library, latent_windows
 from playslot_rl.acting.planners.size import search_size
 from playslot_rl.acting.planning import PlanningActor
 from playslot_rl.config import ExperimentConfig
@@ -62,21 +61,10 @@ class Played:
 
 
 def ways_of_acting(
-    config: ExperimentConfig,
-    agent: Agent,
-    protocol: GoalName,
-    goals: Sequence[GoalEpisode],
-    episodes: Sequence[Tensor] | None = None,
+    config: ExperimentConfig, agent: Agent, protocol: GoalName, goals: Sequence[GoalEpisode]
 ) -> dict[str, Actor]:
     """The rows of a table: random actions and the latent policy (unless `evaluation.references` is false), then each
     planner with each proposal.
-
-    Args:
-        config: of the command.
-        agent: in evaluation mode.
-        protocol: where the goals are from.
-        goals: an episode each.
-        episodes: latent actions (T, [N,] Z) of videos, an episode each; without them there is no row from the videos.
 
     Raises:
         ConfigError: a planner that the world model cannot serve.
@@ -91,14 +79,11 @@ def ways_of_acting(
     if config.evaluation.references:
         actors["random"] = RandomActor(config.env.max_steps, config.env.action_dim)
         actors["policy"] = playslot_actor(agent)
-    library = None if episodes is None else Library(latent_windows(episodes, size.horizon), plan.windows)
-    proposals = [name for name in plan.proposal if name != "videos" or library is not None]
     for name in plan.planner:
         planner = build_planner(name, plan, size, agent.world_model)
-        for proposal in proposals:
-            row, policy = name if proposal == "none" else f"{name}-{proposal}", proposal == "policy"
-            windows = library if proposal == "videos" else None
-            actors[row] = PlanningActor(agent, planner, plan, size, image_of, policy, config.seed, windows)
+        for proposal in plan.proposal:
+            row, policy = (name, False) if proposal == "none" else (f"{name}-{proposal}", True)
+            actors[row] = PlanningActor(agent, planner, plan, size, image_of, policy, config.seed)
     return {name: actor.eval() for name, actor in actors.items()}
 
 

@@ -13,12 +13,12 @@ GOALS: Mapping[str, str] = {
 
 
 def title(name: str) -> str:
-    """What a row is called: `cem-policy` is "CEM from the policy", `cem-videos` "CEM from the videos"."""
+    """What a row is called: `cem-policy` is "CEM from the policy"."""
     planner, _, proposal = name.partition("-")
     words = {"cem": "CEM", "mppi": "MPPI", "gradient": "gradient", "prototypes": "prototypes"}.get(planner)
     if words is None:
         return TITLES.get(name, name)
-    return f"{words} from the {proposal}" if proposal else f"{words} alone"
+    return f"{words} from the policy" if proposal else f"{words} alone"
 
 
 def table(report: Mapping[str, Any]) -> str:

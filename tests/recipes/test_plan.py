@@ -27,8 +27,7 @@ SMALL = (
 def test_a_table_of_everything_and_what_stands_behind_it(run: Path) -> None:
     shutil.rmtree(run / "evaluation")
     before = contents(run)
-    videos = f"data.root={run / 'data' / 'expert'}"
-    done = smoke("plan", f"run={run}", "planner=cem", "proposal=all", "episodes=1", videos, *SMALL)
+    done = smoke("plan", f"run={run}", "planner=cem", "proposal=all", "episodes=1", *SMALL)
     after = contents(run)
     assert {path: after[path] for path in before} == before
     assert {path.split("/")[0] for path in after.keys() - before.keys()} == {"planning"}
@@ -37,19 +36,18 @@ def test_a_table_of_everything_and_what_stands_behind_it(run: Path) -> None:
     report = json.loads((run / "planning" / "planning.json").read_text())
     for goals in ("solved", "ahead"):
         part = report["goals"][goals]
-        assert list(part["rows"]) == ["random", "policy", "cem", "cem-policy", "cem-videos"]
+        assert list(part["rows"]) == ["random", "policy", "cem", "cem-policy"]
         assert part["cost_along_solution"].keys() >= {"slots", "dynamics", "image", "model_error"}
         assert (run / "planning" / goals / "cost.png").read_bytes().startswith(b"\x89PNG")
-        for name in ("cem", "cem-policy", "cem-videos"):
+        for name in ("cem", "cem-policy"):
             info = json.loads((run / "planning" / goals / name / "eval_info.json").read_text())
             assert info == part["rows"][name]
             assert info["seconds_per_decision"] > 0
             assert info["planning"]["horizon"] == 3
             assert len(info["per_episode"]) == info["episodes"] == len(info["seeds"])
             assert (run / "planning" / goals / name / "plan.png").read_bytes().startswith(b"\x89PNG")
-        for name in ("cem-policy", "cem-videos"):
-            costs = [part["rows"][name][f"{whose}_cost_first"] for whose in ("plan", "proposal")]
-            assert costs[0] <= costs[1] * (1 + 1e-5)  # equal but for rounding where the plan is the proposal
+        costs = [part["rows"]["cem-policy"][f"{whose}_cost_first"] for whose in ("plan", "proposal")]
+        assert costs[0] <= costs[1] * (1 + 1e-5)  # equal but for rounding where the plan is the proposal
     again = smoke(
         "plan", f"run={run}", "planner=cem", "goals=ahead", "episodes=1", "evaluation.references=false", *SMALL
     )
@@ -60,7 +58,7 @@ def test_a_table_of_everything_and_what_stands_behind_it(run: Path) -> None:
 
 
 def test_short_keys_are_those_of_the_group() -> None:
-    plan = compose(["planner=all", "proposal=none,policy,videos", "goals=ahead"], "plan").plan
+    plan = compose(["planner=all", "proposal=none,policy", "goals=ahead"], "plan").plan
     assert (plan.planner, plan.proposal, plan.goals) == (PLANNERS, PROPOSALS, ("ahead",))
     assert compose(["planner=[mppi]"], "plan").plan.planner == ("mppi",)
     with pytest.raises(ConfigError, match="unknown key planner"):
@@ -71,7 +69,7 @@ def test_short_keys_are_those_of_the_group() -> None:
     ("argument", "message"),
     [
         ("planner=icem", r"plan\.planner: got 'icem', expected one of cem, mppi, gradient, prototypes"),
-        ("proposal=oracle", r"plan\.proposal: got 'oracle', expected one of none, policy, videos"),
+        ("proposal=oracle", r"plan\.proposal: got 'oracle', expected one of none, policy"),
         ("planner=cem,cem", "planner: got .* expected each one once"),
         ("planner=", "planner: got .* expected at least one"),
         ("plan.horizon=0", r"plan\.horizon: got 0, expected at least 1 agent step"),
@@ -117,12 +115,3 @@ def test_nothing_to_plan_in_is_refused(tmp_path: Path) -> None:
     refused("plan", "run=pretrained/grid_shapes", out, message="no pretrained world model for env=grid_shapes")
     refused("plan", "run=pretrained", message="out: got nothing with run=pretrained")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_plans_from_the_videos_need_videos(run: Path) -> None:
-    message = "proposal=videos: got no videos, expected data.root=SET"
-    assert message in refused("plan", f"run={run}", "proposal=videos", "episodes=1")
-    done = smoke("plan", f"run={run}", "proposal=none,videos", "goals=ahead", "episodes=1", *SMALL)
-    assert "note: no row from the videos" in done.out
-    report = json.loads((run / "planning" / "planning.json").read_text())
-    assert list(report["goals"]["ahead"]["rows"]) == ["random", "policy", "cem"]
