@@ -20,7 +20,7 @@ from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import shipped
 from playslot_rl.config.methods import METHODS, MethodName, method_stage
 from playslot_rl.config.roles import without
-from playslot_rl.config.weights import SCHEME, data_roots
+from playslot_rl.config.weights import data_roots, is_remote
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
 
@@ -226,7 +226,7 @@ def job_config(config: ExperimentConfig, job: Job, world: str) -> ExperimentConf
 
 def absolute(path: str) -> str:
     """A path from the root; nothing, shipped models (`pretrained/ENV`) and addresses on the Hub as they are."""
-    return path if not path or shipped(path) or path.startswith(SCHEME) else str(Path(path).expanduser().resolve())
+    return path if not path or shipped(path) or is_remote(path) else str(Path(path).expanduser().resolve())
 
 
 def absolute_roots(text: str) -> str:

@@ -106,7 +106,7 @@ def _scores(result: Mapping[str, Any], label: str) -> str:
     units = {"psnr": "PSNR after {}, dB", "ssim": "SSIM after {}", "lpips": "LPIPS after {}"}
     body = []
     for title, by_seed_frames in lines.items():
-        scores = [_cell(by_seed_frames.get(shown), name) for shown, name in columns]
+        scores = [_cell(by_seed_frames[shown], name) for shown, name in columns]
         first = next(iter(by_seed_frames.values()))
         body.append([title, *scores, first["sees"], _papers(result, by_seed_frames.get(6, first))])
     headers = ["", *(units[name].format(shown) for shown, name in columns), "told of the true future"]
@@ -122,8 +122,8 @@ def _papers(result: Mapping[str, Any], row: Mapping[str, Any]) -> str:
     return PAPER.get(result["env"], {}).get(row["method"], "–") if asked else "–"
 
 
-def _cell(row: Mapping[str, Any] | None, name: str) -> str:
-    if row is None or row[name] is None:
+def _cell(row: Mapping[str, Any], name: str) -> str:
+    if row[name] is None:
         return "not available"
     digits = 2 if name == "psnr" else 3
     low, high = row[f"{name}_ci95"]

@@ -9,7 +9,16 @@ from typing import Final, NamedTuple
 from playslot_rl.errors import ConfigError
 
 SCHEME: Final = "hf://"
-"""Begins the name of a data set on the Hub (`playslot_rl.data.remote`)."""
+
+
+def is_remote(root: str | Path) -> bool:
+    """Whether a data set's name is an address on the Hub (`playslot_rl.data.remote`).
+
+    Examples:
+        >>> is_remote("hf://datasets/user/name"), is_remote("data/random")
+        (True, False)
+    """
+    return str(root).startswith(SCHEME)
 
 
 class DataRoot(NamedTuple):

@@ -1,6 +1,7 @@
 """Cache folders: made once, whole or absent, safe with several processes, outside every data set.
 
 CACHE/frames/KEY   CACHE/slots/KEY      entries; what is in use is held by a lock in them
+CACHE/remote/NAME-COMMIT                metadata of a data set on the Hub: small, neither listed nor limited
 CACHE/frames/.KEY.part                  one that is being made, or that a kill has left: the next use goes on there
 """
 

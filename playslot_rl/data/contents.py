@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from playslot_rl.config.weights import SCHEME
+from playslot_rl.config.weights import is_remote
 from playslot_rl.data.problems import Problems
 from playslot_rl.data.tables import UNREADABLE, Array, Episode, episodes_of, read_columns, read_table, read_tasks
 from playslot_rl.errors import DataError
@@ -25,6 +25,8 @@ from playslot_rl.errors import DataError
 if TYPE_CHECKING:
     from playslot_rl.data.remote import Remote
 
+FORMAT_TAG: Final = "v3.0"
+"""Tag that LeRobot looks for on the Hub; equal to its CODEBASE_VERSION, whose import costs seconds."""
 INFO_NAME: Final = "meta/info.json"
 STATS_NAME: Final = "meta/stats.json"
 RECORD_NAME: Final = "meta/playslot.json"
@@ -264,7 +266,7 @@ def open_files(root: str | Path) -> Contents:
     folder, expected = Path(root).expanduser(), "expected a LeRobot"
     if not str(root):
         raise DataError(f"data.root is empty, {expected} data set's folder: set data.root=")
-    if str(root).startswith(SCHEME):
+    if is_remote(root):
         raise DataError(
             f"{root}: got a data set on the Hub, expected a folder, or data.stream=true where videos are trained on: "
             "pull it by `playslot dataset pull USER/NAME DIR`"

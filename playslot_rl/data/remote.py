@@ -20,25 +20,17 @@ from typing import Any, Final
 import numpy as np
 
 from playslot_rl import keys
-from playslot_rl.config.weights import SCHEME
 from playslot_rl.data.cache import build_once
-from playslot_rl.data.contents import DATA_PATH, INFO_NAME, Contents, read_metadata
+from playslot_rl.data.contents import DATA_PATH, FORMAT_TAG, INFO_NAME, Contents, read_metadata
 from playslot_rl.data.problems import Problems
 from playslot_rl.data.tables import Array, Episode, read_columns
 from playslot_rl.errors import DataError
 from playslot_rl.storage.secrets import checked_token, masked_logs
 
-LOADED: Final = "v3.0"
-"""The tag that LeRobot loads; main where there is none."""
 BUFFER: Final = 1 << 20
 """Bytes that are asked of the client at once; it reads ahead by more."""
 _LOOK = "pull it and run `playslot dataset verify`"
 _ADDRESS = re.compile(r"hf://datasets/([\w.-]+/[\w.-]+?)(?:@([^@\s]+))?/?")
-
-
-def is_remote(root: str | Path) -> bool:
-    """Whether a data set's name is an address on the Hub."""
-    return str(root).startswith(SCHEME)
 
 
 @dataclass(frozen=True)
@@ -202,7 +194,7 @@ def _commit_of(address: str, cache: Path) -> Remote:
     api = HfApi(token=token or False, library_name="playslot_rl")
     with asking(address, token):
         try:
-            info = api.dataset_info(name, revision=revision or LOADED)
+            info = api.dataset_info(name, revision=revision or FORMAT_TAG)
         except errors.RevisionNotFoundError:
             if revision:
                 raise

@@ -139,6 +139,7 @@ def _columns(
 
 
 def read_tasks(root: Path, problems: Problems) -> dict[int, str]:
+    """`task_index` -> words, of a data set's folder."""
     path = root / TASKS_NAME
     if not path.is_file():
         problems.error("missing tasks", f"{path}: got no such file, expected the tasks in words")
@@ -155,6 +156,7 @@ def read_tasks(root: Path, problems: Problems) -> dict[int, str]:
 
 
 def episodes_of(path: Path, table: Any, problems: Problems) -> list[Episode]:
+    """The readable rows of a table of `meta/episodes`, read from `path`."""
     found = []
     for row in table.to_pylist():
         stats: Stats = {}

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from huggingface_hub import RepoFile
 
 
-FORMAT_TAG = "v3.0"
-"""Tag that LeRobot looks for on the Hub; equal to its CODEBASE_VERSION, whose import costs seconds."""
 CARD_NAME = "README.md"
 REMOTE_RECORD = "meta/playslot_hub.json"
 """Written by a push: fingerprint and counts, for whoever pulls."""

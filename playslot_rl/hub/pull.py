@@ -11,9 +11,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from playslot_rl.data.contents import FORMAT_TAG
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, HubError, OutputError
-from playslot_rl.hub.layout import FORMAT_TAG, LOCAL_RECORD, SCHEME, HubRecord, is_pulled, read_record
+from playslot_rl.hub.layout import LOCAL_RECORD, SCHEME, HubRecord, is_pulled, read_record
 from playslot_rl.hub.session import Repository, open_repository
 from playslot_rl.storage.atomic import explain_write_errors, replace_dir, write_json
 from playslot_rl.storage.locks import locked

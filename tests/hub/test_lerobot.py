@@ -17,8 +17,8 @@ import pytest
 from fake_hub import WRITE_TOKEN, FakeHub, Fault, Repository
 from small_data import contents
 
+from playslot_rl.data.contents import FORMAT_TAG
 from playslot_rl.datasets.fingerprint import content_fingerprint
-from playslot_rl.hub.layout import FORMAT_TAG
 
 Client = Callable[..., dict[str, Any]]
 pytestmark = pytest.mark.slow
