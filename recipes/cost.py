@@ -1,28 +1,38 @@
 """What training takes, estimated before it is begun: `python -m playslot_rl.recipes.cost preset=paper`.
 
 Counts the operations of one step of each stage on this CPU, and prints them with the memory and time that they mean on
-1, 8 and 32 devices of which speed is *assumed* (`playslot_rl.speed.cost.Machine`). Nothing is written.
+1, 8 and 32 devices of which speed is *assumed* (`playslot_rl.speed.cost.Machine`). With `device=` steps are also
+*measured* there, in fp32 and in bf16: `device=cuda preset=paper` takes a minute on an H100, `device=cpu` many.
+Nothing is written.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.config import ExperimentConfig, Precision
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import PlaySlotError, explain
 
 if TYPE_CHECKING:
+    import torch
+
     from playslot_rl.speed.cost import Machine, StageCost
 
 PROCESSES = (1, 8, 32)
 """One device, one node of eight, four nodes."""
 
+PRECISIONS: Final[tuple[Precision, ...]] = ("fp32", "bf16")
+CPU_BATCH: Final = 4
+"""Clips a step on a CPU, on which the paper's 64 would take minutes and 15 GiB."""
+
 
 def main(config: ExperimentConfig) -> str:
     """The two tables, in Markdown; progress goes to standard error."""
+    import torch
+
     from playslot_rl.allocator import tune_allocator
     from playslot_rl.speed.cost import STAGES, Machine, stage_cost
     from playslot_rl.threads import set_threads
@@ -33,7 +43,10 @@ def main(config: ExperimentConfig) -> str:
     for stage in STAGES:
         print(f"{stage} ...", file=sys.stderr, flush=True)
         costs.append(stage_cost(config, stage))
-    return f"{counted(costs)}\n\n{estimated(costs, Machine())}"
+    tables = [counted(costs), estimated(costs, Machine())]
+    if config.device:
+        tables.append(measured(config, costs, torch.device(config.device)))
+    return "\n\n".join(tables)
 
 
 def counted(costs: Sequence[StageCost]) -> str:
@@ -69,6 +82,28 @@ def estimated(costs: Sequence[StageCost], machine: Machine) -> str:
         lines.append(f"| {cost.stage} | {' | '.join(cells)} |")
     hours = [sum(estimate(cost, n, machine) * cost.steps for cost in costs) / 3600 for n in PROCESSES]
     return "\n".join([*lines, f"| all stages | {' | '.join(f'{total:.0f} h' for total in hours)} |"])
+
+
+def measured(config: ExperimentConfig, costs: Sequence[StageCost], device: torch.device) -> str:
+    """Seconds a step and the operations they sustain, a row a stage and precision; on a CPU of `CPU_BATCH` clips."""
+    import torch
+
+    from playslot_rl.speed.step import time_step
+
+    on_gpu = device.type == "cuda"
+    where = torch.cuda.get_device_name(device) if on_gpu else f"this CPU, {torch.get_num_threads()} threads"
+    lines = [f"Measured on {where}, torch {torch.__version__}:", ""]
+    lines.append("| measured | precision | batch | s a step | TFLOP/s | peak memory |")
+    lines.append("|---|---|---|---|---|---|")
+    for cost in costs:
+        batch = cost.batch if on_gpu else min(cost.batch, CPU_BATCH)
+        for precision in PRECISIONS:
+            print(f"{cost.stage}, {precision} ...", file=sys.stderr, flush=True)
+            took = time_step(config, cost.stage, device, precision, batch, steps=10 if on_gpu else 3)
+            rate = cost.at(batch).flops / took.seconds / 1e12
+            peak = "–" if took.peak is None else f"{took.peak / 2**30:.2f} GiB"
+            lines.append(f"| {cost.stage} | {precision} | {batch} | {took.seconds:.4g} | {rate:.3g} | {peak} |")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

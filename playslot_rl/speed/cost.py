@@ -128,7 +128,7 @@ def stage_cost(config: ExperimentConfig, stage: str) -> StageCost:
         ValueError: another stage.
     """
     agent = fresh_agent(config)
-    criterion, batch_of = _parts(config, stage, agent)
+    criterion, batch_of = parts(config, stage, agent)
     begin(criterion, batch_of(2))
     trained = [p for p in criterion.parameters() if p.requires_grad]
     frozen = sum(p.numel() for p in criterion.parameters()) - sum(p.numel() for p in trained)
@@ -136,12 +136,17 @@ def stage_cost(config: ExperimentConfig, stage: str) -> StageCost:
     return StageCost(
         stage,
         config.behaviour.decoder_steps if stage == "decoder" else own.steps,
-        own.batch_size,
+        batch_size(config, stage),
         sum(p.numel() for p in trained),
         frozen,
         _count(criterion, batch_of(2)),
         _count(criterion, batch_of(3)),
     )
+
+
+def batch_size(config: ExperimentConfig, stage: str) -> int:
+    """B of a stage."""
+    return {"slots": config.slots, "dynamics": config.dynamics}.get(stage, config.behaviour).batch_size
 
 
 def fresh_agent(config: ExperimentConfig) -> Agent:
@@ -152,8 +157,12 @@ def fresh_agent(config: ExperimentConfig) -> Agent:
     return agent
 
 
-def _parts(config: ExperimentConfig, stage: str, agent: Agent) -> tuple[nn.Module, Callable[[int], TensorDict]]:
-    """A stage's loss, and a random batch of a size for it."""
+def parts(config: ExperimentConfig, stage: str, agent: Agent) -> tuple[nn.Module, Callable[[int], TensorDict]]:
+    """A stage's loss, and a random batch of a size for it.
+
+    Raises:
+        ValueError: another stage.
+    """
     model, side = agent.world_model, config.env.image_size
     slots, frames = model.slot_shape, (3, side, side)
     latent, action = model.latent_shape, (config.env.action_dim,)

@@ -9,7 +9,7 @@ from torch import nn
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.recipes import cost as recipe
-from playslot_rl.speed import cost
+from playslot_rl.speed import cost, step
 from playslot_rl.speed.cost import Count, Machine, StageCost, estimate, stage_cost
 
 
@@ -46,7 +46,7 @@ def test_every_count_is_a_straight_line_in_the_batch(
 ) -> None:
     found = costs[stage]
     agent = cost.fresh_agent(config)
-    criterion, batch_of = cost._parts(config, stage, agent)
+    criterion, batch_of = cost.parts(config, stage, agent)
     cost.begin(criterion, batch_of(2))
     straight, direct = found.at(5), cost._count(criterion, batch_of(5))
     assert straight.flops == direct.flops
@@ -87,3 +87,35 @@ def test_the_tables_have_a_row_a_stage_and_name_what_is_assumed(costs: dict[str,
         assert f"| {stage} |" in estimated
     assert "Estimated, assuming 20 TFLOP/s sustained a device" in estimated
     assert "| all stages |" in estimated
+
+
+@pytest.mark.parametrize("stage", cost.STAGES)
+def test_a_step_is_timed_after_those_in_which_kernels_are_chosen(
+    config: ExperimentConfig, stage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times = iter([0.0, 100.0, 0.0, 100.0, 0.0, 1.0, 0.0, 3.0, 0.0, 2.0])
+    monkeypatch.setattr(step.time, "perf_counter", lambda: next(times))
+    took = step.time_step(config, stage, torch.device("cpu"), "fp32", steps=3)
+    assert (took.seconds, took.peak) == (2.0, None)
+    assert took.batch == cost.batch_size(config, stage)
+
+
+def test_a_step_of_an_unknown_stage_is_not_timed(config: ExperimentConfig) -> None:
+    with pytest.raises(ValueError, match="stage: got all"):
+        step.time_step(config, "all", torch.device("cpu"), "fp32", batch=2)
+
+
+def test_the_measured_table_has_a_row_a_stage_and_precision(
+    config: ExperimentConfig, costs: dict[str, StageCost], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def half_a_second(*args: object, steps: int) -> step.StepTime:
+        _, stage, _, precision, batch = args
+        return step.StepTime(stage, precision, batch, 0.5, None)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(step, "time_step", half_a_second)
+    table = recipe.measured(config, [*costs.values()], torch.device("cpu"))
+    for stage in cost.STAGES:
+        batch = min(costs[stage].batch, recipe.CPU_BATCH)
+        rate = costs[stage].at(batch).flops / 0.5 / 1e12
+        for precision in recipe.PRECISIONS:
+            assert f"| {stage} | {precision} | {batch} | 0.5 | {rate:.3g} | – |" in table
