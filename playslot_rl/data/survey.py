@@ -114,7 +114,8 @@ def choose_size(seen: Survey) -> Choice:
     if smallest < SIZES[-1]:
         value = 64 if smallest >= 64 else 32
         return Choice(value, f"the camera gives {seen.size[0]}x{seen.size[1]}: more would be invented")
-    lag = max(1, int(np.median(seen.lengths)) // 10)
+    looked_at = max(len(frames) for frames in seen.episodes)  # of long episodes only the first FRAMES
+    lag = max(1, min(int(np.median(seen.lengths)) // 10, looked_at // 2))
     moved = np.concatenate([_moved(resize_frames(frames, 64), lag, seen.threshold) for frames in seen.episodes])
     typical = float(np.median(moved[moved >= 1])) if (moved >= 1).any() else 0.0
     if typical >= DETAIL:

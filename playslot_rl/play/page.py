@@ -34,6 +34,8 @@ HELP: Final = (
 )
 STYLE: Final = ".pixels img { image-rendering: pixelated } .proto img { image-rendering: pixelated; width: 66px }"
 
+AWAY: Final = "<script>window.addEventListener('blur', () => emitEvent('away'))</script>"
+
 
 class PlayPage:
     """The page of one client.
@@ -76,6 +78,8 @@ class PlayPage:
                 self._build_touch()
                 self._build_record()
         ui.keyboard(on_key=self._on_key, repeating=False)
+        ui.add_body_html(AWAY)
+        ui.on("away", self._on_up)  # a key that is let go in another window is never told of
         self.ticker = ui.timer(TICK_S, self._tick, active=False)
         ui.timer(0.4, self._refresh_previews)
         ui.timer(0.05, self._begin, once=True)
@@ -92,7 +96,7 @@ class PlayPage:
                 self.scene = ui.interactive_image(size=(side, side), on_mouse=self._on_scene, events=watched).mark(
                     "scene"
                 )
-                self.scene.classes("pixels").style("width: 384px").on("mouseleave", lambda _: self._leave())
+                self.scene.classes("pixels").style("width: 384px").on("mouseleave", lambda _: self._point(None))
             with ui.column().classes("gap-1") as self.true_column:
                 ui.label("simulator, the decoded actions").classes("text-sm text-gray-500")
                 self.true = ui.interactive_image(size=(side, side)).classes("pixels").style("width: 384px")
@@ -119,7 +123,7 @@ class PlayPage:
                     button.on(event, lambda _: self._on_up())
         with ui.row().classes("items-center gap-4"):
             ui.label("variability")
-            slider = ui.slider(min=-3, max=3, step=0.1, value=0, on_change=self._on_variability).props("label")
+            slider = ui.slider(min=-3, max=3, step=0.1, value=0, on_change=self._outdate).props("label")
             slider.classes("w-48").mark("variability").bind_value(self, "variability")
             if not self.session.varies:
                 slider.disable()
@@ -209,7 +213,7 @@ class PlayPage:
         else:
             frozen = ", frozen" if self.chosen in now.frozen else ""
             self.which.set_text(f"slot {self.chosen + 1}{frozen}")
-        self._stale, self._moved = True, time.monotonic()
+        self._outdate()
 
     @property
     def target(self) -> int | None:
@@ -233,7 +237,8 @@ class PlayPage:
         """A step where one is due; the timer runs only while something is held or plays by itself."""
         now = time.monotonic()
         if now >= self._due and not self._lock.locked():
-            self._due = max(now, self._due + 1.0 / self.fps)
+            period = 1.0 / self.fps
+            self._due = self._due + period if now < self._due + period else now + period  # no catching up after a stall
             await self._step()
 
     def _run(self) -> None:
@@ -252,19 +257,19 @@ class PlayPage:
         paused = time.monotonic() - self._moved > REST_S and not self.ticker.active
         if not self._stale or not paused or self.closed or not self.begun:
             return
-        self._stale = False
+        self._stale, slot = False, self.target
         self.time.show(len(self.session.timeline.branch()), branches=True)
         for number in range(len(self.protos)):
             async with self._lock:
                 if self._stale or self.closed:
                     return
-                content = await self.studio.do(functools.partial(self._animate, number))
+                content = await self.studio.do(functools.partial(self._animate, number, slot))
             if not self.closed:
                 self.protos[number].set_source(self.gallery.put(f"prototype-{number}", content, "image/gif"))
 
-    def _animate(self, number: int) -> bytes:
-        """The small animation of a prototype; in the worker."""
-        return pictures.animated(self.session.preview([number], self.variability, self.target)[0])
+    def _animate(self, number: int, slot: int | None) -> bytes:
+        """The small animation of a prototype, of one slot where each has its own; in the worker."""
+        return pictures.animated(self.session.preview([number], self.variability, slot)[0])
 
     async def _begin(self) -> None:
         if not await self.starts.first():
@@ -307,10 +312,8 @@ class PlayPage:
         if self.driver != ME:
             self.hand.set_value(ME)  # a press takes over
         self.pressed = prototype
-        if not (self.free or self.hold):
-            await self._step()
-        else:
-            self._due = 0.0
+        await self._step()  # at once: a key held for less than a period counts, too
+        self._due = time.monotonic() + 1.0 / self.fps
         self._run()
 
     def _on_up(self) -> None:
@@ -340,7 +343,8 @@ class PlayPage:
     async def _on_masks(self) -> None:
         await self._work(lambda: None)
 
-    def _on_variability(self) -> None:
+    def _outdate(self) -> None:
+        """The prototypes' animations no longer show what they would do."""
         self._stale, self._moved = True, time.monotonic()
 
     async def _on_scene(self, event: events.MouseEventArguments) -> None:
@@ -350,12 +354,16 @@ class PlayPage:
         x, y = (min(max(int(v), 0), side - 1) for v in (event.image_x, event.image_y))
         slot = int(self._owner[y, x])
         if event.type == "mousemove":
-            self.under = slot
+            self._point(slot)
         else:
             await self._choose(slot)
 
-    def _leave(self) -> None:
-        self.under = None
+    def _point(self, slot: int | None) -> None:
+        """The mouse is over a slot, or has left the picture."""
+        before = self.target if self.begun else None
+        self.under = slot
+        if self.begun and self.target != before:
+            self._outdate()
 
     async def _on_strip(self, event: events.MouseEventArguments) -> None:
         if not self.begun:

@@ -71,6 +71,7 @@ class Timeline:
     def __init__(self, first: SceneMoment) -> None:
         self.moments = [first]
         self.at = 0
+        self._heading = 0  # the present moment is on the way to it
 
     @property
     def now(self) -> SceneMoment:
@@ -93,7 +94,7 @@ class Timeline:
         assert moment.number == len(self.moments)
         assert moment.parent == self.at
         self.moments.append(moment)
-        self.at = moment.number
+        self.at = self._heading = moment.number
 
     def back(self) -> bool:
         """Go to the moment before; False at the start."""
@@ -111,6 +112,8 @@ class Timeline:
         """
         if not 0 <= number < len(self.moments):
             raise ValueError(f"timeline: got moment {number}, expected 0 to {len(self.moments) - 1}")
+        if all(moment.number != number for moment in self.path(self._heading)):
+            self._heading = number
         self.at = number
 
     def path(self, number: int | None = None) -> list[SceneMoment]:
@@ -124,9 +127,9 @@ class Timeline:
             at = parent
 
     def branch(self) -> list[SceneMoment]:
-        """The present branch: the path here, and on by the newest child of each moment."""
+        """The present branch: the path here and to where the player was last, and on by the newest child of each."""
         newest = {moment.parent: moment for moment in self.moments}
-        found = self.path()
+        found = self.path(self._heading)
         while found[-1].number in newest:
             found.append(newest[found[-1].number])
         return found

@@ -63,6 +63,12 @@ def test_small_motion_asks_for_larger_frames_where_the_camera_has_them() -> None
     assert choose_size(seen(small, (48, 64)))[0] == 32
 
 
+def test_long_episodes_of_which_only_the_beginning_is_read_move_as_well() -> None:
+    long = replace(seen(moving_blob(0.2, 60, 128, width=10.0), (480, 640)), lengths=np.full(5, 3000, np.int64))
+    value, reason = choose_size(long)
+    assert value == 64, reason
+
+
 def test_a_data_set_is_looked_at_without_reading_all_of_it(foreign_video: Path) -> None:
     found = survey(foreign_video, "observation.images.side")
     assert (found.fps, found.size, found.action_dim, found.lengths.tolist()) == (10.0, (64, 64), 2, [5, 3, 7])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,8 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the extra `play` is not installed")
 
-from nicegui import ui
-from nicegui.testing import User, user_simulation
+from nicegui.testing import User
+from page_script import MOUSE, press, simulate, until
 from scene import DotTask
 
 from playslot_rl.config import ExperimentConfig, to_dict
@@ -24,7 +24,7 @@ from playslot_rl.config.experiment import DataConfig
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.play.gallery import Gallery
 from playslot_rl.play.page import PlayPage
-from playslot_rl.play.server import choose_port, serve_pictures
+from playslot_rl.play.server import choose_port
 from playslot_rl.play.starts import RecordedStarts, SimulatedStarts
 from playslot_rl.play.studio import Studio
 from playslot_rl.recipes import play
@@ -36,44 +36,6 @@ def studio(agent: Agent, recorded: RecordedStarts, simulated: SimulatedStarts, t
     made = Studio(agent.world_model, agent, recorded, simulated, tmp_path / "play", "tiny")
     yield made
     made.close()
-
-
-def simulate(studio: Studio, script: Callable[[User, list[PlayPage]], Awaitable[None]]) -> list[PlayPage]:
-    """Open the page and follow a script; the pages that were built."""
-    pages: list[PlayPage] = []
-
-    def root() -> None:
-        serve_pictures()
-        pages.append(PlayPage(studio, Gallery()))
-        pages[-1].build()
-
-    async def run() -> None:
-        async with user_simulation(root) as user:
-            await user.open("/")
-            await until(lambda: pages[0].begun)
-            await script(user, pages)
-            for page in pages:
-                page.close()
-
-    asyncio.run(run())
-    return pages
-
-
-async def until(true: Callable[[], bool]) -> None:
-    """Wait for something to become true, half a minute at most: other jobs may have the cores."""
-    for _ in range(3000):
-        if true():
-            return
-        await asyncio.sleep(0.01)
-    raise AssertionError("nothing happened for half a minute")
-
-
-def press(user: User, key: str, down: bool = True) -> None:
-    """Press or let go a key."""
-    code = f"Digit{key}" if key.isdigit() else f"Key{key.upper()}"
-    event = {"action": "keydown" if down else "keyup", "repeat": False, "key": key, "code": code, "location": 0}
-    flags = dict.fromkeys(("altKey", "ctrlKey", "shiftKey", "metaKey"), False)
-    user.find(ui.keyboard).trigger("key", {**event, **flags})
 
 
 def test_keys_step_undo_and_reset_and_the_buttons_touch_and_record(studio: Studio) -> None:
@@ -107,11 +69,6 @@ def test_keys_step_undo_and_reset_and_the_buttons_touch_and_record(studio: Studi
 
     simulate(studio, script)
     assert (studio.out / "recording-001" / "dataset" / "meta" / "info.json").is_file()
-
-
-MOUSE: dict[str, Any] = {
-    "button": 0, "buttons": 1, "altKey": False, "ctrlKey": False, "metaKey": False, "shiftKey": False,
-}  # fmt: skip
 
 
 def test_the_planner_steers_to_the_moment_that_goal_was_pressed_at(studio: Studio) -> None:
