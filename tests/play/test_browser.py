@@ -116,6 +116,15 @@ def test_hold_upload_and_touch(server: tuple[str, Path, subprocess.Popen[str]], 
         page.wait_for_timeout(1000)
         assert moment(page) == stopped >= 3, "letting go ends it"
 
+        page.keyboard.down("1")
+        wait(page, lambda: moment(page) >= stopped + 2)
+        page.evaluate("window.dispatchEvent(new Event('blur'))")
+        page.wait_for_timeout(500)
+        left = moment(page)
+        page.wait_for_timeout(1000)
+        assert moment(page) == left, "a key that is let go in another window, too"
+        page.keyboard.up("1")
+
         true = page.locator(".pixels").nth(1)
         assert true.is_visible()
         Image.fromarray(np.full((96, 128, 3), 90, np.uint8)).save(tmp_path / "grey.png")
