@@ -29,7 +29,7 @@ from playslot_rl.training.fit import build_adam, clip_gradients, trainable_param
 if TYPE_CHECKING:
     from playslot_rl.world_model import WorldModel
 
-Case = Literal["savi_step", "dynamics_step", "rollout_cache", "play_step", "ddp_2"]
+Case = Literal["savi_step", "dynamics_step", "rollout_cache", "play_step", "plan_step", "ddp_2"]
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class Sizes:
         decoded_frames: predicted frames that its extra row decodes.
         rollout_batch, rollout_slots, rollout_steps: of the rollout.
         play_slots, play_steps: of a game: four slots are what a task has, the steps fill the predictor's context.
+        plan_candidates, plan_iterations, plan_horizon, plan_elites: of a search.
         episodes, episode_frames: the data set that windows are read from.
         parsed: episodes of it that are parsed into slots.
         window, window_batch: frames a window, windows a batch.
@@ -68,6 +69,10 @@ class Sizes:
     rollout_steps: int = 15
     play_slots: int = 4
     play_steps: int = 30
+    plan_candidates: int = 64
+    plan_iterations: int = 8
+    plan_horizon: int = 16
+    plan_elites: int = 8
     episodes: int = 40
     episode_frames: int = 21
     parsed: int = 8
@@ -91,7 +96,8 @@ def quick_sizes() -> Sizes:
     return Sizes(
         model=small, image_size=32, savi_batch=1, savi_frames=2, shared_batch=2, dynamics_batch=1, seed_frames=2,
         predicted_frames=2, decoded_frames=1, rollout_batch=2, rollout_slots=3, rollout_steps=5, play_slots=3,
-        play_steps=2, episodes=3, episode_frames=8, parsed=2, window=4, window_batch=2, loader_batches=1,
+        play_steps=2, plan_candidates=4, plan_iterations=1, plan_horizon=2, plan_elites=2, episodes=3,
+        episode_frames=8, parsed=2, window=4, window_batch=2, loader_batches=1,
         cache_batches=2, fast_frames=2, full_frames=1, repeats=1,
     )  # fmt: skip
 
@@ -106,7 +112,7 @@ class Variant:
         precision: of convolutions and transformers; `auto` is what this processor is fastest in.
         channels_last: memory format of the convolutions' maps.
         allocator: keep freed memory (`playslot_rl.allocator`).
-        cached: rollout with cached keys and values.
+        cached: rollout with cached keys and values; of a search, our own planner.
         decoded_frames: predicted frames decoded for the image loss; 0 decodes all.
         shipped: the world model that ships for ButtonPress, in the place of `Sizes.model`.
         rank, world, port: which of how many processes it is, and where they meet.
@@ -173,11 +179,12 @@ _ACTION_DIM = 4
 def build_step(variant: Variant, sizes: Sizes) -> Step:
     """Networks and data of a variant, the same for all variants, and the function to time."""
     torch.manual_seed(0)
+    from playslot_rl.speed.plan import plan_step
     from playslot_rl.speed.several import several_step
 
     steps: dict[Case, Callable[[Variant, Sizes], Step]] = {
         "savi_step": _savi_step, "dynamics_step": _dynamics_step, "rollout_cache": _rollout, "play_step": _play,
-        "ddp_2": several_step,
+        "plan_step": plan_step, "ddp_2": several_step,
     }  # fmt: skip
     return steps[variant.case](variant, sizes)
 

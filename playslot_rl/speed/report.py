@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from playslot_rl.config import BlocksConfig, EnvConfig
 from playslot_rl.speed.cases import Sizes, dynamics_variants, play_variants, rollout_variants, savi_variants
+from playslot_rl.speed.plan import plan_variants
 from playslot_rl.threads import available_cores
 from playslot_rl.visualization import document
 
@@ -21,6 +22,7 @@ TARGETS: Final = {
     "render": 12.0,
     "render_block_push": 5.0,
     "play_step": 10.0,
+    "plan_step": 3.0,
     "verify": 20.0,
     "export": 20.0,
     "slot_cache": 20.0,
@@ -73,6 +75,8 @@ def measure(
     rollout = race(rollout_variants(), sizes, threads)
     say("playing in imagination")
     play = race(play_variants(), sizes, threads)
+    say("planning, our CEM against TorchRL's")
+    plan = race(plan_variants(), sizes, threads)
     say("window sampling against LeRobotDataset + DataLoader")
     rates = sampling_rates(sizes)
     say("export, verify, slot cache")
@@ -89,6 +93,7 @@ def measure(
         "render": _entry(render, "full", "fast"),
         "render_block_push": _entry(blocks, "full", "fast"),
         "play_step": _played(play, sizes.play_steps),
+        "plan_step": _entry(plan, "torchrl", "own"),
         **{name: {"ratio": sets[name], "unit": unit, "rate": sets[name]} for name, unit in RATES.items()},
         "ddp_2": _entry(several, "one_process_two_threads", "two_processes"),
         "machine": {**_machine(), "threads": threads, "repeats": sizes.repeats, "quick": quick},

@@ -172,6 +172,7 @@ def test_the_command_writes_every_key_with_its_ratio_and_medians(
         "rollout_cache": ("full", "cached"),
         "render": ("full", "fast"),
         "render_block_push": ("full", "fast"),
+        "plan_step": ("torchrl", "own"),
         "ddp_2": ("one_process_two_threads", "two_processes"),
     }
     for key, (slow, fast) in pairs.items():
