@@ -18,23 +18,32 @@ from playslot_rl.modules.savi import SAVi
 from playslot_rl.recipes import adopt_trials
 from playslot_rl.recipes.adopt import clip_room, savi_for, start_for
 from playslot_rl.recipes.adopt_trials import SHORTEST, scheduled, steps_within, too_short
+from playslot_rl.recipes.play import open_studio
 from playslot_rl.training.runs import load_savi
 from playslot_rl.training.stage_slots import warm_start
 
 QUICK = ("minutes=0.02", "adopt.slots=[2,3]", "adopt.prototypes=4")
 
 
-def write_set(root: Path, lengths: tuple[int, ...], speed: int, cameras: tuple[str, ...] = ("top",)) -> Path:
-    """A square that moves over frames of 40x48, by LeRobot's own writer; no actions."""
+def write_set(
+    root: Path,
+    lengths: tuple[int, ...],
+    speed: int,
+    cameras: tuple[str, ...] = ("top",),
+    size: tuple[int, int] = (80, 96),
+    video: bool = False,
+) -> Path:
+    """A square that moves over frames of a size, as images or videos, by LeRobot's own writer; no actions."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    shape = {"dtype": "image", "shape": (80, 96, 3), "names": ["height", "width", "channels"]}
+    shape = {"dtype": "video" if video else "image", "shape": (*size, 3), "names": ["height", "width", "channels"]}
     features: dict[str, Any] = {f"observation.images.{name}": shape for name in cameras}
-    data = LeRobotDataset.create("me/any", fps=30, features=features, root=root, use_videos=False)
+    data = LeRobotDataset.create("me/any", fps=30, features=features, root=root, use_videos=video)
+    scale = size[0] // 80
     for length in lengths:
         for t in range(length):
-            frame = np.full((80, 96, 3), 60, np.uint8)
-            frame[30:50, 10 + speed * t : 30 + speed * t] = 220
+            frame = np.full((*size, 3), 60, np.uint8)
+            frame[30 * scale : 50 * scale, scale * (10 + speed * t) : scale * (30 + speed * t)] = 220
             data.add_frame({**dict.fromkeys(features, frame), "task": "move"})
         data.save_episode(parallel_encoding=False)
     data.finalize()
@@ -71,6 +80,21 @@ def test_a_set_that_nobody_prepared_becomes_a_world_model(
     refused(
         "adopt", f"data.root={any_set}", f"out={run}", *QUICK, "minutes=3", message="minutes: got 3.0, expected 0.02"
     )
+
+
+def test_videos_of_two_cameras_become_a_model_that_can_be_played(tmp_path: Path) -> None:
+    root = write_set(tmp_path / "set", (24, 22, 26, 24, 23), 2, ("top", "side"), (480, 640), video=True)
+    run = tmp_path / "run"
+    smoke("adopt", f"data.root={root}", "data.camera=observation.images.side", f"out={run}", *QUICK)
+    config = compose([f"run={run}"], "play")
+    assert (config.data.root, config.data.camera) == (str(root), "observation.images.side")
+    studio = open_studio(config)
+    try:
+        session = studio.session()
+        session.begin(studio.start(next(iter(studio.sources)), 1, 2))
+        assert session.press(0).frame.shape == (64, 64, 3)
+    finally:
+        studio.close()
 
 
 def test_what_cannot_be_adopted_is_refused_before_anything_is_written(

@@ -4,8 +4,9 @@ training distribution is standard.
     CEMPlanner(planning_env(...), planning_horizon=H, optim_steps=10, num_candidates=64, top_k=8)(planning_start(...))
 
 Their candidates are called "action" and begin with mean 0 and deviation 1, so the latent actions are renamed and scaled
-at once. They are several times slower than our own on the cached rollout (`playslot bench`, `plan_step`), keep no elites, have no floor of the
-deviation and draw from the global generator: wrap a call in `playslot_rl.seeding.global_seed`.
+at once. They are several times slower than our own on the cached rollout (`playslot bench`, `plan_step`), keep no
+elites, have no floor of the deviation and draw from the global generator: wrap a call in
+`playslot_rl.seeding.global_seed`.
 
 Shapes: M candidates, H horizon, N slots, D slot width, Z latent-action width.
 """
