@@ -120,6 +120,15 @@ def test_what_cannot_be_adopted_is_refused_before_anything_is_written(
     assert not run.exists()
 
 
+def test_playing_refuses_frames_that_the_model_does_not_take(any_set: Path, foreign: Path) -> None:
+    for message, given in {
+        r"got 2 cameras .* set data\.camera=": (f"data.root={foreign}",),
+        r"data\.resize=true": (f"data.root={any_set}",),
+        "no such folder|got no data set": (f"data.root={any_set}-none",),
+    }.items():
+        refused("play", "run=pretrained", *given, message=message)
+
+
 @pytest.mark.parametrize("preset", ["smoke", "compact", "paper"])
 @pytest.mark.parametrize("size", [32, 64, 128])
 def test_every_preset_has_a_savi_for_every_frame_size(preset: str, size: int) -> None:
