@@ -2,7 +2,8 @@
 
 Counts the operations of one step of each stage on this CPU, and prints them with the memory and time that they mean on
 1, 8 and 32 devices of which speed is *assumed* (`playslot_rl.speed.cost.Machine`). With `device=` steps are also
-*measured* there, in fp32 and, where the processor multiplies it, in bf16: `device=cuda preset=paper` takes a minute on an H100, `device=cpu` many.
+*measured* there, in fp32 and, where the processor multiplies it, in bf16: `device=cuda preset=paper` takes a minute on
+an H100, `device=cpu` many.
 Nothing is written.
 """
 

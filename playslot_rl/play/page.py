@@ -33,7 +33,6 @@ HELP: Final = (
     "choose it."
 )
 STYLE: Final = ".pixels img { image-rendering: pixelated } .proto img { image-rendering: pixelated; width: 66px }"
-
 AWAY: Final = "<script>window.addEventListener('blur', () => emitEvent('away'))</script>"
 
 
@@ -218,7 +217,7 @@ class PlayPage:
     @property
     def target(self) -> int | None:
         """The slot that actions go to: the one under the mouse, else the chosen one; None where all share one."""
-        if not self.session.per_slot:
+        if not (self.begun and self.session.per_slot):
             return None
         found = self.chosen if self.under is None else self.under
         return found if found in self.session.now.present else None
@@ -238,7 +237,9 @@ class PlayPage:
         now = time.monotonic()
         if now >= self._due and not self._lock.locked():
             period = 1.0 / self.fps
-            self._due = self._due + period if now < self._due + period else now + period  # no catching up after a stall
+            self._due += period
+            if self._due <= now:
+                self._due = now + period  # no catching up after a stall
             await self._step()
 
     def _run(self) -> None:
@@ -251,6 +252,10 @@ class PlayPage:
         self.pressed = None
         self.free_switch.set_value(False)
         self._run()
+
+    def _outdate(self) -> None:
+        """The prototypes' animations no longer show what they would do."""
+        self._stale, self._moved = True, time.monotonic()
 
     async def _refresh_previews(self) -> None:
         """The prototypes' animations, when the player has paused; one after the other, so that a key waits for one."""
@@ -343,10 +348,6 @@ class PlayPage:
     async def _on_masks(self) -> None:
         await self._work(lambda: None)
 
-    def _outdate(self) -> None:
-        """The prototypes' animations no longer show what they would do."""
-        self._stale, self._moved = True, time.monotonic()
-
     async def _on_scene(self, event: events.MouseEventArguments) -> None:
         if self._owner is None:
             return
@@ -360,9 +361,8 @@ class PlayPage:
 
     def _point(self, slot: int | None) -> None:
         """The mouse is over a slot, or has left the picture."""
-        before = self.target if self.begun else None
-        self.under = slot
-        if self.begun and self.target != before:
+        before, self.under = self.target, slot
+        if self.target != before:
             self._outdate()
 
     async def _on_strip(self, event: events.MouseEventArguments) -> None:

@@ -127,7 +127,7 @@ class Timeline:
             at = parent
 
     def branch(self) -> list[SceneMoment]:
-        """The present branch: the path here and to where the player was last, and on by the newest child of each."""
+        """The present branch: the path to the furthest moment visited on it, and on by the newest child of each."""
         newest = {moment.parent: moment for moment in self.moments}
         found = self.path(self._heading)
         while found[-1].number in newest:

@@ -45,11 +45,12 @@ def _own(model: WorldModel, statistics: Whitening, start: Tensor, distance: Dist
     from playslot_rl.acting.planners.costs import GoalCost
 
     shape, generator = (sizes.plan_horizon, *model.latent_shape), torch.Generator().manual_seed(0)
-    nothing = torch.empty(0, *shape)
+    nothing = torch.empty(0, *shape)  # to begin with
+    past = torch.empty(0, *model.latent_shape)
     planner = CEMPlanner(sizes.plan_candidates, sizes.plan_iterations, sizes.plan_elites)
 
     def step() -> Tensor:
-        cost = GoalCost(model, start[None], nothing[0:0, 0], distance)
+        cost = GoalCost(model, start[None], past, distance)
         return planner(Search(cost, shape, statistics, nothing), generator).latents.abs().max()
 
     return step

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import torch
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.play.session import PlaySession
 from playslot_rl.play.starts import RecordedStarts, SimulatedStarts
+from playslot_rl.play.studio import Studio
 from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.world_model import Agent, WorldModel
 
@@ -55,3 +57,10 @@ def session(agent: Agent, recorded: RecordedStarts) -> PlaySession:
     made = PlaySession(agent.world_model, agent)
     made.begin(recorded.start(1, 3))
     return made
+
+
+@pytest.fixture
+def studio(agent: Agent, recorded: RecordedStarts, simulated: SimulatedStarts, tmp_path: Path) -> Iterator[Studio]:
+    made = Studio(agent.world_model, agent, recorded, simulated, tmp_path / "play", "tiny")
+    yield made
+    made.close()

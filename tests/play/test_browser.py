@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import signal
 import subprocess
-import sys
-import time
-import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from served import served
 
 from playslot_rl.datasets.verify import verify
-from playslot_rl.processes import free_port
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
@@ -33,26 +29,9 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path, subprocess.Popen[str]]]:
     """`playslot play` with the shipped model; its address, and the folder it runs in."""
-    folder, port = tmp_path_factory.mktemp("play"), free_port()
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
-    command = [sys.executable, "-m", "playslot_rl", "play", "run=pretrained/block_push_easy", f"port={port}"]
-    process = subprocess.Popen(
-        [*command, "device=cpu"], cwd=folder, env=environment, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
-    address = f"http://127.0.0.1:{port}"
-    try:
-        for _ in range(240):
-            try:
-                urllib.request.urlopen(address, timeout=5).close()
-                break
-            except OSError:
-                assert process.poll() is None, process.communicate()[1]
-                time.sleep(0.5)
+    folder = tmp_path_factory.mktemp("play")
+    with served(folder, "run=pretrained/block_push_easy") as (address, process):
         yield address, folder, process
-    finally:
-        process.kill()
-        process.communicate()
 
 
 @contextmanager

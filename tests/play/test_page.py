@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,17 +24,10 @@ from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.play.gallery import Gallery
 from playslot_rl.play.page import PlayPage
 from playslot_rl.play.server import choose_port
-from playslot_rl.play.starts import RecordedStarts, SimulatedStarts
+from playslot_rl.play.starts import RecordedStarts
 from playslot_rl.play.studio import Studio
 from playslot_rl.recipes import play
 from playslot_rl.world_model import Agent, WorldModel
-
-
-@pytest.fixture
-def studio(agent: Agent, recorded: RecordedStarts, simulated: SimulatedStarts, tmp_path: Path) -> Iterator[Studio]:
-    made = Studio(agent.world_model, agent, recorded, simulated, tmp_path / "play", "tiny")
-    yield made
-    made.close()
 
 
 def test_keys_step_undo_and_reset_and_the_buttons_touch_and_record(studio: Studio) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import io
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +16,9 @@ from page_script import MOUSE, press, simulate, until
 from PIL import Image
 
 from playslot_rl.play.page import GAP, PlayPage
-from playslot_rl.play.starts import RecordedStarts, SimulatedStarts
+from playslot_rl.play.starts import RecordedStarts
 from playslot_rl.play.studio import Studio
-from playslot_rl.world_model import Agent, WorldModel
-
-
-@pytest.fixture
-def studio(agent: Agent, recorded: RecordedStarts, simulated: SimulatedStarts, tmp_path: Path) -> Iterator[Studio]:
-    made = Studio(agent.world_model, agent, recorded, simulated, tmp_path / "play", "tiny")
-    yield made
-    made.close()
+from playslot_rl.world_model import WorldModel
 
 
 def test_a_key_that_is_let_go_while_the_page_is_busy_still_steps_once(studio: Studio) -> None:
