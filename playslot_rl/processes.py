@@ -20,7 +20,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from playslot_rl.errors import PeerError
+from playslot_rl.errors import ConfigError, PeerError
 
 if TYPE_CHECKING:
     import torch
@@ -88,6 +88,7 @@ def start(device: str = "") -> None:
             GPU of its own, where there are some.
 
     Raises:
+        ConfigError: this machine has fewer GPUs than processes.
         RuntimeError: they cannot be reached.
     """
     global _here
@@ -98,6 +99,12 @@ def start(device: str = "") -> None:
     from accelerate.utils import InitProcessGroupKwargs
 
     on_cpu = device == "cpu" or not torch.cuda.is_available()
+    own, gpus = int(os.environ.get("LOCAL_WORLD_SIZE", "1")), torch.cuda.device_count()
+    if not on_cpu and own > gpus:
+        raise ConfigError(
+            f"got {own} processes on a machine with {gpus} GPU{'s' * (gpus > 1)}, expected at most one each: start "
+            f"{gpus} (torchrun --nproc-per-node={gpus}), or let them meet on the CPU (device=cpu)"
+        )
     # Without `cpu=True` accelerate takes every process on a CPU for the only one.
     engine = Accelerator(cpu=on_cpu, kwargs_handlers=[InitProcessGroupKwargs(timeout=TIMEOUT)])
     _here = Processes(engine.process_index, engine.num_processes)

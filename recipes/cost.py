@@ -3,7 +3,7 @@
 Counts the operations of one step of each stage on this CPU, and prints them with the memory and time that they mean on
 1, 8 and 32 devices of which speed is *assumed* (`playslot_rl.speed.cost.Machine`). With `device=` steps are also
 *measured* there, in fp32 and, where the processor multiplies it, in bf16: `device=cuda preset=paper` takes a minute on
-an H100, `device=cpu` many.
+an H100, `device=cpu` many. Stages of which the setting `compile` is on are measured without and with torch.compile.
 Nothing is written.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Final
 
 from playslot_rl.config import ExperimentConfig, Precision
@@ -103,12 +104,14 @@ def measured(config: ExperimentConfig, costs: Sequence[StageCost], device: torch
     lines.append("|---|---|---|---|---|---|")
     for cost in costs:
         batch = cost.batch if on_gpu else min(cost.batch, CPU_BATCH)
-        for precision in precisions:
-            print(f"{cost.stage}, {precision} ...", file=sys.stderr, flush=True)
-            took = time_step(config, cost.stage, device, precision, batch, steps=10 if on_gpu else 3)
+        own = {"slots": config.slots, "dynamics": config.dynamics}.get(cost.stage, config.behaviour)
+        for precision, compiled in product(precisions, (False, True)[: 1 + own.compile]):
+            how = f"{precision}, compiled" if compiled else precision
+            print(f"{cost.stage}, {how} ...", file=sys.stderr, flush=True)
+            took = time_step(config, cost.stage, device, precision, batch, 10 if on_gpu else 3, compiled)
             rate = cost.at(batch).flops / took.seconds / 1e12
             peak = "–" if took.peak is None else f"{took.peak / 2**30:.2f} GiB"
-            lines.append(f"| {cost.stage} | {precision} | {batch} | {took.seconds:.4g} | {rate:.3g} | {peak} |")
+            lines.append(f"| {cost.stage} | {how} | {batch} | {took.seconds:.4g} | {rate:.3g} | {peak} |")
     return "\n".join(lines)
 
 

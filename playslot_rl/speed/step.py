@@ -20,10 +20,11 @@ from playslot_rl.config import ExperimentConfig, Precision
 from playslot_rl.losses.common import total_loss
 from playslot_rl.precision import autocast
 from playslot_rl.speed.cost import batch_size, begin, fresh_agent, parts
+from playslot_rl.training.compiling import compile_parts
 from playslot_rl.training.fit import build_adam
 
 WARM: Final = 2
-"""Steps before the first that is timed: kernels are chosen, the codebook begins."""
+"""Steps before the first that is timed: kernels are chosen or compiled, the codebook begins."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class StepTime:
         batch: B.
         seconds: median of the steps timed.
         peak: bytes that tensors took on the device at most; None on a CPU, where nobody counts them.
+        compiled: whether the networks' parts were kernels of torch.compile.
     """
 
     stage: str
@@ -43,6 +45,7 @@ class StepTime:
     batch: int
     seconds: float
     peak: int | None
+    compiled: bool = False
 
 
 def time_step(
@@ -52,6 +55,7 @@ def time_step(
     precision: Precision,
     batch: int = 0,
     steps: int = 10,
+    compiled: bool = False,
 ) -> StepTime:
     """Time the step of a stage.
 
@@ -62,8 +66,10 @@ def time_step(
         precision: of convolutions and transformers; weights and optimiser stay in fp32.
         batch: B; 0 takes the config's.
         steps: that are timed.
+        compiled: have torch.compile make kernels of what is trained, as the setting `compile` of a stage does.
 
     Raises:
+        ConfigError: no C++ compiler for `compiled`.
         ValueError: another stage.
     """
     on_gpu, size = device.type == "cuda", batch or batch_size(config, stage)
@@ -74,6 +80,8 @@ def time_step(
     if on_gpu:
         torch.cuda.reset_peak_memory_stats(device)
     begin(criterion, data)
+    if compiled:
+        compile_parts(dict(criterion.named_children()), f"{stage}.compile")
     optim = {"slots": config.slots.optim, "dynamics": config.dynamics.optim}.get(stage, config.behaviour.optim)
     trained = {name: p for name, p in criterion.named_parameters() if p.requires_grad}
     adam = build_adam(trained, replace(optim, warmup_steps=0))
@@ -95,4 +103,5 @@ def time_step(
     for _ in range(WARM):
         step()
     seconds = statistics.median(step() for _ in range(steps))
-    return StepTime(stage, precision, size, seconds, torch.cuda.max_memory_allocated(device) if on_gpu else None)
+    peak = torch.cuda.max_memory_allocated(device) if on_gpu else None
+    return StepTime(stage, precision, size, seconds, peak, compiled)

@@ -146,6 +146,16 @@ def test_lapos_models_of_other_sizes_are_refused(trained: dict[str, Path], share
                       "baselines.lapo.codes=3"), message="lapo.codes: got 3, expected 4")  # fmt: skip
 
 
+@pytest.mark.parametrize("method", ["svg", "slotformer", "ocvp_seq"])
+def test_a_model_of_videos_is_trained_by_itself(shared_run: Path, tmp_path: Path, method: str) -> None:
+    videos, out = shared_run / "data" / "random", tmp_path / "run"
+    own = (f"run={shared_run}",) if method != "svg" else ()
+    smoke("train-baseline", f"method={method}", f"data.root={videos}", f"out={out}", *own)
+    assert _meta(out, method)["steps"] == 4
+    rows = [json.loads(line) for line in (out / method / "metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows if row["split"] == "validation"] == [2, 4]
+
+
 def test_caddys_methods_find_the_caddy_that_was_trained_into_their_run(shared_run: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     smoke("train-baseline", "method=caddy", f"data.root={shared_run / 'data' / 'random'}", f"out={out}")

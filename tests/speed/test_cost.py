@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import nn
@@ -101,6 +103,20 @@ def test_a_step_is_timed_after_those_in_which_kernels_are_chosen(
     assert took.batch == cost.batch_size(config, stage)
 
 
+@pytest.mark.parametrize("stage", cost.STAGES)
+def test_what_is_trained_is_compiled_when_asked_for(
+    config: ExperimentConfig, stage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled: list[nn.Module] = []
+    monkeypatch.setattr(nn.Module, "compile", lambda part: compiled.append(part))
+    assert step.time_step(config, stage, torch.device("cpu"), "fp32", 2, 1, True).compiled
+    assert compiled
+    assert all(any(p.requires_grad for p in part.parameters()) for part in compiled)
+    seen = len(compiled)
+    assert not step.time_step(config, stage, torch.device("cpu"), "fp32", 2, 1).compiled
+    assert len(compiled) == seen
+
+
 def test_a_step_of_an_unknown_stage_is_not_timed(config: ExperimentConfig) -> None:
     with pytest.raises(ValueError, match="stage: got all"):
         step.time_step(config, "all", torch.device("cpu"), "fp32", batch=2)
@@ -110,16 +126,19 @@ def test_a_step_of_an_unknown_stage_is_not_timed(config: ExperimentConfig) -> No
 def test_the_measured_table_has_a_row_a_stage_and_precision(
     config: ExperimentConfig, costs: dict[str, StageCost], monkeypatch: pytest.MonkeyPatch, native: bool
 ) -> None:
-    def half_a_second(*args: object, steps: int) -> step.StepTime:
-        _, stage, _, precision, batch = args
-        return step.StepTime(stage, precision, batch, 0.5, None)  # type: ignore[arg-type]
+    def half_a_second(*args: object) -> step.StepTime:
+        _, stage, _, precision, batch, _, compiled = args
+        return step.StepTime(stage, precision, batch, 0.25 if compiled else 0.5, None)  # type: ignore[arg-type]
 
     monkeypatch.setattr(step, "time_step", half_a_second)
     monkeypatch.setattr(precision_module, "native_bf16", lambda _: native)
-    table = recipe.measured(config, [*costs.values()], torch.device("cpu"))
+    own = replace(config, slots=replace(config.slots, compile=True))
+    table = recipe.measured(own, [*costs.values()], torch.device("cpu"))
     for stage in cost.STAGES:
         batch = min(costs[stage].batch, recipe.CPU_BATCH)
         rate = costs[stage].at(batch).flops / 0.5 / 1e12
         for precision in recipe.PRECISIONS:
             row = f"| {stage} | {precision} | {batch} | 0.5 | {rate:.3g} | – |"
             assert (row in table) == (native or precision == "fp32")
+            row = f"| {stage} | {precision}, compiled | {batch} | 0.25 | {2 * rate:.3g} | – |"
+            assert (row in table) == (stage == "slots" and (native or precision == "fp32"))
