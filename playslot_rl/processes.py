@@ -132,10 +132,13 @@ def wait() -> None:
         PeerError: one of them ended.
     """
     if _here.world > 1:
+        import torch
         import torch.distributed as dist
 
+        # NCCL would guess the GPU from the rank, and say so.
+        own = [torch.cuda.current_device()] if dist.get_backend() == "nccl" else None
         with _exchange():
-            dist.barrier()
+            dist.barrier(device_ids=own)
 
 
 def own_device(device: torch.device) -> torch.device:
@@ -269,11 +272,13 @@ def _on_cpu(result: Any) -> Any:
 
 @contextlib.contextmanager
 def _exchange() -> Iterator[None]:
-    """Say what a failed exchange means: gloo and NCCL give a page about sockets."""
+    """Say what a failed exchange means: gloo and NCCL give a page about sockets. What NCCL adds of its own is kept."""
     try:
         yield
     except RuntimeError as error:
+        words = str(error).partition("Last error:")[2].split("\n")
+        own = next((f" (NCCL: {line.strip()})" for line in words if line.strip()), "")
         raise PeerError(
             f"rank {_here.rank} of {_here.world}: another process ended or did not answer within "
-            f"{TIMEOUT.seconds // 60} minutes; its own line says why; the same command carries on"
+            f"{TIMEOUT.seconds // 60} minutes{own}; its own line says why; the same command carries on"
         ) from error

@@ -149,7 +149,7 @@ def test_lapos_models_of_other_sizes_are_refused(trained: dict[str, Path], share
 @pytest.mark.parametrize("method", ["svg", "slotformer", "ocvp_seq"])
 def test_a_model_of_videos_is_trained_by_itself(shared_run: Path, tmp_path: Path, method: str) -> None:
     videos, out = shared_run / "data" / "random", tmp_path / "run"
-    own = (f"run={shared_run}",) if method != "svg" else ()
+    own = ("preset=smoke", f"run={shared_run}") if method != "svg" else ()
     smoke("train-baseline", f"method={method}", f"data.root={videos}", f"out={out}", *own)
     assert _meta(out, method)["steps"] == 4
     rows = [json.loads(line) for line in (out / method / "metrics.jsonl").read_text().splitlines()]

@@ -11,7 +11,8 @@ import torch
 from ranks import log_of, run_ranks
 from tiny_stages import DOUBLE, STAGES, in_double
 
-from playslot_rl.errors import CheckpointError
+from playslot_rl import processes
+from playslot_rl.errors import CheckpointError, ConfigError, PeerError
 from playslot_rl.processes import agreed, claim, here, wait
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
 from playslot_rl.training.fit import fit
@@ -85,6 +86,29 @@ def claims() -> None:
 def test_one_rank_has_what_all_of_them_claim() -> None:
     assert run_ranks(3, claims) == [0, 0, 0]
     assert [claim("error"), claim("error")] == [True, True]  # a process alone
+
+
+def test_more_processes_than_gpus_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in processes.launcher_variables(1, 3, 1).items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    with pytest.raises(ConfigError, match=r"got 3 processes on a machine with 2 GPUs, .*--nproc-per-node=2"):
+        processes.start()
+
+
+@pytest.mark.parametrize(
+    ("said", "kept"),
+    [
+        ("Connection closed by peer [127.0.0.1]:1", "minutes; its own"),
+        ("NCCL error in: a.cpp:1\nLast error:\nDuplicate GPU detected : rank 0 and 1", "minutes (NCCL: Duplicate GPU"),
+    ],
+)
+def test_a_failed_exchange_is_one_line_with_what_nccl_adds(said: str, kept: str) -> None:
+    with pytest.raises(PeerError) as failed, processes._exchange():
+        raise RuntimeError(said)
+    assert kept in str(failed.value)
+    assert "\n" not in str(failed.value)
 
 
 def accumulated(folder: Path) -> None:
