@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import Any, Final
 
 from playslot_rl.config import BlocksConfig, EnvConfig
-from playslot_rl.speed.cases import Sizes, dynamics_variants, play_variants, rollout_variants, savi_variants
+from playslot_rl.speed.cases import (
+    Sizes,
+    computed_here,
+    dynamics_variants,
+    play_variants,
+    rollout_variants,
+    savi_variants,
+)
 from playslot_rl.speed.plan import plan_variants
 from playslot_rl.threads import available_cores
 from playslot_rl.visualization import document
@@ -50,7 +57,8 @@ def measure(
         say: told what is being timed.
 
     Returns:
-        For each key of `TARGETS` a dict with `ratio`, `unit` and the medians it was made of; and `machine`. The
+        For each key of `TARGETS` a dict with `ratio`, `unit` and the medians it was made of, those in bf16 only where
+        the processor multiplies it; and `machine`. The
         `ratio` of `play_step` is no ratio of two paths but imagined frames a second, that of `RATES` what they say.
 
     Raises:
@@ -65,8 +73,9 @@ def measure(
     from playslot_rl.speed.several import several_seconds
 
     tune_allocator()  # of this process, which samples windows, as every recipe does; each child sets its own
-    say("SAVi training step, eight variants")
-    savi = race(savi_variants(), sizes, threads)
+    variants = computed_here(savi_variants())
+    say(f"SAVi training step, {len(variants)} variants")
+    savi = race(variants, sizes, threads)
     say("dynamics training step")
     dynamics = race(dynamics_variants(sizes.decoded_frames), sizes, threads)
     say("SAVi training step, two processes against two threads")
@@ -74,7 +83,7 @@ def measure(
     say("rollout, cached against full")
     rollout = race(rollout_variants(), sizes, threads)
     say("playing in imagination")
-    play = race(play_variants(), sizes, threads)
+    play = race(computed_here(play_variants()), sizes, threads)
     say("planning, our CEM against TorchRL's")
     plan = race(plan_variants(), sizes, threads)
     say("window sampling against LeRobotDataset + DataLoader")

@@ -259,6 +259,7 @@ def test_a_trial_is_the_training_in_small() -> None:
     assert in_steps(config, "svg", 100).baselines.svg.optim.warmup_steps < config.baselines.svg.optim.warmup_steps
 
 
+@pytest.mark.usefixtures("started")
 def test_seeds_share_the_trials_whichever_comes_first(finished: Path, tmp_path: Path) -> None:
     tried = {}
     for seeds in ("0,1", "1"):

@@ -25,11 +25,13 @@ from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.predictors.cocvp import COCVP
 from playslot_rl.precision import resolve_precision
+from playslot_rl.speed import cases
 from playslot_rl.speed.cases import (
     Sizes,
     Variant,
     build_savi,
     build_step,
+    computed_here,
     dynamics_loss,
     dynamics_variants,
     play_variants,
@@ -61,6 +63,14 @@ def test_the_savi_rows_are_first_layer_times_precision_times_allocator() -> None
     assert len(rows) == len(savi_variants()) == 8
     assert savi_variants()["plain_fp32_glibc"] == Variant("savi_step", False, "fp32", False, False)
     assert savi_variants()["collapsed_bf16_allocator"] == Variant("savi_step", precision="bf16")
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_what_the_processor_only_emulates_is_left_out(native: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cases, "native_bf16", lambda _: native)
+    left = computed_here(savi_variants() | play_variants())
+    assert len(left) == (11 if native else 6)
+    assert native or all(variant.precision == "fp32" for variant in left.values())
 
 
 @pytest.mark.parametrize("case", ["savi_step", "dynamics_step", "rollout_cache"])
@@ -179,9 +189,9 @@ def test_the_command_writes_every_key_with_its_ratio_and_medians(
         assert figures[key]["ratio"] == pytest.approx(figures[key][slow] / figures[key][fast])
     sampling = figures["window_sampling"]
     assert sampling["ratio"] == pytest.approx(sampling["cache"] / sampling["lerobot"])
-    assert set(savi_variants()) <= set(figures["savi_step"])
+    assert set(figures["savi_step"]) == {"ratio", "unit", *computed_here(savi_variants())}
     played = figures["play_step"]
-    assert set(play_variants()) <= set(played)
+    assert set(played) == {"ratio", "unit", *computed_here(play_variants())}
     assert played["ratio"] == pytest.approx(1 / played["shipped"])
     assert set(sampling) == {"ratio", "unit", "cache", "stream", "lerobot"}
     for key, unit in RATES.items():
