@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from commands import ONE_CORE, playslot, refused
 from sketchy_layout import name_of, write_sketchy
 
 
+@pytest.mark.usefixtures("started")
 def test_a_converted_data_set_trains_and_compares_on_both_cameras(tmp_path: Path) -> None:
     source, out = write_sketchy(tmp_path / "download"), tmp_path / "set"
     done = playslot("convert", "env=sketchy", f"data.root={source}", f"out={out}", *ONE_CORE)
