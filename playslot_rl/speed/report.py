@@ -57,9 +57,8 @@ def measure(
         say: told what is being timed.
 
     Returns:
-        For each key of `TARGETS` a dict with `ratio`, `unit` and the medians it was made of, those in bf16 only where
-        the processor multiplies it; and `machine`. The
-        `ratio` of `play_step` is no ratio of two paths but imagined frames a second, that of `RATES` what they say.
+        For each key of `TARGETS` a dict with `ratio`, `unit` and the medians it was made of (see `computed_here`), and
+        `machine`. The `ratio` of `play_step` is imagined frames a second, that of `RATES` what they say.
 
     Raises:
         PlaySlotError: a child died. RenderError: no GL backend.
@@ -73,9 +72,8 @@ def measure(
     from playslot_rl.speed.several import several_seconds
 
     tune_allocator()  # of this process, which samples windows, as every recipe does; each child sets its own
-    variants = computed_here(savi_variants())
-    say(f"SAVi training step, {len(variants)} variants")
-    savi = race(variants, sizes, threads)
+    say("SAVi training step, its variants")
+    savi = race(computed_here(savi_variants()), sizes, threads)
     say("dynamics training step")
     dynamics = race(dynamics_variants(sizes.decoded_frames), sizes, threads)
     say("SAVi training step, two processes against two threads")
