@@ -94,6 +94,7 @@ def measured(config: ExperimentConfig, costs: Sequence[StageCost], device: torch
     import torch
 
     from playslot_rl.precision import native_bf16
+    from playslot_rl.speed.cost import stage_config
     from playslot_rl.speed.step import time_step
 
     on_gpu = device.type == "cuda"
@@ -104,8 +105,8 @@ def measured(config: ExperimentConfig, costs: Sequence[StageCost], device: torch
     lines.append("|---|---|---|---|---|---|")
     for cost in costs:
         batch = cost.batch if on_gpu else min(cost.batch, CPU_BATCH)
-        own = {"slots": config.slots, "dynamics": config.dynamics}.get(cost.stage, config.behaviour)
-        for precision, compiled in product(precisions, (False, True)[: 1 + own.compile]):
+        ways = (False, True) if stage_config(config, cost.stage).compile else (False,)
+        for precision, compiled in product(precisions, ways):
             how = f"{precision}, compiled" if compiled else precision
             print(f"{cost.stage}, {how} ...", file=sys.stderr, flush=True)
             took = time_step(config, cost.stage, device, precision, batch, 10 if on_gpu else 3, compiled)

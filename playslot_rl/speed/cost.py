@@ -23,7 +23,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from playslot_rl import keys
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.config import ExperimentConfig, StageConfig
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.losses.common import total_loss
 from playslot_rl.losses.dynamics import DynamicsLoss
@@ -132,11 +132,11 @@ def stage_cost(config: ExperimentConfig, stage: str) -> StageCost:
     begin(criterion, batch_of(2))
     trained = [p for p in criterion.parameters() if p.requires_grad]
     frozen = sum(p.numel() for p in criterion.parameters()) - sum(p.numel() for p in trained)
-    own = {"slots": config.slots, "dynamics": config.dynamics}.get(stage, config.behaviour)
+    own = stage_config(config, stage)
     return StageCost(
         stage,
         config.behaviour.decoder_steps if stage == "decoder" else own.steps,
-        batch_size(config, stage),
+        own.batch_size,
         sum(p.numel() for p in trained),
         frozen,
         _count(criterion, batch_of(2)),
@@ -144,9 +144,15 @@ def stage_cost(config: ExperimentConfig, stage: str) -> StageCost:
     )
 
 
-def batch_size(config: ExperimentConfig, stage: str) -> int:
-    """B of a stage."""
-    return {"slots": config.slots, "dynamics": config.dynamics}.get(stage, config.behaviour).batch_size
+def config_group(stage: str) -> str:
+    """Where a stage's settings are; policy and decoder share theirs."""
+    return stage if stage in ("slots", "dynamics") else "behaviour"
+
+
+def stage_config(config: ExperimentConfig, stage: str) -> StageConfig:
+    """The settings of a stage."""
+    found: StageConfig = getattr(config, config_group(stage))
+    return found
 
 
 def fresh_agent(config: ExperimentConfig) -> Agent:

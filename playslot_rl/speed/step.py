@@ -19,7 +19,7 @@ import torch
 from playslot_rl.config import ExperimentConfig, Precision
 from playslot_rl.losses.common import total_loss
 from playslot_rl.precision import autocast
-from playslot_rl.speed.cost import batch_size, begin, fresh_agent, parts
+from playslot_rl.speed.cost import begin, config_group, fresh_agent, parts, stage_config
 from playslot_rl.training.compiling import compile_parts
 from playslot_rl.training.fit import build_adam
 
@@ -72,7 +72,8 @@ def time_step(
         ConfigError: no C++ compiler for `compiled`.
         ValueError: another stage.
     """
-    on_gpu, size = device.type == "cuda", batch or batch_size(config, stage)
+    own, on_gpu = stage_config(config, stage), device.type == "cuda"
+    size = batch or own.batch_size
     agent = fresh_agent(config)
     agent.world_model.savi.precision = precision
     criterion, batch_of = parts(config, stage, agent)
@@ -81,10 +82,9 @@ def time_step(
         torch.cuda.reset_peak_memory_stats(device)
     begin(criterion, data)
     if compiled:
-        compile_parts(dict(criterion.named_children()), f"{stage}.compile")
-    optim = {"slots": config.slots.optim, "dynamics": config.dynamics.optim}.get(stage, config.behaviour.optim)
+        compile_parts(dict(criterion.named_children()), f"{config_group(stage)}.compile")
     trained = {name: p for name, p in criterion.named_parameters() if p.requires_grad}
-    adam = build_adam(trained, replace(optim, warmup_steps=0))
+    adam = build_adam(trained, replace(own.optim, warmup_steps=0))
 
     def step() -> float:
         began = time.perf_counter()
@@ -93,8 +93,8 @@ def time_step(
         with nullcontext() if stage == "slots" else autocast(device.type, precision):
             out = criterion(data)
         total_loss(out).backward()
-        if optim.grad_clip > 0:
-            torch.nn.utils.clip_grad_norm_(trained.values(), optim.grad_clip)
+        if own.optim.grad_clip > 0:
+            torch.nn.utils.clip_grad_norm_(trained.values(), own.optim.grad_clip)
         adam.step()
         if on_gpu:
             torch.cuda.synchronize(device)

@@ -11,6 +11,7 @@ from torch import nn
 from playslot_rl import precision as precision_module
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import compose
+from playslot_rl.errors import ConfigError
 from playslot_rl.recipes import cost as recipe
 from playslot_rl.speed import cost, step
 from playslot_rl.speed.cost import Count, Machine, StageCost, estimate, stage_cost
@@ -100,7 +101,7 @@ def test_a_step_is_timed_after_those_in_which_kernels_are_chosen(
     monkeypatch.setattr(step.time, "perf_counter", lambda: next(times))
     took = step.time_step(config, stage, torch.device("cpu"), "fp32", steps=3)
     assert (took.seconds, took.peak) == (2.0, None)
-    assert took.batch == cost.batch_size(config, stage)
+    assert took.batch == cost.stage_config(config, stage).batch_size
 
 
 @pytest.mark.parametrize("stage", cost.STAGES)
@@ -115,6 +116,16 @@ def test_what_is_trained_is_compiled_when_asked_for(
     seen = len(compiled)
     assert not step.time_step(config, stage, torch.device("cpu"), "fp32", 2, 1).compiled
     assert len(compiled) == seen
+
+
+@pytest.mark.parametrize(("stage", "key"), [("slots", "slots"), ("decoder", "behaviour")])
+def test_without_a_compiler_the_setting_to_leave_out_is_named(
+    config: ExperimentConfig, stage: str, key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(ConfigError, match=rf"^{key}\.compile=true: got no C\+\+ compiler"):
+        step.time_step(config, stage, torch.device("cpu"), "fp32", 2, 1, True)
 
 
 def test_a_step_of_an_unknown_stage_is_not_timed(config: ExperimentConfig) -> None:
