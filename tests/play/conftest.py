@@ -64,3 +64,11 @@ def studio(agent: Agent, recorded: RecordedStarts, simulated: SimulatedStarts, t
     made = Studio(agent.world_model, agent, recorded, simulated, tmp_path / "play", "tiny")
     yield made
     made.close()
+
+
+@pytest.fixture
+def studio_of_many(many: WorldModel, source: EpisodeFrames, tmp_path: Path) -> Iterator[Studio]:
+    """With one latent action per slot; recordings, no simulator."""
+    made = Studio(many, None, RecordedStarts(many, source), None, tmp_path)
+    yield made
+    made.close()

@@ -27,7 +27,7 @@ from playslot_rl.play.server import choose_port
 from playslot_rl.play.starts import RecordedStarts
 from playslot_rl.play.studio import Studio
 from playslot_rl.recipes import play
-from playslot_rl.world_model import Agent, WorldModel
+from playslot_rl.world_model import Agent
 
 
 def test_keys_step_undo_and_reset_and_the_buttons_touch_and_record(studio: Studio) -> None:
@@ -136,11 +136,7 @@ def test_without_a_policy_the_button_says_so(agent: Agent, recorded: RecordedSta
     studio.close()
 
 
-def test_actions_go_to_the_slot_under_the_mouse_where_each_has_its_own(
-    many: WorldModel, recorded: RecordedStarts, tmp_path: Path
-) -> None:
-    studio = Studio(many, None, RecordedStarts(many, recorded.source), None, tmp_path)
-
+def test_actions_go_to_the_slot_under_the_mouse_where_each_has_its_own(studio_of_many: Studio) -> None:
     async def script(user: User, pages: list[PlayPage]) -> None:
         page, owner = pages[0], pages[0].session.look().owner
         for slot in sorted(set(owner.flatten().tolist()))[:2]:
@@ -152,8 +148,7 @@ def test_actions_go_to_the_slot_under_the_mouse_where_each_has_its_own(
             assert page.session.now.label == f"prototype 1, slot {slot + 1}"
             await page.time.undo()
 
-    simulate(studio, script)
-    studio.close()
+    simulate(studio_of_many, script)
 
 
 def test_an_upload_starts_anew_and_a_bad_one_is_told(studio: Studio) -> None:

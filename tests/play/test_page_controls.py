@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import io
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +15,7 @@ from page_script import MOUSE, press, simulate, until
 from PIL import Image
 
 from playslot_rl.play.page import GAP, PlayPage
-from playslot_rl.play.starts import RecordedStarts
 from playslot_rl.play.studio import Studio
-from playslot_rl.world_model import WorldModel
 
 
 def test_a_key_that_is_let_go_while_the_page_is_busy_still_steps_once(studio: Studio) -> None:
@@ -66,11 +63,7 @@ def test_after_a_stall_nothing_is_caught_up_with(studio: Studio) -> None:
     simulate(studio, script)
 
 
-def test_previews_are_made_anew_for_the_slot_that_the_mouse_moves_to(
-    many: WorldModel, recorded: RecordedStarts, tmp_path: Path
-) -> None:
-    studio = Studio(many, None, RecordedStarts(many, recorded.source), None, tmp_path)
-
+def test_previews_are_made_anew_for_the_slot_that_the_mouse_moves_to(studio_of_many: Studio) -> None:
     async def script(user: User, pages: list[PlayPage]) -> None:
         page, owner = pages[0], pages[0].session.look().owner
         slots = sorted(set(owner.flatten().tolist()))[:2]
@@ -84,8 +77,7 @@ def test_previews_are_made_anew_for_the_slot_that_the_mouse_moves_to(
         page._point(None)
         assert page._stale
 
-    simulate(studio, script)
-    studio.close()
+    simulate(studio_of_many, script)
 
 
 def test_the_variability_slider_changes_what_a_press_does(studio: Studio) -> None:
