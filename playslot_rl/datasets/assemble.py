@@ -30,7 +30,7 @@ from playslot_rl.data.contents import (
     Span,
 )
 from playslot_rl.data.tables import TASKS_NAME, Array, Episode, Stats
-from playslot_rl.datasets.statistics import aggregate, of_numbers
+from playslot_rl.datasets.statistics import aggregate, of_numbers, reduced
 from playslot_rl.datasets.video_copy import VideoCopier
 from playslot_rl.errors import DataError
 from playslot_rl.storage.atomic import write_json
@@ -100,17 +100,24 @@ def assemble(choices: Sequence[Choice], out: Path, made_by: str) -> None:
                     )
                     assert path is not None, "a sound data set, or one whose frames were decoded"
                     row |= copier.copy(path, float(begin), episode.length)
-                stats = {**episode.stats, **stats_of_places}
+                stats = {**_stored_stats(contents, episode), **stats_of_places}
                 table.append(_episode_row(episode, row, stats))
                 all_stats.append(stats)
     finally:
         rows.close()
         for copier in copiers.values():
             copier.close()
-    _write_metadata(out, table, list(tasks))
+    try:
+        total = aggregate(all_stats)
+        _write_metadata(out, table, list(tasks))
+    except (ValueError, TypeError, KeyError) as error:  # pyarrow's are among them
+        raise DataError(
+            f"{choices[0].contents.root}: got statistics in meta/episodes that differ in shape from episode to episode "
+            f"({' '.join(str(error).split())[:80]}), expected LeRobot's: run `playslot dataset verify` and `repair`"
+        ) from error
     info |= {"total_episodes": rows.episodes, "total_frames": rows.rows, "total_tasks": len(tasks)}
     info["splits"] = {"train": f"0:{rows.episodes}"}
-    write_json(out / STATS_NAME, _plain(aggregate(all_stats)))
+    write_json(out / STATS_NAME, _plain(total))
     write_json(out / INFO_NAME, info)
     _write_record(choices, out, made_by)
 
@@ -189,6 +196,15 @@ class _RowWriter:
     def close(self) -> None:
         if self._writer is not None:
             self._writer.close()
+
+
+def _stored_stats(contents: Contents, episode: Episode) -> Stats:
+    """An episode's statistics of its features, all in the shape of LeRobot's."""
+    return {
+        name: reduced(stats, ([1, *contents.features[name]["shape"]])[-1]) if name in contents.columns else stats
+        for name, stats in episode.stats.items()
+        if name in contents.features
+    }
 
 
 def _episode_row(episode: Episode, changes: Mapping[str, Any], stats: Stats) -> dict[str, Any]:

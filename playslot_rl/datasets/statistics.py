@@ -1,6 +1,6 @@
 """Statistics as LeRobot keeps them: of each episode in `meta/episodes`, of all in `meta/stats.json`.
 
-Numbers: per component. Cameras: per channel, scaled to [0, 1], from some evenly spread frames of each episode.
+Numbers: per component of the last axis; a frame's further axes count as rows. Cameras: per channel, scaled to [0, 1], from some evenly spread frames of each episode.
 Quantiles of the whole are the weighted means of those of the episodes, as LeRobot makes them.
 
 Note: exact quantiles; LeRobot reads them off a histogram of 5000 bins. Exact means and deviations, too: LeRobot's
@@ -67,15 +67,19 @@ def _added(total: Any, rows: Array) -> Any:
     return np.add.reduce(rows if total is None else np.concatenate([total[None], rows]))
 
 
+def rows_of(values: Array) -> Array:
+    """One episode's values, (n,) or (n, ..., K), as the rows that statistics are taken over, (n ..., K); K may be 1."""
+    return values.reshape(-1, 1 if values.ndim == 1 else values.shape[-1])
+
+
 def of_numbers(values: Array) -> dict[str, Array]:
-    """Statistics of one episode's values, (n,) or (n, ...): float64 of the shape of one, at least (1,)."""
-    rows = np.asarray(values, np.float64)
-    rows = rows.reshape(len(rows), -1) if rows.ndim == 1 else rows
+    """Statistics of one episode's values, (n,) or (n, ..., K): float64 (K,), or (1,); `count` is n."""
+    rows = rows_of(np.asarray(values, np.float64))
     stats = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
     # No interpolation, as theirs: numpy's `inverted_cdf`, which sorts anew for each of them.
     places = np.ceil(len(rows) * np.array(list(QUANTILES.values())) - 1).clip(0).astype(np.int64)
     quantiles = np.sort(rows, axis=0)[places]
-    return {**stats, "count": np.array([len(rows)]), **dict(zip(QUANTILES, quantiles, strict=True))}
+    return {**stats, "count": np.array([len(values)]), **dict(zip(QUANTILES, quantiles, strict=True))}
 
 
 def of_frames(frames: Sequence[npt.NDArray[np.uint8]]) -> dict[str, Array]:
@@ -146,6 +150,19 @@ def _aggregate(parts: Sequence[dict[str, Array]]) -> dict[str, Array]:
     total["std"] = np.sqrt(np.tensordot(weight, spread, axes=1))
     total["count"] = np.array([int(count.sum())])
     return total
+
+
+def reduced(stats: dict[str, Array], width: int) -> dict[str, Array]:
+    """Statistics of numbers as (K,) where they are those of every component of a frame, (..., K), all else as it is.
+
+    LeRobot keeps them so of an episode of one frame, and what this package once wrote has them of every episode.
+    """
+    finer = {k: v.reshape(-1, width) for k, v in stats.items() if k != "count" and v.ndim > 1 and v.shape[-1] == width}
+    total = {name: values.mean(0) for name, values in finer.items()}
+    if {"min", "max", "mean", "std"} <= finer.keys():
+        total["min"], total["max"] = finer["min"].min(0), finer["max"].max(0)
+        total["std"] = np.sqrt((finer["std"] ** 2 + (finer["mean"] - total["mean"]) ** 2).mean(0))
+    return {**stats, **total}
 
 
 def differing(

@@ -47,3 +47,13 @@ def test_the_whole_circle(name: str, hub: FakeHub, client: Client, tmp_path: Pat
     assert main(["train-slots", *small, *data, f"out={tmp_path / 'run'}", "slots.steps=1"]) == 0
     meta = json.loads((tmp_path / "run" / "slots" / "checkpoint" / "meta.json").read_text())
     assert meta["steps"] == 1
+
+
+def test_features_of_every_kind_go_both_ways(hub: FakeHub, client: Client, tmp_path: Path) -> None:
+    from foreign_features import write_features
+
+    made = write_features(tmp_path / "made")
+    pushed = client("push", root=made, repo_id="owner/features", private=False)
+    assert pushed["result"]["record"]["fingerprint"] == verify(made).fingerprint
+    client("pull", root=tmp_path / "pulled", repo_id="owner/features")
+    assert verify(tmp_path / "pulled").fingerprint == verify(made).fingerprint
