@@ -99,7 +99,7 @@ def _recorded(out: Path) -> bool:
 
 
 def _episodes(root: str | Path) -> int:
-    from playslot_rl.data.contents import open_files
+    from playslot_rl.data.agreement import open_files
 
     return len(open_files(root).episodes)
 

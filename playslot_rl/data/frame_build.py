@@ -25,8 +25,9 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.data.cache import write_header
-from playslot_rl.data.contents import Contents, Span, stated_size
+from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.frames import rgb_frames, sized
+from playslot_rl.data.metadata import stated_size
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.storage.atomic import explain_write_errors, write_text
 from playslot_rl.threads import available_cores

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import io
 import itertools
+import struct
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -18,13 +19,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.data.contents import Contents, Span, stated_size
+from playslot_rl.data.contents import Contents, Span
+from playslot_rl.data.metadata import LARGEST_PICTURE, stated_size
+from playslot_rl.data.places import inside, plain_relative
 from playslot_rl.data.problems import Problems
-from playslot_rl.data.tables import Array
+from playslot_rl.data.tables import WRONG_COLUMN, Array
 from playslot_rl.errors import DataError
 
 ROWS_A_PIECE = 256
 DAMAGED = "damaged frame"
+FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF")
+"""Of stored images; Pillow knows more, and starts other programs for some."""
 
 Decoded = Any
 """Pixels of an image, uint8 (H, W, 3), or (H, W) of a depth map; or PyAV's `VideoFrame`."""
@@ -67,12 +72,19 @@ def rgb_frames(
 
 
 def to_rgb(frame: Decoded) -> npt.NDArray[np.uint8]:
-    """Pixels of a decoded frame, uint8 (H, W, 3)."""
-    from PIL import Image
+    """Pixels of a decoded frame, uint8 (H, W, 3); of 16 bits the upper eight.
 
+    Raises:
+        DataError: a picture of one number a pixel that has neither 8 nor 16 bits.
+    """
     if not isinstance(frame, np.ndarray):
         frame = frame.to_ndarray(format="rgb24")
-    pixels: npt.NDArray[np.uint8] = frame if frame.ndim == 3 else np.asarray(Image.fromarray(frame).convert("RGB"))
+    if frame.ndim == 2 and frame.dtype not in (np.uint8, np.uint16):
+        raise DataError(f"got a picture of {frame.dtype}, expected colours, or grey of 8 or 16 bits")
+    if frame.ndim == 2:
+        grey = frame if frame.dtype == np.uint8 else (frame >> 8).astype(np.uint8)
+        frame = np.repeat(grey[..., None], 3, axis=-1)
+    pixels: npt.NDArray[np.uint8] = frame
     return pixels
 
 
@@ -100,8 +112,7 @@ def _image_frames(
     wanted = np.zeros(contents.rows, bool)
     for span in spans:
         wanted[span.start : span.stop] = True
-    decode = functools.partial(_decode_image, contents.root)
-    size = stated_size(contents.features[camera])
+    decode = functools.partial(_decode_image, contents.root, stated_size(contents.features[camera]))
     row = 0
     # Decoding PNG releases the interpreter lock; two threads suffice to keep one core busy with it.
     with ThreadPoolExecutor(2) as pool:
@@ -113,14 +124,10 @@ def _image_frames(
                 numbers = (first + np.flatnonzero(wanted[begin + first : begin + first + len(cells)])).tolist()
                 chosen = cells.take(pa.array([number - first for number in numbers], pa.int64())).to_pylist()
                 for number, result in zip(numbers, pool.map(decode, chosen), strict=True):
-                    if isinstance(result, str):
-                        fault = f"cannot be decoded ({result}), expected a PNG or JPEG image"
-                    elif result.shape[:2] != size:
-                        fault = f"got {result.shape[:2]}, expected {size} as stated"
-                    else:
+                    if not isinstance(result, str):
                         yield begin + number, result
                         continue
-                    problems.error(DAMAGED, f"{path}: row {number}, {camera}: {fault}")
+                    problems.error(DAMAGED, f"{path}: row {number}, {camera}: {result}")
 
 
 def _stored_images(
@@ -130,8 +137,8 @@ def _stored_images(
     import pyarrow.parquet as pq
 
     with pq.ParquetFile(contents.opened(path)) as file:
-        if camera not in file.schema_arrow.names:
-            problems.error("missing column", f"{path}: got no column {camera}, expected the camera's frames")
+        if file.schema_arrow.names.count(camera) != 1 or not is_image_type(file.schema_arrow.field(camera).type):
+            problems.error(WRONG_COLUMN, f"{path}: got no column {camera} of images, expected the camera's frames")
             return
         counts = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
         ends = np.cumsum(counts).tolist()
@@ -146,21 +153,47 @@ def _stored_images(
                 first += len(batch)
 
 
-def _decode_image(root: Path, cell: dict[str, Any] | None) -> Array | str:
-    """Pixels of a stored image, (H, W, 3) uint8 for colours, or why it cannot be decoded."""
+def is_image_type(stored: Any) -> bool:
+    """Whether a column holds images as LeRobot stores them: bytes, or the path of a file."""
+    import pyarrow as pa
+
+    names = {stored.field(number).name for number in range(stored.num_fields)} if pa.types.is_struct(stored) else set()
+    return bool(names & {"bytes", "path"})
+
+
+def _decode_image(root: Path, size: tuple[int, int], cell: dict[str, Any] | None) -> Array | str:
+    """Pixels of a stored image, (H, W, 3) uint8 for colours, or what is wrong with it.
+
+    Its header is read first: nothing is decoded that has another size (H, W) than stated.
+    """
     from PIL import Image, UnidentifiedImageError
 
+    expected = "expected a PNG or JPEG image"
     try:
         if cell is None:
-            return "no image"
-        content = cell["bytes"] if cell.get("bytes") else (root / str(cell["path"])).read_bytes()
-        with Image.open(io.BytesIO(content)) as image:
-            depth = image.mode.startswith(("I", "F"))
-            return np.asarray(image if depth else image.convert("RGB"))
+            return f"cannot be decoded (no image), {expected}"
+        with Image.open(io.BytesIO(_stored_bytes(root, cell)), formats=FORMATS) as image:
+            got = (image.height, image.width)
+            if got != size:
+                return f"got {got}, expected {size} as stated"
+            one_number = image.mode.startswith(("I", "F"))
+            return np.asarray(image if one_number else image.convert("RGB"))
     except UnidentifiedImageError:
-        return "not an image"
-    except (OSError, ValueError, SyntaxError, KeyError, TypeError, AttributeError) as error:
-        return " ".join(str(error).split())[:80] or type(error).__name__
+        return f"cannot be decoded (not an image), {expected}"
+    except Image.DecompressionBombError:
+        return f"got a picture of more than {Image.MAX_IMAGE_PIXELS} pixels, expected {size} as stated"
+    except (OSError, ValueError, SyntaxError, KeyError, TypeError, AttributeError, EOFError, struct.error) as error:
+        return f"cannot be decoded ({' '.join(str(error).split())[:80] or type(error).__name__}), {expected}"
+
+
+def _stored_bytes(root: Path, cell: dict[str, Any]) -> bytes:
+    """Of an image in a cell, or of the file below the data set's folder that it names."""
+    if cell.get("bytes"):
+        return bytes(cell["bytes"])
+    path: Path = root / cell["path"]
+    if not plain_relative(cell["path"]) or not inside(root, path):
+        raise ValueError("it names a file that is not of the data set")
+    return path.read_bytes()
 
 
 def _video_frames(
@@ -171,11 +204,11 @@ def _video_frames(
     for episode in contents.episodes:
         if episode.index not in rows:
             continue
-        path, begin = contents.video_file(camera, episode.row), episode.row.get(f"videos/{camera}/from_timestamp")
-        if path is None or begin is None:
+        path, place = contents.video_file(camera, episode.row), contents.video_times(camera, episode.row)
+        if path is None or place is None:
             problems.error(DAMAGED, f"episode {episode.index}: got no place of {camera} in meta/episodes, expected one")
             continue
-        files.setdefault(path, []).append((float(begin), rows[episode.index]))
+        files.setdefault(path, []).append((place[0], rows[episode.index]))
     size = stated_size(contents.features[camera])
     for path, places in files.items():
         if not contents.holds(path):
@@ -230,6 +263,8 @@ def _decoded_from(source: Any, begin: float) -> Iterator[tuple[float, Any]]:
 
     with av.open(str(source) if isinstance(source, Path) else source) as container:
         stream: Any = container.streams.video[0]
+        if stream.width * stream.height > LARGEST_PICTURE:  # as its header says: nothing has been decoded
+            raise DataError(f"{source}: got frames of {stream.height}x{stream.width}, expected fewer pixels")
         stream.thread_type = "AUTO"
         if begin > 0:
             container.seek(int(begin / stream.time_base), stream=stream)

@@ -25,6 +25,10 @@ class Problems:
         """Errors of one kind."""
         return self._errors.get(kind, [])
 
+    def warnings_of(self, kind: str) -> list[str]:
+        """Warnings of one kind."""
+        return self._warnings.get(kind, [])
+
     @property
     def errors(self) -> list[str]:
         """One line each."""

@@ -21,9 +21,11 @@ import numpy as np
 
 from playslot_rl import keys
 from playslot_rl.data.cache import build_once
-from playslot_rl.data.contents import DATA_PATH, FORMAT_TAG, INFO_NAME, Contents, read_metadata
+from playslot_rl.data.contents import Contents, read_metadata
+from playslot_rl.data.metadata import DATA_PATH, FORMAT_TAG, INFO_NAME
+from playslot_rl.data.places import filled, is_plain_path
 from playslot_rl.data.problems import Problems
-from playslot_rl.data.tables import Array, Episode, read_columns
+from playslot_rl.data.tables import MOST_ROWS, Array, Episode, read_columns
 from playslot_rl.errors import DataError
 from playslot_rl.storage.secrets import checked_token, masked_logs
 
@@ -207,7 +209,7 @@ def _commit_of(address: str, cache: Path) -> Remote:
     hashes = {path: file.lfs.sha256 if file.lfs else file.blob_id for path, file in files.items()}
 
     def fetch(folder: Path) -> None:
-        wanted = [glob.escape(path) for path in files if path.startswith("meta/")]
+        wanted = [glob.escape(path) for path in files if path.startswith("meta/") and is_plain_path(path)]
         with asking(address, token):
             api.snapshot_download(name, repo_type="dataset", revision=commit, local_dir=folder, allow_patterns=wanted)
 
@@ -219,13 +221,14 @@ def _rows_of_files(remote: Remote, info: Mapping[str, Any], episodes: Sequence[E
     """How many rows each data file has, in order, as the episodes' metadata tell it."""
     template, found, row = info.get("data_path") or DATA_PATH, dict[Path, int](), 0
     for episode in episodes:
-        try:
-            place = {key: int(episode.row[f"data/{key}"]) for key in ("chunk_index", "file_index")}
-            path, begin = remote.root / template.format(**place), int(episode.row["dataset_from_index"])
-        except (KeyError, TypeError, ValueError) as error:
+        place = filled(template, episode.row.get("data/chunk_index"), episode.row.get("data/file_index"))
+        begin = episode.row.get("dataset_from_index")
+        if place is None or row + episode.length > MOST_ROWS:
             raise DataError(
-                f"{remote.address}: got {error!r} for episode {episode.index}, expected its place in data/: {_LOOK}"
-            ) from error
+                f"{remote.address}: got no file or too many rows of episode {episode.index}, expected its place in "
+                f"data/: {_LOOK}"
+            )
+        path = remote.root / place
         if begin != row or path < next(reversed(found), path) or not remote.holds(path):
             raise DataError(
                 f"{remote.address}: got episode {episode.index} from row {begin} of "

@@ -19,10 +19,12 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
+from playslot_rl.data.agreement import open_files
 from playslot_rl.data.cache import CachePlace, build_on, cache_folder, load_cached, note_read, settings
 from playslot_rl.data.cache_entries import ENTRY_NAME, room
-from playslot_rl.data.contents import Contents, open_files, stated_size
+from playslot_rl.data.contents import Contents
 from playslot_rl.data.frame_build import FrameArray, build_frames
+from playslot_rl.data.metadata import stated_size
 from playslot_rl.errors import DataError
 from playslot_rl.storage.atomic import write_json
 
@@ -350,10 +352,11 @@ def labels_of(files: Contents) -> dict[str, npt.NDArray[Any]]:
     lengths = np.array([episode.length for episode in files.episodes], np.int64)
     starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
     found: dict[str, npt.NDArray[Any]] = {"starts": starts, "lengths": lengths}
-    if keys.FEATURE_ACTION in files.columns:
-        found["actions"] = files.columns[keys.FEATURE_ACTION].astype(np.float32).reshape(files.rows, -1)
-    if keys.FEATURE_SUCCESS in files.columns:
-        found["success"] = files.columns[keys.FEATURE_SUCCESS].astype(bool)
-    if keys.FEATURE_SEED in files.columns:
-        found["seeds"] = files.columns[keys.FEATURE_SEED][starts].astype(np.int64)
+    actions, success, seeds = map(files.numbers, (keys.FEATURE_ACTION, keys.FEATURE_SUCCESS, keys.FEATURE_SEED))
+    if actions is not None:
+        found["actions"] = actions.astype(np.float32).reshape(files.rows, -1)
+    if success is not None:
+        found["success"] = success.astype(bool)
+    if seeds is not None:
+        found["seeds"] = seeds[starts].astype(np.int64)
     return found

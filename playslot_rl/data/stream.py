@@ -26,9 +26,11 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config.weights import is_remote
+from playslot_rl.data.agreement import open_files
 from playslot_rl.data.cache import CachePlace, cache_folder
-from playslot_rl.data.contents import Contents, Span, open_files, stated_size
+from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.frames import rgb_frames, sized
+from playslot_rl.data.metadata import stated_size
 from playslot_rl.data.remote import open_remote
 from playslot_rl.data.shifts import ShiftedFrames
 from playslot_rl.data.source import (

@@ -20,8 +20,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.data.contents import Contents, open_files, stated_size
+from playslot_rl.data.agreement import open_files
+from playslot_rl.data.contents import Contents
 from playslot_rl.data.frames import resize_frames, rgb_frames
+from playslot_rl.data.metadata import stated_size
 from playslot_rl.data.windows import spread_evenly
 from playslot_rl.errors import DataError
 

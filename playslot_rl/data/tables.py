@@ -13,12 +13,17 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from playslot_rl.data.metadata import MOST, NUMBERS, OTHERS, REQUIRED, damaged, whole
+from playslot_rl.data.places import inside
 from playslot_rl.data.problems import Problems
 
 TASKS_NAME: Final = "meta/tasks.parquet"
 EPISODES_AT_ONCE: Final = 64
 """Of the metadata with statistics, some 150 columns."""
 UNREADABLE: Final = "unreadable parquet"
+WRONG_COLUMN: Final = "wrong column"
+MOST_ROWS: Final = 10**9
+"""Of a data set, its frames or its episodes."""
 
 Array = npt.NDArray[Any]
 Stats = dict[str, dict[str, Array]]
@@ -77,7 +82,7 @@ def read_table(
     try:
         file = pq.ParquetFile(opened(path))
         return file.read(columns=[name for name in file.schema_arrow.names if wanted(name)])
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, KeyError) as error:
         reason = " ".join(str(error).split())[:120]
         problems.error(
             UNREADABLE,
@@ -97,13 +102,15 @@ def _to_array(column: Any, shape: Sequence[int]) -> Array:
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     if isinstance(array, pa.ChunkedArray):
         array = pa.concat_arrays([chunk.storage for chunk in array.chunks])
+    if isinstance(array, pa.DictionaryArray):
+        array = array.dictionary_decode()
     rows = len(array)
-    if array.null_count:
-        raise ValueError(f"{array.null_count} missing values")
-    while isinstance(array, pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
+    while isinstance(array, pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray) and not array.null_count:
         if pa.types.is_struct(array.type.value_type):
             break
         array = array.flatten()
+    if array.null_count:
+        raise ValueError(f"{array.null_count} missing values")
     if pa.types.is_nested(array.type):
         objects = np.empty(rows, object)
         objects[:] = array.to_pylist()
@@ -125,23 +132,37 @@ def _columns(
     rows = {}
     for name in names:
         if name not in table.column_names:
-            problems.error("missing column", f"{path}: got no column {name}, expected every feature of meta/info.json")
+            problems.error(WRONG_COLUMN, f"{path}: got no column {name}, expected every feature of meta/info.json")
             return None
         try:
             rows[name] = _to_array(table.column(name), features[name]["shape"])
-        except ValueError as error:
-            expected = tuple(features[name]["shape"])
+            _check_kind(name, rows[name], features[name]["dtype"])
+        except (ValueError, TypeError, NotImplementedError) as error:
+            expected, reason = tuple(features[name]["shape"]), " ".join(str(error).split())[:120]
             problems.error(
-                "wrong shape", f"{path}: got column {name} with {error}, expected values of shape {expected}"
+                WRONG_COLUMN, f"{path}: got column {name} with {reason}, expected values of shape {expected}"
             )
             return None
     return rows
 
 
+def _check_kind(name: str, values: Array, dtype: str) -> None:
+    """Refuse text for numbers and numbers for text; other numbers than stated are still numbers.
+
+    Raises:
+        ValueError: what was got.
+    """
+    stated, stored = bool(NUMBERS.fullmatch(dtype)), values.dtype.kind in "fiub"
+    if stated != stored and (stated or dtype in OTHERS):
+        raise ValueError(f"values of type {'text or records' if values.dtype == object else values.dtype} for {dtype}")
+    if name in REQUIRED and name != "timestamp" and values.dtype.kind not in "iu":
+        raise ValueError(f"values of type {values.dtype} for whole numbers")
+
+
 def read_tasks(root: Path, problems: Problems) -> dict[int, str]:
     """`task_index` -> words, of a data set's folder."""
     path = root / TASKS_NAME
-    if not path.is_file():
+    if not path.is_file() or not inside(root, path):
         problems.error("missing tasks", f"{path}: got no such file, expected the tasks in words")
         return {}
     table = read_table(path, problems)
@@ -151,8 +172,12 @@ def read_tasks(root: Path, problems: Problems) -> dict[int, str]:
     if words is None or "task_index" not in table.column_names:
         problems.error("missing tasks", f"{path}: got columns {table.column_names}, expected task and task_index")
         return {}
-    numbers = table.column("task_index").to_pylist()
-    return dict(zip((int(n) for n in numbers), map(str, table.column(words).to_pylist()), strict=True))
+    try:
+        numbers = [whole(number, 0, MOST) for number in table.column("task_index").to_pylist()]
+    except ValueError as error:
+        problems.error("missing tasks", f"{path}: got task_index {error}")
+        return {}
+    return dict(zip(numbers, map(str, table.column(words).to_pylist()), strict=True))
 
 
 def episodes_of(path: Path, table: Any, problems: Problems) -> list[Episode]:
@@ -161,20 +186,26 @@ def episodes_of(path: Path, table: Any, problems: Problems) -> list[Episode]:
     for row in table.to_pylist():
         stats: Stats = {}
         for key in [key for key in row if key.startswith("stats/")]:
-            value, (_, feature, name) = row.pop(key), key.split("/", 2)
-            if value is not None:
-                stats.setdefault(feature, {})[name] = np.asarray(value, np.float64)
+            value, (feature, _, name) = row.pop(key), key.removeprefix("stats/").rpartition("/")
+            try:
+                if value is not None:
+                    stats.setdefault(feature, {})[name] = np.asarray(value, np.float64)
+            except (TypeError, ValueError) as error:
+                problems.error("wrong statistics", f"{path}: got {key} that is {damaged(error)}, expected numbers")
         try:
             tasks = tuple(str(task) for task in row["tasks"] or ())
-            found.append(Episode(int(row["episode_index"]), int(row["length"]), tasks, row, stats))
+            index, length = whole(row["episode_index"], 0, MOST_ROWS), whole(row["length"], 1, MOST_ROWS)
+            found.append(Episode(index, length, tasks, row, stats))
         except (KeyError, TypeError, ValueError) as error:
-            problems.error("damaged episode row", f"{path}: got {error!r}, expected episode_index, length and tasks")
+            problems.error(
+                "damaged episode row", f"{path}: got {damaged(error)}, expected episode_index, length and tasks"
+            )
     return found
 
 
-def stored_episodes(paths: Sequence[Path]) -> Iterator[Episode]:
-    """The rows of `meta/episodes` with their statistics, one after the other as they are stored; unreadable ones, which
-    `read_contents` notes, are left out.
+def stored_episodes(paths: Sequence[Path], problems: Problems) -> Iterator[Episode]:
+    """The rows of `meta/episodes` with their statistics, one after the other as they are stored. Unreadable ones, which
+    `read_contents` notes, are left out; statistics that are no numbers go to `problems`.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -185,6 +216,9 @@ def stored_episodes(paths: Sequence[Path]) -> Iterator[Episode]:
                 for group in range(file.num_row_groups):
                     table = file.read_row_group(group)
                     for first in range(0, len(table), EPISODES_AT_ONCE):
-                        yield from episodes_of(path, table.slice(first, EPISODES_AT_ONCE), Problems())
+                        rows, seen = table.slice(first, EPISODES_AT_ONCE), Problems()
+                        yield from episodes_of(path, rows, seen)
+                        for line in seen.of("wrong statistics"):
+                            problems.error("wrong statistics", line)
         except (pa.ArrowException, OSError):
             continue

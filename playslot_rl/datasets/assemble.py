@@ -19,16 +19,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from playslot_rl.data.contents import (
+from playslot_rl.data.contents import Contents, Span
+from playslot_rl.data.metadata import (
     DATA_PATH,
     EPISODES_PATH,
     INFO_NAME,
     RECORD_NAME,
     STATS_NAME,
     VIDEO_PATH,
-    Contents,
-    Span,
+    json_content,
 )
+from playslot_rl.data.places import inside
 from playslot_rl.data.tables import TASKS_NAME, Array, Episode, Stats
 from playslot_rl.datasets.statistics import aggregate, of_numbers, reduced
 from playslot_rl.datasets.video_copy import VideoCopier
@@ -94,12 +95,10 @@ def assemble(choices: Sequence[Choice], out: Path, made_by: str) -> None:
                 task_index = np.array([tasks.setdefault(contents.tasks[n], len(tasks)) for n in numbers], np.int64)
                 row, stats_of_places = rows.write(piece, task_index)
                 for camera, copier in copiers.items():
-                    path, begin = (
-                        contents.video_file(camera, episode.row),
-                        episode.row[f"videos/{camera}/from_timestamp"],
-                    )
+                    path, times = contents.video_file(camera, episode.row), contents.video_times(camera, episode.row)
                     assert path is not None, "a sound data set, or one whose frames were decoded"
-                    row |= copier.copy(path, float(begin), episode.length)
+                    assert times is not None, "so are its times"
+                    row |= copier.copy(path, times[0], episode.length)
                 stats = {**_stored_stats(contents, episode), **stats_of_places}
                 table.append(_episode_row(episode, row, stats))
                 all_stats.append(stats)
@@ -110,14 +109,14 @@ def assemble(choices: Sequence[Choice], out: Path, made_by: str) -> None:
     try:
         total = aggregate(all_stats)
         _write_metadata(out, table, list(tasks))
+        write_json(out / STATS_NAME, _plain(total))
     except (ValueError, TypeError, KeyError) as error:  # pyarrow's are among them
         raise DataError(
-            f"{choices[0].contents.root}: got statistics in meta/episodes that differ in shape from episode to episode "
-            f"({' '.join(str(error).split())[:80]}), expected LeRobot's: run `playslot dataset verify` and `repair`"
+            f"{choices[0].contents.root}: got statistics in meta/episodes that are no numbers, or of another shape in "
+            f"each episode ({' '.join(str(error).split())[:80]}), expected LeRobot's: run `playslot dataset repair`"
         ) from error
     info |= {"total_episodes": rows.episodes, "total_frames": rows.rows, "total_tasks": len(tasks)}
     info["splits"] = {"train": f"0:{rows.episodes}"}
-    write_json(out / STATS_NAME, _plain(total))
     write_json(out / INFO_NAME, info)
     _write_record(choices, out, made_by)
 
@@ -238,7 +237,7 @@ def _plain(stats: Stats) -> dict[str, dict[str, Any]]:
 
 def _write_record(choices: Sequence[Choice], out: Path, made_by: str) -> None:
     """Our own record of seeds and outcomes, where every source has one."""
-    records = [read_record(choice.contents) for choice in choices]
+    records = [read_record(choice.contents.root) for choice in choices]
     if any(record is None for record in records):
         return
     episodes: list[Any] = []
@@ -254,11 +253,18 @@ def _write_record(choices: Sequence[Choice], out: Path, made_by: str) -> None:
     write_json(out / RECORD_NAME, content)
 
 
-def read_record(contents: Contents) -> dict[str, Any] | None:
-    """Our own record of a data set, or None where there is none that can be used."""
+def read_record(root: Path) -> dict[str, Any] | None:
+    """Our own record of the data set at `root`, or None where there is none that can be used."""
+    path = root / RECORD_NAME
     try:
-        record = json.loads((contents.root / RECORD_NAME).read_text())
-        usable = isinstance(record["episodes"], list) and all(isinstance(e, dict) for e in record["episodes"])
-    except (OSError, ValueError, KeyError, TypeError):
+        record = json_content(path) if inside(root, path) else {}
+        json.dumps(record, allow_nan=False)
+        usable = all(isinstance(entry, dict) for entry in [*record["episodes"], *(record.get("sources") or [])])
+        spec = record.get("spec") or {}
+        numbers = (record.get("success_rate"), (spec.get("env") or {}).get("frame_skip"))
+        tables = (spec.get("render") or {}, record.get("versions") or {})
+        usable &= all(isinstance(table, dict) for table in tables)
+        usable &= all(number is None or isinstance(number, int | float) for number in numbers)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
     return record if usable else None

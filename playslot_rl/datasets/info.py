@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from playslot_rl import keys
-from playslot_rl.data.contents import REQUIRED, Contents
+from playslot_rl.data.contents import Contents
+from playslot_rl.data.metadata import REQUIRED
 from playslot_rl.datasets.assemble import read_record
 from playslot_rl.datasets.verify import require_sound
 
@@ -95,14 +96,14 @@ def info(root: str | Path) -> DatasetSummary:
     sizes = {}
     for name, folder in (("rows", "data"), ("videos", "videos"), ("metadata", "meta")):
         sizes[name] = sum(path.stat().st_size for path in (contents.root / folder).rglob("*") if path.is_file())
-    solved, seeds = contents.columns.get(keys.FEATURE_SUCCESS), contents.columns.get(keys.FEATURE_SEED)
+    solved, seeds = contents.numbers(keys.FEATURE_SUCCESS), contents.numbers(keys.FEATURE_SEED)
     success_rate = None
     if solved is not None:
         success_rate = float(np.mean([bool(solved[span.start : span.stop].any()) for span in contents.spans]))
     return DatasetSummary(
         root=str(root),
         format=str(contents.info["codebase_version"]),
-        robot=str(contents.info.get("robot_type") or ""),
+        robot=" ".join(str(contents.info.get("robot_type") or "").split()),
         fps=contents.fps,
         episodes=len(lengths),
         frames=contents.rows,
@@ -123,7 +124,7 @@ def _kind(feature: Mapping[str, Any]) -> str:
 
 
 def _source(contents: Contents) -> dict[str, Any] | None:
-    record = read_record(contents)
+    record = read_record(contents.root)
     if record is None:
         return None
     if "made_by" in record:

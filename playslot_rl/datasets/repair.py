@@ -7,18 +7,20 @@ are made anew from the rows and frames. A parquet file without a footer cannot b
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from playslot_rl.data.agreement import length_fault, row_faults
 from playslot_rl.data.contents import Contents, Span, read_contents
 from playslot_rl.data.problems import Problems
 from playslot_rl.data.tables import UNREADABLE, Episode, Stats
 from playslot_rl.datasets.assemble import Choice, assemble
 from playslot_rl.datasets.fingerprint import CameraScan, scan_frames
 from playslot_rl.datasets.statistics import differing
-from playslot_rl.datasets.verify import LOOSE_CAMERA, Verification, episode_statistics, length_fault, row_faults, verify
+from playslot_rl.datasets.verify import LOOSE_CAMERA, Verification, episode_statistics, verify
 from playslot_rl.datasets.video_copy import frame_count
 from playslot_rl.errors import DataError, OutputError
 from playslot_rl.storage.atomic import explain_write_errors, fsync_folder
@@ -159,12 +161,18 @@ def _whole_episodes(contents: Contents, lost: list[str]) -> Choice:
         seen.add(span.index)
         spans.append(span)
         episodes.append(replace(episode, stats=_statistics(contents, scans, number, episode)))
-    expected = set(known) | set(range(int(contents.info["total_episodes"])))
-    gone = sorted(expected - {span.index for span in contents.spans})
-    if gone:
-        more = f" and {len(gone) - 8} more" if len(gone) > 8 else ""
-        lost.append(f"episodes {', '.join(map(str, gone[:8]))}{more}: no rows are left of them")
+    lost += _gone(set(known), {span.index for span in contents.spans}, int(contents.info["total_episodes"]))
     return Choice(contents, spans, episodes)
+
+
+def _gone(known: set[int], there: set[int], stated: int) -> list[str]:
+    """A line about the episodes that have metadata, or a number below the stated one, and no rows."""
+    missing = (number for number in itertools.count() if number not in there)
+    beyond = sorted(number for number in known - there if number >= stated)
+    below = stated - sum(number < stated for number in there)
+    shown = [*itertools.islice(missing, min(below, 8)), *beyond][:8]
+    more = f" and {below + len(beyond) - 8} more" if below + len(beyond) > 8 else ""
+    return [f"episodes {', '.join(map(str, shown))}{more}: no rows are left of them"] if shown else []
 
 
 def _reason(
@@ -227,10 +235,10 @@ def _locate_videos(contents: Contents, spans: list[Span], known: Mapping[int, Ep
         for camera, files in counts.items():
             name = f"videos/{camera}"
             place = episode.row.get(f"{name}/chunk_index"), episode.row.get(f"{name}/file_index")
-            end = episode.row.get(f"{name}/to_timestamp")
+            times = contents.video_times(camera, episode.row)
             numbers = [number for number, file in enumerate(files) if file[:2] == place]
-            if numbers and end is not None:
-                position[camera] = numbers[0], round(float(end) * contents.fps)
+            if numbers and times is not None:
+                position[camera] = numbers[0], round(times[1] * contents.fps)
     return located
 
 
@@ -241,6 +249,8 @@ Place = tuple[int, int, int]
 def _video_files(contents: Contents, camera: str) -> list[Place]:
     found: list[Place] = []
     for path in sorted((contents.root / "videos" / camera).glob("chunk-*/file-*.mp4")):
+        if not contents.holds(path):
+            continue
         try:
             chunk, file = int(path.parent.name.removeprefix("chunk-")), int(path.stem.removeprefix("file-"))
             found.append((chunk, file, frame_count(path)))

@@ -1,6 +1,7 @@
 """Statistics as LeRobot keeps them: of each episode in `meta/episodes`, of all in `meta/stats.json`.
 
-Numbers: per component of the last axis; a frame's further axes count as rows. Cameras: per channel, scaled to [0, 1], from some evenly spread frames of each episode.
+Numbers: per component of the last axis; a frame's further axes count as rows. Cameras: per channel, scaled to [0, 1],
+from some evenly spread frames of each episode.
 Quantiles of the whole are the weighted means of those of the episodes, as LeRobot makes them.
 
 Note: exact quantiles; LeRobot reads them off a histogram of 5000 bins. Exact means and deviations, too: LeRobot's

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,26 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from playslot_rl.data.contents import (
-    INFO_NAME,
-    PLACE,
-    RECORD_NAME,
-    REQUIRED,
-    STATS_NAME,
-    Contents,
-    Span,
-    episode_files,
-    is_depth,
-    read_contents,
-)
+from playslot_rl.data.agreement import check_rows
+from playslot_rl.data.contents import Contents, Span, episode_files, read_contents
+from playslot_rl.data.metadata import PLACE, RECORD_NAME, REQUIRED, STATS_NAME, damaged, is_depth, json_content
+from playslot_rl.data.places import inside
 from playslot_rl.data.problems import Problems
-from playslot_rl.data.tables import TASKS_NAME, Array, Episode, Stats, stored_episodes
+from playslot_rl.data.tables import Array, Stats, stored_episodes
 from playslot_rl.datasets.fingerprint import CameraScan, fingerprint_of, scan_frames
 from playslot_rl.datasets.statistics import Aggregate, differing, of_numbers, reduced, rounded, rows_of
 from playslot_rl.errors import DataError
 
-TIME_TOLERANCE_S = 1e-4
-"""As LeRobot's default; float32 holds it up to about half an hour."""
 LOOSE_CAMERA = 0.05
 """Tolerance, of [0, 1], for statistics of frames that were compressed with loss or sampled in another way."""
 
@@ -128,167 +117,6 @@ def require_sound(root: str | Path) -> Contents:
     return contents
 
 
-def check_rows(contents: Contents, problems: Problems) -> None:
-    """Check the rows and the metadata that speak about them; reads no frames. Findings go to `problems`.
-
-    LeRobot's own reader takes all of this for granted: a stale shard, for instance, gives it more rows than episodes.
-    """
-    _check_counts(contents, problems)
-    _check_files(contents, problems)
-    _check_episodes(contents, problems)
-    for span in contents.spans:
-        for kind, fault in row_faults(contents, span):
-            problems.error(kind, f"episode {span.index}: {fault}")
-    _check_places(contents, problems)
-
-
-def row_faults(contents: Contents, span: Span) -> list[tuple[str, str]]:
-    """What is wrong with the rows of one episode, whatever else the data set holds: (kind, message)."""
-    rows = slice(span.start, span.stop)
-    faults = []
-    frame = contents.columns["frame_index"][rows]
-    if not np.array_equal(frame, np.arange(span.length)):
-        shown = ", ".join([str(number) for number in frame[:4]] + ["..."] * (span.length > 4))
-        faults.append(("frame_index", f"got frame_index [{shown}], expected 0 to {span.length - 1} in order"))
-    late = np.abs(contents.columns["timestamp"][rows].astype(np.float64) - np.arange(span.length) / contents.fps)
-    if not bool((late <= TIME_TOLERANCE_S).all()):
-        worst = int(np.argmax(np.nan_to_num(late, nan=np.inf)))
-        got = contents.columns["timestamp"][rows][worst]
-        faults.append(
-            (
-                "timestamp",
-                f"got timestamp {got:.6g} at frame {worst}, expected {worst / contents.fps:.6g} (frame / fps)",
-            )
-        )
-    unknown = set(contents.columns["task_index"][rows].tolist()) - set(contents.tasks)
-    if unknown:
-        faults.append(("task_index", f"got task_index {sorted(unknown)}, expected one of {TASKS_NAME}"))
-    for name, values in contents.columns.items():
-        if values.dtype.kind == "f" and not np.isfinite(values[rows]).all():
-            faults.append(("not finite", f"got a value of {name} that is NaN or infinite, expected numbers"))
-    return faults
-
-
-def length_fault(episode: Episode, span: Span) -> str:
-    """Disagreement of an episode's metadata with its number of rows, or nothing."""
-    if episode.length == span.length:
-        return ""
-    return f"got {span.length} rows, expected {episode.length} as in meta/episodes"
-
-
-def _check_counts(contents: Contents, problems: Problems) -> None:
-    info = contents.info
-    for name, got in (
-        ("total_frames", contents.rows),
-        ("total_episodes", len(contents.episodes)),
-        ("total_tasks", len(contents.tasks)),
-    ):
-        if name in info and int(info[name]) != got:
-            problems.error("wrong count", f"{INFO_NAME}: got {name} {info[name]}, but the files hold {got}")
-    if not contents.rows:
-        problems.error("empty", f"{contents.root}: got no readable rows, expected episodes")
-    expected = f"0:{len(contents.episodes)}"
-    splits = info.get("splits") or {}
-    if set(splits) == {"train"} and splits["train"] != expected:
-        problems.warning("splits", f"{INFO_NAME}: got splits train={splits['train']}, expected {expected}")
-
-
-def _check_files(contents: Contents, problems: Problems) -> None:
-    """Every file that is named is there, and every file that is there is named."""
-    of_rows = [(episode, contents.data_file(episode.row)) for episode in contents.episodes]
-    of_video = [(e, contents.video_file(camera, e.row)) for e in contents.episodes for camera in contents.videos]
-    videos = set((contents.root / "videos").rglob("*.mp4"))
-    for what, present, namers in (("rows", set(contents.data_files), of_rows), ("video", videos, of_video)):
-        for episode, path in namers:
-            if path is None:
-                problems.error(
-                    "damaged episode row", f"episode {episode.index}: got no file of its {what}, expected one"
-                )
-        named = {path for _, path in namers if path is not None}
-        for path in sorted(named - present):
-            if not path.is_file():  # an unreadable one has been noted already
-                problems.error(f"missing {what}", f"{path}: got no such file, expected {what} that meta/episodes names")
-        for path in sorted(present - named):
-            problems.error(
-                "stale shard",
-                f"{path}: got a file that no episode names, expected none: it is left from another version",
-            )
-    leftovers = contents.root / "images"  # LeRobot leaves its folders, but no files unless it was interrupted
-    if any(path.is_file() for path in leftovers.rglob("*")):
-        problems.warning("leftover", f"{leftovers}: got images of an interrupted recording, expected none: delete them")
-
-
-def _check_episodes(contents: Contents, problems: Problems) -> None:
-    numbers = [episode.index for episode in contents.episodes]
-    if numbers != list(range(len(numbers))):
-        problems.error(
-            "episode_index", f"meta/episodes: got episodes {numbers[:6]}..., expected 0, 1, 2, ... each once"
-        )
-    by_index = {episode.index: episode for episode in contents.episodes}
-    rows_of = Counter(span.index for span in contents.spans)
-    for index in sorted(set(by_index) - set(rows_of)):
-        problems.error("missing rows", f"episode {index}: got no rows, expected {by_index[index].length}")
-    for index, runs in rows_of.items():
-        if runs > 1:
-            problems.error("episode_index", f"episode {index}: got rows in {runs} places, expected one run of rows")
-    for span in contents.spans:
-        episode = by_index.get(span.index)
-        if episode is None:
-            problems.error("missing metadata", f"episode {span.index}: got rows, but no row in meta/episodes")
-            continue
-        fault = length_fault(episode, span)
-        if fault:
-            problems.error("wrong length", f"episode {span.index}: {fault}")
-        _check_metadata(contents, episode, span, problems)
-
-
-def _check_metadata(contents: Contents, episode: Episode, span: Span, problems: Problems) -> None:
-    place = (episode.row.get("dataset_from_index"), episode.row.get("dataset_to_index"))
-    if place != (span.start, span.stop):
-        problems.error(
-            "dataset_from_index",
-            f"episode {span.index}: got dataset_from_index, dataset_to_index {place}, expected {span.start, span.stop}",
-        )
-    words = {contents.tasks.get(int(n)) for n in contents.columns["task_index"][span.start : span.stop]}
-    if words != set(episode.tasks):
-        got = sorted(map(str, words))
-        problems.error(
-            "tasks", f"episode {span.index}: got tasks {got} in its rows, expected {sorted(episode.tasks)} as stated"
-        )
-    there, named = contents.data_files[span.file], contents.data_file(episode.row)
-    if named is None:
-        return  # noted with the files
-    if named != there:
-        problems.error("wrong file", f"episode {span.index}: got rows in {there}, expected them in {named}")
-    for camera in contents.videos:
-        begin, end = (episode.row.get(f"videos/{camera}/{side}_timestamp") for side in ("from", "to"))
-        if begin is None or end is None or abs((end - begin) * contents.fps - span.length) > 0.5:
-            problems.error(
-                "video timestamps",
-                f"episode {span.index}: got {camera} from {begin} to {end} s, expected {span.length} frames of it",
-            )
-
-
-def _check_places(contents: Contents, problems: Problems) -> None:
-    index = contents.columns["index"]
-    wrong = np.flatnonzero(index != np.arange(len(index)))
-    if len(wrong):
-        row = int(wrong[0])
-        problems.error("index", f"row {row}: got index {index[row]}, expected {row} (and {len(wrong) - 1} more rows)")
-    order = [span.index for span in contents.spans]
-    if order != sorted(order):
-        problems.error("episode_index", f"got rows of episodes in the order {order[:6]}..., expected ascending")
-    for episode in contents.episodes:
-        chunk, file = (episode.row.get(f"meta/episodes/{name}_index") for name in ("chunk", "file"))
-        if chunk is not None and file is not None:
-            path = contents.root / f"meta/episodes/chunk-{chunk:03d}/file-{file:03d}.parquet"
-            if not path.is_file():
-                problems.warning(
-                    "meta/episodes", f"episode {episode.index}: names {path}, which is not there: LeRobot's own "
-                    "merge_datasets leaves such rows, and its split_dataset fails on them",
-                )  # fmt: skip
-
-
 def check_statistics(contents: Contents, scans: Mapping[str, CameraScan], problems: Problems) -> None:
     """Recompute the statistics of every episode and of all, and compare."""
     numbers = {span.index: number for number, span in enumerate(contents.spans)}
@@ -302,7 +130,7 @@ def check_statistics(contents: Contents, scans: Mapping[str, CameraScan], proble
         return exact, theirs
 
     # One episode after the other, as they are stored: those of all at once are some 40 KB each.
-    for episode in stored_episodes(episode_files(contents.root)):
+    for episode in stored_episodes(episode_files(contents.root), problems):
         number = numbers.get(episode.index)
         if number not in left:
             continue
@@ -323,10 +151,12 @@ def check_statistics(contents: Contents, scans: Mapping[str, CameraScan], proble
 def _check_total(contents: Contents, total: Stats, their_total: Stats, problems: Problems) -> None:
     path = contents.root / STATS_NAME
     try:
-        content: dict[str, dict[str, Any]] = json.loads(path.read_text())
+        if not inside(contents.root, path):
+            raise ValueError("a link out of the data set")
+        content: dict[str, dict[str, Any]] = json_content(path)
         stored = {name: {k: np.asarray(v, np.float64) for k, v in group.items()} for name, group in content.items()}
     except (OSError, ValueError, AttributeError, TypeError) as error:
-        reason = "no such file" if isinstance(error, FileNotFoundError) else f"{error!r}"
+        reason = "no such file" if isinstance(error, FileNotFoundError) else damaged(error)
         problems.error("wrong statistics", f"{path}: got {reason}, expected the statistics of all frames")
         return
     for name, feature in contents.features.items():
@@ -399,10 +229,10 @@ def _check_record(contents: Contents, problems: Problems) -> None:
     if not path.is_file():
         return
     try:
-        episodes = json.loads(path.read_text())["episodes"]
+        episodes = json_content(path)["episodes"]
         seeds = [entry.get("seed") for entry in episodes]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        problems.error("record", f"{path}: got {error!r}, expected our record of the episodes")
+        problems.error("record", f"{path}: got {damaged(error)}, expected our record of the episodes")
         return
     if len(seeds) != len(contents.spans):
         problems.error("record", f"{path}: got {len(seeds)} episodes, but the rows hold {len(contents.spans)}")

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from playslot_rl.data.contents import VIDEO_PATH
+from playslot_rl.data.metadata import VIDEO_PATH
 from playslot_rl.errors import DataError
 
 

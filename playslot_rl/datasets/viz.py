@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.data.contents import Contents, Span, is_depth
+from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.frames import rgb_frames
+from playslot_rl.data.metadata import is_depth
 from playslot_rl.data.tables import Array, Episode
 from playslot_rl.datasets.info import info
 from playslot_rl.datasets.verify import require_sound

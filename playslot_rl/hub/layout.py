@@ -6,12 +6,14 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from playslot_rl import __version__
+from playslot_rl.data.metadata import json_content
+from playslot_rl.data.places import inside, is_plain, is_plain_path
 from playslot_rl.errors import HubError
 
 if TYPE_CHECKING:
@@ -31,13 +33,13 @@ _GENERATED = {REMOTE_RECORD, LOCAL_RECORD}
 def is_data(path: str) -> bool:
     """Whether a path (from the root, with slashes) is part of a data set: rows, videos or metadata, nothing hidden."""
     parts = PurePosixPath(path).parts
-    if len(parts) < 2 or any(part.startswith(".") for part in parts):
+    if len(parts) < 2 or not is_plain_path(path) or any(part.startswith(".") for part in parts):
         return False
     return PurePosixPath(path).suffix in _SUFFIXES.get(parts[0], set())
 
 
 def _is_licence(path: str) -> bool:
-    return path.startswith("LICENSE") and "/" not in path
+    return path.startswith("LICENSE") and is_plain(path)
 
 
 def is_pulled(path: str) -> bool:
@@ -45,13 +47,29 @@ def is_pulled(path: str) -> bool:
     return (is_data(path) and path != LOCAL_RECORD) or path == CARD_NAME or _is_licence(path)
 
 
+def require_plain(paths: Iterable[str], name: str) -> None:
+    """Refuse files of a repository that would not be written where their names say.
+
+    Raises:
+        HubError: such as `meta/a\\..\\b.json`, which leads elsewhere on another system.
+    """
+    odd = [path for path in paths if not is_plain_path(path)]
+    if odd:
+        raise HubError(
+            f"{name}: got a file named {odd[0][:80]!r}, expected a path of plain names below the folder: ask its owner "
+            "to remove it"
+        )
+
+
 def local_files(root: Path) -> tuple[list[str], list[str]]:
     """Paths of the files below `root` that a push uploads, and of those that it leaves, in order.
 
     Left are caches, journals, lock and temporary files, images/ that LeRobot did not clean up, hidden files, and the
-    two records this package writes itself. The card and the record are made by the push.
+    two records this package writes itself. Links out of the folder are not even named. The card and the record are made
+    by the push.
     """
-    paths = sorted(file.relative_to(root).as_posix() for file in root.rglob("*") if file.is_file())
+    files = [file for file in root.rglob("*") if file.is_file()]
+    paths = sorted(file.relative_to(root).as_posix() for file in files if inside(root, file))
     others = [path for path in paths if path != CARD_NAME and path not in _GENERATED]
     sent = [path for path in others if is_data(path) or _is_licence(path)]
     return sent, [path for path in others if path not in set(sent)]
@@ -114,7 +132,7 @@ def read_record(root: Path) -> HubRecord | None:
     if not path.is_file():
         return None
     try:
-        return HubRecord(**json.loads(path.read_text()))
+        return HubRecord(**json_content(path))
     except (ValueError, TypeError) as error:
         raise HubError(
             f"{REMOTE_RECORD}: got a damaged record ({type(error).__name__}), expected what `playslot dataset push` "

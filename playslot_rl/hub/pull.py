@@ -11,10 +11,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from playslot_rl.data.contents import FORMAT_TAG
+from playslot_rl.data.metadata import FORMAT_TAG
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, HubError, OutputError
-from playslot_rl.hub.layout import LOCAL_RECORD, SCHEME, HubRecord, is_pulled, read_record
+from playslot_rl.hub.layout import LOCAL_RECORD, SCHEME, HubRecord, is_pulled, read_record, require_plain
 from playslot_rl.hub.session import Repository, open_repository
 from playslot_rl.storage.atomic import explain_write_errors, replace_dir, write_json
 from playslot_rl.storage.locks import locked
@@ -88,7 +88,9 @@ def pull(repo_id: str, root: Path, *, revision: str | None = None, token: str | 
     _refuse_existing(root)
     with open_repository(repo_id, root, token=token, writing=False, revision=revision or "") as hub:
         name, why, commit = _choose(hub, revision)
-        wanted = {path: file for path, file in hub.tree(commit).items() if is_pulled(path)}
+        listed = hub.tree(commit)
+        require_plain((path for path in listed if path.startswith(("data/", "meta/", "videos/"))), hub.name)
+        wanted = {path: file for path, file in listed.items() if is_pulled(path)}
         if INFO not in wanted:
             raise DataError(f"{hub.name}: got no {INFO} at {name}, expected a LeRobot data set: check the name")
         with explain_write_errors(root):

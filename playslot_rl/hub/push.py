@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl import keys
+from playslot_rl.datasets.assemble import read_record
 from playslot_rl.datasets.info import DatasetSummary, info
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, HubError
@@ -22,9 +23,6 @@ from playslot_rl.sharing.card import facts_table, front_matter
 
 MARK = "<!-- made by `playslot dataset push`; remove this line to keep your own text -->"
 """A card with this line was made here and not edited by hand."""
-META_NAME = "meta/playslot.json"
-"""Settings and outcome of a recorded data set; written by the collectors."""
-
 TASKS_SHOWN = 8
 USE = """\
 ## Use it
@@ -45,9 +43,7 @@ def make_card(data: DatasetSummary, repo_id: str, fingerprint: str) -> str:
         repo_id: `user/name`.
         fingerprint: content hash.
     """
-    path = Path(data.root) / META_NAME
-    note = json.loads(path.read_text()) if path.is_file() else {}
-    note = note if isinstance(note, dict) else {}
+    note = read_record(Path(data.root)) or {}
     made = _made(note)
     header = {
         # Ours are free, as this package is; of others' data we know nothing.

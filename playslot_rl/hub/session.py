@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from playslot_rl.data.places import inside
 from playslot_rl.errors import HubError
 from playslot_rl.hub.errors import translate
 from playslot_rl.hub.layout import CARD_NAME, same_content, size_of
@@ -343,7 +344,7 @@ def send(
     head = hub.commit_of(branch)
     remote = hub.tree(head)
     local = root / CARD_NAME
-    by_hand = local.is_file() and mark not in local.read_text(errors="replace")
+    by_hand = local.is_file() and inside(root, local) and mark not in local.read_text(errors="replace")
     if by_hand:
         files = {**files, CARD_NAME: local}
     elif CARD_NAME in remote and mark not in _read(hub, CARD_NAME, head):

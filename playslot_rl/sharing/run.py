@@ -12,7 +12,7 @@ from typing import Any, Final
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import data_roots
-from playslot_rl.data.contents import read_info
+from playslot_rl.data.metadata import read_info
 from playslot_rl.errors import CheckpointError, ConfigError, DataError
 from playslot_rl.evaluation.success import POLICY_PROTOCOLS, run_facts
 from playslot_rl.sharing.card import Result, make_card

@@ -14,8 +14,8 @@ import pytest
 from foreign import foreign_frames
 
 from playslot_rl.data import frame_build, source
+from playslot_rl.data.agreement import open_files
 from playslot_rl.data.cache import Cache
-from playslot_rl.data.contents import open_files
 from playslot_rl.data.frame_build import FrameArray, build_frames, units
 from playslot_rl.data.source import open_source
 

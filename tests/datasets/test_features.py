@@ -1,4 +1,4 @@
-"""Features of one to three dimensions, bool and string, as LeRobot writes them: sound, and whole after every command."""
+"""Features of one to three dimensions, bool and string, by LeRobot's writer: sound, and whole after every command."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ import pytest
 from fake_hub import WRITE_TOKEN, FakeHub, Fault, Repository
 from small_data import contents
 
-from playslot_rl.data.contents import FORMAT_TAG
+from playslot_rl.data.metadata import FORMAT_TAG
 from playslot_rl.datasets.fingerprint import content_fingerprint
 
 Client = Callable[..., dict[str, Any]]

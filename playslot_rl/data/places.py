@@ -1,0 +1,122 @@
+"""Where a data set's files may lie: paths made from metadata stay below its folder, and what lies there is sorted.
+
+LeRobot's own paths are `str.format` templates. A format can ask for a width of ten digits or for the attributes of what
+it is given; here a template has the known fields only, and a path made from it has no way out of the folder.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+from playslot_rl.data.problems import Problems
+
+OUTSIDE: Final = "outside"
+"""Kind of problem: a link out of the data set."""
+CLUTTER: Final = "clutter"
+"""Kind of warning: files of another file system."""
+FARTHEST: Final = 10**9
+"""The highest number of a folder or a file."""
+_FIELD: Final = re.compile(r"\{(chunk_index|file_index|video_key)(?::0?(\d)d?)?\}")
+_CLUTTER: Final = (".DS_Store", "Thumbs.db", "desktop.ini")
+_LONGEST_PATH: Final = 1024
+_LONGEST_NAME: Final = 255
+
+
+def is_plain(name: str) -> bool:
+    """Whether a text can be the name of one folder or file, here and on other systems."""
+    printable = all(character.isprintable() and character not in "/\\" for character in name)
+    return bool(name) and printable and name not in (".", "..") and len(name.encode()) <= _LONGEST_NAME
+
+
+def is_plain_path(path: str) -> bool:
+    """Whether a path with slashes leads to a place below where it begins."""
+    return len(path) <= _LONGEST_PATH and all(map(is_plain, path.split("/")))
+
+
+def checked_template(template: Any, fields: tuple[str, ...]) -> bool:
+    """Whether a template has `file_index` and `fields`, at most `chunk_index` too, and its paths stay below a root."""
+    if not isinstance(template, str) or not is_plain_path(template):
+        return False
+    found = {match[1] for match in _FIELD.finditer(template)}
+    needed = {"file_index", *fields}
+    return needed <= found <= needed | {"chunk_index"} and not set("{}") & set(_FIELD.sub("", template))
+
+
+def filled(template: str, chunk: Any, file: Any, video_key: str = "") -> str | None:
+    """The path of a checked template for numbers from metadata, or None where those are none."""
+    numbers = {"chunk_index": chunk, "file_index": file}
+    if not all(isinstance(n, int) and not isinstance(n, bool) and 0 <= n <= FARTHEST for n in numbers.values()):
+        return None
+
+    def value(match: re.Match[str]) -> str:
+        return video_key if match[1] == "video_key" else str(numbers[match[1]]).zfill(int(match[2] or 0))
+
+    return _FIELD.sub(value, template)
+
+
+def inside(root: Path, path: Path) -> bool:
+    """Whether a file lies below a data set's folder after all links are followed.
+
+    A folder of huggingface_hub's cache counts as whole: its files are links to the blobs beside it.
+    """
+    base, target = Path(os.path.realpath(root)), Path(os.path.realpath(path))
+    if target.is_relative_to(base):
+        return True
+    return base.parent.name == "snapshots" and target.is_relative_to(base.parent.parent / "blobs")
+
+
+def is_clutter(path: Path) -> bool:
+    """Whether a file is what another file system or file manager leaves beside others.
+
+    Note: LeRobot takes `._file-000.parquet` for rows, and fails on it. One that is parquet is no clutter.
+    """
+    if path.name in _CLUTTER or not path.name.startswith("._"):
+        return path.name in _CLUTTER
+    if path.suffix != ".parquet" or not path.is_file():
+        return True
+    with path.open("rb") as file:
+        return file.read(4) != b"PAR1"
+
+
+def parquet_files(root: Path, folder: str) -> list[Path]:
+    """The files that LeRobot reads below `folder`, in order, but for clutter and links out of the data set."""
+    found = sorted((root / folder).glob("*/*.parquet"))
+    return [path for path in found if not is_clutter(path) and inside(root, path)]
+
+
+def note_odd_files(root: Path, problems: Problems) -> None:
+    """Note what lies in a data set's folders and is not of it: links out of it, clutter, rows where none are read."""
+    for path in _files(root):
+        if path.is_symlink() and not inside(root, path):
+            problems.error(
+                OUTSIDE, f"{path}: got a link out of the data set, expected a file of its own: copy it there"
+            )
+        elif is_clutter(path):
+            fails = " and LeRobot fails on it" if path.suffix == ".parquet" else ""
+            problems.warning(CLUTTER, f"{path}: got a file of another file system, passed over{fails}: delete it")
+        elif path.suffix == ".parquet" and not path.is_dir():
+            place = path.relative_to(root).parts
+            if (place[0] == "data" and len(place) != 3) or (place[:2] == ("meta", "episodes") and len(place) != 4):
+                problems.error(
+                    "stale shard",
+                    f"{path}: got a parquet file that no reader looks for, expected none: it is left from another "
+                    "version, or foreign",
+                )
+
+
+def _files(root: Path) -> Iterator[Path]:
+    for name in ("meta", "data", "videos"):
+        if (root / name).is_symlink():
+            yield root / name
+        for folder, folders, files in os.walk(root / name):
+            yield from (Path(folder) / entry for entry in sorted(files))
+            yield from (Path(folder) / entry for entry in sorted(folders) if (Path(folder) / entry).is_symlink())
+
+
+def plain_relative(path: Any) -> bool:
+    """Whether a path from a data set's cells leads to a place below its folder."""
+    return isinstance(path, str) and not PurePosixPath(path).is_absolute() and is_plain_path(path)
