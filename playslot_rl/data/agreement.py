@@ -18,7 +18,7 @@ from playslot_rl.config.weights import is_remote
 from playslot_rl.data.contents import Contents, Span, episode_files, read_contents
 from playslot_rl.data.metadata import EPISODES_PATH, INFO_NAME, NUMBERS, OTHERS
 from playslot_rl.data.places import CLUTTER, OUTSIDE, filled, is_clutter, parquet_files
-from playslot_rl.data.problems import Problems
+from playslot_rl.data.problems import SHOWN, Problems
 from playslot_rl.data.tables import TASKS_NAME, UNREADABLE, WRONG_COLUMN, Episode
 from playslot_rl.errors import DataError
 
@@ -75,7 +75,7 @@ def _check_types(contents: Contents, problems: Problems) -> None:
         dtype, values = feature["dtype"], contents.columns.get(name)
         if not NUMBERS.fullmatch(dtype) and dtype not in OTHERS:
             problems.error("unknown type", f"{INFO_NAME}: got {name} of type {dtype[:40]!r}, expected one of LeRobot's")
-        elif values is not None and not dtype.startswith(kinds.get(values.dtype.kind, "")):
+        elif values is not None and len(values) and not dtype.startswith(kinds.get(values.dtype.kind, "")):
             problems.warning(
                 "other type", f"got {name} as {values.dtype} in data/, expected {dtype} as stated in {INFO_NAME}"
             )
@@ -232,10 +232,10 @@ def open_files(root: str | Path) -> Contents:
         "it was never finalised, or is truncated: collect it again (the same `playslot collect` command carries on), "
         "or call finalize() on the LeRobotDataset that wrote it"
     )
-    if not parquet_files(folder, "data") or not episode_files(folder):
-        raise DataError(f"{root}: got no rows under data/ and meta/episodes/, expected parquet files; {unfinished}")
     if problems.of(OUTSIDE):
         raise DataError(problems.of(OUTSIDE)[0])
+    if not parquet_files(folder, "data") or not episode_files(folder):
+        raise DataError(f"{root}: got no rows under data/ and meta/episodes/, expected parquet files; {unfinished}")
     if problems.of(UNREADABLE):
         raise DataError(f"{problems.of(UNREADABLE)[0]}; {unfinished}")
     if problems.of(WRONG_COLUMN):
@@ -262,13 +262,19 @@ def _require_order(contents: Contents, problems: Problems) -> None:
             f"{contents.root}: {disorder[0]}; got rows that nobody knows the order of, expected whole episodes: run "
             "`playslot dataset repair` on it"
         )
+    moving = sum(span.length > 1 for span in contents.spans)
+    if contents.videos and moving and len(problems.of("timestamp")) >= moving:
+        raise DataError(
+            f"{contents.root}: {problems.of('timestamp')[0]}; got fps {contents.fps:g}, expected the rate of its "
+            f"videos, at which their frames are found: mend {INFO_NAME}"
+        )
     if problems.errors:
         more = f" (and {len(problems.errors) - 1} more)" if len(problems.errors) > 1 else ""
         _say(
-            f"note: {contents.root}: {problems.errors[0]}{more}; no frame is read by that, so training goes on, but "
-            "LeRobot's reader may fail: run `playslot dataset verify`, then `repair`"
+            f"note: {contents.root}: {problems.errors[0].replace(f'{contents.root}/', '')}{more}; stage 1 does not "
+            "need that and trains, LeRobot's reader may fail: run `playslot dataset verify`, then `repair`"
         )
-    for line in problems.warnings_of(CLUTTER)[:1]:
+    for line in problems.warnings_of(CLUTTER)[:SHOWN]:
         _say(f"note: {line}")
 
 

@@ -6,6 +6,7 @@ it is given; here a template has the known fields only, and a path made from it 
 
 from __future__ import annotations
 
+import codecs
 import os
 import re
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from playslot_rl.data.problems import Problems
 OUTSIDE: Final = "outside"
 """Kind of problem: a link out of the data set."""
 CLUTTER: Final = "clutter"
-"""Kind of warning: files of another file system."""
+"""Kind of warning: files of another file system that LeRobot takes for rows."""
 FARTHEST: Final = 10**9
 """The highest number of a folder or a file."""
 _FIELD: Final = re.compile(r"\{(chunk_index|file_index|video_key)(?::0?(\d)d?)?\}")
@@ -76,10 +77,14 @@ def is_clutter(path: Path) -> bool:
     """
     if path.name in _CLUTTER or not path.name.startswith("._"):
         return path.name in _CLUTTER
-    if path.suffix != ".parquet" or not path.is_file():
-        return True
+    return path.suffix != ".parquet" or not _begins(path, b"PAR1")
+
+
+def _begins(path: Path, content: bytes) -> bool:
+    if not path.is_file():
+        return False
     with path.open("rb") as file:
-        return file.read(4) != b"PAR1"
+        return file.read(len(content)) == content
 
 
 def parquet_files(root: Path, folder: str) -> list[Path]:
@@ -96,8 +101,10 @@ def note_odd_files(root: Path, problems: Problems) -> None:
                 OUTSIDE, f"{path}: got a link out of the data set, expected a file of its own: copy it there"
             )
         elif is_clutter(path):
-            fails = " and LeRobot fails on it" if path.suffix == ".parquet" else ""
-            problems.warning(CLUTTER, f"{path}: got a file of another file system, passed over{fails}: delete it")
+            kind, fails = (CLUTTER, " here, though LeRobot fails on it") if path.suffix == ".parquet" else ("views", "")
+            problems.warning(kind, f"{path}: got a file of another file system, passed over{fails}: delete it")
+        elif path.suffix == ".json" and _begins(path, codecs.BOM_UTF8):
+            problems.warning("mark", f"{path}: got a byte-order mark, on which LeRobot fails: save it without one")
         elif path.suffix == ".parquet" and not path.is_dir():
             place = path.relative_to(root).parts
             if (place[0] == "data" and len(place) != 3) or (place[:2] == ("meta", "episodes") and len(place) != 4):

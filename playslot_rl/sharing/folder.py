@@ -14,7 +14,6 @@ policy.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,6 +24,7 @@ from torch import nn
 
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig, ModelConfig, from_dict, to_dict
+from playslot_rl.data.metadata import json_content
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_json, write_text
 from playslot_rl.storage.folders import new_folder
@@ -123,7 +123,7 @@ def camera_of(inputs: dict[str, Any]) -> str:
 def is_model_folder(folder: Path) -> bool:
     """Whether a folder says that it holds a PlaySlot policy."""
     try:
-        values = json.loads((folder / CONFIG).read_text())
+        values = json_content(folder / CONFIG)
     except (OSError, ValueError):
         return False
     return isinstance(values, dict) and values.get("type") == TYPE
@@ -139,19 +139,29 @@ def read_config(folder: Path) -> SharedPolicyConfig:
     if not path.is_file():
         raise CheckpointError(f"{path} is missing, expected the folder of a policy: make one by `playslot export`")
     try:
-        values = json.loads(path.read_text())
+        values = json_content(path)
     except ValueError as error:
         raise CheckpointError(f"{path} is damaged ({error}), expected JSON: export the policy again") from error
     kind = values.get("type") if isinstance(values, dict) else None
     if kind != TYPE:
         raise CheckpointError(f"{path}: got a policy of type {kind!r}, expected {TYPE!r}: check the folder")
     try:
-        return SharedPolicyConfig.of(camera_of(values["input_features"]), {key: values[key] for key in OURS})
-    except (KeyError, TypeError, ValueError) as error:
+        config = SharedPolicyConfig.of(camera_of(values["input_features"]), {key: values[key] for key in OURS})
+        for name, stated, made in zip(("in", "out"), _shapes(values), _shapes(config.to_lerobot()), strict=True):
+            if stated != made:
+                raise ValueError(f"{name}put_features: got shapes {stated}, but env and model are of {made}")
+        return config
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise CheckpointError(
             f"{path}: {what}; expected a config of this version of playslot_rl: export the policy again"
         ) from error
+
+
+def _shapes(values: dict[str, Any]) -> list[dict[str, list[int]]]:
+    """Of what goes in and of what comes out of a policy, by the values of its `config.json`."""
+    sides = (values["input_features"], values["output_features"])
+    return [{name: list(feature["shape"]) for name, feature in side.items()} for side in sides]
 
 
 CARD: Final = "README.md"

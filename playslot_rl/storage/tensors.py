@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
 import torch
 from torch import Tensor, nn
 
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_bytes
+
+LONGEST_HEADER: Final = 100_000_000
+"""Bytes, as safetensors has it."""
 
 
 def module_tensors(modules: Mapping[str, nn.Module]) -> dict[str, Tensor]:
@@ -45,14 +50,32 @@ def load_tensors(path: Path) -> dict[str, Tensor]:
     from safetensors.torch import load
 
     try:
+        _check_header(path)
         return load(path.read_bytes())
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} is missing, expected a checkpoint's weights: train that stage again") from error
-    except (SafetensorError, ValueError, KeyError) as error:
+    except (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(
             f"{path} is damaged ({str(error).splitlines()[0]}), expected a whole safetensors file: "
             "delete its folder and run the same command again"
         ) from error
+
+
+def _check_header(path: Path) -> None:
+    """Refuse a file whose header does not account for its size, before more than the header is read.
+
+    Raises:
+        ValueError: a header that is absurdly long or no JSON, or tensors that end elsewhere than the file.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+        if not 2 <= length <= min(size - 8, LONGEST_HEADER):
+            raise ValueError(f"a header of {length} bytes in a file of {size}")
+        header = json.loads(file.read(length))
+    ends = [int(tensor["data_offsets"][1]) for name, tensor in header.items() if name != "__metadata__"]
+    if 8 + length + max(ends, default=0) != size:
+        raise ValueError(f"tensors of {max(ends, default=0)} bytes in a file of {size}")
 
 
 def load_modules(modules: Mapping[str, nn.Module], tensors: Mapping[str, Tensor], where: str) -> None:
@@ -68,7 +91,7 @@ def load_into(expected: Mapping[str, Tensor], tensors: Mapping[str, Tensor], whe
     """Copy tensors into others of the same names and shapes; nothing is changed unless everything fits.
 
     Raises:
-        CheckpointError: a tensor is missing, unexpected, or of another shape.
+        CheckpointError: a tensor is missing, unexpected, of another shape, or holds what is no number.
     """
     missing, unexpected = sorted(set(expected) - set(tensors)), sorted(set(tensors) - set(expected))
     if missing or unexpected:
@@ -84,6 +107,11 @@ def load_into(expected: Mapping[str, Tensor], tensors: Mapping[str, Tensor], whe
                 f"{where}: tensor {key} has shape {tuple(tensors[key].shape)}, expected {tuple(value.shape)}: "
                 "the config does not belong to these weights; train that stage again"
             )
+        if not torch.isfinite(tensors[key]).all() and torch.isfinite(value).all():
+            raise CheckpointError(
+                f"{where}: tensor {key} holds values that are NaN or infinite, expected numbers: train that stage "
+                "again, or download the weights again"
+            )
     with torch.no_grad():
         for key, value in expected.items():
             value.copy_(tensors[key])
@@ -91,4 +119,5 @@ def load_into(expected: Mapping[str, Tensor], tensors: Mapping[str, Tensor], whe
 
 def weights_fingerprint(path: Path) -> str:
     """First 16 hex digits of the SHA-256 of a weights file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]

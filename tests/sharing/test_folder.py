@@ -100,11 +100,41 @@ def reshape(tensors: dict[str, torch.Tensor]) -> None:
     tensors[name] = torch.zeros(3)
 
 
+def set_nan(tensors: dict[str, torch.Tensor]) -> None:
+    name = next(key for key in tensors if key.startswith(NAME))
+    tensors[name].view(-1)[0] = float("nan")
+
+
+def absurd_header(folder: Path) -> None:
+    path = folder / "model.safetensors"
+    path.write_bytes((1 << 62).to_bytes(8, "little") + path.read_bytes()[8:])
+
+
+def grown(folder: Path) -> None:
+    """A file of a terabyte that is all holes after the weights."""
+    with (folder / "model.safetensors").open("r+b") as file:
+        file.truncate(1 << 40)
+
+
 DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
     "other weights": (edit_tensors(nudge), "got fingerprint"),
     "a lost tensor": (edit_tensors(drop), "misses tensor agent.action_decoder"),
     "a foreign tensor": (edit_tensors(lambda t: t.update(x=torch.zeros(1))), "unexpected tensor x"),
     "a misshapen tensor": (edit_tensors(reshape), r"has shape \(3,\), expected"),
+    "weights that are NaN": (edit_tensors(set_nan), "holds values that are NaN"),
+    "a header of an absurd length": (absurd_header, "a header of 4611686018427387904 bytes"),
+    "a terabyte of holes": (grown, "in a file of 1099511627776"),
+    "another frame size than it says": (
+        edit_config(lambda v: v["input_features"]["observation.images.front"].update(shape=[3, 96, 96])),
+        "input_features: got shapes",
+    ),
+    "another action width than it says": (
+        edit_config(lambda v: v["output_features"]["action"].update(shape=[7])),
+        "output_features: got shapes",
+    ),
+    "another action width": (edit_config(lambda v: v["env"].update(action_dim=7)), "output_features: got shapes"),
+    "features that are a list": (edit_config(lambda v: v.update(input_features=[])), "expected a config of this"),
+    "a config of lists in lists": (lambda f: (f / "config.json").write_text("[" * 99999), "is damaged"),
     "no weights": (lambda f: (f / "model.safetensors").unlink(), "model.safetensors is missing"),
     "half a weights file": (truncate, "is damaged"),
     "no config": (lambda f: (f / "config.json").unlink(), "config.json is missing"),

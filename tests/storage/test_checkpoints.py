@@ -15,7 +15,7 @@ from playslot_rl.config import to_dict
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
 from playslot_rl.storage.resume import first_difference
-from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
+from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors, weights_fingerprint
 from playslot_rl.testing import tiny_config
 from playslot_rl.training.runs import (
     load_agent,
@@ -55,6 +55,62 @@ def write_run(run: Path, seed: int = 0, oracle: bool = True) -> Agent:
 
 def edit(path: Path, **changes: object) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def framed(header: object, tensors: bytes = b"") -> bytes:
+    text = json.dumps(header).encode()
+    return len(text).to_bytes(8, "little") + text + tensors
+
+
+TENSOR = {"dtype": "F32", "shape": [2], "data_offsets": [0, 8]}
+HEADERS = {
+    "no header": b"",
+    "half a length": b"\1\0\0",
+    "a length of all bits": b"\xff" * 8 + b"{}",
+    "a gigabyte in ten bytes": (10**9).to_bytes(8, "little") + b"{}",
+    "lists in lists": (200_000).to_bytes(8, "little") + b"[" * 200_000,
+    "no table": framed([1]),
+    "no tensor": framed({"a": None}),
+    "no offsets": framed({"a": TENSOR | {"data_offsets": []}}),
+    "offsets below 0": framed({"a": TENSOR | {"data_offsets": [0, -8]}}),
+    "terabytes that are not there": framed({"a": TENSOR | {"shape": [2**40], "data_offsets": [0, 2**42]}}),
+    "another shape than its bytes": framed({"a": TENSOR | {"shape": [2**40]}}, bytes(8)),
+    "another type": framed({"a": TENSOR | {"dtype": "Q9"}}, bytes(8)),
+    "more than its tensors": framed({"a": TENSOR}, bytes(9)),
+}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_an_absurd_header_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "weights.safetensors"
+    path.write_bytes(HEADERS[name])
+    with pytest.raises(CheckpointError, match=r"weights\.safetensors is damaged") as raised:
+        load_tensors(path)
+    assert "\n" not in str(raised.value)
+    path.write_bytes(framed({"a": TENSOR}, bytes(8)))
+    assert load_tensors(path)["a"].shape == (2,)
+
+
+def test_a_file_of_holes_is_refused_by_its_header(tmp_path: Path) -> None:
+    path = tmp_path / "weights.safetensors"
+    path.write_bytes(framed({"a": TENSOR}, bytes(8)))
+    with path.open("r+b") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(CheckpointError, match="tensors of 8 bytes in a file of 1099511627776"):
+        load_tensors(path)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_no_numbers_are_refused(value: float, tmp_path: Path) -> None:
+    write_run(tmp_path / "run")
+    folder = checkpoint_folder(tmp_path / "run", "slots")
+    tensors = load_tensors(folder / "weights.safetensors")
+    name = next(key for key, tensor in tensors.items() if tensor.is_floating_point())
+    tensors[name].view(-1)[0] = value
+    save_tensors(folder / "weights.safetensors", tensors)
+    edit(folder / "meta.json", fingerprint=weights_fingerprint(folder / "weights.safetensors"))
+    with pytest.raises(CheckpointError, match=f"tensor {name} holds values that are NaN or infinite"):
+        load_savi(tmp_path / "run")
 
 
 @pytest.fixture(scope="module")
