@@ -197,8 +197,9 @@ def _check_places(contents: Contents, problems: Problems) -> None:
         chunk, file = (episode.row.get(f"meta/episodes/{name}_index") for name in ("chunk", "file"))
         if chunk is not None and file is not None:
             place = filled(EPISODES_PATH, chunk, file)
-            path = contents.root / (place or "meta/episodes/?")
-            if not path.is_file():
+            if place is None:
+                problems.error("damaged episode row", f"episode {episode.index}: got no place of its metadata")
+            elif not (path := contents.root / place).is_file():
                 problems.warning(
                     "meta/episodes", f"episode {episode.index}: names {path}, which is not there: LeRobot's own "
                     "merge_datasets leaves such rows, and its split_dataset fails on them",

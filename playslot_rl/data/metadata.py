@@ -67,7 +67,8 @@ def json_content(path: Path) -> Any:
 
 def damaged(error: BaseException) -> str:
     """The name and the beginning of an error's text, for a message of one line."""
-    return f"{type(error).__name__} ({' '.join(str(error).split())[:120]})"
+    text = " ".join(str(error).split())[:120]
+    return text if isinstance(error, _BoundsError) else f"{type(error).__name__} ({text})"
 
 
 def read_info(root: Path) -> dict[str, Any]:
@@ -189,10 +190,10 @@ def _check_feature(name: str, feature: Any) -> None:
     for number in shape:
         _named(f"shape {_short(shape)} of {name}:", number, 1, LARGEST_VALUE)
     camera = dtype in ("image", "video")
-    if math.prod(shape) > LARGEST_VALUE or (camera and math.prod(stated_size(feature)) > LARGEST_PICTURE):
-        raise _BoundsError(f"shape {_short(shape)} of {name}, expected at most {LARGEST_VALUE} numbers in a frame")
     if camera and len(shape) not in (2, 3):
         raise _BoundsError(f"shape {_short(shape)} of the camera {name}, expected height, width and channels")
+    if math.prod(shape) > LARGEST_VALUE or (camera and math.prod(stated_size(feature)) > LARGEST_PICTURE):
+        raise _BoundsError(f"shape {_short(shape)} of {name}, expected at most {LARGEST_VALUE} numbers in a frame")
     index, single = name in REQUIRED and name != "timestamp", shape in ([], [1])
     if name in REQUIRED and not (single and re.fullmatch(r"u?int\d+" if index else r"float\d+", dtype)):
         raise _BoundsError(f"{name} as {_short(dtype)} {_short(shape)}, expected one {'int64' if index else 'float32'}")

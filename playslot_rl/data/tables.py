@@ -131,8 +131,9 @@ def _columns(
         return None
     rows = {}
     for name in names:
-        if name not in table.column_names:
-            problems.error(WRONG_COLUMN, f"{path}: got no column {name}, expected every feature of meta/info.json")
+        if table.column_names.count(name) != 1:
+            got = "several columns" if name in table.column_names else "no column"
+            problems.error(WRONG_COLUMN, f"{path}: got {got} {name}, expected every feature of meta/info.json once")
             return None
         try:
             rows[name] = _to_array(table.column(name), features[name]["shape"])

@@ -180,7 +180,13 @@ class _RowWriter:
             self._path = self.out / DATA_PATH.format(chunk_index=chunk, file_index=file)
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._writer = pq.ParquetWriter(self._path, self._schema, compression="snappy", use_dictionary=True)
-        self._writer.write_table(table.select(self._schema.names).cast(self._schema))
+        try:
+            self._writer.write_table(table.select(self._schema.names).cast(self._schema))
+        except (pa.ArrowException, KeyError) as error:
+            raise DataError(
+                f"{self._path.name}: got a data set whose columns are stored as others than those before "
+                f"({' '.join(str(error).split())[:100]}), expected equal types: run `playslot dataset verify` on each"
+            ) from error
         chunk, file = divmod(self._number, self._files)
         row = {
             "episode_index": self.episodes,
