@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from playslot_rl.config.roles import Checked, at_least, within
+from playslot_rl.config.roles import Checked, at_least, below_one
 
 
 @dataclass(frozen=True)
@@ -19,9 +19,9 @@ class AdoptConfig(Checked):
     """
 
     group = "adopt."
-    slots: tuple[int, ...] = field(default=(4, 6, 8), metadata=at_least(2, "numbers of slots from 2 on"))
-    prototypes: int = field(default=16, metadata=at_least(4))
-    tolerance: float = field(default=0.05, metadata=within(lambda value: 0 <= value < 1, "a fraction in [0, 1)"))
+    slots: tuple[int, ...] = field(default=(4, 6, 8), metadata=at_least(2, "numbers of slots from 2 on", 256))
+    prototypes: int = field(default=16, metadata=at_least(4, largest=4096))
+    tolerance: float = field(default=0.05, metadata=below_one())
     patience: int = field(default=3, metadata=at_least(1))
 
     def __post_init__(self) -> None:

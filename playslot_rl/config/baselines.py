@@ -9,13 +9,25 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import Checked, at_least, between, role, within
+from playslot_rl.config.roles import (
+    COUNT,
+    LAYERS,
+    NOT_NEGATIVE,
+    OPEN_FRACTION,
+    RATE,
+    YEAR_MINUTES,
+    Checked,
+    above_zero,
+    at_least,
+    between,
+    role,
+    within,
+)
 from playslot_rl.config.stages import OptimConfig, StageConfig
 from playslot_rl.config.video import CADDYConfig, OCVPSeqConfig, SlotFormerConfig, SVGConfig
 
 SHARE = between(0, 1, "a number in [0, 1]")
-ABOVE_ZERO = within(lambda value: value > 0, "above 0")
-SEQUENCE = within(lambda value: value == 0 or value >= 2, "0 (whole episodes), or at least 2")
+SEQUENCE = within(lambda value: value != 1, "0 (whole episodes), or at least 2")
 
 
 @dataclass(frozen=True)
@@ -73,21 +85,21 @@ class LAPOConfig(Checked):
     """
 
     group = "baselines.lapo."
-    channels: tuple[int, ...] = (64, 128, 128)
-    hidden: int = 256
+    channels: tuple[int, ...] = field(default=(64, 128, 128), metadata=COUNT)
+    hidden: int = field(default=256, metadata=COUNT)
     groups: int = field(default=8, metadata=at_least(1))
-    code_dim: int = 16
+    code_dim: int = field(default=16, metadata=COUNT)
     codes: int = field(default=64, metadata=at_least(2))
-    decay: float = field(default=0.99, metadata=within(lambda value: 0 < value < 1, "a number in (0, 1)"))
-    dead_threshold: float = 1.0
-    commitment: float = 0.05
+    decay: float = field(default=0.99, metadata=OPEN_FRACTION)
+    dead_threshold: float = field(default=1.0, metadata=NOT_NEGATIVE)
+    commitment: float = field(default=0.05, metadata=NOT_NEGATIVE)
     loss: Literal["l2", "l1"] = "l2"
     targets: Literal["quantised", "continuous"] = "quantised"
     shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
     model: StageConfig = field(default_factory=lambda: _stage(200_000, 3e-4, "cosine"))
     policy: StageConfig = field(default_factory=lambda: _stage(20_000, 2e-4, "constant"))
     decoder_steps: int = field(default=20_000, metadata=at_least(1))
-    decoder_lr: float = 2e-4
+    decoder_lr: float = field(default=2e-4, metadata=RATE)
     world: str = field(default="", metadata=role("machine", "folder"))
 
     def __post_init__(self) -> None:
@@ -117,7 +129,7 @@ class CADDYPolicyConfig(Checked):
     shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
     policy: StageConfig = field(default_factory=lambda: _stage(20_000, 2e-4, "constant"))
     decoder_steps: int = field(default=20_000, metadata=at_least(1))
-    decoder_lr: float = 2e-4
+    decoder_lr: float = field(default=2e-4, metadata=RATE)
     world: str = field(default="", metadata=role("machine", "folder"))
 
 
@@ -166,14 +178,14 @@ class OnlineConfig(Checked):
     """
 
     steps: int = field(default=1_000_000, metadata=at_least(1))
-    minutes: float = field(default=0.0, metadata=role("free") | at_least(0))
+    minutes: float = field(default=0.0, metadata=role("free") | at_least(0, largest=YEAR_MINUTES))
     prefill: int = field(default=1000, metadata=at_least(1))
-    envs: int = field(default=1, metadata=at_least(1))
-    workers: int = field(default=0, metadata=at_least(0))
-    update_ratio: float = field(default=0.5, metadata=ABOVE_ZERO)
+    envs: int = field(default=1, metadata=at_least(1, largest=1024))
+    workers: int = field(default=0, metadata=at_least(0, largest=1024))
+    update_ratio: float = field(default=0.5, metadata=above_zero())
     batch_size: int = field(default=16, metadata=at_least(1))
     sequence: int = field(default=64, metadata=SEQUENCE)
-    reward_scale: float = field(default=1.0, metadata=ABOVE_ZERO)
+    reward_scale: float = field(default=1.0, metadata=above_zero())
     capacity: int = field(default=1_000_000, metadata=at_least(1))
     replay_on_disk: bool = field(default=False, metadata=role("free"))
     evaluate_every: int = field(default=10_000, metadata=role("free") | at_least(1))
@@ -216,33 +228,34 @@ class DreamerConfig(OnlineConfig):
         critic_rate: of the slow critic's moving average.
     """
 
-    update_ratio: float = 0.25
+    update_ratio: float = field(default=0.25, metadata=above_zero())
     group = "baselines.dreamer."
     frame_size: int = field(default=0, metadata=at_least(0, "0 (the environment's) or pixels"))
-    depth: int = 16
-    mults: tuple[int, ...] = (2, 3, 4, 4)
-    kernel: int = 5
-    belief: int = 2048
-    blocks: int = 8
-    categoricals: int = 32
-    classes: int = 16
-    hidden: int = 256
-    units: int = 256
-    layers: int = 3
-    lr: float = 4e-5
-    warmup: int = 1000
-    reconstruction_weight: float = 1.0
-    free_nats: float = 1.0
-    representation_weight: float = 0.1
-    replay_value_weight: float = 0.3
+    depth: int = field(default=16, metadata=COUNT)
+    mults: tuple[int, ...] = field(default=(2, 3, 4, 4), metadata=COUNT)
+    kernel: int = field(default=5, metadata=between(1, 31, "1 to 31"))
+    belief: int = field(default=2048, metadata=COUNT)
+    blocks: int = field(default=8, metadata=COUNT)
+    categoricals: int = field(default=32, metadata=COUNT)
+    classes: int = field(default=16, metadata=COUNT)
+    hidden: int = field(default=256, metadata=COUNT)
+    units: int = field(default=256, metadata=COUNT)
+    layers: int = field(default=3, metadata=LAYERS)
+    lr: float = field(default=4e-5, metadata=RATE)
+    warmup: int = field(default=1000, metadata=NOT_NEGATIVE)
+    reconstruction_weight: float = field(default=1.0, metadata=NOT_NEGATIVE)
+    free_nats: float = field(default=1.0, metadata=NOT_NEGATIVE)
+    representation_weight: float = field(default=0.1, metadata=NOT_NEGATIVE)
+    replay_value_weight: float = field(default=0.3, metadata=NOT_NEGATIVE)
     horizon: int = field(default=15, metadata=at_least(1))
-    gamma: float = field(default=1 - 1 / 333, metadata=within(lambda value: 0 < value < 1, "between 0 and 1"))
+    gamma: float = field(default=1 - 1 / 333, metadata=OPEN_FRACTION)
     lmbda: float = field(default=0.95, metadata=between(0, 1, "0 to 1"))
-    entropy: float = 3e-4
-    critic_rate: float = 0.02
+    entropy: float = field(default=3e-4, metadata=NOT_NEGATIVE)
+    critic_rate: float = field(default=0.02, metadata=SHARE)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check(len(self.mults) > 0, "baselines.dreamer.mults", self.mults, "at least one")
         check(self.belief % self.blocks == 0, "belief", self.belief, f"a multiple of blocks ({self.blocks})")
 
 
@@ -281,34 +294,32 @@ class SOLDConfig(OnlineConfig):
     group = "baselines.sold."
     batch_size: int = field(default=16, metadata=at_least(1))
     sequence: int = field(default=18, metadata=SEQUENCE)
-    dim: int = 256
-    heads: int = 8
-    mlp_dim: int = 512
-    dynamics_layers: int = 4
-    head_layers: int = 3
-    bins: int = field(
-        default=255, metadata=within(lambda value: value >= 3 and value % 2 == 1, "an odd number from 3 on")
-    )
-    limit: float = field(default=20.0, metadata=ABOVE_ZERO)
+    dim: int = field(default=256, metadata=COUNT)
+    heads: int = field(default=8, metadata=COUNT)
+    mlp_dim: int = field(default=512, metadata=COUNT)
+    dynamics_layers: int = field(default=4, metadata=LAYERS)
+    head_layers: int = field(default=3, metadata=LAYERS)
+    bins: int = field(default=255, metadata=within(lambda value: value % 2 == 1, "an odd number from 3 on", 3))
+    limit: float = field(default=20.0, metadata=above_zero())
     mean: Literal["symlog", "linear"] = "symlog"
     context: int = field(default=3, metadata=at_least(1))
     horizon: int = field(default=15, metadata=at_least(1))
     starts: int = field(default=256, metadata=at_least(1))
     gamma: float = field(default=0.96, metadata=SHARE)
     lmbda: float = field(default=0.95, metadata=SHARE)
-    entropy: float = 3e-4
+    entropy: float = field(default=3e-4, metadata=NOT_NEGATIVE)
     actor_gradient: Literal["dynamics", "reinforce"] = "dynamics"
     return_rate: float = field(default=0.01, metadata=SHARE)
     critic_decay: float = field(default=0.98, metadata=SHARE)
     actor_average: float = field(default=0.0, metadata=SHARE)
-    slot_weight: float = 1.0
-    image_weight: float = 1.0
-    decoded_frames: int = 0
-    actor_lr: float = 3e-5
-    critic_lr: float = 3e-5
-    model_lr: float = 1e-4
-    grad_clip: float = 10.0
-    world_model_updates: int = 0
+    slot_weight: float = field(default=1.0, metadata=NOT_NEGATIVE)
+    image_weight: float = field(default=1.0, metadata=NOT_NEGATIVE)
+    decoded_frames: int = field(default=0, metadata=NOT_NEGATIVE)
+    actor_lr: float = field(default=3e-5, metadata=RATE)
+    critic_lr: float = field(default=3e-5, metadata=RATE)
+    model_lr: float = field(default=1e-4, metadata=RATE)
+    grad_clip: float = field(default=10.0, metadata=NOT_NEGATIVE)
+    world_model_updates: int = field(default=0, metadata=NOT_NEGATIVE)
     savi_steps: int | None = field(default=None, metadata=at_least(0, "0 or more"))
 
     def __post_init__(self) -> None:

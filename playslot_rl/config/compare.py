@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from playslot_rl.config.methods import METHODS, MethodName
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import SEED, Checked, at_least, role
+from playslot_rl.config.roles import SEED, Checked, at_least, between, role
 
 LAUNCHERS: dict[str, str] = {
     "basic": "hydra",
@@ -42,9 +42,9 @@ class CompareConfig(Checked):
     demos: tuple[int, ...] = field(default=(10, 50, 100, 150), metadata=at_least(1, "numbers of at least 1"))
     labels: tuple[int, ...] = field(default=(), metadata=at_least(1, "numbers of at least 1"))
     seeds: tuple[int, ...] = field(default=(0, 1, 2), metadata=SEED)
-    online_seeds: tuple[int, ...] = ()
+    online_seeds: tuple[int, ...] = field(default=(), metadata=SEED)
     evaluation_seed: int = field(default=100, metadata=SEED)
-    processes: int = field(default=1, metadata=role("machine") | at_least(1))
+    processes: int = field(default=1, metadata=role("machine") | between(1, 1024, "at least 1, 1024 at most"))
     launcher: str = ""
     hydra: tuple[str, ...] = ()
 

@@ -7,7 +7,8 @@ from typing import Final, Literal, get_args
 
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import SEED, Checked, at_least, between, role, within
+from playslot_rl.config.roles import OPEN_FRACTION, SEED, YEAR_MINUTES, Checked, above_zero, at_least, between, role
+from playslot_rl.episode_seeds import EPISODES
 
 VideoMethod = Literal["svg", "caddy", "slotformer", "ocvp_seq", "playslot", "playslot_m"]
 VIDEO_METHODS: Final[tuple[VideoMethod, ...]] = get_args(VideoMethod)
@@ -67,14 +68,14 @@ class CompareVideoConfig(Checked):
     vary: str = ""
     values: tuple[str, ...] = ()
     objects: tuple[int, ...] = field(default=(), metadata=between(1, 5, "numbers of 1 to 5"))
-    episodes: int = field(default=40, metadata=at_least(2))
-    tested: float = field(default=0.1, metadata=within(lambda share: 0 < share < 1, "a fraction in (0, 1)"))
+    episodes: int = field(default=40, metadata=at_least(2, largest=EPISODES))
+    tested: float = field(default=0.1, metadata=OPEN_FRACTION)
     clips: int = field(default=64, metadata=at_least(2))
     pictures: int = field(default=3, metadata=at_least(1))
-    budget_minutes: float = field(default=0.0, metadata=at_least(0, "0 (the preset's steps) or more"))
-    rates: tuple[float, ...] = field(default=(0.3, 1.0, 3.0), metadata=within(lambda rate: rate > 0, "above 0"))
+    budget_minutes: float = field(default=0.0, metadata=at_least(0, "0 (the preset's steps) or more", YEAR_MINUTES))
+    rates: tuple[float, ...] = field(default=(0.3, 1.0, 3.0), metadata=above_zero())
     trial_steps: int = field(default=150, metadata=at_least(2))
-    processes: int = field(default=1, metadata=role("machine") | at_least(1))
+    processes: int = field(default=1, metadata=role("machine") | between(1, 1024, "at least 1, 1024 at most"))
     launcher: str = ""
     hydra: tuple[str, ...] = ()
 

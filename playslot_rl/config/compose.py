@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
+from playslot_rl.config.arguments import require_digits, require_folders, require_once, require_plain
+from playslot_rl.config.memory import require_memory
 from playslot_rl.config.methods import MethodName, canonical_method
 from playslot_rl.config.plain import flatten, type_hints
 from playslot_rl.config.planning import GOALS, PLANNERS, PROPOSALS
@@ -54,16 +56,19 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
     """Build the config of one command.
 
     Args:
-        overrides: `key=value` strings, such as `preset=smoke` or `slots.optim.lr=1e-3`; the last of equal keys wins.
+        overrides: `key=value` strings, such as `preset=smoke` or `slots.optim.lr=1e-3`, each key once.
         command: name of the command, which decides whether `run=DIR` brings its stored config.
 
     Returns:
         The validated config.
 
     Raises:
-        ConfigError: an argument that is not `key=value`, an unknown environment, preset or key, a value outside its
-            range, or a run folder without a usable `config.json`.
+        ConfigError: an argument that is not `key=value`, or that interpolates; an unknown environment, preset or key, a
+            value outside its bounds, sizes that fit into no memory here, or a run folder without a usable
+            `config.json`.
     """
+    for argument in overrides:
+        require_plain(argument.partition("=")[0].strip(), argument)
     if command in COMPARISONS:
         overrides = _compare_keys(overrides, command)
     elif command in NAMES:
@@ -85,6 +90,7 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         else:
             groups = tuple(f"{group}={pairs[group]}" for group in GROUPS if group in pairs)
             config = from_dict(ExperimentConfig, _merge(_presets(groups), _typed(pairs)))
+        require_memory(config, {key: value for key, value in pairs.items() if key not in GROUPS})
     except ConfigError:
         raise
     except ValueError as error:
@@ -94,8 +100,9 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
 
 
 def _parse(overrides: Sequence[str]) -> dict[str, str]:
-    """Split `key=value` arguments; the last of equal keys wins."""
+    """Split `key=value` arguments."""
     pairs: dict[str, str] = {}
+    typed: list[str] = []
     for argument in overrides:
         key, equals, value = argument.partition("=")
         key = key.strip().lstrip("+")
@@ -108,8 +115,12 @@ def _parse(overrides: Sequence[str]) -> dict[str, str]:
             value = _method_names(key, value)
         if key == "port" and not value.strip():
             value = "0"  # `port=`: any
-        pairs.pop(key, None)  # the order of the arguments is kept: a later one wins
+        require_digits(key, value, hint)
+        if key in keys_of(ExperimentConfig, "folder"):
+            require_folders(key, _unquote(value))
+        typed.append(key)
         pairs[key] = _unquote(value) if key in GROUPS else value
+    require_once(typed)
     return pairs
 
 
@@ -245,9 +256,8 @@ def _presets(groups: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _typed(pairs: Mapping[str, str]) -> dict[str, Any]:
-    """What was typed, read by Hydra's grammar, as a plain nested dict; of equal keys the later one counts."""
+    """What was typed, read by Hydra's grammar, as a plain nested dict. Nothing is interpolated."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
-    from omegaconf import OmegaConf
 
     typed: dict[str, Any] = {}
     with _explained():
@@ -257,9 +267,8 @@ def _typed(pairs: Mapping[str, str]) -> dict[str, Any]:
                     f"cannot read the arguments: got several values for {override.key_or_group}, expected one "
                     "(a list goes in brackets)"
                 )
-            value = OmegaConf.to_container(OmegaConf.create({"value": override.value()}), resolve=True)
             *path, last = override.key_or_group.split(".")
-            change = {last: cast("dict[str, Any]", value)["value"]}
+            change: dict[str, Any] = {last: override.value()}
             for name in reversed(path):
                 change = {name: change}
             typed = _merge(typed, change)

@@ -58,8 +58,8 @@ class GridConfig(Checked):
 
     group = "env.grid."
     objects: int = field(default=2, metadata=between(1, 5, "1 to 5"))
-    size: int = field(default=15, metadata=at_least(3, "at least 3 pixels"))
-    speed: int = field(default=2, metadata=at_least(1, "at least 1 pixel"))
+    size: int = field(default=15, metadata=between(3, 128, "at least 3 pixels, 128 at most"))
+    speed: int = field(default=2, metadata=between(1, 128, "at least 1 pixel, 128 at most"))
     change: float = field(default=0.25, metadata=between(0, 1, "a probability"))
 
 
@@ -79,7 +79,7 @@ class BlocksConfig(Checked):
     group = "env.blocks."
     task: Literal["red", "reddest", "odd", "odd_groups"] = "odd"
     distractors: int = field(default=3, metadata=between(0, 4, "0 to 4"))
-    distractors_to: int | None = None
+    distractors_to: int | None = field(default=None, metadata=between(0, 4, "0 to 4, or null"))
     colour: str = ""
     reward: Literal["dense", "sparse"] = "dense"
 
@@ -111,11 +111,11 @@ class EnvConfig(Checked):
 
     group = "env."
     name: str = "button_press"
-    image_size: int = field(default=64, metadata=within((32, 64, 128).__contains__, "32, 64 or 128"))
-    action_dim: int = 4
-    frame_skip: int = field(default=5, metadata=at_least(1))
-    max_steps: int = field(default=20, metadata=at_least(2))
-    warmup_steps: int = 12
+    image_size: int = field(default=64, metadata=within((32, 64, 128).__contains__, "32, 64 or 128", 32, 128))
+    action_dim: int = field(default=4, metadata=between(1, 4096, "1 to 4096"))
+    frame_skip: int = field(default=5, metadata=at_least(1, largest=1000))
+    max_steps: int = field(default=20, metadata=at_least(2, largest=10**6))
+    warmup_steps: int = field(default=12, metadata=at_least(0, "0 or more", 10_000))
     grid: GridConfig = field(default_factory=GridConfig)
     blocks: BlocksConfig = field(default_factory=BlocksConfig)
 

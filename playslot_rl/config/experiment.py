@@ -13,10 +13,25 @@ from playslot_rl.config.env import EnvConfig, RenderConfig
 from playslot_rl.config.methods import MethodName
 from playslot_rl.config.model import ModelConfig
 from playslot_rl.config.planning import PlanConfig
-from playslot_rl.config.roles import SEED, Checked, at_least, between, role, within
+from playslot_rl.config.roles import (
+    COUNT,
+    EPISODE_COUNT,
+    NOT_NEGATIVE,
+    SEED,
+    YEAR_MINUTES,
+    Checked,
+    above_zero,
+    at_least,
+    below_one,
+    between,
+    role,
+    text,
+)
 from playslot_rl.config.sizes import is_amount
 from playslot_rl.config.stages import BehaviourStageConfig, DynamicsStageConfig, SlotsStageConfig
-from playslot_rl.episode_seeds import EVALUATION
+from playslot_rl.episode_seeds import EPISODES, EVALUATION
+
+WORKERS = at_least(0, "0 (one per core) or more", 1024)
 
 
 @dataclass(frozen=True)
@@ -52,12 +67,12 @@ class DataConfig(Checked):
     stride: int = field(default=1, metadata=at_least(1, "1 (every frame) or more"))
     resize: bool = False
     cache: str = field(default="", metadata=role("machine", "folder"))
-    cache_limit: str = field(default="", metadata=role("machine") | within(is_amount, "an amount such as 20GB"))
-    workers: int = field(default=1, metadata=role("machine") | at_least(0, "0 (one per core) or more"))
+    cache_limit: str = field(default="", metadata=role("machine") | text(is_amount, "an amount such as 20GB"))
+    workers: int = field(default=1, metadata=role("machine") | WORKERS)
     stream: bool = False
     shuffle_buffer: int = field(default=20_000, metadata=at_least(1))
-    validation: float = field(default=0.05, metadata=within(lambda value: 0 <= value < 1, "a fraction in [0, 1)"))
-    tested: float = field(default=0.0, metadata=within(lambda value: 0 <= value < 1, "a fraction in [0, 1)"))
+    validation: float = field(default=0.05, metadata=below_one())
+    tested: float = field(default=0.0, metadata=below_one())
 
 
 @dataclass(frozen=True)
@@ -79,14 +94,14 @@ class CollectConfig(Checked):
     """
 
     group = "collect."
-    random_episodes: int = 400
-    random_steps: int = 20
-    expert_episodes: int = 150
-    validation_episodes: int = field(default=10, metadata=role("machine") | at_least(0, "0 or more"))
-    expert_steps: int = 20
-    noise: float = 0.0
-    noisy_episodes: int = 0
-    exploration_noise: float = 0.5
+    random_episodes: int = field(default=400, metadata=EPISODE_COUNT)
+    random_steps: int = field(default=20, metadata=COUNT)
+    expert_episodes: int = field(default=150, metadata=EPISODE_COUNT)
+    validation_episodes: int = field(default=10, metadata=role("machine") | EPISODE_COUNT)
+    expert_steps: int = field(default=20, metadata=COUNT)
+    noise: float = field(default=0.0, metadata=NOT_NEGATIVE)
+    noisy_episodes: int = field(default=0, metadata=EPISODE_COUNT)
+    exploration_noise: float = field(default=0.5, metadata=NOT_NEGATIVE)
     learn_from_demos: bool = False
     storage: Literal["image", "video"] = "image"
 
@@ -104,7 +119,7 @@ class CollectorConfig(Checked):
 
     group = "collector."
     backend: Literal["local", "ray"] = "local"
-    timeout_s: float = field(default=120.0, metadata=within(lambda value: value > 0, "a number of seconds above 0"))
+    timeout_s: float = field(default=120.0, metadata=above_zero("a number of seconds above 0"))
     restarts: int = field(default=5, metadata=at_least(0, "0 or more"))
     ray_address: str = ""
 
@@ -199,17 +214,17 @@ class ExperimentConfig(Checked):
 
     preset: str = field(default="paper", metadata=role("machine"))
     policy: Literal["random", "expert"] = field(default="expert", metadata=role("call"))
-    episodes: int | None = field(default=None, metadata=role("call") | at_least(1))
+    episodes: int | None = field(default=None, metadata=role("call") | at_least(1, largest=EPISODES))
     seed: int = field(default=0, metadata=SEED)
-    workers: int = field(default=0, metadata=role("call", "machine") | at_least(0, "0 (one per core) or more"))
+    workers: int = field(default=0, metadata=role("call", "machine") | WORKERS)
     out: str = field(default="", metadata=role("call", "machine", "folder"))
     run: str = field(default="", metadata=role("call", "machine", "folder"))
     protocol: Literal["simulation", "imagination", "replay", "slots"] = field(
         default="simulation", metadata=role("call")
     )
     device: str = field(default="", metadata=role("call", "machine"))
-    threads: int = field(default=0, metadata=role("machine"))
-    minutes: float = field(default=60.0, metadata=role("call", "machine", "free") | within(lambda v: v > 0, "above 0"))
+    threads: int = field(default=0, metadata=role("machine") | at_least(0, "0 (torch's choice) or more", 1024))
+    minutes: float = field(default=60.0, metadata=role("call", "machine", "free") | above_zero(largest=YEAR_MINUTES))
     method: MethodName = "playslot"
     demos: int | None = field(default=None, metadata=at_least(1))
     port: int = field(default=0, metadata=role("call", "machine") | between(0, 65535, "0 (any) to 65535"))

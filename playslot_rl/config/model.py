@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import Checked, at_least, within
+from playslot_rl.config.roles import COUNT, LAYERS, NOT_NEGATIVE, OPEN_FRACTION, Checked, at_least, below_one, between
 
 LatentMode = Literal["hybrid", "discrete", "continuous", "ground_truth", "none"]
 
@@ -39,25 +39,27 @@ class SAViConfig(Checked):
 
     group = "model.savi."
     n_slots: int = field(default=4, metadata=at_least(1))
-    slot_dim: int = 128
+    slot_dim: int = field(default=128, metadata=COUNT)
     initial: Literal["gaussian", "learned"] = "gaussian"
     encoder: Literal["full", "strided"] = "full"
-    encoder_channels: tuple[int, ...] = (32, 32, 32, 32)
-    encoder_strides: tuple[int, ...] = (1, 1, 1, 1)
-    token_dim: int = 128
+    encoder_channels: tuple[int, ...] = field(default=(32, 32, 32, 32), metadata=COUNT)
+    encoder_strides: tuple[int, ...] = field(default=(1, 1, 1, 1), metadata=between(1, 8, "1 to 8"))
+    token_dim: int = field(default=128, metadata=COUNT)
     decoder: Literal["broadcast", "pixel_shuffle"] = "broadcast"
-    decoder_channels: tuple[int, ...] = (64, 64, 64, 64)
+    decoder_channels: tuple[int, ...] = field(default=(64, 64, 64, 64), metadata=COUNT)
     decoder_position: Literal["linear", "learned"] = "linear"
     collapse: bool = True
-    first_iterations: int = 3
-    iterations: int = 1
-    corrector_mlp: int = 256
-    transition_heads: int = 4
-    transition_mlp: int = 512
+    first_iterations: int = field(default=3, metadata=LAYERS)
+    iterations: int = field(default=1, metadata=LAYERS)
+    corrector_mlp: int = field(default=256, metadata=COUNT)
+    transition_heads: int = field(default=4, metadata=COUNT)
+    transition_mlp: int = field(default=512, metadata=COUNT)
     transition_start: Literal["xavier", "identity"] = "xavier"
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name in ("encoder_channels", "decoder_channels"):
+            check(len(getattr(self, name)) > 0, self.group + name, getattr(self, name), "at least one width")
         check(
             len(self.encoder_channels) == len(self.encoder_strides),
             "model.savi.encoder_strides",
@@ -103,16 +105,16 @@ class InverseDynamicsConfig(Checked):
     group = "model.inverse_dynamics."
     variant: Literal["single", "multi"] = "single"
     mode: LatentMode = "hybrid"
-    latent_dim: int = 16
+    latent_dim: int = field(default=16, metadata=COUNT)
     n_prototypes: int = field(default=8, metadata=at_least(2))
-    dim: int = 256
-    layers: int = 4
-    heads: int = 4
-    head_dim: int = 64
-    mlp_dim: int = 1024
-    decay: float = field(default=0.99, metadata=within(lambda value: 0 < value < 1, "a number in (0, 1)"))
-    dead_threshold: float = 1.0
-    commitment: float = 0.25
+    dim: int = field(default=256, metadata=COUNT)
+    layers: int = field(default=4, metadata=LAYERS)
+    heads: int = field(default=4, metadata=COUNT)
+    head_dim: int = field(default=64, metadata=COUNT)
+    mlp_dim: int = field(default=1024, metadata=COUNT)
+    decay: float = field(default=0.99, metadata=OPEN_FRACTION)
+    dead_threshold: float = field(default=1.0, metadata=NOT_NEGATIVE)
+    commitment: float = field(default=0.25, metadata=NOT_NEGATIVE)
     sample: bool = False
 
 
@@ -131,11 +133,11 @@ class PredictorConfig(Checked):
 
     group = "model.predictor."
     kind: Literal["cocvp", "ocvp_seq", "slotformer"] = "cocvp"
-    dim: int = 256
-    layers: int = 4
-    heads: int = 8
-    head_dim: int = 64
-    mlp_dim: int = 1024
+    dim: int = field(default=256, metadata=COUNT)
+    layers: int = field(default=4, metadata=LAYERS)
+    heads: int = field(default=8, metadata=COUNT)
+    head_dim: int = field(default=64, metadata=COUNT)
+    mlp_dim: int = field(default=1024, metadata=COUNT)
     residual: bool = False
     context: int = field(default=24, metadata=at_least(2, "at least 2 frames"))
     project_out: bool = True
@@ -151,7 +153,7 @@ class PredictorConfig(Checked):
 
 
 @dataclass(frozen=True)
-class PolicyConfig:
+class PolicyConfig(Checked):
     """Sizes of the latent policy: InvDyn_S's architecture with one head (paper, appendix A.4).
 
     Attributes:
@@ -159,11 +161,12 @@ class PolicyConfig:
         whiten: it gives whitened coordinates; `behaviour.whiten` sets it where a policy is trained.
     """
 
-    dim: int = 256
-    layers: int = 4
-    heads: int = 4
-    head_dim: int = 64
-    mlp_dim: int = 1024
+    group = "model.policy."
+    dim: int = field(default=256, metadata=COUNT)
+    layers: int = field(default=4, metadata=LAYERS)
+    heads: int = field(default=4, metadata=COUNT)
+    head_dim: int = field(default=64, metadata=COUNT)
+    mlp_dim: int = field(default=1024, metadata=COUNT)
     whiten: bool = False
 
 
@@ -183,9 +186,9 @@ class ActionDecoderConfig(Checked):
     group = "model.action_decoder."
     hidden_dim: int = field(default=128, metadata=at_least(1))
     state_dim: int = field(default=64, metadata=at_least(1))
-    state_layers: int = field(default=2, metadata=at_least(1))
+    state_layers: int = field(default=2, metadata=LAYERS)
     state_heads: int = field(default=4, metadata=at_least(1))
-    state_dropout: float = field(default=0.5, metadata=within(lambda share: 0 <= share < 1, "0 to below 1"))
+    state_dropout: float = field(default=0.5, metadata=below_one("0 to below 1"))
     whiten: bool = False
     reads_slots: bool = False
 

@@ -7,6 +7,7 @@ import difflib
 import functools
 import hashlib
 import json
+import math
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -20,7 +21,21 @@ def check(ok: bool, what: str, got: object, expected: str) -> None:
         ValueError: not `ok`; one line that says what was got and what was expected.
     """
     if not ok:
-        raise ValueError(f"{what}: got {got!r}, expected {expected}")
+        raise ValueError(f"{what}: got {shortened(got)}, expected {expected}")
+
+
+def shortened(value: object) -> str:
+    """A value as it is said in a message: one that is long by its beginning.
+
+    Examples:
+        >>> shortened("smol"), shortened(10**400)
+        ("'smol'", '1000000000000000000000000... (about 1e400)')
+    """
+    if isinstance(value, int) and abs(value) >= 10**40:
+        digits = math.floor(value.bit_length() * math.log10(2))
+        return f"{'-' if value < 0 else ''}{abs(value) // 10 ** max(0, digits - 24)}... (about 1e{digits})"
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:160]}... ({len(text)} characters)"
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -67,18 +82,22 @@ def from_dict[T](cls: type[T], values: dict[str, Any], where: str = "") -> T:
             hint = f"; did you mean {where}{near[0]!s}?" if near else ""
             raise ValueError(f"unknown key {where}{key}: expected one of {', '.join(sorted(names))}{hint}")
     kwargs = {key: _convert(hints[key], value, f"{where}{key}") for key, value in values.items()}
-    return cls(**kwargs)
+    try:
+        return cls(**kwargs)
+    except ValueError as error:  # of a class that several groups share, by its name alone
+        group = where.rstrip(".")
+        raise ValueError(str(error) if group in str(error) else f"{error} (of {group})") from error
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
     origin = get_origin(hint)
     if dataclasses.is_dataclass(hint):
         if not isinstance(value, dict):
-            raise ValueError(f"{where}: got {value!r}, expected a group of keys")
+            raise ValueError(f"{where}: got {shortened(value)}, expected a group of keys")
         return from_dict(typing.cast(type, hint), value, f"{where}.")
     if origin is Literal:
         if value not in get_args(hint):
-            raise ValueError(f"{where}: got {value!r}, expected one of {', '.join(map(str, get_args(hint)))}")
+            raise ValueError(f"{where}: got {shortened(value)}, expected one of {', '.join(map(str, get_args(hint)))}")
         return value
     if origin in (Union, types.UnionType):
         if value is None:
@@ -86,12 +105,15 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         return _convert(next(a for a in get_args(hint) if a is not type(None)), value, where)
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
-            raise ValueError(f"{where}: got {value!r}, expected a list")
+            raise ValueError(f"{where}: got {shortened(value)}, expected a list")
         return tuple(_convert(get_args(hint)[0], v, where) for v in value)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise ValueError(f"{where}: got {shortened(value)}, expected a number that a float can hold") from None
     if hint is str and value is None:
         return ""
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
-        raise ValueError(f"{where}: got {value!r} ({type(value).__name__}), expected {hint.__name__}")
+        raise ValueError(f"{where}: got {shortened(value)} ({type(value).__name__}), expected {hint.__name__}")
     return value

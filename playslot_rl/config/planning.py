@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Final, Literal, get_args
 
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import Checked, at_least, between, within
+from playslot_rl.config.roles import Checked, above_zero, at_least, below_one, between
 
 PlannerName = Literal["cem", "mppi", "gradient", "prototypes"]
 ProposalName = Literal["none", "policy"]
@@ -16,7 +16,7 @@ PLANNERS: Final[tuple[PlannerName, ...]] = get_args(PlannerName)
 PROPOSALS: Final[tuple[ProposalName, ...]] = get_args(ProposalName)
 GOALS: Final[tuple[GoalName, ...]] = get_args(GoalName)
 
-_POSITIVE = within(lambda value: value > 0, "a number above 0")
+_POSITIVE = above_zero("a number above 0")
 
 
 @dataclass(frozen=True)
@@ -77,12 +77,12 @@ class PlanConfig(Checked):
     start_spread: float = field(default=0.2, metadata=_POSITIVE)
     floor: float = field(default=0.05, metadata=_POSITIVE)
     bound: float = field(default=3.0, metadata=_POSITIVE)
-    correlation: float = field(default=0.5, metadata=within(lambda value: 0 <= value < 1, "0 to under 1"))
+    correlation: float = field(default=0.5, metadata=below_one("0 to under 1"))
     temperature: float = field(default=0.2, metadata=_POSITIVE)
     learning_rate: float = field(default=0.1, metadata=_POSITIVE)
     prior: float | None = field(default=None, metadata=at_least(0, "0 or more"))
-    history: int = field(default=1, metadata=at_least(1, "at least 1 frame"))
-    looks: int = field(default=2, metadata=at_least(1, "at least 1"))
+    history: int = field(default=1, metadata=at_least(1, "at least 1 frame", 1000))
+    looks: int = field(default=2, metadata=at_least(1, "at least 1", 1000))
     ahead: int = field(default=25, metadata=at_least(1, "at least 1 environment step"))
     budget: int = field(default=50, metadata=at_least(1, "at least 1 environment step"))
     near: float = field(default=0.05, metadata=_POSITIVE)

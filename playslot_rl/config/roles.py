@@ -1,17 +1,20 @@
 """What a key of the config counts for and which values it takes, said where the key is declared:
 `field(default=0, metadata=role("machine") | at_least(0))`.
 
-A key without a role says what is computed: it is stored with a run, handed on, and part of every identity.
+A key without a role says what is computed: it is stored with a run, handed on, and part of every identity. Every number
+has bounds (`tests/config/test_bounds.py`).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final, Literal
 
 from playslot_rl.config.plain import check, to_dict, type_hints
-from playslot_rl.episode_seeds import LARGEST_SEED
+from playslot_rl.episode_seeds import EPISODES, LARGEST_SEED
 
 Role = Literal["call", "machine", "free", "folder"]
 """`call`: what one invocation does; a stored run does not hand it on.
@@ -28,30 +31,89 @@ def role(*roles: Role) -> dict[str, Any]:
     return {"roles": frozenset(roles)}
 
 
-def within(accepts: Callable[[Any], bool], expected: str) -> dict[str, Any]:
-    """Metadata of a field that takes the values, each of a tuple, that `accepts` is true for, and None."""
-    return {"range": (accepts, expected)}
+LARGEST: Final = 10**9
+"""The largest number that a field takes which names no other: beyond it there are only slips."""
 
 
-def at_least(smallest: float, expected: str = "") -> dict[str, Any]:
-    """Metadata of a field that takes numbers from `smallest` on."""
-    return within(lambda value: value >= smallest, expected or f"at least {smallest}")
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    """Which values a field takes, each of a tuple; None always.
+
+    Attributes:
+        accepts: whether a value is one of them.
+        expected: the values in words.
+        smallest, largest: of numbers, finite; outside of them none is accepted. None for text.
+    """
+
+    accepts: Callable[[Any], bool]
+    expected: str
+    smallest: float | None = None
+    largest: float | None = None
+
+    def refused(self, value: Any) -> str:
+        """What is expected instead of a value; empty where it is accepted."""
+        if self.smallest is None or self.largest is None:
+            return "" if self.accepts(value) else self.expected
+        if isinstance(value, float) and not math.isfinite(value):
+            return f"a finite number, {self.expected}"
+        if value > self.largest:
+            most = f"{self.largest:.17g}"
+            return self.expected if most in self.expected else f"{self.expected}, {most} at most"
+        return "" if value >= self.smallest and self.accepts(value) else self.expected
+
+
+def text(accepts: Callable[[str], bool], expected: str) -> dict[str, Any]:
+    """Metadata of a field that takes texts which `accepts` is true for."""
+    return {"bounds": Bounds(accepts, expected)}
+
+
+def within(
+    accepts: Callable[[Any], bool], expected: str, smallest: float = 0, largest: float = LARGEST
+) -> dict[str, Any]:
+    """Metadata of a field that takes numbers from `smallest` to `largest` which `accepts` is true for."""
+    return {"bounds": Bounds(accepts, expected, smallest, largest)}
+
+
+def at_least(smallest: float, expected: str = "", largest: float = LARGEST) -> dict[str, Any]:
+    """Metadata of a field that takes numbers from `smallest` on, and up to `largest`."""
+    return within(lambda value: value >= smallest, expected or f"at least {smallest}", smallest, largest)
 
 
 def between(smallest: float, largest: float, expected: str) -> dict[str, Any]:
     """Metadata of a field that takes numbers from `smallest` to `largest`, both included."""
-    return within(lambda value: smallest <= value <= largest, expected)
+    return within(lambda value: smallest <= value <= largest, expected, smallest, largest)
 
 
+def above_zero(expected: str = "above 0", largest: float = LARGEST) -> dict[str, Any]:
+    """Metadata of a field that takes numbers above 0, and up to `largest`."""
+    return within(lambda value: value > 0, expected, 0, largest)
+
+
+def below_one(expected: str = "a fraction in [0, 1)") -> dict[str, Any]:
+    """Metadata of a field that takes fractions from 0 to below 1."""
+    return within(lambda value: value < 1, expected, 0, 1)
+
+
+OPEN_FRACTION: Final = within(lambda value: 0 < value < 1, "a number in (0, 1)", 0, 1)
 SEED: Final = between(0, LARGEST_SEED, f"a non-negative integer of 32 bits, 0 to {LARGEST_SEED}")
 """Metadata of a field that takes seeds."""
+NOT_NEGATIVE: Final = at_least(0, "0 or more")
+COUNT: Final = at_least(1)
+"""Metadata of a width, or of a number of steps or things."""
+LAYERS: Final = between(1, 1000, "1 to 1000")
+"""Metadata of what is computed one after the other: layers, or iterations."""
+RATE: Final = at_least(0, "0 or more", 1e40)
+"""Metadata of a learning rate; one that diverges is said by the training."""
+YEAR_MINUTES: Final = 525_600
+EPISODE_COUNT: Final = at_least(0, "0 or more", EPISODES)
+"""Metadata of a number of episodes that are recorded with one seed."""
 
 
 class Checked:
-    """A config whose fields are checked against the ranges in their metadata when it is made.
+    """A config whose fields are checked against the bounds in their metadata when it is made.
 
     Raises:
-        ValueError: a value outside its range.
+        ValueError: a value outside its bounds.
     """
 
     group: ClassVar[str] = ""
@@ -59,13 +121,14 @@ class Checked:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
-            if "range" in field.metadata:
-                accepts, expected = field.metadata["range"]
-                value = getattr(self, field.name)
+            if "bounds" in field.metadata:
+                bounds, value = field.metadata["bounds"], getattr(self, field.name)
                 for one in value if isinstance(value, tuple) else (value,):
-                    check(one is None or accepts(one), self.group + field.name, one, expected)
+                    expected = "" if one is None else bounds.refused(one)
+                    check(not expected, self.group + field.name, one, expected)
 
 
+@functools.cache
 def keys_of(cls: type, wanted: Role) -> frozenset[str]:
     """Dotted names of the keys and groups of a config class, at any depth, that have a role."""
     hints, found = type_hints(cls), set[str]()

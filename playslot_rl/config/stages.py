@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import Checked, at_least, between, role, within
+from playslot_rl.config.roles import COUNT, NOT_NEGATIVE, RATE, Checked, above_zero, at_least, below_one, between, role
 
 Precision = Literal["fp32", "bf16", "auto"]
 
@@ -28,12 +28,12 @@ class OptimConfig(Checked):
 
     group = "optim."
 
-    lr: float = 1e-4
-    warmup_steps: int = 0
+    lr: float = field(default=1e-4, metadata=RATE)
+    warmup_steps: int = field(default=0, metadata=NOT_NEGATIVE)
     schedule: Literal["cosine", "constant"] = "cosine"
-    grad_clip: float = 0.05
+    grad_clip: float = field(default=0.05, metadata=NOT_NEGATIVE)
     accumulate: int = field(default=1, metadata=role("free") | at_least(1))
-    ema: float = field(default=0.0, metadata=within(lambda value: 0 <= value < 1, "0 (none) to below 1"))
+    ema: float = field(default=0.0, metadata=below_one("0 (none) to below 1"))
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class StageConfig(Checked):
     optim: OptimConfig = field(default_factory=OptimConfig)
     precision: Precision = "fp32"
     checkpoint_every: int = field(default=1000, metadata=role("free") | at_least(1))
-    validate_every: int = field(default=1000, metadata=role("free"))
-    log_every: int = field(default=50, metadata=role("free"))
+    validate_every: int = field(default=1000, metadata=role("free") | at_least(1))
+    log_every: int = field(default=50, metadata=role("free") | at_least(1))
     compile: bool = field(default=False, metadata=role("free"))
 
 
@@ -79,13 +79,13 @@ class SlotsStageConfig(StageConfig):
     """
 
     group = "slots."
-    clip_frames: int = 8
+    clip_frames: int = field(default=8, metadata=COUNT)
     start_from: str = field(default="", metadata=role("folder"))
     motion_weight: float = field(default=0.0, metadata=at_least(0, "0 (all pixels alike) or more"))
     zoom_steps: int = field(default=0, metadata=at_least(0, "0 (none) or more"))
     zoom: float = field(default=2.0, metadata=between(1, 8, "1 (as they are) to 8 times"))
     patience: int = field(default=0, metadata=at_least(0, "0 (train all steps) or more"))
-    segmented_episodes: int = field(default=4, metadata=role("free") | at_least(0, "0 (no FG-ARI) or more"))
+    segmented_episodes: int = field(default=4, metadata=role("free") | at_least(0, "0 (no FG-ARI) or more", 1000))
 
 
 @dataclass(frozen=True)
@@ -105,12 +105,12 @@ class DynamicsStageConfig(StageConfig):
     group = "dynamics."
     seed_frames: int = field(default=6, metadata=at_least(1))
     predicted_frames: int = field(default=8, metadata=at_least(1))
-    from_start: float = 0.0
-    teacher_steps: int = 0
-    decoded_frames: int = 0
-    image_weight: float = 1.0
-    slot_weight: float = 1.0
-    vq_weight: float = 0.25
+    from_start: float = field(default=0.0, metadata=between(0, 1, "a fraction, 0 to 1"))
+    teacher_steps: int = field(default=0, metadata=NOT_NEGATIVE)
+    decoded_frames: int = field(default=0, metadata=NOT_NEGATIVE)
+    image_weight: float = field(default=1.0, metadata=NOT_NEGATIVE)
+    slot_weight: float = field(default=1.0, metadata=NOT_NEGATIVE)
+    vq_weight: float = field(default=0.25, metadata=NOT_NEGATIVE)
     patience: int = field(default=0, metadata=at_least(0, "0 (train all steps) or more"))
 
 
@@ -166,10 +166,10 @@ class BehaviourStageConfig(StageConfig):
     decoder_inputs: Literal["inverse_dynamics", "policy", "both"] = "inverse_dynamics"
     decoder_state: bool = False
     decoder_steps: int = field(default=2000, metadata=at_least(1))
-    decoder_lr: float = field(default=2e-4, metadata=within(lambda rate: rate > 0, "above 0"))
+    decoder_lr: float = field(default=2e-4, metadata=above_zero(largest=1e40))
     finetune_steps: int = field(default=0, metadata=at_least(0, "0 (none) or more"))
     finetune_labels: int = field(default=10, metadata=at_least(1))
-    finetune_lr: float = field(default=2e-4, metadata=within(lambda rate: rate > 0, "above 0"))
+    finetune_lr: float = field(default=2e-4, metadata=above_zero(largest=1e40))
     policy_from: str = field(default="", metadata=role("machine", "folder"))
     oracle: bool = True
 

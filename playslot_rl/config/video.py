@@ -7,11 +7,8 @@ from typing import Literal
 
 from playslot_rl.config.model import PredictorConfig
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import at_least, role, within
+from playslot_rl.config.roles import COUNT, LAYERS, NOT_NEGATIVE, OPEN_FRACTION, above_zero, at_least, role
 from playslot_rl.config.stages import DynamicsStageConfig, OptimConfig, StageConfig
-
-NOT_NEGATIVE = at_least(0, "0 or more")
-FRACTION = within(lambda value: 0 < value < 1, "a number in (0, 1)")
 
 
 @dataclass(frozen=True)
@@ -50,12 +47,12 @@ class SVGConfig(VideoStageConfig):
     optim: OptimConfig = field(
         default_factory=lambda: OptimConfig(lr=2e-3, warmup_steps=0, schedule="constant", grad_clip=0.0)
     )
-    channels: tuple[int, ...] = (64, 128, 256, 512)
-    convs: tuple[int, ...] = (2, 2, 3, 3)
-    features: int = 128
-    latent_dim: int = 64
-    hidden: int = 256
-    layers: int = field(default=2, metadata=at_least(1))
+    channels: tuple[int, ...] = field(default=(64, 128, 256, 512), metadata=COUNT)
+    convs: tuple[int, ...] = field(default=(2, 2, 3, 3), metadata=LAYERS)
+    features: int = field(default=128, metadata=COUNT)
+    latent_dim: int = field(default=64, metadata=COUNT)
+    hidden: int = field(default=256, metadata=COUNT)
+    layers: int = field(default=2, metadata=LAYERS)
     kl_weight: float = field(default=1e-4, metadata=NOT_NEGATIVE)
 
     def __post_init__(self) -> None:
@@ -95,20 +92,20 @@ class CADDYConfig(VideoStageConfig):
     optim: OptimConfig = field(
         default_factory=lambda: OptimConfig(lr=4e-4, warmup_steps=0, schedule="constant", grad_clip=0.0)
     )
-    encoder: tuple[int, ...] = (16, 16, 32, 64)
-    dynamics: int = 128
-    generator: tuple[int, ...] = (128, 64, 32)
+    encoder: tuple[int, ...] = field(default=(16, 16, 32, 64), metadata=COUNT)
+    dynamics: int = field(default=128, metadata=COUNT)
+    generator: tuple[int, ...] = field(default=(128, 64, 32), metadata=COUNT)
     actions: int = field(default=8, metadata=at_least(2))
-    latent_dim: int = 8
+    latent_dim: int = field(default=8, metadata=COUNT)
     perceptual: str = field(default="", metadata=role("folder"))
     perceptual_weight: float = field(default=1.0, metadata=NOT_NEGATIVE)
     state_weight: float = field(default=0.2, metadata=NOT_NEGATIVE)
     kl_weight: float = field(default=1e-4, metadata=NOT_NEGATIVE)
     information_weight: float = field(default=0.15, metadata=NOT_NEGATIVE)
-    information_decay: float = field(default=0.8, metadata=FRACTION)
-    centroid_decay: float = field(default=0.9, metadata=FRACTION)
+    information_decay: float = field(default=0.8, metadata=OPEN_FRACTION)
+    centroid_decay: float = field(default=0.9, metadata=OPEN_FRACTION)
     warmup_steps: int = field(default=1000, metadata=NOT_NEGATIVE)
-    temperature: tuple[float, float] = (1.0, 0.4)
+    temperature: tuple[float, float] = field(default=(1.0, 0.4), metadata=above_zero())
     anneal_steps: int = field(default=20_000, metadata=at_least(1))
     first_frames: int = field(default=7, metadata=at_least(2))
     growth_steps: int = field(default=25_000, metadata=NOT_NEGATIVE)
@@ -118,7 +115,7 @@ class CADDYConfig(VideoStageConfig):
         super().__post_init__()
         check(len(self.encoder) == 4, "baselines.caddy.encoder", self.encoder, "four widths")
         check(len(self.generator) == 3, "baselines.caddy.generator", self.generator, "three widths")
-        check(min(self.temperature) > 0, "baselines.caddy.temperature", self.temperature, "two numbers above 0")
+        check(len(self.temperature) == 2, "baselines.caddy.temperature", self.temperature, "two numbers above 0")
 
 
 @dataclass(frozen=True)
@@ -127,7 +124,7 @@ class SlotFormerSizes(PredictorConfig):
 
     group = "baselines.slotformer.predictor."
     kind: Literal["cocvp", "ocvp_seq", "slotformer"] = "slotformer"
-    head_dim: int = 32
+    head_dim: int = field(default=32, metadata=COUNT)
     residual: bool = True
     context: int = field(default=6, metadata=at_least(2, "at least 2 frames"))
     project_out: bool = False
@@ -139,8 +136,8 @@ class OCVPSeqSizes(PredictorConfig):
 
     group = "baselines.ocvp_seq.predictor."
     kind: Literal["cocvp", "ocvp_seq", "slotformer"] = "ocvp_seq"
-    head_dim: int = 32
-    mlp_dim: int = 512
+    head_dim: int = field(default=32, metadata=COUNT)
+    mlp_dim: int = field(default=512, metadata=COUNT)
     residual: bool = True
     project_out: bool = False
 

@@ -84,14 +84,18 @@ def test_what_a_task_changes_names_a_task_and_a_preset() -> None:
     assert set(choices("env_preset")) <= {f"{env}_{preset}" for env in ENVS for preset in PRESETS}
 
 
-def test_the_last_of_equal_keys_wins() -> None:
-    config = compose(["preset=paper", "seed=1", "preset=smoke", "seed=2"])
-    assert (config.preset, config.seed) == ("smoke", 2)
+@pytest.mark.parametrize("twice", [("seed=1", "seed=2"), ("preset=paper", "preset=smoke"), ("out=a", "+out=a")])
+def test_a_key_is_typed_once(twice: tuple[str, ...]) -> None:
+    key = twice[0].partition("=")[0]
+    with pytest.raises(ConfigError, match=f"^{key}: got it 2 times, expected it once"):
+        compose(["episodes=3", *twice])
+    with pytest.raises(ConfigError, match=r"^compare\.seeds: got it 2 times"):
+        compose(["seeds=1", "compare.seeds=[2]"], "compare")
 
 
 @pytest.mark.parametrize(
     "path",
-    ["a b/c", "x,y", "k=v", "123", "it's", "(1) [2] {3}", "${HOME}", "tail\\", "null-ish", "a/~", "true", "1e5", ""],
+    ["a b/c", "x,y", "k=v", "123", "it's", "(1) [2] {3}", "$HOME", "tail\\", "null-ish", "a/~", "true", "1e5", ""],
 )
 def test_text_reaches_the_config_as_typed(path: str) -> None:
     assert compose([f"data.root={path}"]).data.root == path
