@@ -344,8 +344,15 @@ def _run(name: str, options: argparse.Namespace) -> int:
 
         return doctor.main(config)
     from playslot_rl import processes
+    from playslot_rl.config.weights import data_roots, is_remote
     from playslot_rl.envs.rendering import import_mujoco
+    from playslot_rl.storage.folders import require_outside
 
+    read = [root.path for text in (config.data.root, config.data.demos) for root in data_roots(text)]
+    written = {"out=": config.out, "data.cache=": config.data.cache, "--json ": getattr(options, "json", None)}
+    for key, place in written.items():
+        if place and place != config.run:
+            require_outside(place, [root for root in read if not is_remote(root)], key)
     if processes.launched().world > 1:
         processes.start(config.device)
     import_mujoco()  # torchrl imports it too, and would fail without our cure

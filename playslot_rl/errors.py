@@ -61,4 +61,11 @@ def explain(error: BaseException) -> str:
     text = " ".join(str(error).split()) or "no message"
     if isinstance(error, PlaySlotError):
         return text
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "allocate memory" in text:
+        return (
+            f"got too little memory ({text}), expected enough for these sizes: choose a smaller batch or smaller sizes"
+        )
+    if isinstance(error, OSError) and error.errno is not None and error.filename is not None:
+        wanted = "expected a path that can be read and written: choose another, or mend this one"
+        return f"got {type(error).__name__}: {text}, {wanted}"
     return f"{type(error).__name__}: {text} (unexpected; {DEBUG}=1 shows where)"

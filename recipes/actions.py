@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from playslot_rl.storage.folders import require_outside
+
 Argument = tuple[str, dict[str, Any]]
 """Name and settings of `ArgumentParser.add_argument`."""
 
@@ -24,6 +26,7 @@ class Action:
         does: `module:function`, imported when it is run; takes the arguments by name.
         arguments: in the order of the help.
         either: of which at most one may be given.
+        writes: the argument that names what it writes.
     """
 
     summary: str
@@ -32,6 +35,7 @@ class Action:
     does: str
     arguments: tuple[Argument, ...]
     either: tuple[Argument, ...] = ()
+    writes: str = "out"
 
 
 def make_parser(
@@ -81,11 +85,16 @@ def run_action(actions: Mapping[str, Action], options: argparse.Namespace) -> in
         The exit code: 0 done, 1 a data set that is not sound.
 
     Raises:
+        OutputError: it would write into the data set that it reads, or into another.
         PlaySlotError: whatever the action raises.
         KeyboardInterrupt: with a line about what that leaves.
     """
     values = dict(vars(options))
     action, as_json = actions[values.pop("action")], values.pop("json", False)
+    if values.get(action.writes) is not None:
+        read = [values[name] for name in ("root", "roots") if name in values and name != action.writes]
+        flat = [root for one in read for root in (one if isinstance(one, list) else [one])]
+        require_outside(values[action.writes], flat, "--out " if action.writes == "out" else "")
     try:
         result = pkgutil.resolve_name(action.does)(**values)
         lines = result if isinstance(result, list) else result.lines()

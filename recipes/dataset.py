@@ -151,5 +151,6 @@ ACTIONS: Final[dict[str, Action]] = {
             ),
             ("--revision", {"metavar": "R", "help": "branch, tag or commit (default the format's version tag)"}),
         ),
+        writes="root",
     ),
 }

@@ -25,6 +25,9 @@ _REASONS = {
     ),
     errno.EROFS: ("the file system is read-only", "choose another folder"),
     errno.EACCES: ("permission denied", "choose a folder you can write"),
+    errno.EPERM: ("permission denied", "choose a folder you can write"),
+    errno.ENAMETOOLONG: ("a name is too long", "choose a shorter one"),
+    errno.ELOOP: ("its symbolic links go round in a circle", "choose another folder"),
     errno.ENOTDIR: ("a file stands where a folder is needed", "choose another folder"),
     errno.EEXIST: ("a file stands where a folder is needed", "choose another folder"),
 }

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from playslot_rl.errors import OutputError
@@ -25,6 +26,28 @@ def require_free(out: Path, key: str = "out=") -> None:
         raise OutputError(
             f"{key}{out}: got something that is there already, expected none; choose another {key.strip()}"
         )
+
+
+def require_outside(out: str | Path, reads: Iterable[str | Path] = (), key: str = "out=") -> None:
+    """Refuse to write into a data set: what lies in one is pushed with it. Symbolic links are followed.
+
+    Args:
+        out: file or folder to write.
+        reads: data sets, or downloads, that are read: `out` may neither be one nor lie in one. It may not lie in any
+            other LeRobot data set either.
+        key: how its user names `out`, for the message.
+
+    Raises:
+        OutputError: it does, or a file stands where one of its parents has to be.
+    """
+    place = Path(os.path.realpath(out))  # unlike Path.resolve, of links that go round in a circle too
+    inside = [root for root in reads if place.is_relative_to(os.path.realpath(root))]
+    inside += [parent for parent in place.parents if (parent / "meta" / "info.json").is_file()]
+    if inside:
+        raise OutputError(f"{key}{out}: got a place inside the data set {inside[0]}, expected one outside")
+    for parent in place.parents:
+        if parent.exists() and not parent.is_dir():
+            raise OutputError(f"{key}{out}: got the file {parent} in its path, expected folders: choose another")
 
 
 @contextlib.contextmanager
