@@ -37,7 +37,27 @@ COMMANDS = [
     "bench",
     "doctor",
 ]
-KEYS = ["env=", "preset=", "policy=", "episodes=", "seed=", "workers=", "out=", "data.root=", "run=", "protocol="]
+KEYS = {
+    "collect": "preset= policy= episodes= seed= workers= out= collect.noise= env. collector. render.",
+    "convert": "env= episodes= out= data.root= data.camera= env.image_size= collect.storage=",
+    "train-slots": "env= preset= seed= out= device= threads= data.root= data. model.savi. slots. logging.",
+    "train-dynamics": "run= seed= out= data.root= model.inverse_dynamics. model.predictor. dynamics.",
+    "train-policy": "run= demos= data.demos= model.policy. model.action_decoder. behaviour.",
+    "train-baseline": "method= run= demos= env= preset= data.root= baselines.lapo. baselines.sold. behaviour.",
+    "evaluate": "run= episodes= seed= protocol= device= env. render. evaluation.",
+    "inspect": "run= episodes= seed= out= data.",
+    "plan": "run= episodes= seed= out= planner= proposal= goals= plan.",
+    "export": "run= out= export.",
+    "play": "run= port= seed= out= play. data.",
+    "pipeline": "env= preset= episodes= seed= workers= out= data.root= collect. slots. behaviour. evaluation.",
+    "adopt": "minutes= seed= out= data.root= data. adopt. slots. dynamics.",
+    "compare": "run= seed= out= methods= demos= labels= seeds= processes= hydra.launcher= compare. baselines.lapo.",
+    "compare-video": "run= seed= methods= seeds= vary= values= objects= hydra.launcher= compare_video. metrics.",
+    "demo": "episodes= seed= out= collect. behaviour.",
+    "bench": "preset= threads=",
+    "doctor": "device= out= data.cache=",
+}
+"""Keys and groups of which the help of each command has a line."""
 
 Recipe = Callable[..., None]
 
@@ -67,15 +87,101 @@ def test_the_commands_are_the_promised_ones() -> None:
     assert list(cli.GROUPS) == ["dataset", "cache"]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_explains_with_examples_and_the_common_keys(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def help_of(command: str, capsys: pytest.CaptureFixture[str]) -> str:
     with pytest.raises(SystemExit) as ended:
         cli.main([command, "--help"])
     assert ended.value.code == 0
-    text = capsys.readouterr().out
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_explains_with_examples_and_the_commands_own_keys(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = help_of(command, capsys)
     assert f"playslot {command}" in text
     assert "examples:" in text
-    assert all(f"  {key}" in text for key in KEYS)
+    shown = text.split("\nkeys:\n", 1)[1]
+    for key in KEYS[command].split():
+        assert re.search(rf"[ \n]{re.escape(key)}", shown), key
+    keys = {found[1] for line in shown.splitlines() if (found := re.match(r"  ([a-z][a-z_.]*)[=.]", line))}
+    foreign = {"protocol": ("evaluate", "pipeline"), "policy": ("collect",), "minutes": ("adopt",), "port": ("play",)}
+    foreign |= {"method": ("train-baseline",), "export": ("export",), "plan": ("plan",), "adopt": ("adopt",)}
+    assert not [key for key, of in foreign.items() if key in keys and command not in of]
+
+
+def test_every_key_is_in_the_help_of_a_command() -> None:
+    from playslot_rl.config.plain import flatten, to_dict
+
+    listed = {key for command in cli.COMMANDS.values() for key in command.keys}
+    keys = flatten(to_dict(ExperimentConfig()))
+    assert [key for key in keys if not any(f"{key}.".startswith(f"{of}.") for of in listed)] == []
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_lists_the_keys_of_its_examples(command: str) -> None:
+    from playslot_rl.config.compose import COMPARISONS, NAMES
+
+    short = {*COMPARISONS.get(command, ()), *NAMES.get(command, ())}
+    for example in cli.COMMANDS[command].examples:
+        for key in re.findall(r" ([a-z_.]+)=", example):
+            own = key in short or key.startswith("hydra.")
+            assert own or any(f"{key}.".startswith(f"{of}.") for of in cli.COMMANDS[command].keys), key
+
+
+def test_the_words_of_a_key_are_those_of_its_field(capsys: pytest.CaptureFixture[str]) -> None:
+    text = " ".join(help_of("adopt", capsys).split())
+    assert "minutes=60.0 of wall-clock time that `adopt` may take" in text
+    assert "slots. steps batch_size optim.{lr,warmup_steps,schedule,grad_clip,accumulate,ema} precision" in text
+    assert "policy=random|expert" in " ".join(help_of("collect", capsys).split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "near"),
+    [
+        (["train-polcy"], "train-policy"),
+        (["colect", "seed=1"], "collect"),
+        (["dataset", "splt"], "split"),
+        (["cache", "lst"], "list"),
+        (["datset"], "dataset"),
+    ],
+)
+def test_a_slip_in_a_name_gets_the_nearest(arguments: list[str], near: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(arguments)
+    assert ended.value.code == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert f"; did you mean {near}?" in err
+
+
+@pytest.fixture
+def in_a_folder_with_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "mine").mkdir(parents=True)
+    (tmp_path / "runs" / "mine" / "config.json").write_text("{}")
+
+
+@pytest.mark.parametrize(
+    ("run", "near"),
+    [("pretraind", "pretrained"), ("pretraind/block_push", "pretrained/block_push"), ("runs/mien", "runs/mine")],
+)
+@pytest.mark.parametrize("command", ["evaluate", "train-policy", "play"])
+def test_a_slip_in_a_runs_name_gets_the_nearest(
+    command: str,
+    run: str,
+    near: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "mine").mkdir(parents=True)
+    (tmp_path / "runs" / "mine" / "config.json").write_text("{}")
+    assert cli.main([command, f"run={run}"]) == 2
+    err = capsys.readouterr().err
+    assert f"; did you mean run={near}?" in err
+    assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import functools
 import json
 import os
@@ -21,7 +20,7 @@ from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.arguments import require_digits, require_folders, require_once, require_plain
 from playslot_rl.config.memory import require_memory
 from playslot_rl.config.methods import MethodName, canonical_method
-from playslot_rl.config.plain import flatten, type_hints
+from playslot_rl.config.plain import flatten, nearest, type_hints
 from playslot_rl.config.planning import GOALS, PLANNERS, PROPOSALS
 from playslot_rl.config.roles import keys_of
 from playslot_rl.errors import ConfigError
@@ -44,6 +43,15 @@ SHIPPED: Final = "pretrained"
 def shipped(run: str) -> bool:
     """Whether `run` names a shipped world model instead of a folder."""
     return run.partition("/")[0] == SHIPPED
+
+
+def near_run(run: str) -> str:
+    """The shipped model or the run beside it that a name may be meant for, as the end of a message."""
+    models = [SHIPPED, *(f"{SHIPPED}/{env}" for env in choices("env"))]
+    place = Path(run)
+    with contextlib.suppress(OSError):
+        models += [str(found.parent) for found in place.parent.glob("*/config.json")]
+    return nearest(run, models, "run=")
 
 
 def choices(group: str) -> list[str]:
@@ -203,16 +211,14 @@ def _unknown_key(key: str) -> str:
         group = group.rpartition(".")[0]
     level = _hint(group) if group else ExperimentConfig
     names = [f"{group}.{f.name}" if group else f.name for f in dataclasses.fields(level)]
-    near = difflib.get_close_matches(key, [*names, *flatten(to_dict(ExperimentConfig()))], n=1)
-    hint = f"; did you mean {near[0]}?" if near else ""
+    hint = nearest(key, [*names, *flatten(to_dict(ExperimentConfig()))])
     return f"unknown key {key}: expected one of {', '.join(sorted(names))}{hint}"
 
 
 def _check_choice(group: str, name: str) -> None:
     known = choices(group)
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"; did you mean {group}={near[0]}?" if near else ""
+        hint = nearest(name, known, f"{group}=")
         raise ConfigError(f"unknown {group} {name!r}: expected one of {', '.join(known)}{hint}")
 
 
@@ -309,8 +315,9 @@ def _from_run(run: Path, pairs: Mapping[str, str]) -> ExperimentConfig:
 def _read_stored(run: Path) -> ExperimentConfig:
     path = run / "config.json"
     if not path.is_file():
+        hint = near_run(str(run))
         raise ConfigError(
-            f"run={run}: got no {path}, expected the folder of a run; make one with `playslot pipeline out={run}`"
+            f"run={run}: got no {path}, expected the folder of a run{hint}; make one with `playslot pipeline out={run}`"
         )
     try:
         values = json.loads(path.read_text(encoding="utf-8"))

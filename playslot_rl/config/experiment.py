@@ -183,7 +183,13 @@ class MetricsConfig:
 
 @dataclass(frozen=True)
 class LoggingConfig:
-    """Logging: `tensorboard` (default), `wandb`, `trackio` or `none`, and a progress bar."""
+    """Where a training says how it goes.
+
+    Attributes:
+        backend: `tensorboard` (default), `wandb`, `trackio` or `none`.
+        progress: show a progress bar.
+        project: the project's name for `wandb` and `trackio`.
+    """
 
     backend: Literal["tensorboard", "wandb", "trackio", "none"] = "tensorboard"
     progress: bool = True

@@ -10,7 +10,7 @@ import json
 import math
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, Literal, Union, get_args, get_origin
 
 
@@ -36,6 +36,17 @@ def shortened(value: object) -> str:
         return f"{'-' if value < 0 else ''}{abs(value) // 10 ** max(0, digits - 24)}... (about 1e{digits})"
     text = repr(value)
     return text if len(text) <= 200 else f"{text[:160]}... ({len(text)} characters)"
+
+
+def nearest(text: str, known: Iterable[str], prefix: str = "") -> str:
+    """The end of a message about an unknown name: the known one that it may be meant for; empty where none is near.
+
+    Examples:
+        >>> nearest("smol", ["smoke", "paper"], "preset=")
+        '; did you mean preset=smoke?'
+    """
+    near = difflib.get_close_matches(text, [str(name) for name in known], n=1)
+    return f"; did you mean {prefix}{near[0]}?" if near else ""
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -78,8 +89,7 @@ def from_dict[T](cls: type[T], values: dict[str, Any], where: str = "") -> T:
     names = {f.name for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for key in values:
         if key not in names:
-            near = difflib.get_close_matches(str(key), names, n=1)
-            hint = f"; did you mean {where}{near[0]!s}?" if near else ""
+            hint = nearest(str(key), sorted(names), where)
             raise ValueError(f"unknown key {where}{key}: expected one of {', '.join(sorted(names))}{hint}")
     kwargs = {key: _convert(hints[key], value, f"{where}{key}") for key, value in values.items()}
     try:

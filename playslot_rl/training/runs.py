@@ -30,7 +30,7 @@ from playslot_rl.config import (
     from_dict,
     to_dict,
 )
-from playslot_rl.config.compose import SHIPPED
+from playslot_rl.config.compose import SHIPPED, near_run
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_bytes, write_json
 from playslot_rl.storage.checkpoints import (
@@ -83,7 +83,8 @@ def run_folder(run: Path | str) -> Path:
         return pretrained_folder(env)
     folder = Path(run)
     if not str(run) or not folder.is_dir():
-        raise CheckpointError(f"run={run}: no such folder, expected a run folder or `{SHIPPED}`: check run=")
+        hint = near_run(str(run))
+        raise CheckpointError(f"run={run}: no such folder, expected a run folder or `{SHIPPED}`: check run={hint}")
     return folder
 
 

@@ -14,8 +14,11 @@ import typing
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 import playslot_rl
 from playslot_rl import config as config_package
+from playslot_rl.cli import COMMANDS
 from playslot_rl.config import ExperimentConfig
 
 ROOT = Path(playslot_rl.__file__).parents[1]
@@ -219,3 +222,38 @@ def test_what_stages_inherit_counts_for_all_of_them_in_the_loops_only() -> None:
     steps = {f"{stage}.steps" for stage in ("slots", "dynamics", "behaviour", "baselines.lapo.policy")}
     assert steps.isdisjoint(Reads({"playslot_rl/training/fit.py": source}).unread())
     assert steps & set(Reads({"elsewhere.py": source}).unread()) == steps - {"baselines.lapo.policy.steps"}
+
+
+# --- the help of a command lists what its recipe reads ------------------------------------------------------------
+
+STORED = {
+    "evaluate": {"method", "out"},
+    "export": {"method", "env.name"},
+    "plan": {"method"},
+    "compare": {"out"},
+}
+"""Keys that a recipe reads of what a run has stored, or only to refuse them."""
+
+
+def listed(command: str) -> tuple[str, ...]:
+    return COMMANDS[command].keys
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name != "doctor"])
+def test_what_a_recipe_reads_is_listed(command: str) -> None:
+    path = f"recipes/{command.replace('-', '_')}.py"
+    found = Reads({path: (ROOT / path).read_text()}).found
+    keys = {
+        key: any(f"{key}.".startswith(f"{of}.") for of in listed(command))
+        for key, cls, name in leaves(ExperimentConfig)
+        if (cls.__name__, name) in found
+    }
+    assert keys
+    unlisted = {key for key, there in keys.items() if not there}
+    assert unlisted <= STORED.get(command, set())
+
+
+def test_a_command_lists_nothing_that_is_no_key() -> None:
+    keys = [key for key, _, _ in leaves(ExperimentConfig)] + ["env", "preset"]
+    for command in COMMANDS:
+        assert all(any(f"{key}.".startswith(f"{of}.") for key in keys) for of in listed(command)), command
