@@ -17,8 +17,9 @@ H W image height and width. "[B,]" may be there or not; "[N,]" is there with one
 from __future__ import annotations
 
 from collections.abc import Sequence
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, SupportsIndex
 
 import numpy as np
 import numpy.typing as npt
@@ -29,8 +30,9 @@ from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.acting.imagination import ImaginationEnv, ImaginationSession, latent_actions
 from playslot_rl.config import ExperimentConfig, RenderConfig
-from playslot_rl.errors import CheckpointError
-from playslot_rl.frames import normalise
+from playslot_rl.devices import named_device, probed
+from playslot_rl.errors import CheckpointError, require_type
+from playslot_rl.frames import as_numbers, normalise
 from playslot_rl.modules.inverse_dynamics import LatentActions
 from playslot_rl.modules.savi import Decoded
 from playslot_rl.world_model import Agent, WorldModel, module_device
@@ -65,9 +67,11 @@ def load(run: str | Path = "pretrained", device: str = "", seed: int = 0) -> Pla
     from playslot_rl.storage.checkpoints import checkpoint_folder
     from playslot_rl.training.runs import load_agent, load_world_model, run_folder
 
+    require_type(run, "run", str, PathLike, expected="a run folder or `pretrained`")
+    require_type(seed, "seed", SupportsIndex, expected="a number")
     if is_model_folder(Path(run)):
         return PlaySlot.from_pretrained(run, device, seed=seed)
-    target = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    target = probed(named_device(device))
     if (checkpoint_folder(run_folder(run), "policy") / "meta.json").is_file():
         agent = load_agent(run, target)
         return PlaySlot(agent.world_model, agent, seed)
@@ -101,6 +105,7 @@ class PlaySlot:
         """
         from playslot_rl.testing import tiny_agent
 
+        require_type(config, "config", ExperimentConfig, type(None), expected="an ExperimentConfig, or None")
         agent = tiny_agent(config, seed)
         return cls(agent.world_model, agent, seed)
 
@@ -123,12 +128,14 @@ class PlaySlot:
         """
         from playslot_rl.sharing.folder import load_pretrained
 
-        folder = Path(name)
+        require_type(name, "name", str, PathLike, expected="a folder, or user/name on the Hub")
+        require_type(seed, "seed", SupportsIndex, expected="a number")
+        folder, target = Path(name), probed(named_device(device))
         if not folder.is_dir():
             from playslot_rl.hub.policy import pull_policy
 
             folder = pull_policy(str(name), revision, token=token)
-        agent, policy = load_pretrained(folder, device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        agent, policy = load_pretrained(folder, target)
         model = cls(agent.world_model, agent, seed)
         model._policy = policy
         return model
@@ -156,6 +163,7 @@ class PlaySlot:
             raise CheckpointError(
                 "save_pretrained: got a world model without a policy; run `playslot train-policy` and load that run"
             )
+        require_type(folder, "folder", str, PathLike, expected="the folder to write")
         path, agent = Path(folder), self.agent
         known = self._policy or SharedPolicyConfig()
         source = {**known.source, "versions": versions()}
@@ -191,7 +199,7 @@ class PlaySlot:
         return out
 
     @torch.no_grad()
-    def infer_actions(self, slots: Tensor) -> LatentActions:
+    def infer_actions(self, slots: Array) -> LatentActions:
         """Latent actions between consecutive frames, from the slots of a clip or of a batch of clips.
 
         Args:
@@ -256,7 +264,7 @@ class PlaySlot:
         return future if batched else future[0]
 
     @torch.no_grad()
-    def decode(self, slots: Tensor) -> Decoded:
+    def decode(self, slots: Array) -> Decoded:
         """Frames and masks of slots.
 
         Args:
@@ -322,6 +330,10 @@ class PlaySlot:
             >>> PlaySlot.untrained().imagination([2]).rollout(3)["slots"].shape
             torch.Size([2, 3, 4, 32])
         """
+        require_type(horizon, "horizon", SupportsIndex, expected="a number of steps, or 0")
+        sizes = as_numbers(batch_size, "batch_size", "a list of numbers, such as [2]")
+        if sizes.ndim != 1 or (sizes < 1).any() or (sizes.numel() and sizes.is_floating_point()):
+            raise ValueError(f"batch_size: got {batch_size!r}, expected numbers from 1 on, such as [2]")
         return ImaginationEnv(self.world_model, batch_size, horizon=horizon, generator=self._generator())
 
     def session(self) -> ImaginationSession:
@@ -344,6 +356,7 @@ class PlaySlot:
             )
         from playslot_rl.acting.simulation import make_simulation_env
 
+        require_type(render, "render", RenderConfig, type(None), expected="a RenderConfig, or None")
         env, decoder = self.world_model.env, self.agent.action_decoder
         return make_simulation_env(env, render or RenderConfig(), self.world_model, decoder, self._generator())
 
@@ -352,7 +365,7 @@ class PlaySlot:
 
     def _frames(self, frames: Array) -> Tensor:
         """Any accepted layout to float (..., 3, H, W) in [0, 1] on the model's device."""
-        pixels = torch.as_tensor(frames)
+        pixels = as_numbers(frames, "frames", "pixels as a numpy array or a tensor: decode a video or picture first")
         side, shape = self.world_model.env.image_size, tuple(pixels.shape)
         if shape[-3:] == (side, side, 3):
             pixels = pixels.movedim(-1, -3)
@@ -360,18 +373,24 @@ class PlaySlot:
             raise ValueError(
                 f"frames: got shape {shape}, expected (..., {side}, {side}, 3) or (..., 3, {side}, {side})"
             )
+        if not pixels.numel():
+            raise ValueError(f"frames: got shape {shape}, which holds none, expected at least one frame")
         pixels = pixels.to(module_device(self.world_model))
         if pixels.dtype == torch.uint8:
             return normalise(pixels)
         if not pixels.is_floating_point() or not bool(((pixels >= 0) & (pixels <= 1)).all()):
-            low, high = pixels.min().item(), pixels.max().item()
+            values = pixels.double()  # of some integers torch finds no minimum
+            low, high = values.min().item(), values.max().item()
             raise ValueError(
                 f"frames: got {pixels.dtype} in [{low:g}, {high:g}], expected uint8 in [0, 255] or floats in [0, 1]"
             )
         return pixels.float()
 
-    def _slots(self, slots: Tensor) -> Tensor:
-        if tuple(slots.shape[-2:]) != self.world_model.slot_shape:
+    def _slots(self, slots: Array) -> Tensor:
+        given = as_numbers(slots, "slots", "slots as `parse` gives them")
+        if tuple(given.shape[-2:]) != self.world_model.slot_shape or not given.numel():
             expected = self.world_model.slot_shape
-            raise ValueError(f"slots: got shape {tuple(slots.shape)}, expected (..., {expected[0]}, {expected[1]})")
-        return slots.to(module_device(self.world_model))
+            raise ValueError(f"slots: got shape {tuple(given.shape)}, expected (..., {expected[0]}, {expected[1]})")
+        if not given.is_floating_point():
+            raise ValueError(f"slots: got {given.dtype}, expected floats, as `parse` gives them")
+        return given.to(module_device(self.world_model)).float()

@@ -150,7 +150,8 @@ def _run(name: str, options: argparse.Namespace) -> int:
     written = {"out=": config.out, "data.cache=": config.data.cache, "--json ": getattr(options, "json", None)}
     for key, place in written.items():
         if place and place != config.run:
-            require_outside(place, [root for root in read if not is_remote(root)], key)
+            local = [root for root in read if not is_remote(root)]
+            require_outside(place, local, key, "file" if key == "--json " else "folder")
     if processes.launched().world > 1:
         processes.start(config.device)
     import_mujoco()  # torchrl imports it too, and would fail without our cure

@@ -49,6 +49,17 @@ class HubError(PlaySlotError, RuntimeError):
     """A push or pull failed: no or a bad token, no network, repository or revision, offline, or a server error."""
 
 
+def require_type(given: object, what: str, *kinds: type, expected: str) -> None:
+    """Refuse an argument of another type; a bool is no number.
+
+    Raises:
+        TypeError: in one line.
+    """
+    if not isinstance(given, kinds) or isinstance(given, bool):
+        said = " ".join(repr(given).split())[:60]
+        raise TypeError(f"{what}: got {said} ({type(given).__name__}), expected {expected}")
+
+
 def explain(error: BaseException) -> str:
     """One line about an error, the full disk first: libraries wrap it in errors of their own."""
     cause: BaseException | None = error

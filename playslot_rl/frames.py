@@ -38,3 +38,34 @@ def to_uint8(frames: Tensor) -> npt.NDArray[np.uint8]:
     """What networks draw, (..., 3, H, W) float, to pictures (..., H, W, 3) uint8."""
     array: npt.NDArray[np.uint8] = quantise(frames).movedim(-3, -1).cpu().numpy()
     return array
+
+
+def as_numbers(given: object, what: str, expected: str) -> Tensor:
+    """What somebody hands over, as a tensor of real numbers.
+
+    Args:
+        given: a tensor or an array, or nested lists of numbers, of any shape.
+        what: the argument's name, for the message.
+        expected: what it should be, for the message.
+
+    Raises:
+        TypeError: anything else, such as the name of a file.
+
+    Examples:
+        >>> as_numbers([[0.5]], "actions", "floats").shape
+        torch.Size([1, 1])
+        >>> as_numbers("x.mp4", "frames", "frames as an array")
+        Traceback (most recent call last):
+        TypeError: frames: got 'x.mp4' (str), expected frames as an array
+    """
+    if isinstance(given, np.ndarray) and any(stride < 0 for stride in given.strides):
+        given = given.copy()  # reversed: torch has no negative strides
+    try:
+        values = torch.as_tensor(given)
+    except (TypeError, ValueError, RuntimeError) as error:
+        said = "" if isinstance(given, np.ndarray) else f" {' '.join(repr(given).split())[:60]}"
+        kind = f"{given.dtype} array" if isinstance(given, np.ndarray) else type(given).__name__
+        raise TypeError(f"{what}: got{said} ({kind}), expected {expected}") from error
+    if values.is_complex() or values.is_quantized or values.is_sparse:
+        raise TypeError(f"{what}: got {values.dtype}, expected {expected}")
+    return values

@@ -7,6 +7,7 @@ import pkgutil
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from playslot_rl.storage.folders import require_outside
@@ -94,7 +95,8 @@ def run_action(actions: Mapping[str, Action], options: argparse.Namespace) -> in
     if values.get(action.writes) is not None:
         read = [values[name] for name in ("root", "roots") if name in values and name != action.writes]
         flat = [root for one in read for root in (one if isinstance(one, list) else [one])]
-        require_outside(values[action.writes], flat, "--out " if action.writes == "out" else "")
+        written, key = Path(values[action.writes]), "--out " if action.writes == "out" else ""
+        require_outside(written, flat, key, "file" if written.suffix == ".html" else "folder")
     try:
         result = pkgutil.resolve_name(action.does)(**values)
         lines = result if isinstance(result, list) else result.lines()

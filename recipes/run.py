@@ -101,21 +101,14 @@ def open_device(config: ExperimentConfig) -> torch.device:
     Raises:
         ConfigError: no such device.
     """
-    import torch
-
     from playslot_rl.allocator import tune_allocator
+    from playslot_rl.devices import named_device, probed
     from playslot_rl.processes import own_device
     from playslot_rl.threads import set_threads
 
     tune_allocator()
     set_threads(config.threads)
-    try:
-        device = torch.device(config.device or ("cuda" if torch.cuda.is_available() else "cpu"))
-        device = own_device(device)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise ConfigError(f"device={config.device}: {str(error).splitlines()[0]}; use device=cpu") from error
-    return device
+    return probed(own_device(named_device(config.device)))
 
 
 def demonstration_views(

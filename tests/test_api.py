@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import doctest
 import importlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import playslot_rl
 from playslot_rl import api
 from playslot_rl.api import PlaySlot
 from playslot_rl.config import to_dict
-from playslot_rl.errors import CheckpointError
+from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
 from playslot_rl.testing import tiny_config
 from playslot_rl.world_model import Agent
@@ -200,3 +202,80 @@ def test_docstring_examples_run(module: str, monkeypatch: pytest.MonkeyPatch) ->
     result = doctest.testmod(loaded, optionflags=doctest.NORMALIZE_WHITESPACE)
     assert result.attempted > 0
     assert result.failed == 0
+
+
+WRONG = ["x.mp4", b"x", Path("x.mp4"), None, ["a", "b"], [[1, 2], [3]], object(), {"a": 1}, Image.new("RGB", (64, 64)),
+         np.array(["a"]), np.zeros((64, 64, 3), object), np.zeros((64, 64, 3), complex)]  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: type(wrong).__name__)
+def test_what_holds_no_numbers_is_refused_in_one_line(model: PlaySlot, video: np.ndarray, wrong: object) -> None:
+    calls: dict[str, Callable[[], object]] = {
+        "frames": lambda: model.parse(wrong),  # type: ignore[arg-type]
+        "slots": lambda: model.infer_actions(wrong),  # type: ignore[arg-type]
+        "slots ": lambda: model.decode(wrong),  # type: ignore[arg-type]
+        "actions": lambda: model.imagine(video[0], wrong),  # type: ignore[arg-type]
+        "frames ": lambda: model.imagine(wrong, torch.zeros(2, dtype=torch.long)),  # type: ignore[arg-type]
+        "frames  ": lambda: model.act(wrong),  # type: ignore[arg-type]
+        "batch_size": lambda: model.imagination(wrong),  # type: ignore[arg-type]
+    }
+    for what, call in calls.items():
+        with pytest.raises(TypeError, match=f"^{what.strip()}: got .*, expected ") as caught:
+            call()
+        assert "\n" not in str(caught.value)
+        assert len(str(caught.value)) < 250
+
+
+@pytest.mark.parametrize("wrong", [5, 5.0, True, torch.zeros(0, 64, 64, 3), torch.zeros(0, 3, 64, 64, dtype=torch.int8),
+                                   np.zeros((64, 64, 3), np.uint16), np.zeros((64, 64, 3), bool)])  # fmt: skip
+def test_numbers_that_are_no_frames_are_refused_in_one_line(model: PlaySlot, wrong: object) -> None:
+    for call in (model.parse, model.act):
+        with pytest.raises(ValueError, match=r"^frames: got .*, expected ") as caught:
+            call(wrong)  # type: ignore[arg-type]
+        assert "\n" not in str(caught.value)
+
+
+def test_slots_are_floats(model: PlaySlot, video: np.ndarray) -> None:
+    slots = model.parse(video)
+    for call in (model.infer_actions, model.decode):
+        with pytest.raises(ValueError, match=r"^slots: got torch\.int64, expected floats"):
+            call(slots.long())
+        with pytest.raises(ValueError, match=r"^slots: got shape \(0, 4, 32\)"):
+            call(slots[:0])
+    torch.testing.assert_close(model.decode(slots.numpy()).frames, model.decode(slots.double()).frames)
+
+
+def test_frames_may_be_reversed(model: PlaySlot, video: np.ndarray) -> None:
+    torch.testing.assert_close(model.parse(video[::-1]), model.parse(video[::-1].copy()))
+
+
+@pytest.mark.parametrize("wrong", [5, None, ["runs/a"], True, object()], ids=str)
+def test_names_of_another_type_are_refused_in_one_line(model: PlaySlot, wrong: object) -> None:
+    calls: dict[str, Callable[[], object]] = {
+        "run": lambda: playslot_rl.load(wrong),  # type: ignore[arg-type]
+        "name": lambda: PlaySlot.from_pretrained(wrong),  # type: ignore[arg-type]
+        "folder": lambda: model.save_pretrained(wrong),  # type: ignore[arg-type]
+        "device": lambda: playslot_rl.load("pretrained", device=wrong),  # type: ignore[arg-type]
+    }
+    if wrong is not None:
+        calls["render"] = lambda: model.simulation(wrong)  # type: ignore[arg-type]
+        calls["config"] = lambda: PlaySlot.untrained(wrong)  # type: ignore[arg-type]
+    if wrong != 5:
+        calls["seed"] = lambda: playslot_rl.load("pretrained", seed=wrong)  # type: ignore[arg-type]
+        calls["horizon"] = lambda: model.imagination([2], wrong)  # type: ignore[arg-type]
+    for what, call in calls.items():
+        with pytest.raises(TypeError, match=f"^{what}: got .*, expected ") as caught:
+            call()
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("device", ["meta", "gpu", "cuda:99", "cpu:x"])
+def test_a_device_that_computes_nothing_is_refused(device: str) -> None:
+    with pytest.raises(ConfigError, match=f"^device={device}: .*; use device=cpu$"):
+        playslot_rl.load("pretrained", device=device)
+
+
+@pytest.mark.parametrize("sizes", [[-1], [0], [2.5], [[2]]])
+def test_a_batch_of_imagined_episodes_has_whole_sizes(model: PlaySlot, sizes: object) -> None:
+    with pytest.raises(ValueError, match=r"^batch_size: got .*, expected numbers from 1 on"):
+        model.imagination(sizes)  # type: ignore[arg-type]

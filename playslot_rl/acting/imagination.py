@@ -21,7 +21,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from playslot_rl import keys
-from playslot_rl.frames import normalise
+from playslot_rl.frames import as_numbers, normalise
 from playslot_rl.world_model import WorldModel, dynamics_module, module_device
 
 FirstSlots = Callable[[int], Tensor]
@@ -197,9 +197,11 @@ def latent_actions(world_model: WorldModel, given: npt.NDArray[Any] | Tensor, n_
         ([B,] P, [N,] Z), on the world model's device.
 
     Raises:
+        TypeError: no numbers.
         ValueError: another shape, or a prototype that does not exist.
     """
-    values = torch.as_tensor(given).to(module_device(world_model))
+    values = as_numbers(given, "actions", "latent actions as floats, or prototypes by number")
+    values = values.to(module_device(world_model))
     shape = world_model.latent_shape
     if n_slots is not None and world_model.inverse_dynamics.per_slot:
         shape = (n_slots, *shape[1:])

@@ -17,6 +17,7 @@ PATH_BYTES: Final = 4095
 LONGEST_NUMBER: Final = 1000
 
 _INTERPOLATION: Final = re.compile(r"\$\\*\{")
+_RESOLVER: Final = re.compile(r"\$\\*\{[^}]*:")
 _GROUPED: Final = re.compile(r"[+-]?\d[\d_]*_\d[\d_]*(\.\d*)?([eE][+-]?\d+)?")
 _HIDDEN: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
@@ -38,8 +39,10 @@ def require_plain(key: str, argument: str) -> None:
         raise ConfigError(
             f"{_HIDDEN.sub('?', key)}: got a line break, a control character or no valid text, expected plain text"
         )
-    if _INTERPOLATION.search(argument):
-        name = "an argument" if _INTERPOLATION.search(key) else key
+    # Hydra's own keys, which go to it as they are, may name one another, but nothing from elsewhere.
+    pattern = _RESOLVER if key.startswith("hydra.") else _INTERPOLATION
+    if pattern.search(argument):
+        name = "an argument" if "{" in key else key
         raise ConfigError(
             f"{name}: got an interpolation (${{...}}), expected the value itself: nothing is looked up in the "
             "environment or in other keys"

@@ -76,7 +76,7 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
             `config.json`.
     """
     for argument in overrides:
-        require_plain(argument.partition("=")[0].strip(), argument)
+        require_plain(argument.partition("=")[0].strip().lstrip("+"), argument)
     if command in COMPARISONS:
         overrides = _compare_keys(overrides, command)
     elif command in NAMES:
@@ -189,9 +189,8 @@ def _named_keys(overrides: Sequence[str], command: str) -> list[str]:
 
 
 def quoted(text: str) -> str:
-    """Text as Hydra reads it back unchanged."""
-    text = text.replace("\\", "\\\\").replace("'", "\\'")
-    return "'" + text.replace("${", "\\${") + "'"
+    """Text as Hydra's grammar reads it back unchanged."""
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def _hint(key: str) -> Any:
@@ -236,7 +235,7 @@ def _expand_home(folders: str) -> str:
 def _assignments(pairs: Mapping[str, str]) -> list[str]:
     """Hydra overrides that set (`++`) values.
 
-    Text is quoted here, since commas, equals signs, brackets, `${` and digits in a path mean something to Hydra.
+    Text is quoted here, since commas, equals signs, brackets and digits in a path mean something to Hydra.
     """
     assignments, folders = [], keys_of(ExperimentConfig, "folder")
     for key, value in pairs.items():

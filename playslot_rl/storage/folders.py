@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Literal
 
 from playslot_rl.errors import OutputError
 from playslot_rl.storage.atomic import explain_write_errors, replace_dir, temporary_name
@@ -28,7 +29,9 @@ def require_free(out: Path, key: str = "out=") -> None:
         )
 
 
-def require_outside(out: str | Path, reads: Iterable[str | Path] = (), key: str = "out=") -> None:
+def require_outside(
+    out: str | Path, reads: Iterable[str | Path] = (), key: str = "out=", kind: Literal["folder", "file"] = "folder"
+) -> None:
     """Refuse to write into a data set: what lies in one is pushed with it. Symbolic links are followed.
 
     Args:
@@ -36,6 +39,7 @@ def require_outside(out: str | Path, reads: Iterable[str | Path] = (), key: str 
         reads: data sets, or downloads, that are read: `out` may neither be one nor lie in one. It may not lie in any
             other LeRobot data set either.
         key: how its user names `out`, for the message.
+        kind: what `out` is to be.
 
     Raises:
         OutputError: it does, or a file stands where one of its parents has to be.
@@ -44,7 +48,8 @@ def require_outside(out: str | Path, reads: Iterable[str | Path] = (), key: str 
     inside = [root for root in reads if place.is_relative_to(os.path.realpath(root))]
     inside += [parent for parent in place.parents if (parent / "meta" / "info.json").is_file()]
     if inside:
-        raise OutputError(f"{key}{out}: got a place inside the data set {inside[0]}, expected one outside")
+        wanted = f"a {kind} outside: a push would upload it"
+        raise OutputError(f"{key}{out}: got a place inside the data set {inside[0]}, expected {wanted}")
     for parent in place.parents:
         if parent.exists() and not parent.is_dir():
             raise OutputError(f"{key}{out}: got the file {parent} in its path, expected folders: choose another")

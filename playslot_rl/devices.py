@@ -1,0 +1,56 @@
+"""The device that computes, by the name that people type."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from playslot_rl.errors import ConfigError, require_type
+
+if TYPE_CHECKING:
+    import torch
+
+KINDS: Final = ("cpu", "cuda", "mps", "xpu")
+"""Kinds of devices on which numbers are computed; torch knows others, such as `meta`, which only keep shapes."""
+
+
+def named_device(name: str | torch.device = "") -> torch.device:
+    """The device of a name, which need not be there (`probed`).
+
+    Args:
+        name: `cpu`, `cuda`, `cuda:1`, ...; empty means a GPU if there is one.
+
+    Raises:
+        TypeError: no text.
+        ConfigError: no such kind of device, or one that computes nothing.
+
+    Examples:
+        >>> named_device("cuda:1").index
+        1
+    """
+    import torch
+
+    require_type(name, "device", str, torch.device, expected="its name, such as 'cpu' or 'cuda'")
+    try:
+        device = torch.device(name or ("cuda" if torch.cuda.is_available() else "cpu"))
+    except RuntimeError as error:
+        raise ConfigError(f"device={name}: {str(error).splitlines()[0]}; use device=cpu") from error
+    if device.type not in KINDS:
+        raise ConfigError(
+            f"device={name}: got a device that computes nothing, expected one of {', '.join(KINDS)}; use device=cpu"
+        )
+    return device
+
+
+def probed(device: torch.device) -> torch.device:
+    """The device, after a look whether it is there.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    import torch
+
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(f"device={device}: {str(error).splitlines()[0]}; use device=cpu") from error
+    return device
