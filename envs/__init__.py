@@ -1,4 +1,8 @@
-"""Simulated tasks: Gymnasium environments and their TorchRL form. Everything is imported when first used."""
+"""Simulated tasks: Gymnasium environments and their TorchRL form.
+
+Importing this package registers the Gymnasium ids, which loads Gymnasium and nothing else; simulator and torch are
+loaded when first used.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +61,7 @@ def block_ids() -> dict[str, tuple[str, EnvConfig]]:
 
 
 def register() -> None:
-    """Register the Gymnasium ids; calling it again does nothing. Called by `make_env` and by Gymnasium's plug-ins."""
+    """Register the Gymnasium ids; calling it again does nothing."""
     from gymnasium.envs.registration import register as gym_register
     from gymnasium.envs.registration import registry
 
@@ -84,25 +88,45 @@ def gym_id(name: str) -> str:
     return ENVIRONMENTS[name][0]
 
 
-def make_env(env: EnvConfig | None = None, render: RenderConfig | None = None) -> gym.Env[Any, Any]:
+def task_config(env: EnvConfig | str | None = None) -> EnvConfig:
+    """A task's config, given itself or by its name, with the settings that `env=NAME` has; None means ButtonPress.
+
+    Raises:
+        ConfigError: unknown name, or something else.
+    """
+    if isinstance(env, str):
+        default = "", EnvConfig(env)
+        return block_ids().get(gym_id(env), default)[1]
+    if not isinstance(env, EnvConfig | None):
+        known = ", ".join(sorted(ENVIRONMENTS))
+        raise ConfigError(f"env: got {type(env).__name__}, expected an EnvConfig or a name, one of {known}")
+    return env or EnvConfig()
+
+
+def make_env(env: EnvConfig | str | None = None, render: RenderConfig | None = None) -> gym.Env[Any, Any]:
     """Make a task as a Gymnasium environment without wrappers, so that `expert_action()` can be called on it.
 
-    Observations: `{"pixels": uint8 (H, W, 3), "state": float32 (S,)}`; actions float32 (A,) in [-1, 1];
+    Observations: `keys.PIXELS` uint8 (H, W, 3), `keys.STATE` float32 (S,); actions float32 (A,) in [-1, 1];
     `info["success"]: bool` from `reset` and `step`.
+
+    Args:
+        env: the task, or its name; None means the defaults.
+        render: how frames are drawn; None means the defaults.
 
     Raises:
         ConfigError: unknown environment name.
         RenderError: there is no working GL backend.
     """
-    env = env or EnvConfig()
+    env = task_config(env)
     name = gym_id(env.name)
     from playslot_rl.envs.rendering import import_mujoco
 
     import_mujoco()
     import gymnasium
 
-    register()
-    return gymnasium.make(name, env=env, render=render or RenderConfig(), render_mode="rgb_array")
+    made: gym.Env[Any, Any] = gymnasium.make(name, env=env, render=render or RenderConfig(), render_mode="rgb_array")
+    task_env(made).open_renderer()
+    return made
 
 
 def task_env(env: gym.Env[Any, Any]) -> PixelTask:
@@ -120,7 +144,6 @@ def task_metadata(env: EnvConfig) -> dict[str, Any]:
     import gymnasium
     from gymnasium.envs.registration import load_env_creator
 
-    register()
     entry_point = gymnasium.spec(name).entry_point
     creator: Any = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
     describe = getattr(creator, "metadata_of", None)  # a family of tasks says what is to be done in each
@@ -128,11 +151,11 @@ def task_metadata(env: EnvConfig) -> dict[str, Any]:
     return metadata
 
 
-def make_torchrl_env(env: EnvConfig | None = None, render: RenderConfig | None = None) -> EnvBase:
+def make_torchrl_env(env: EnvConfig | str | None = None, render: RenderConfig | None = None) -> EnvBase:
     """Make a task for TorchRL.
 
     Args:
-        env: the task; None means the defaults.
+        env: the task, or its name; None means the defaults.
         render: how frames are drawn; None means the defaults.
 
     Returns:
@@ -148,3 +171,6 @@ def make_torchrl_env(env: EnvConfig | None = None, render: RenderConfig | None =
     from playslot_rl.envs.torchrl import TensorView, wrap
 
     return wrap(TensorView(task))
+
+
+register()  # `gymnasium.make("playslot_rl.envs:ID")` imports this package and expects its ids to be there

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -208,7 +209,7 @@ class BlockEnv(PixelTask):
         if render.quality == "fast":
             lighten(model)
         still = Still(self._simulation.data, STILL, SCREEN)
-        self._renderer = FrameRenderer(model, CAMERA, self.config.image_size, render, still)
+        self._make_renderer = partial(FrameRenderer, model, CAMERA, self.config.image_size, render, still)
 
     def _begin(self, rng: np.random.Generator) -> None:
         self.layout = draw_layout(rng, self.variant, self.config.blocks, self._simulation.start_grip)

@@ -6,6 +6,7 @@ Shapes: A = 4, S = 4, H = W = `EnvConfig.image_size`.
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -71,7 +72,7 @@ class ButtonPressEnv(PixelTask):
         self._simulation.max_path_length = np.iinfo(np.int64).max
         self._expert = SawyerButtonPressV3Policy()
         model = self._simulation.model
-        self._renderer = FrameRenderer(model, CAMERA, self.config.image_size, render or RenderConfig())
+        self._make_renderer = partial(FrameRenderer, model, CAMERA, self.config.image_size, render or RenderConfig())
         self._full: npt.NDArray[np.float64] = np.zeros(0)
 
     def _begin(self, rng: np.random.Generator) -> None:

@@ -14,12 +14,21 @@ import threading
 from collections.abc import Iterator
 from typing import Any, Final
 
+from playslot_rl.errors import RenderError
+
 KEPT: Final = 8
 """Contexts kept at most; those that are closed beyond it are freed."""
 
 _free: list[tuple[int, Any]] = []
 """Process and context: a forked process cannot use what its parent made."""
+_begun: list[int] = []
+"""The process that made the first context, where there is one."""
 _choosing = threading.Lock()
+
+FORKED: Final = (
+    "drawing: got a process that was forked from one that draws, expected one of its own: start it by `forkserver` or "
+    '`spawn` (gymnasium.make_vec: vector_kwargs={"context": "forkserver"})'
+)
 
 
 class KeptContext:
@@ -27,6 +36,9 @@ class KeptContext:
 
     Args:
         width, height: not used, as by MuJoCo's own: what is drawn into lies in the context.
+
+    Raises:
+        RenderError: the process was forked from one that draws.
     """
 
     def __init__(self, width: int, height: int) -> None:
@@ -34,7 +46,10 @@ class KeptContext:
         if self._context is None:
             from mujoco.egl import GLContext
 
+            if _begun and _begun[0] != os.getpid():
+                raise RenderError(FORKED)  # asked for a context, the driver would wait for its threads for ever
             self._context = GLContext(width, height)
+            _begun[:] = [os.getpid()]
             _end_at_exit()
 
     def make_current(self) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.envs import make_env, task_metadata
+from playslot_rl.envs import make_env, task_config, task_metadata
 
 CAMERA: Final = "front"
 """Camera of the frames: LeRobot calls them `observation.images.front`, as our data sets do."""
@@ -25,7 +25,7 @@ class LeRobotTask(gym.Wrapper[Observation, npt.NDArray[np.float32], Any, npt.NDA
     LeRobot's own environments do. (Ours go on: clips of a data set have a fixed length.)
 
     Args:
-        env: the task; its `max_steps` is the longest episode, in agent steps.
+        env: the task, or its name; its `max_steps` is the longest episode, in agent steps.
         render: how frames are drawn.
 
     Attributes:
@@ -38,8 +38,8 @@ class LeRobotTask(gym.Wrapper[Observation, npt.NDArray[np.float32], Any, npt.NDA
         RenderError: there is no working GL backend.
     """
 
-    def __init__(self, env: EnvConfig | None = None, render: RenderConfig | None = None) -> None:
-        self._config = env or EnvConfig()
+    def __init__(self, env: EnvConfig | str | None = None, render: RenderConfig | None = None) -> None:
+        self._config = task_config(env)
         super().__init__(make_env(self._config, render).unwrapped)
         described = task_metadata(self._config)
         self.task, self.task_description = self._config.name, str(described["task"])

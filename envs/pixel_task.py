@@ -6,7 +6,8 @@ Shapes: A = 4, S = 4, H = W = `EnvConfig.image_size`.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, ClassVar, Final, cast
 
 import gymnasium as gym
@@ -45,7 +46,7 @@ class PixelTask(gym.Env[Observation, Action]):
     """
 
     _simulation: Any  # MuJoCo's `model` and `data`, and `close`; made by the subclass, as is the next one
-    _renderer: FrameRenderer
+    _make_renderer: Callable[[], FrameRenderer]
     still: ClassVar[tuple[str, ...]] = ()
     """Bodies of an object that stay where they are and look like ground."""
 
@@ -65,6 +66,19 @@ class PixelTask(gym.Env[Observation, Action]):
         self._frame: Frame | None = None
         self._steps = 0
         self.draw_steps = self.draw_resets = True
+
+    @cached_property
+    def _renderer(self) -> FrameRenderer:
+        """Made with the first episode: a process that is forked from one with a GL context cannot draw."""
+        return self._make_renderer()
+
+    def open_renderer(self) -> None:
+        """Make the GL context now, not with the first episode.
+
+        Raises:
+            RenderError: there is no working GL backend.
+        """
+        assert self._renderer is not None
 
     @abstractmethod
     def _begin(self, rng: np.random.Generator) -> None:
@@ -127,7 +141,8 @@ class PixelTask(gym.Env[Observation, Action]):
 
     def close(self) -> None:
         """Free the GL context."""
-        self._renderer.close()
+        if "_renderer" in self.__dict__:
+            self._renderer.close()
         self._simulation.close()
 
     def reset(
@@ -142,8 +157,12 @@ class PixelTask(gym.Env[Observation, Action]):
         Returns:
             The first observation and `{"success": bool}`: True for an episode that starts solved, which only random
             warm-up steps can make.
+
+        Raises:
+            RenderError: there is no working GL backend.
         """
         del options
+        self.open_renderer()
         super().reset(seed=seed)
         episode = int(self.np_random.integers(2**31)) if seed is None else seed
         task, warmup = (np.random.default_rng(s) for s in np.random.SeedSequence(episode).spawn(2))

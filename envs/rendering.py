@@ -94,6 +94,8 @@ def _make_renderer(mj: Any, model: mujoco.MjModel, side: int) -> Any:
         with warnings.catch_warnings(), kept_contexts():
             warnings.simplefilter("ignore")  # GLFW warns, then fails
             return QuietRenderer(model, height=side, width=side)
+    except RenderError:
+        raise
     except Exception as error:  # each GL backend raises its own types
         raise RenderError(_message(error)) from error
 

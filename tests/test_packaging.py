@@ -110,7 +110,10 @@ def test_the_wheel_is_complete(repository: Path, tmp_path: Path) -> None:
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
+        (entries,) = (archive.read(name).decode() for name in names if name.endswith("/entry_points.txt"))
     assert {name for name in names if name.startswith("playslot_rl/")} == installed_files(repository)
+    assert "[console_scripts]\nplayslot = playslot_rl.cli:main\n" in entries
+    assert "[gymnasium.envs]\n__root__ = playslot_rl.envs:register\n" in entries
     assert {name.partition("/")[0].partition("-")[0] for name in names} == {"playslot_rl"}
     assert any(name.endswith("dist-info/licenses/LICENSE") for name in names)
 
