@@ -25,8 +25,8 @@ HAND_STATE = slice(0, STATE_DIM)
 class ButtonPressEnv(PixelTask):
     """Press the button.
 
-    Observations are `pixels`, uint8 [0, 255] (H, W, 3), and `state`, float32 (4,): hand xyz in metres and the gripper's
-    opening. Actions are float32 (4,) in [-1, 1]: hand displacement xyz and gripper effort. One agent step is
+    Observations are `pixels`, uint8 [0, 255] (H, W, 3), and `state_vector`, float32 (4,): hand xyz in metres and the
+    gripper's opening. Actions are float32 (4,) in [-1, 1]: hand displacement xyz and gripper effort. One agent step is
     `frame_skip` environment steps of the same action; its reward is their mean (0 to 10), and `info["success"]` says
     whether any of them solved the task. Success does not terminate: clips have a fixed length, `max_steps`.
 

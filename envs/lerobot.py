@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from playslot_rl import keys
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.envs import make_env, task_config, task_metadata
 
@@ -47,7 +48,7 @@ class LeRobotTask(gym.Wrapper[Observation, npt.NDArray[np.float32], Any, npt.NDA
         self.metadata = {**described, "render_fps": frames_a_second(self._config)}
         inner: Any = self.env.observation_space
         self.observation_space = gym.spaces.Dict(
-            {"pixels": gym.spaces.Dict({CAMERA: inner["pixels"]}), "agent_pos": inner["state"]}
+            {"pixels": gym.spaces.Dict({CAMERA: inner["pixels"]}), "agent_pos": inner[keys.STATE]}
         )
 
     def reset(
@@ -69,7 +70,7 @@ class LeRobotTask(gym.Wrapper[Observation, npt.NDArray[np.float32], Any, npt.NDA
 
 
 def _named(observation: Any) -> Observation:
-    return {"pixels": {CAMERA: observation["pixels"]}, "agent_pos": observation["state"]}
+    return {"pixels": {CAMERA: observation["pixels"]}, "agent_pos": observation[keys.STATE]}
 
 
 def frames_a_second(env: EnvConfig) -> int:

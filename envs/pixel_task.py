@@ -5,6 +5,7 @@ Shapes: A = 4, S = 4, H = W = `EnvConfig.image_size`.
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -14,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
+from playslot_rl import keys
 from playslot_rl.config import EnvConfig
 from playslot_rl.envs.rendering import FrameRenderer, import_mujoco
 from playslot_rl.errors import ConfigError
@@ -23,7 +25,16 @@ STATE_DIM: Final = 4
 
 Action = npt.NDArray[np.float32]
 Frame = npt.NDArray[np.uint8]
-Observation = dict[str, npt.NDArray[Any]]
+
+
+class Observation(dict[str, npt.NDArray[Any]]):
+    """What a task shows, by the names of `keys.py`. "state", an older name of `keys.STATE`, still reads it."""
+
+    def __missing__(self, key: str) -> npt.NDArray[Any]:
+        if key != "state":
+            raise KeyError(key)
+        warnings.warn(f'observation["state"] is called "{keys.STATE}"', DeprecationWarning, stacklevel=2)
+        return self[keys.STATE]
 
 
 class PixelTask(gym.Env[Observation, Action]):
@@ -57,8 +68,8 @@ class PixelTask(gym.Env[Observation, Action]):
         size = config.image_size
         space = gym.spaces.Dict(
             {
-                "pixels": gym.spaces.Box(0, 255, (size, size, 3), np.uint8),
-                "state": gym.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32),
+                keys.PIXELS: gym.spaces.Box(0, 255, (size, size, 3), np.uint8),
+                keys.STATE: gym.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32),
             }
         )
         self.observation_space = cast(gym.Space[Observation], space)
@@ -191,7 +202,7 @@ class PixelTask(gym.Env[Observation, Action]):
     def _observe(self, draw: bool) -> Observation:
         if draw or self._frame is None:
             self._frame = self.draw()
-        return {"pixels": self._frame, "state": self._state()}
+        return Observation({keys.PIXELS: self._frame, keys.STATE: self._state()})
 
     def render(self) -> Frame | None:
         """The present frame, uint8 (H, W, 3); None without a render mode or before the first reset."""

@@ -33,7 +33,7 @@ class TensorView(gym.Wrapper[View, npt.NDArray[np.float32], dict[str, npt.NDArra
         height, width, channels = spaces["pixels"].shape or ()
         shown: dict[str, gym.Space[Any]] = {
             keys.PIXELS: gym.spaces.Box(0, 255, (channels, height, width), np.uint8),
-            keys.STATE: spaces["state"],
+            keys.STATE: spaces[keys.STATE],
             keys.SUCCESS: gym.spaces.MultiBinary(1),
             **(more or {}),
         }
@@ -44,7 +44,7 @@ class TensorView(gym.Wrapper[View, npt.NDArray[np.float32], dict[str, npt.NDArra
         """One observation and its info under the new names."""
         return {
             keys.PIXELS: np.ascontiguousarray(observation["pixels"].transpose(2, 0, 1)),
-            keys.STATE: observation["state"],
+            keys.STATE: observation[keys.STATE],
             keys.SUCCESS: np.array([info["success"]], np.int8),
         }
 

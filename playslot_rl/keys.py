@@ -13,7 +13,8 @@ from typing import Final
 PIXELS: Final = "pixels"
 """Frame(s): uint8 [0, 255] of shape (..., 3, H, W)."""
 STATE: Final = "state_vector"
-"""Proprioception: float32 (..., S). Not called "state", which TorchRL renames to "observation"."""
+"""Proprioception: float32 (..., S), in Gymnasium's observations too: "state" is what TorchRL's `GymEnv` renames.
+LeRobot's names are its own: `FEATURE_STATE` in data sets, `agent_pos` of what its programs run."""
 ACTION: Final = "action"
 """Real action: float32 (..., A) in [-1, 1]."""
 SLOTS: Final = "slots"

@@ -67,7 +67,7 @@ def given(page: str, block: int) -> dict[str, Any]:
 
 
 def test_every_page_with_python_is_run() -> None:
-    assert {"README.md", "python.md", "data.md", "datasets.md", "hub.md", "play.md", "policies.md"} <= {
+    assert {"README.md", "python.md", "data.md", "datasets.md", "hub.md", "play.md", "policies.md", "torchrl.md"} <= {
         page.name for page in PAGES
     }
 

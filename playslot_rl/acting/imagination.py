@@ -26,6 +26,8 @@ from playslot_rl.world_model import WorldModel, dynamics_module, module_device
 
 FirstSlots = Callable[[int], Tensor]
 """Draws the first slots of that many episodes: n -> (n, N, D)."""
+Reward = Callable[[Tensor], Tensor]
+"""Slots (..., N, D) to what coming to them is worth, (..., 1)."""
 
 
 class ImaginationEnv(ModelBasedEnvBase):
@@ -33,7 +35,8 @@ class ImaginationEnv(ModelBasedEnvBase):
 
     A reset takes the first slots from SLOTS (..., N, D) in the tensordict it gets, else parses PIXELS (..., 3, H, W) in
     it, else asks `first_slots`, else parses a mid-grey frame (which is there so that the specs can be checked, not to
-    be learned from). The reward is zero: PlaySlot has no reward model.
+    be learned from). PlaySlot has no reward model: without `reward` there is no reward, and a loss that reads one fails
+    where it would learn from zeros in silence.
 
     The histories are part of the state, so a rollout stores them at every step: `rollout.select(keys.SLOTS,
     keys.LATENT_ACTION, ("next", keys.SLOTS))` keeps what is wanted.
@@ -44,6 +47,7 @@ class ImaginationEnv(ModelBasedEnvBase):
         first_slots: draws first slots, e.g. from a data set.
         horizon: steps after which an episode is truncated; 0 never does.
         differentiable: keep the graph, for learning through imagination.
+        reward: of the slots that a step leads to.
         generator: of sampled initial slots where a reset parses frames.
 
     Examples:
@@ -68,6 +72,7 @@ class ImaginationEnv(ModelBasedEnvBase):
         horizon: int = 0,
         differentiable: bool = False,
         generator: torch.Generator | None = None,
+        reward: Reward | None = None,
     ) -> None:
         if horizon < 0:
             raise ValueError(f"horizon: got {horizon}, expected 0 (none) or more steps")
@@ -87,6 +92,7 @@ class ImaginationEnv(ModelBasedEnvBase):
         self.horizon = horizon
         self.differentiable = differentiable
         self.generator = generator
+        self.reward = reward
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -109,7 +115,8 @@ class ImaginationEnv(ModelBasedEnvBase):
         # What the state becomes is observed too: that is how a rollout hands it to the next step.
         self.observation_spec.update(self.state_spec.clone())
         self.action_spec = Composite({keys.LATENT_ACTION: spec(self.latent_shape)}, shape=batch, device=device)
-        self.reward_spec = spec((1,))
+        rewards = {} if self.reward is None else {"reward": spec((1,))}
+        self.reward_spec = Composite(rewards, shape=batch, device=device)
         flag = Binary(1, (*batch, 1), dtype=torch.bool, device=device)
         self.done_spec = Composite(
             {name: flag.clone() for name in ("done", "terminated", "truncated")}, shape=batch, device=device
@@ -166,9 +173,10 @@ class ImaginationEnv(ModelBasedEnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         with torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled()):
             out: TensorDictBase = super()._step(tensordict)
+            if self.reward is not None:
+                out.set("reward", _rewards(self.reward, out.get(keys.SLOTS)))
         count = tensordict.get(keys.STEP_COUNT) + 1
         out.set(keys.STEP_COUNT, count)
-        out.set("reward", torch.zeros(count.shape, device=self.device))
         out.update(self._done(count, at=self.horizon or None))
         return out
 
@@ -183,6 +191,13 @@ class ImaginationEnv(ModelBasedEnvBase):
         """Imagination is deterministic; only first frames parsed with sampled initial slots are not."""
         if self.generator is not None and seed is not None:
             self.generator.manual_seed(seed)
+
+
+def _rewards(reward: Reward, slots: Tensor) -> Tensor:
+    got, expected = reward(slots), (*slots.shape[:-2], 1)
+    if got.shape != expected:
+        raise ValueError(f"reward: got shape {tuple(got.shape)} of slots {tuple(slots.shape)}, expected {expected}")
+    return got
 
 
 def latent_actions(world_model: WorldModel, given: npt.NDArray[Any] | Tensor, n_slots: int | None = None) -> Tensor:

@@ -255,3 +255,39 @@ def test_a_session_refuses_what_does_not_fit_in_one_line(agent: Agent) -> None:
         session.step(prototypes=[0])
     with pytest.raises(ValueError, match="expected one of them"):
         session.step(torch.zeros(2, 8), prototypes=[0, 1])
+
+
+def nearness(slots: Tensor) -> Tensor:
+    return -slots.square().mean((-2, -1))[..., None]
+
+
+@pytest.mark.parametrize("batch", [(), (2, 2)])
+def test_a_reward_is_that_of_the_slots_a_step_leads_to(agent: Agent, batch: tuple[int, ...]) -> None:
+    env = ImaginationEnv(agent.world_model, batch_size=batch, reward=nearness)
+    check_env_specs(env, break_when_any_done="both")
+    rollout = imagine(env, agent, slots_of(batch), 3)
+    assert torch.equal(rollout["next", "reward"], nearness(rollout["next", keys.SLOTS]))
+    assert rollout["next", "reward"].unique().numel() > 1
+
+
+def test_a_reward_can_be_learned_through(agent: Agent) -> None:
+    env = ImaginationEnv(agent.world_model, [2], differentiable=True, reward=nearness)
+    first = slots_of((2,)).requires_grad_()
+    rewards = imagine(env, agent, first, 2)["next", "reward"]
+    assert torch.autograd.grad(rewards.sum(), first)[0].abs().sum() > 0
+
+
+def test_without_a_reward_there_is_none_to_learn_from(agent: Agent) -> None:
+    """Zeros would be learned from in silence."""
+    env = ImaginationEnv(agent.world_model, [2])
+    assert env.reward_keys == []
+    rollout = imagine(env, agent, slots_of((2,)), 2)
+    assert rollout["next"].get("reward", None) is None
+    with pytest.raises(KeyError, match='"reward" not found'):
+        rollout["next", "reward"]
+
+
+def test_a_reward_of_another_shape_is_refused(agent: Agent) -> None:
+    env = ImaginationEnv(agent.world_model, [2], reward=lambda slots: slots.mean((-2, -1)))
+    with pytest.raises(ValueError, match=r"reward: got shape \(2,\) of slots \(2, 4, 32\), expected \(2, 1\)"):
+        imagine(env, agent, slots_of((2,)), 1)

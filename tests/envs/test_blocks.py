@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from playslot_rl import keys
 from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.envs import EASY, ENVIRONMENTS, block_config, block_ids, make_env
@@ -35,7 +36,7 @@ def ranged() -> Iterator[BlockPushEnv]:
 def episode(env: BlockEnv, seed: int, steps: int = 4) -> tuple[np.ndarray, np.ndarray]:
     first = env.reset(seed=seed)[0]
     seen = [first, *(env.step(env.expert_action())[0] for _ in range(steps))]
-    return np.stack([o["pixels"] for o in seen]), np.stack([o["state"] for o in seen])
+    return np.stack([o["pixels"] for o in seen]), np.stack([o[keys.STATE] for o in seen])
 
 
 def test_same_seed_repeats_the_same_episode_whatever_came_before(ranged: BlockPushEnv) -> None:
@@ -57,8 +58,8 @@ def test_same_seed_repeats_the_same_episode_whatever_came_before(ranged: BlockPu
 def test_the_grip_starts_at_the_references_place_and_cubes_stand_where_they_were_put(push: BlockPushEnv) -> None:
     for seed in range(5):
         observation, info = push.reset(seed=seed)
-        np.testing.assert_allclose(observation["state"][:3], (1.3419, 0.7491, 0.5348), atol=2e-4)
-        assert 0.0 <= observation["state"][3] < 1e-3
+        np.testing.assert_allclose(observation[keys.STATE][:3], (1.3419, 0.7491, 0.5348), atol=2e-4)
+        assert 0.0 <= observation[keys.STATE][3] < 1e-3
         np.testing.assert_allclose(push.scene.places, push.layout.places, atol=1e-9)
         assert info == {"success": False}
         for _ in range(3):
@@ -255,7 +256,7 @@ def test_every_id_starts_from_the_task_it_names() -> None:
 def test_warm_up_steps_move_the_arm_before_the_first_frame() -> None:
     env = BlockPickEnv(replace(block_config("block_pick", BlocksConfig()), warmup_steps=3))
     env.draw_resets = env.draw_steps = False
-    starts = [env.reset(seed=s)[0]["state"][:3] for s in range(3)]
+    starts = [env.reset(seed=s)[0][keys.STATE][:3] for s in range(3)]
     assert np.ptp(starts, axis=0).max() > 0.02
     env.close()
 

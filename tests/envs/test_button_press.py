@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from playslot_rl import keys
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.envs import make_env, task_env
 from playslot_rl.envs.button_press import ButtonPressEnv
@@ -40,7 +41,7 @@ def test_seeds_move_the_button_and_the_arm(env: ButtonPressEnv) -> None:
     for seed in range(4):
         observation, _ = env.reset(seed=seed)
         boxes.append(env._simulation.model.body("box").pos.copy())
-        hands.append(observation["state"][:3])
+        hands.append(observation[keys.STATE][:3])
     assert np.ptp(np.stack(boxes)[:, 0]) > 0.01
     assert np.ptp(np.stack(hands), axis=0).max() > 0.005
 
@@ -51,7 +52,7 @@ def test_warm_up_is_independent_of_the_buttons_place(env: ButtonPressEnv) -> Non
     for seed in range(24):
         observation, _ = env.reset(seed=seed)
         places.append(env._simulation.model.body("box").pos[0])
-        hands.append(observation["state"][0])
+        hands.append(observation[keys.STATE][0])
     assert abs(np.corrcoef(places, hands)[0, 1]) < 0.6
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.data import Composite
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, ObservationNorm, Transform, TransformedEnv
 
 from playslot_rl import keys
@@ -51,7 +51,8 @@ class GoalReward(Transform):
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         """One number."""
-        return reward_spec
+        reward = Unbounded((*reward_spec.shape, 1), device=reward_spec.device)
+        return Composite({"reward": reward}, shape=reward_spec.shape, device=reward_spec.device)
 
 
 class ReturnAdvantage(TensorDictModuleBase):
