@@ -147,10 +147,10 @@ class BlockEnv(PixelTask):
     """One task of the blocks family; `BlockPushEnv`, `BlockReachEnv` and `BlockPickEnv` say what is to be done.
 
     Observations are `pixels`, uint8 [0, 255] (H, W, 3), and `state_vector`, float32 (4,): grip xyz and the gripper's
-    opening, in metres. Actions are float32 (4,) in [-1, 1]: grip displacement xyz in units of 0.05 m, and (Pick only) gripper
-    effort, negative closes. One agent step is `frame_skip` environment steps (25 Hz) of the same action; its reward is
-    their mean, and `info["success"]` says whether any of them solved the task. Success does not terminate: clips have a
-    fixed length, `max_steps`.
+    opening, in metres. Actions are float32 (4,) in [-1, 1]: grip displacement xyz in units of 0.05 m, and (Pick only)
+    gripper effort, negative closes. One agent step is `frame_skip` environment steps (25 Hz) of the same action; its
+    reward is their mean, and `info["success"]` says whether any of them solved the task. Success does not terminate:
+    clips have a fixed length, `max_steps`.
 
     Dense reward of an environment step, in (0, 1], with the distance d from the object to its goal and the distance g
     from the grip to the object: 0.9 exp(-20 d) + 0.1 exp(-10 g); for Reach, where the grip itself is the object,

@@ -81,12 +81,12 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def figure_bytes(figure: Figure, theme: Theme, kind: str = "png") -> bytes:
-    """A figure as `png` or `svg`, the same bytes for the same figure."""
+def figure_bytes(figure: Figure, theme: Theme, kind: str = "png", facts: Mapping[str, str] | None = None) -> bytes:
+    """A figure as `png` or `svg`, the same bytes for the same figure; `facts` are stored as a PNG's text."""
     import matplotlib as mpl
 
     buffer = io.BytesIO()
-    metadata = {"Date": None} if kind == "svg" else {}
+    metadata = {"Date": None} if kind == "svg" else dict(facts or {})
     with mpl.rc_context({"svg.hashsalt": "playslot_rl", "svg.fonttype": "none"}):
         figure.savefig(buffer, format=kind, dpi=144, facecolor=theme.ground, metadata=metadata)
     return buffer.getvalue()
