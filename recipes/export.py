@@ -13,27 +13,26 @@ from playslot_rl.recipes import evaluate
 def main(config: ExperimentConfig) -> None:
     """Write the policy of `config.run` to the new folder `config.out`, and push it where `config.export.repo` is given.
 
-    A folder that holds this very policy already is pushed as it is: that is how a failed push is tried again.
+    A folder that holds this very policy already is left as it is, and pushed where a push is asked for: that is how the
+    same command is typed again after a kill or a push that failed.
 
     Raises:
         ConfigError: no run or no `out`, or the run is a baseline's.
         CheckpointError: the run has no trained policy, or its checkpoints are damaged or do not belong together.
-        OutputError: `out` exists, or cannot be written.
+        OutputError: `out` holds something else, or cannot be written.
         HubError: the push failed; the folder stays.
     """
     run, folder = evaluate.check_run(replace(config, out="")), check_out(config)
-    from playslot_rl.sharing.folder import is_model_folder, read_config
-    from playslot_rl.sharing.run import export_run, read_source
+    from playslot_rl.sharing.folder import is_model_folder
+    from playslot_rl.sharing.run import export_run, read_source, require_exported
 
     source = read_source(run)
-    there = folder.exists() or folder.is_symlink()
-    if there and not (config.export.repo and is_model_folder(folder)):
+    if is_model_folder(folder):
+        require_exported(run, folder, config, source)
+        print(f"policy: {folder} is there already, exported before", flush=True)
+    elif folder.exists() or folder.is_symlink():
         raise OutputError(f"out={folder}: got something that is there already, expected a new folder: choose another")
-    if there and read_config(folder).source.get("fingerprints") != source["fingerprints"]:
-        raise OutputError(
-            f"out={folder}: got another policy, expected a new folder or that of run={run}: choose another"
-        )
-    if not there:
+    else:
         export_run(run, folder, config, source)
         print(f"policy: {folder}", flush=True)
     if config.export.repo:

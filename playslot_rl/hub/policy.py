@@ -10,7 +10,7 @@ from playslot_rl.data.cache import build_once, cache_folder
 from playslot_rl.errors import CheckpointError
 from playslot_rl.hub.session import MAIN, Pushed, open_repository, send
 from playslot_rl.sharing.card import MARK
-from playslot_rl.sharing.folder import CONFIG, FILES, WEIGHTS, load_pretrained
+from playslot_rl.sharing.folder import CONFIG, FILES, WEIGHTS, require_whole
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,7 @@ def push_policy(
         CheckpointError: the folder is not whole, or its files do not belong together.
         HubError: bad names, no or bad token, offline, no network, an error of the Hub, or a tag that is taken.
     """
-    _, config = load_pretrained(folder)
-    missing = [name for name in FILES if not (folder / name).is_file()]
-    if missing:
-        raise CheckpointError(f"{folder}: {missing[0]} is missing, expected a whole policy: export it again")
+    config = require_whole(folder)
     files: dict[str, Path | bytes] = {name: folder / name for name in FILES}
     message = f"PlaySlot policy, weights {config.fingerprint}"
     target = branch or MAIN

@@ -265,6 +265,19 @@ def load_pretrained(folder: Path, device: torch.device | str = "cpu") -> tuple[A
     return agent, config
 
 
+def require_whole(folder: Path) -> SharedPolicyConfig:
+    """The config of a model folder, after checking that every file is there and that the weights load.
+
+    Raises:
+        CheckpointError: the folder is not whole, or its files do not belong together.
+    """
+    _, config = load_pretrained(folder)
+    missing = [name for name in FILES if not (folder / name).is_file()]
+    if missing:
+        raise CheckpointError(f"{folder}: {missing[0]} is missing, expected a whole policy: export it again")
+    return config
+
+
 def make_processors(device: str) -> tuple[Any, Any]:
     """LeRobot's pipelines before and after the policy: rename, add a batch dimension, move to the device; and back.
 

@@ -6,19 +6,23 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.metadata import read_info
-from playslot_rl.errors import CheckpointError, ConfigError, DataError
+from playslot_rl.errors import CheckpointError, ConfigError, DataError, OutputError
 from playslot_rl.evaluation.success import POLICY_PROTOCOLS, run_facts
 from playslot_rl.sharing.card import Result, make_card
-from playslot_rl.sharing.folder import SharedPolicyConfig, save_pretrained
+from playslot_rl.sharing.folder import SharedPolicyConfig, require_whole, save_pretrained
 from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
 from playslot_rl.training.runs import load_agent, pretrained_folder, world_model_checkpoints
+
+if TYPE_CHECKING:
+    from playslot_rl.world_model import Agent
 
 LIBRARIES: Final = ("torch", "torchrl", "tensordict", "lerobot", "gymnasium", "mujoco", "metaworld")
 """Named on the card with their versions."""
@@ -139,15 +143,39 @@ def export_run(
     source = source or read_source(run)
     results = read_results(run, source)
     agent = load_agent(run)
-    policy = SharedPolicyConfig(
+    return save_pretrained(
+        agent,
+        folder,
+        _policy(agent, config, source),
+        lambda written: make_card(folder.name, written, agent, config, results),
+    )
+
+
+def require_exported(run: Path, folder: Path, config: ExperimentConfig, source: dict[str, Any]) -> None:
+    """Check that a model folder is whole and holds what `export_run` would write into it.
+
+    Versions of libraries and results on its card may be those of the day on which it was made.
+
+    Raises:
+        CheckpointError: the folder is damaged, or as `export_run`.
+        ConfigError: as `export_run`.
+        OutputError: it holds another policy.
+    """
+    made = require_whole(folder)
+    wanted = replace(_policy(load_agent(run), config, source), fingerprint=made.fingerprint)
+    if made.source.get("fingerprints") != source["fingerprints"] or replace(made, source=source) != wanted:
+        raise OutputError(
+            f"out={folder}: got another policy, expected a new folder or that of run={run}: choose another"
+        )
+
+
+def _policy(agent: Agent, config: ExperimentConfig, source: dict[str, Any]) -> SharedPolicyConfig:
+    return SharedPolicyConfig(
         env=agent.world_model.env,
         model=agent.world_model.config,
         camera=camera(config),
         resize=config.data.resize,
         source=source,
-    )
-    return save_pretrained(
-        agent, folder, policy, lambda written: make_card(folder.name, written, agent, config, results)
     )
 
 

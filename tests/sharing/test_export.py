@@ -180,6 +180,28 @@ def test_a_run_without_a_policy_or_with_damaged_weights_is_refused(run: Path, tm
     assert not (tmp_path / "new").exists()
 
 
+def test_the_same_command_again_says_that_the_policy_is_there(run: Path, tmp_path: Path) -> None:
+    """Also after a kill between the last rename and the end, which leaves a whole folder."""
+    out = tmp_path / "press"
+    exported(run, out)
+    before = contents(out)
+    evaluated(run, "simulation")  # for the next card, not for this one
+    done = playslot("export", f"run={run}", f"out={out}", *ONE_CORE)
+    assert (done.code, done.err) == (0, ""), done.err
+    assert done.out == f"policy: {out} is there already, exported before\n"
+    assert contents(out) == before
+
+
+def test_a_folder_that_another_export_or_a_damage_left_is_refused(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "press"
+    exported(run, out)
+    command = ("export", f"run={run}", f"out={out}")
+    refused(*command, "data.camera=observation.images.top", message="got another policy, expected a new folder")
+    refused(*command, "data.resize=true", message="got another policy, expected a new folder")
+    (out / "policy_postprocessor.json").unlink()
+    refused(*command, message="policy_postprocessor.json is missing, expected a whole policy")
+
+
 def test_another_runs_folder_is_not_pushed_in_its_name(run: Path, tmp_path: Path) -> None:
     exported(run, tmp_path / "press")
     config = tmp_path / "press" / "config.json"
