@@ -41,6 +41,7 @@ def main(config: ExperimentConfig) -> None:
 
 def compare(config: ExperimentConfig) -> None:
     """One comparison, into `config.out`; raises as `main` does."""
+    from playslot_rl.comparison.begun import require_begun_alike
     from playslot_rl.comparison.launch import comparison_lock, open_comparison, run_due
     from playslot_rl.comparison.video_plan import check_variants, video_job_config, video_job_record, video_jobs
     from playslot_rl.comparison.video_report import VideoComparison
@@ -70,6 +71,7 @@ def compare(config: ExperimentConfig) -> None:
         for job in video_jobs(config, out):
             own_config = video_job_config(config, job, config.run)
             jobs[job] = video_job_record(job, own_config, parents, lpips=lpips.network is not None)
+        require_begun_alike(jobs, config.compare_video)
         references, truth = _references(config, out, parents)
         report = VideoComparison(config, out, jobs, references, truth, lpips.reason, began)
         run_due("compare-video", report, own.launcher, own.hydra)

@@ -49,7 +49,8 @@ def _chosen(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> 
 
     The method's job that comes first makes the trials; those of its other seeds wait for them.
     """
-    from playslot_rl.comparison.video_plan import in_steps, training_of, with_training
+    from playslot_rl.comparison.begun import require_same_choice
+    from playslot_rl.comparison.video_plan import asked_of, in_steps, training_of, with_training
     from playslot_rl.storage.atomic import write_json
     from playslot_rl.storage.locks import locked
 
@@ -58,7 +59,9 @@ def _chosen(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> 
     with locked(path.with_suffix(".lock")):
         stored = json.loads(path.read_text()) if path.is_file() else {}
         if stored.get("fingerprint") != record["choice"]:
-            stored = {"fingerprint": record["choice"], **_tried(job, config, record)}
+            chosen = _tried(job, config, record)
+            require_same_choice(job, asked_of(record), chosen, stored)
+            stored = {"fingerprint": record["choice"], **chosen}
             write_json(path, stored)
     own = training_of(config, job.method)
     optim = replace(own.optim, lr=own.optim.lr * float(stored["rate"]))
@@ -67,10 +70,10 @@ def _chosen(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> 
 
 def _tried(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> dict[str, Any]:
     """The factor of the learning rate, the steps, and the trials that led to them."""
-    from playslot_rl.comparison.video_plan import TRIAL_SEED, asked_of, training_of
+    from playslot_rl.comparison.video_plan import TRIAL_SEED, asked_of, makes_trials, training_of
 
     asked, steps = asked_of(record), int(training_of(config, job.method).steps)
-    if len(asked.rates) == 1 and not asked.budget_minutes:
+    if not makes_trials(asked):
         return {"rate": asked.rates[0], "steps": steps, "tried": []}
     config, processes = replace(config, seed=TRIAL_SEED), int(record["processes"])
     tried = [_trial(job, config, rate, asked.trial_steps, processes) for rate in asked.rates]
@@ -92,7 +95,7 @@ def _trial(job: VideoJob, config: ExperimentConfig, rate: float, steps: int, pro
 
     config = in_steps(config, job.method, steps)
     own = training_of(config, job.method)
-    out = job.trials / f"rate_{rate:g}"
+    out = job.trial(rate)
     optim = replace(own.optim, lr=own.optim.lr * rate)
     changes: dict[str, Any] = {"optim": optim, "checkpoint_every": steps, "validate_every": steps}
     try:

@@ -93,6 +93,10 @@ class VideoJob:
         """Folder of the trials of learning rates, one for all seeds."""
         return self.out / "trials" / self._method_name
 
+    def trial(self, rate: float) -> Path:
+        """Run folder of the trial of a factor of the learning rate."""
+        return self.trials / f"rate_{rate:g}"
+
     @property
     def choice(self) -> Path:
         """The learning rate and the number of steps that they led to."""
@@ -173,6 +177,11 @@ def _with_setting(config: ExperimentConfig, key: str, text: str) -> ExperimentCo
         return from_dict(ExperimentConfig, values)
     except ValueError as error:
         raise ConfigError(f"values: got {text!r} for {key}: {error}") from None
+
+
+def makes_trials(asked: CompareVideoConfig) -> bool:
+    """Whether trainings are tried in small first: for a choice of learning rates, or to know what a step takes."""
+    return len(asked.rates) > 1 or bool(asked.budget_minutes)
 
 
 def uses_slots(config: ExperimentConfig) -> bool:

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.config.plain import flatten
+from playslot_rl.config.spelling import typed_key
 from playslot_rl.errors import CheckpointError, OutputError
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.folders import new_folder
@@ -200,7 +201,7 @@ class TrainingCheckpoints:
             raise CheckpointError(f"{path} is damaged (no {', '.join(sorted(missing))}): {cure}")
         difference = first_difference(stored["identity"], self.identity)
         if difference is not None:
-            key, old, new = difference
+            key, old, new = typed_key(difference[0]), *difference[1:]
             raise CheckpointError(
                 f"{key}: got {new}, expected {old}, with which {self.folder.parent} was begun: "
                 f"set {key} back, use another out=, or delete that folder"

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import playslot, refused, run_jobs_here, smoke
+from commands import contents, playslot, refused, run_jobs_here, smoke
 
 from playslot_rl.comparison.launch import sweep_command
 from playslot_rl.comparison.video_plan import VideoJob, in_steps, video_job_config
@@ -94,6 +94,48 @@ def test_the_same_command_trains_nothing_again_and_gives_the_same_numbers(finish
     done = smoke("compare-video", "env=button_press", f"methods={METHODS}", f"out={finished}")
     assert done.out.count("done before, skipped") == len(VIDEO_METHODS)
     assert result(finished)["summary"] == before["summary"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            "compare_video.trial_steps=3",
+            r"compare_video\.trial_steps: got 3, expected 2, .*/rate_1 was begun",
+        ),
+        ("compare_video.trained_frames=1", r"compare_video\.trained_frames: got 1, expected 2, with which "),
+    ],
+)
+def test_other_trials_and_clips_are_refused_by_the_name_that_was_typed(
+    finished: Path, change: str, message: str
+) -> None:
+    before = contents(finished / "trials")
+    command = ("compare-video", "env=button_press", f"methods={METHODS}", f"out={finished}", "compare_video.shown=[1]")
+    refused(*command, change, message=message)
+    assert contents(finished / "trials") == before
+
+
+@pytest.mark.usefixtures("started")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("baselines.svg.kl_weight=0.5", "baselines.svg.kl_weight: got 0.5, expected "),
+        (
+            "compare_video.rates=[1.0]",
+            "compare_video.rates: got [1.0], which leads to a rate of 1, expected ",
+        ),
+    ],
+)
+def test_a_setting_of_a_training_is_refused_as_it_is_typed(
+    finished: Path, tmp_path: Path, change: str, message: str
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(finished, out)
+    command = ("compare-video", "env=button_press", "preset=smoke", "methods=svg", f"out={out}", "threads=1")
+    done = playslot(*command, "device=cpu", change)
+    assert "1 of 1 trainings failed (svg-s0)" in done.err
+    error = result(out)["jobs"][0]["error"]
+    assert error.startswith(message), error
 
 
 @pytest.mark.usefixtures("started")
