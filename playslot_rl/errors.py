@@ -60,14 +60,25 @@ def require_type(given: object, what: str, *kinds: type, expected: str) -> None:
         raise TypeError(f"{what}: got {said} ({type(given).__name__}), expected {expected}")
 
 
+_SYSTEM: Final = {
+    errno.ENOSPC: ("got a full disk{}, expected free space: free some and run the same command again"),
+    errno.EDQUOT: ("got a used-up disk quota{}, expected free space: free some and run the same command again"),
+    errno.EROFS: ("got a read-only file system{}, expected one that can be written: choose another folder"),
+    errno.EACCES: ("got no permission{}, expected it: change it or choose another folder"),
+    errno.EMFILE: ("got too many open files{}, expected a higher limit: raise it (`ulimit -n 4096`) and run again"),
+    errno.ENFILE: ("got too many open files{} on this machine, expected fewer: end other programs and run again"),
+}
+"""What a user can act on, whichever library ran into it; the place goes into the braces."""
+
+
 def explain(error: BaseException) -> str:
-    """One line about an error, the full disk first: libraries wrap it in errors of their own."""
+    """One line about an error, the system's refusals first: libraries wrap them in errors of their own."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(error, PlaySlotError):
-        if (isinstance(cause, OSError) and cause.errno == errno.ENOSPC) or os.strerror(errno.ENOSPC) in str(cause):
-            where = getattr(cause, "filename", None)
-            place = f" for {where}" if where else ""
-            return f"got a full disk{place}, expected free space: free some and run the same command again"
+        for number, line in _SYSTEM.items():
+            if (isinstance(cause, OSError) and cause.errno == number) or os.strerror(number) in str(cause):
+                where = getattr(cause, "filename", None)
+                return line.format(f" for {where}" if where else "")
         cause = cause.__cause__ or cause.__context__
     text = " ".join(str(error).split()) or "no message"
     if isinstance(error, PlaySlotError):

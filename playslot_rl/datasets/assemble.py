@@ -68,7 +68,7 @@ def assemble(choices: Sequence[Choice], out: Path, made_by: str) -> None:
 
     Args:
         choices: of data sets with the same features and rate.
-        out: folder; must not exist.
+        out: folder, new or empty.
         made_by: command, for our own record.
 
     Raises:
@@ -77,7 +77,7 @@ def assemble(choices: Sequence[Choice], out: Path, made_by: str) -> None:
     """
     if not any(choice.spans for choice in choices):
         raise DataError(f"{out}: got no episode to write, expected at least one")
-    out.mkdir(parents=True)
+    out.mkdir(parents=True, exist_ok=True)
     info = _info(choices)
     tasks: dict[str, int] = {}  # numbered as they appear
     video_bytes = int(float(info.get("video_files_size_in_mb") or VIDEO_SIZE_MB) * MEGABYTE)

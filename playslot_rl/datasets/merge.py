@@ -59,7 +59,7 @@ def merge(roots: Sequence[str | Path], out: str | Path) -> MergeResult:
     contents = [require_sound(folder) for folder in folders]
     for other in contents[1:]:
         require_same_kind(contents[0], other)
-    with new_folder(target, create=False, key="--out ") as temporary:
+    with new_folder(target, key="--out ") as temporary:
         choices = [choose(each, [span.index for span in each.spans]) for each in contents]
         assemble(choices, temporary, "playslot dataset merge")
         result = require_verified(temporary, folders)

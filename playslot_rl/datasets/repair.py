@@ -96,7 +96,7 @@ def repair(root: str | Path, out: str | Path | None = None) -> RepairResult:
         raise DataError(f"{folder}: got no whole episode to restore ({(lost or before.errors)[0]}), expected one{more}")
     stated = int(contents.info["total_episodes"])
     repaired = Path(out) if out is not None else folder.with_name(f"{folder.name}.repaired")
-    with new_folder(repaired, create=False, key="--out ") as temporary:
+    with new_folder(repaired, key="--out ") as temporary:
         assemble([choice], temporary, "playslot dataset repair")
         result = verify(temporary)
         if not result.ok:

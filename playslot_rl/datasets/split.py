@@ -65,7 +65,7 @@ def split(root: str | Path, out: str | Path, fractions: Mapping[str, float], *, 
     contents = require_sound(root)
     parts = draw(len(contents.spans), fractions, seed)
     made = {}
-    with new_folder(target, create=False, key="--out ") as temporary:
+    with new_folder(target, key="--out ") as temporary:
         for name, indices in parts.items():
             assemble([choose(contents, indices)], temporary / name, "playslot dataset split")
             made[name] = require_verified(temporary / name, [contents.root])

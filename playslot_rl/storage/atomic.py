@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import json
 import os
 import shutil
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from playslot_rl.errors import OutputError
 
@@ -30,6 +31,7 @@ _REASONS = {
     errno.ELOOP: ("its symbolic links go round in a circle", "choose another folder"),
     errno.ENOTDIR: ("a file stands where a folder is needed", "choose another folder"),
     errno.EEXIST: ("a file stands where a folder is needed", "choose another folder"),
+    errno.ENOTEMPTY: ("another process has just made it", "use that one, or choose another folder"),
 }
 
 
@@ -65,24 +67,65 @@ def fsync_folder(folder: Path) -> None:
         os.close(handle)
 
 
+def alone(handle: int) -> bool:
+    """Whether no other process holds an open file or folder; this one then does, until it closes it or ends.
+
+    Where the system or the file system has no such locks nobody is known to hold anything.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def is_open_at(handle: int, path: Path) -> bool:
+    """Whether an open file or folder still has that name."""
+    try:
+        return path.stat().st_ino == os.fstat(handle).st_ino
+    except FileNotFoundError:
+        return False
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically; its folder is made if needed.
+
+    What a process that was killed in here has left is written over by the next one.
 
     Raises:
         OutputError: full disk or a folder that cannot be written; `path` keeps its old content.
     """
     with explain_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = temporary_name(path)
-        try:
-            with temporary.open("wb") as file:
+        temporary, file = _free_temporary(path)
+        with file:
+            try:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+                temporary.replace(path)
+            except BaseException:
+                temporary.unlink(missing_ok=True)
+                raise
         fsync_folder(path.parent)
+
+
+def _free_temporary(path: Path) -> tuple[Path, BinaryIO]:
+    """A hidden file beside `path`, empty, open and nobody else's: the first that no process writes."""
+    for number in itertools.count():
+        temporary = path.with_name(f".{path.name}.tmp-{number}")
+        file = temporary.open("ab")
+        if alone(file.fileno()) and is_open_at(file.fileno(), temporary):
+            file.truncate(0)
+            return temporary, file
+        file.close()
+    raise AssertionError
 
 
 def write_text(path: Path, text: str) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from playslot_rl.errors import OutputError
-from playslot_rl.storage.atomic import explain_write_errors, replace_dir, temporary_name
+from playslot_rl.storage.atomic import alone, explain_write_errors, replace_dir, temporary_name
 
 
 def require_free(out: Path, key: str = "out=") -> None:
@@ -59,13 +59,13 @@ def require_outside(
 def new_folder(final: Path, *, replace: bool = False, create: bool = True, key: str = "out=") -> Iterator[Path]:
     """Gives a temporary path beside `final`, renamed to it at the end and removed after an error.
 
-    What processes that were killed in here have left is removed first, so one process at a time may make `final`
-    (`playslot_rl.storage.locks` where there can be several).
+    What processes that were killed in here have left is removed first. Another process that makes `final` at the same
+    time is left alone: the first one to end has made it, the other one is refused.
 
     Args:
         final: the folder to make; its parents are made too.
         replace: whether something at `final` is replaced instead of refused.
-        create: make the temporary folder; False where a library wants to.
+        create: make the temporary folder; False where a library wants to, and the caller keeps other processes out.
         key: how the user names `final`, for the message.
 
     Raises:
@@ -85,18 +85,35 @@ def new_folder(final: Path, *, replace: bool = False, create: bool = True, key: 
     with explain_write_errors(final):
         final.parent.mkdir(parents=True, exist_ok=True)
         remove_leftovers(final)
+        handle = _made(temporary) if create else None
         try:
-            if create:
-                temporary.mkdir()
             yield temporary
-            if not replace and final.is_dir():
-                final.rmdir()  # empty
+            if not replace:
+                require_free(final, key)
+                if final.is_dir():
+                    final.rmdir()  # empty
             replace_dir(temporary, final)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
+            if handle is not None:
+                os.close(handle)
+
+
+def _made(temporary: Path) -> int:
+    """Make a folder and hold it, so that no other process takes it for a leftover."""
+    temporary.mkdir()
+    handle = os.open(temporary, os.O_RDONLY)
+    alone(handle)
+    return handle
 
 
 def remove_leftovers(final: Path) -> None:
     """Remove what processes that were killed while they made `final` have left."""
     for leftover in final.parent.glob(f".{final.name}.tmp-*"):
-        shutil.rmtree(leftover, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            handle = os.open(leftover, os.O_RDONLY)
+            try:
+                if alone(handle):
+                    shutil.rmtree(leftover, ignore_errors=True)
+            finally:
+                os.close(handle)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import fcntl
 import os
@@ -10,12 +9,12 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from small_sets import assert_whole, begin, small, spec_of
+from tiny_disk import tiny_disk
 
 from playslot_rl.collectors import recording
 from playslot_rl.collectors.journal import Journal
@@ -180,19 +179,6 @@ def test_journal_removed_by_another_process_is_noticed(recorded: Path, tmp_path:
 
 
 # --- full disk -------------------------------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def tiny_disk(folder: Path, kib: int) -> Iterator[Path]:
-    """A file system that is really full at `kib`; skips where this user may not mount."""
-    folder.mkdir()
-    mount = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={kib}k", "tmpfs", str(folder)], capture_output=True)
-    if mount.returncode:
-        pytest.skip(f"may not mount: {mount.stderr.decode().strip()}")
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
 def test_disk_that_fills_while_recording_keeps_what_was_stored(

@@ -5,14 +5,16 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import json
 import multiprocessing
 import re
 import signal
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from playslot_rl import cli
 from playslot_rl.comparison import launch
@@ -37,6 +39,20 @@ def playslot(*arguments: str) -> Done:
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = cli.main(arguments)
     return Done(code, out.getvalue(), err.getvalue())
+
+
+def finished_pipeline(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> tuple[Path, Done]:
+    """The run folder of `pipeline preset=smoke` and what the command said; made once for all of pytest's workers."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base if worker_id == "master" else base.parent
+    run, said = shared / "smoke" / "run", shared / "smoke.json"
+    with FileLock(f"{said}.lock"):
+        if not said.is_file():
+            done = playslot("pipeline", "preset=smoke", f"out={run}", "episodes=2", *ONE_CORE)
+            said.write_text(json.dumps(asdict(done)))
+    done = Done(**json.loads(said.read_text()))
+    assert done.code == 0, done.err
+    return run, done
 
 
 def smoke(command: str, *arguments: object) -> Done:

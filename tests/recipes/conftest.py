@@ -2,34 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from filelock import FileLock
 
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
 
-from commands import ONE_CORE, Done, playslot, run_jobs_here
+from commands import Done, finished_pipeline, run_jobs_here
 
 
 @pytest.fixture(scope="session")
 def pipeline(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> tuple[Path, Done]:
     """The run folder of `pipeline preset=smoke` and what the command said; made once for all of pytest's workers."""
-    base = tmp_path_factory.getbasetemp()
-    shared = base if worker_id == "master" else base.parent
-    run, said = shared / "smoke" / "run", shared / "smoke.json"
-    with FileLock(f"{said}.lock"):
-        if not said.is_file():
-            done = playslot("pipeline", "preset=smoke", f"out={run}", "episodes=2", *ONE_CORE)
-            said.write_text(json.dumps(asdict(done)))
-    done = Done(**json.loads(said.read_text()))
-    assert done.code == 0, done.err
-    return run, done
+    return finished_pipeline(tmp_path_factory, worker_id)
 
 
 @pytest.fixture(scope="session")

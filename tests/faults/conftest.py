@@ -1,0 +1,41 @@
+"""Fixtures: a server of children, and a finished run to copy from."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "collectors"))
+
+from children import Children
+from commands import finished_pipeline
+from lab import Lab
+from table import TABLE
+
+
+@pytest.fixture(scope="session")
+def children(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Children]:
+    """Run commands."""
+    server = Children(tmp_path_factory.mktemp("children"))
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def lab(
+    children: Children, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, worker_id: str
+) -> Callable[..., Lab]:
+    """A row of the table that has run once, undisturbed."""
+
+    def open_lab(name: str, root: Path | None = None) -> Lab:
+        made = Lab(TABLE[name], children, finished_pipeline(tmp_path_factory, worker_id)[0], root or tmp_path / "work")
+        made.undisturbed()
+        return made
+
+    return open_lab
