@@ -70,8 +70,8 @@ def main(config: ExperimentConfig) -> None:
     train_slots.main(config)
     config = _chosen_prototypes(config, run, decide, budget)
     train_dynamics.main(config)
+    print(f"look at it: playslot play run={run} data.root={config.data.root}", flush=True)
     inspect.main_if_needed(replace(config, run=str(run), out=""))
-    print(f"play it: playslot play run={run} data.root={config.data.root}")
 
 
 def _for_frames(config: ExperimentConfig, seen: Survey, decide: Decisions) -> ExperimentConfig:

@@ -19,11 +19,12 @@ from playslot_rl.recipes.run import existing_run, open_device, open_run, parent_
 
 if TYPE_CHECKING:
     from playslot_rl.data.source import EpisodeFrames
+    from playslot_rl.evaluation.card_verdict import Conclusion
     from playslot_rl.world_model import WorldModel
 
 
 def main(config: ExperimentConfig) -> None:
-    """Measure the world model of `config.run` on a data set and print a line for each measure.
+    """Measure the world model of `config.run` on a data set; print a line for each measure, and one for the verdict.
 
     A shipped model (`run=pretrained/ENV`) is made a run in `out` first, as `evaluate` does.
 
@@ -49,7 +50,7 @@ def main(config: ExperimentConfig) -> None:
     result = card_json(card, source, facts(config, run), began)
     page = write_document(card_document(result, card, model), out / FOLDER, "inspect")
     write_card(out, result)
-    print(f"{describe(result)}\nreport card: {page}", flush=True)
+    print(f"{describe(result)}\nreport card: {page}\n{concluded(result)}", flush=True)
 
 
 def check_run(config: ExperimentConfig) -> str:
@@ -114,17 +115,26 @@ def facts(config: ExperimentConfig, run: str) -> dict[str, Any]:
 
 def main_if_needed(config: ExperimentConfig) -> None:
     """As `main`, unless this world model was inspected on these videos before; where they cannot measure it (nothing
-    moves) that is said, and the rest of a pipeline goes on.
+    moves) that is said, and the rest of a pipeline goes on. The last line is the verdict in every case.
     """
     from playslot_rl.evaluation.card import RESULT
+    from playslot_rl.evaluation.card_verdict import Conclusion
 
-    if stored_result(Path(config.run) / RESULT, facts(config, config.run)) is not None:
-        print("inspect: made before, skipped", flush=True)
+    stored = stored_result(Path(config.run) / RESULT, facts(config, config.run))
+    if stored is not None:
+        print(f"inspect: made before, skipped\n{concluded(stored)}", flush=True)
         return
     try:
         main(config)
     except DataError as error:
-        print(f"inspect: not made, {error}", flush=True)
+        print(f"inspect: not made\n{Conclusion(False, str(error))}", flush=True)
+
+
+def concluded(result: Mapping[str, Any]) -> Conclusion:
+    """The verdict of a stored card, also of one from before there were any."""
+    from playslot_rl.evaluation.card_verdict import conclude
+
+    return conclude(result["lines"], result["details"].get("code_counts", []))
 
 
 def describe(result: Mapping[str, Any]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +17,8 @@ from playslot_rl.data.slot_cache import parse_episodes
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import spread_windows
 from playslot_rl.errors import DataError
-from playslot_rl.evaluation.card_lines import Line, line
+from playslot_rl.evaluation.card_lines import MEASURES, NO_NUMBERS, Line, line
+from playslot_rl.evaluation.card_verdict import WORDS, conclude, settle, worthless
 from playslot_rl.evaluation.effect_lines import Replayed, effect_lines
 from playslot_rl.evaluation.held_out import HeldOut, hold_out
 from playslot_rl.evaluation.latent_lines import Parsed, action_lines, usage_lines
@@ -27,6 +28,7 @@ from playslot_rl.frames import normalise
 from playslot_rl.modules.savi.health import MOVING, SlotHealth
 from playslot_rl.seeding import global_seed
 from playslot_rl.storage.atomic import write_json
+from playslot_rl.training.logging import finite
 from playslot_rl.world_model import WorldModel, module_device
 
 FORMAT: Final = "playslot_rl.inspect/1"
@@ -87,11 +89,14 @@ def make_card(
     with global_seed(seed, 0, "inspect"):  # for latents that are sampled, and for nothing else
         parsed = parse(model, chosen, tested)
         usage, details = usage_lines(model, parsed)
-        actions, probes = action_lines(model, parsed, seed)
+        numbers = bool(np.isfinite(parsed.slots).all() and np.isfinite(parsed.latents).all())
+        actions, probes = action_lines(model, parsed, seed) if numbers else ([], {})
         used = [code for code, count in enumerate(details.get("code_counts", [])) if count]
         effects, replays, replayed = effect_lines(model, parsed, seed, used)
         health, values = health_lines(model, parsed)
-    lines = [*usage, *actions, *effects, *health]
+    lines = settle([*usage, *actions, *effects, *health])
+    if not numbers:
+        lines = [line(key, None, NO_NUMBERS) for key in MEASURES]
     return Card(lines, details | probes | replays | {"slots": values}, held, replayed, parsed)
 
 
@@ -141,13 +146,16 @@ def health_lines(model: WorldModel, parsed: Parsed) -> tuple[list[Line], dict[st
         health.add(normalise(parsed.source.pixels(pixels[some]).to(device)), decoded.frames, decoded.masks)
     values = health.values()
     clips, explained = f"{len(rows)} clips of {frames} frames", values.get("moving_explained")
-    one = n == 1
+    one, entropy = n == 1, values.get("mask_entropy", math.nan) / math.log(max(2, n))
+    in_use = line("slots_in_use", values["slots_in_use"] / n, f"{values['slots_in_use']:.1f} of {n}, {clips}")
+    if not one and worthless("mask_entropy", entropy):
+        in_use = in_use.without_value(WORDS["mask_entropy"])  # whoever is a hair ahead holds a pixel
     return [
-        line("slots_in_use", values["slots_in_use"] / n, f"{values['slots_in_use']:.1f} of {n}, {clips}"),
+        in_use,
         line("flicker", None if one else values["flicker"], "a single slot" if one else clips),
-        line("mask_entropy", None if one else values["mask_entropy"] / math.log(n), "a single slot" if one else clips),
+        line("mask_entropy", None if one else entropy, "a single slot" if one else clips),
         line("moving_explained", explained, clips if explained is not None else "nothing moves in these clips"),
-    ], values
+    ], finite(values)
 
 
 def card_json(card: Card, source: EpisodeFrames, facts: Mapping[str, Any], began: float) -> dict[str, Any]:
@@ -169,7 +177,8 @@ def card_json(card: Card, source: EpisodeFrames, facts: Mapping[str, Any], began
         "episodes_fitted": len(held.fitted),
         "held_out": held.told_by,
         "held_out_known": held.known,
-        "lines": [one.plain() for one in card.lines],
+        "lines": (lines := [one.plain() for one in card.lines]),
+        "verdict": asdict(conclude(lines, card.details.get("code_counts", []))),
         "details": card.details,
         "wall_seconds": round(time.perf_counter() - began, 2),
         "hardware": hardware(),

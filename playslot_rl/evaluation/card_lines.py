@@ -5,11 +5,13 @@ A verdict is a rule of thumb, not a test: `good` and `bad` each have a border, w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal
 
 Verdict = Literal["good", "fair", "bad", "not measured"]
+NO_NUMBERS: Final = "what the world model computes are not numbers (NaN or infinite)"
 
 
 @dataclass(frozen=True)
@@ -179,6 +181,11 @@ class Line:
         """As JSON holds it."""
         return asdict(self)
 
+    def without_value(self, why: str) -> Line:
+        """The line where its value says nothing: not measured, and why."""
+        told = "" if self.value is None else f"{self.value:.2f} says nothing, "
+        return replace(self, value=None, verdict="not measured", note=f"{told}{why} ({self.note})")
+
 
 def judge(value: float | None, borders: tuple[float, float]) -> Verdict:
     """On which side of the borders (good from, bad up to) a value is.
@@ -205,4 +212,6 @@ def line(key: str, value: float | None, note: str = "") -> Line:
         note: what it was computed from, or why there is none.
     """
     m = MEASURES[key]
+    if value is not None and not math.isfinite(value):
+        value, note = None, NO_NUMBERS
     return Line(key, m.group, m.name, value, m.good, m.bad, judge(value, m.borders), note)

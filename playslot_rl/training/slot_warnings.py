@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from playslot_rl.config import SAViConfig
+from playslot_rl.config import SAViConfig, SlotsStageConfig
 
 SINGLE: Final = 1.5
 """Slots in use, below which one holds everything."""
@@ -20,14 +20,20 @@ UNSEEN: Final = 0.3
 """Share of the moving pixels' change that is explained, below which what moves is not drawn."""
 
 
-def slot_warnings(values: Mapping[str, float], savi: SAViConfig, zoomed: bool = False) -> dict[str, str]:
+MAGNIFIED: Final = 1500
+"""First steps with magnified frames that took slots off the plateau, of a stage that is three times as long or more."""
+MOTION: Final = 30
+"""Weight of the pixels that move, with which a ball of 40 pixels was drawn."""
+
+
+def slot_warnings(values: Mapping[str, float], savi: SAViConfig, stage: SlotsStageConfig) -> dict[str, str]:
     """Kind -> one line, for each thing that is wrong.
 
     Args:
         values: of `playslot_rl.modules.savi.health.SlotHealth`, and of `playslot_rl.evaluation.slots`; what is not
             among them is not judged.
         savi: sizes and settings, so that no cure is named that is in use already.
-        zoomed: the training shows magnified frames first.
+        stage: likewise; and no cure that takes longer than the stage.
     """
     found: dict[str, str] = {}
     slots, entropy = savi.n_slots, values.get("mask_entropy", 0.0)
@@ -37,43 +43,53 @@ def slot_warnings(values: Mapping[str, float], savi: SAViConfig, zoomed: bool = 
     if shared:
         found["shared"] = (
             f"all slots share all pixels (mask entropy {entropy:.2f} of at most {math.log(slots):.2f}): the scene is "
-            f"not taken apart yet; {_leave_plateau(savi, zoomed)}"
+            f"not taken apart yet; {_leave_plateau(savi, stage)}"
         )
     elif values.get("slots_in_use", slots) < SINGLE:
         found["single"] = (
             f"one slot holds everything ({values['slots_in_use']:.1f} of {slots} slots in use): it can draw whole "
-            f"frames alone; {_less_room(savi)}, or {_leave_plateau(savi, zoomed)}"
+            f"frames alone; {', or '.join([*_less_room(savi, stage), _leave_plateau(savi, stage)])}"
         )
     elif values.get("slots_per_object", 1.0) > SPLIT:
         found["split"] = (
             f"objects are spread over several slots ({values['slots_per_object']:.1f} each, FG-ARI "
-            f"{values.get('foreground_ari', math.nan):.2f}): {_less_room(savi)}"
+            f"{values.get('foreground_ari', math.nan):.2f}): "
+            f"{', or '.join(_less_room(savi, stage) or [_LONGER.format(stage.steps)])}"
         )
     if values.get("flicker", 0.0) > FLICKER and not shared:
-        cure = "train for longer (slots.steps)" if savi.transition_start == "identity" else _IDENTITY
+        cure = _LONGER.format(stage.steps) if savi.transition_start == "identity" else _IDENTITY
         found["flicker"] = f"slots change places ({values['flicker']:.2f} exchanges a transition): {cure}"
     if values.get("moving_explained", 1.0) < UNSEEN:
+        weight = "" if stage.motion_weight else f"weigh what moves (slots.motion_weight={MOTION}), "
         found["unseen"] = (
             f"what moves is hardly drawn ({100 * values['moving_explained']:.0f} % of the moving pixels' change "
-            f"explained): {_leave_plateau(savi, zoomed)}"
+            f"explained): {weight}{_leave_plateau(savi, stage)}"
         )
     return found
 
 
 _IDENTITY: Final = "start the transition as identity, model.savi.transition_start=identity"
+_LONGER: Final = "train for longer than {} steps (slots.steps=, or minutes= of adopt)"
+_LEARNED: Final = "let the decoder learn its position map (model.savi.decoder_position=learned)"
 
 
-def _less_room(savi: SAViConfig) -> str:
-    return (
+def _less_room(savi: SAViConfig, stage: SlotsStageConfig) -> list[str]:
+    """Other sizes than those of the SAVi that is started from cannot be had."""
+    if stage.start_from:
+        return []
+    return [
         f"give slots less room by a smaller model.savi.slot_dim (now {savi.slot_dim}) and fewer "
         f"model.savi.decoder_channels (now {list(savi.decoder_channels)})"
-    )
+    ]
 
 
-def _leave_plateau(savi: SAViConfig, zoomed: bool) -> str:
-    learned = "" if savi.decoder_position == "learned" or savi.decoder != "pixel_shuffle" else _LEARNED
-    large = "show more magnified frames first" if zoomed else "show magnified frames first (slots.zoom_steps=1500)"
-    return f"{learned}{large}, or start from one that can do it (slots.start_from=pretrained/ENV)"
-
-
-_LEARNED: Final = "let the decoder learn its position map (model.savi.decoder_position=learned), "
+def _leave_plateau(savi: SAViConfig, stage: SlotsStageConfig) -> str:
+    """What is left to do of what has helped; the last of them always is."""
+    cures = []
+    if savi.decoder_position != "learned" and savi.decoder == "pixel_shuffle" and not stage.start_from:
+        cures.append(_LEARNED)
+    if stage.steps >= 3 * MAGNIFIED and stage.zoom_steps < MAGNIFIED:
+        cures.append(f"show magnified frames first (slots.zoom_steps={MAGNIFIED}, now {stage.zoom_steps})")
+    if not stage.start_from:
+        cures.append("start from one that can do it (slots.start_from=pretrained/ENV)")
+    return ", or ".join([*cures, _LONGER.format(stage.steps)])

@@ -96,7 +96,7 @@ class SlotsStage:
         while frames are magnified, in which slots have not taken the scene apart yet.
         """
         known = 4 * step >= self.config.steps and step > self.config.zoom_steps
-        return slot_warnings(values, self.savi.config, self.config.zoom_steps > 0) if known else {}
+        return slot_warnings(values, self.savi.config, self.config) if known else {}
 
     def pictures(self, step: int) -> Mapping[str, npt.NDArray[np.uint8]]:
         """The first held-out clip, (3 H, T W, 3): frames, reconstructions, segmentation."""

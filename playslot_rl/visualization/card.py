@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from playslot_rl.evaluation.card import RESULT, Card
+from playslot_rl.evaluation.card_verdict import conclude
 from playslot_rl.evaluation.effect_lines import Replayed
 from playslot_rl.visualization.charts import usage_chart
 from playslot_rl.visualization.document import Block, Document, Missing, Picture, Section, Table, Text
@@ -35,10 +36,11 @@ def _row(one: Mapping[str, Any]) -> list[str]:
     return [one["measure"], value, VERDICTS[one["verdict"]], one["good"], one["bad"], note]
 
 
-def verdict_text(lines: Sequence[Mapping[str, Any]]) -> str:
-    """`12 good, 5 fair, 2 bad (perplexity of the codes; ...)`."""
-    counts = {v: sum(one["verdict"] == v for one in lines) for v in VERDICTS}
-    return ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+def verdict_text(result: Mapping[str, Any]) -> str:
+    """`verdict: usable: replay 0.82; 12 good, 5 fair, 2 bad`."""
+    counts = {v: sum(one["verdict"] == v for one in result["lines"]) for v in VERDICTS}
+    counted = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+    return f"{conclude(result['lines'], result['details'].get('code_counts', []))}; {counted}"
 
 
 def told_text(result: Mapping[str, Any]) -> str:
@@ -61,7 +63,7 @@ def card_document(result: Mapping[str, Any], card: Card, model: WorldModel) -> D
     pictures = _pictures(card, model)
     sections = [Section(group, [table, *pictures.get(group, [])]) for group, table in card_tables(result["lines"])]
     lead = (
-        f"World model of `{result['run']}`: {verdict_text(result['lines'])}. {told_text(result)} A verdict is a rule "
+        f"World model of `{result['run']}`: {verdict_text(result)}. {told_text(result)} A verdict is a rule "
         "of thumb; the borders are in the columns `good` and `bad`, what lies between is fair."
     )
     return Document("PlaySlot report card", lead, sections)
@@ -181,7 +183,7 @@ def card_section(given: ReportInput) -> Section:
     prints = {stage: given.metas.get(stage, {}).get("fingerprint") for stage in ("slots", "dynamics")}
     if result["fingerprints"] != prints:
         return Section(title, [Missing("The report card is that of another world model.", command)])
-    blocks: list[Block] = [Text(f"{verdict_text(result['lines'])}. {told_text(result)}")]
+    blocks: list[Block] = [Text(f"{verdict_text(result)}. {told_text(result)}")]
     for group, table in card_tables(result["lines"]):
         blocks.append(Table([group, *table.headers[1:]], table.rows))
     return Section(title, [*blocks, Text("With pictures: `inspect/inspect.html`.")])

@@ -69,6 +69,7 @@ def test_a_set_that_nobody_prepared_becomes_a_world_model(
     assert made["prototypes"]["value"] == 4
     assert all(f"{name}: {choice['value']} (" in done.out for name, choice in made.items())
     assert f"playslot play run={run} data.root={any_set}" in done.out
+    assert done.out.splitlines()[-1].startswith("verdict: not usable: ")
     assert json.loads((run / "inspect" / "inspect.json").read_text())["lines"]
     model = playslot_rl.load(run, device="cpu")
     assert model.world_model.slot_shape[0] == made["slots"]["value"]
@@ -77,6 +78,7 @@ def test_a_set_that_nobody_prepared_becomes_a_world_model(
     again = smoke("adopt", f"data.root={any_set}", f"out={run}", *QUICK)
     assert json.loads((run / "adopt.json").read_text())["choices"] == made
     assert again.out.count("finished before") == 2
+    assert again.out.splitlines()[-1] == done.out.splitlines()[-1]
     refused(
         "adopt", f"data.root={any_set}", f"out={run}", *QUICK, "minutes=3", message="minutes: got 3.0, expected 0.02"
     )

@@ -96,7 +96,8 @@ def test_a_set_without_actions_is_measured_without_them(run: Path, tmp_path: Pat
     assert isinstance(lines, list)
     notes = {one["key"]: (one["verdict"], one["note"]) for one in lines}
     assert notes["mlp_probe"] == ("not measured", "no actions")
-    assert notes["slots_in_use"][0] != "not measured"
+    assert notes["moving_explained"][0] != "not measured"
+    assert done.out.splitlines()[-1].startswith("verdict: not usable: ")  # six steps
 
 
 @pytest.mark.parametrize(

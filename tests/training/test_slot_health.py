@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from playslot_rl.training.stage import Stage, WatchedStage
 from playslot_rl.training.stage_slots import SlotsStage
 
 HEALTHY = {"slots_in_use": 4.0, "flicker": 0.0, "mask_entropy": 0.4, "moving_explained": 0.8}
+LONG = SlotsStageConfig(steps=6000)
 BLOCKS = SAViConfig(decoder="pixel_shuffle", decoder_position="learned", transition_start="identity")
 
 
@@ -115,9 +117,9 @@ def test_a_warning_is_said_when_it_comes_up_and_again_once_it_had_gone(
 
 
 def test_healthy_slots_are_not_warned_of() -> None:
-    assert slot_warnings(HEALTHY, SAViConfig()) == {}
-    assert slot_warnings({}, SAViConfig()) == {}
-    assert slot_warnings({"slots_in_use": 1.0}, SAViConfig(n_slots=1)) == {}
+    assert slot_warnings(HEALTHY, SAViConfig(), LONG) == {}
+    assert slot_warnings({}, SAViConfig(), LONG) == {}
+    assert slot_warnings({"slots_in_use": 1.0}, SAViConfig(n_slots=1), LONG) == {}
 
 
 @pytest.mark.parametrize(
@@ -141,7 +143,7 @@ def test_healthy_slots_are_not_warned_of() -> None:
     ],
 )
 def test_each_sickness_is_named_with_its_cure(kind: str, sick: dict[str, float], text: str, cure: str) -> None:
-    found = slot_warnings(HEALTHY | sick, SAViConfig(decoder="pixel_shuffle"))
+    found = slot_warnings(HEALTHY | sick, SAViConfig(decoder="pixel_shuffle"), LONG)
     assert list(found) == [kind]
     assert text in found[kind]
     assert cure in found[kind]
@@ -149,12 +151,27 @@ def test_each_sickness_is_named_with_its_cure(kind: str, sick: dict[str, float],
 
 
 def test_a_cure_in_use_is_not_named_again() -> None:
-    found = slot_warnings(HEALTHY | {"flicker": 1.0, "moving_explained": 0.0}, BLOCKS)
+    found = slot_warnings(HEALTHY | {"flicker": 1.0, "moving_explained": 0.0}, BLOCKS, LONG)
     assert set(found) == {"flicker", "unseen"}
     assert "identity" not in found["flicker"]
     assert "decoder_position" not in found["unseen"]
-    assert "slots.zoom_steps=" in found["unseen"]
-    assert "slots.zoom_steps=" not in slot_warnings(HEALTHY | {"moving_explained": 0.0}, BLOCKS, zoomed=True)["unseen"]
+    assert "slots.zoom_steps=1500" in found["unseen"]
+    assert "slots.motion_weight=30" in found["unseen"]
+    used = replace(LONG, zoom_steps=1500, start_from="pretrained/block_push_easy", motion_weight=30.0)
+    left = slot_warnings(HEALTHY | {"moving_explained": 0.0}, SAViConfig(decoder="pixel_shuffle"), used)["unseen"]
+    assert left.endswith("explained): train for longer than 6000 steps (slots.steps=, or minutes= of adopt)")
+
+
+@pytest.mark.parametrize(
+    "sick", [{"mask_entropy": math.log(4)}, {"slots_in_use": 1.0}, {"slots_per_object": 2.0}, {"moving_explained": 0.0}]
+)
+def test_cures_fit_into_the_stage_and_its_settings(sick: dict[str, float]) -> None:
+    """A stage of 142 steps has no room for 1,500 magnified ones, and one that starts from another none for new sizes."""
+    short = SlotsStageConfig(steps=142, start_from="pretrained/block_push_easy")
+    (said,) = slot_warnings(HEALTHY | sick, SAViConfig(decoder="pixel_shuffle"), short).values()
+    assert "train for longer than 142 steps" in said
+    for other in ("zoom_steps", "start_from", "slot_dim", "decoder_position"):
+        assert other not in said
 
 
 def test_the_first_quarter_is_not_warned_of() -> None:
