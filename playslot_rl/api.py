@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from playslot_rl.acting.agent import playslot_actor
-from playslot_rl.acting.closed_loop import ClosedLoop
+from playslot_rl.acting.closed_loop import ClosedLoop, resized
 from playslot_rl.acting.imagination import ImaginationEnv, ImaginationSession, latent_actions
 from playslot_rl.config import ExperimentConfig, RenderConfig
 from playslot_rl.devices import named_device, probed
@@ -65,17 +65,22 @@ def load(run: str | Path = "pretrained", device: str = "", seed: int = 0) -> Pla
     """
     from playslot_rl.sharing.folder import is_model_folder
     from playslot_rl.storage.checkpoints import checkpoint_folder
-    from playslot_rl.training.runs import load_agent, load_world_model, run_folder
+    from playslot_rl.training.runs import load_agent, load_world_model, run_folder, stored_view
 
     require_type(run, "run", str, PathLike, expected="a run folder or `pretrained`")
     require_type(seed, "seed", SupportsIndex, expected="a number")
     if is_model_folder(Path(run)):
         return PlaySlot.from_pretrained(run, device, seed=seed)
     target = probed(named_device(device))
-    if (checkpoint_folder(run_folder(run), "policy") / "meta.json").is_file():
-        agent = load_agent(run, target)
-        return PlaySlot(agent.world_model, agent, seed)
-    return PlaySlot(load_world_model(run, target), None, seed)
+    resize = stored_view(run).resize
+    if not (checkpoint_folder(run_folder(run), "policy") / "meta.json").is_file():
+        return PlaySlot(load_world_model(run, target), None, seed, resize)
+    from playslot_rl.sharing.run import described
+
+    agent = load_agent(run, target)
+    model = PlaySlot(agent.world_model, agent, seed, resize)
+    model._policy = described(run)
+    return model
 
 
 class PlaySlot:
@@ -85,12 +90,16 @@ class PlaySlot:
         world_model: put into evaluation mode.
         agent: the agent of that world model; without one `act` is refused.
         seed: of sampled initial slots; equal calls give equal results.
+        resize: whether frames of another size are resized by area averaging, as those of the training were
+            (`data.resize`), or refused.
     """
 
-    def __init__(self, world_model: WorldModel, agent: Agent | None = None, seed: int = 0) -> None:
+    def __init__(
+        self, world_model: WorldModel, agent: Agent | None = None, seed: int = 0, resize: bool = False
+    ) -> None:
         self.world_model = world_model.eval()
         self.agent = None if agent is None else agent.eval()
-        self._seed = seed
+        self._seed, self._resize = seed, resize
         side = world_model.env.image_size
         self._loop = None if agent is None else ClosedLoop(playslot_actor(agent), image_size=side, seed=seed)
         self._policy: SharedPolicyConfig | None = None
@@ -136,7 +145,7 @@ class PlaySlot:
 
             folder = pull_policy(str(name), revision, token=token)
         agent, policy = load_pretrained(folder, target)
-        model = cls(agent.world_model, agent, seed)
+        model = cls(agent.world_model, agent, seed, policy.resize)
         model._policy = policy
         return model
 
@@ -165,7 +174,7 @@ class PlaySlot:
             )
         require_type(folder, "folder", str, PathLike, expected="the folder to write")
         path, agent = Path(folder), self.agent
-        known = self._policy or SharedPolicyConfig()
+        known = self._policy or SharedPolicyConfig(resize=self._resize)
         source = {**known.source, "versions": versions()}
         config = replace(known, env=agent.world_model.env, model=agent.world_model.config, source=source)
         save_pretrained(agent, path, config, lambda written: make_card(path.name, written, agent))
@@ -181,7 +190,8 @@ class PlaySlot:
             ([B,] [T,] N, D).
 
         Raises:
-            ValueError: other shapes, another frame size than the model's, or floats outside [0, 1].
+            ValueError: other shapes, another frame size than the model's where its training did not resize either, or
+                floats outside [0, 1].
 
         Examples:
             >>> import numpy as np
@@ -367,24 +377,25 @@ class PlaySlot:
         """Any accepted layout to float (..., 3, H, W) in [0, 1] on the model's device."""
         pixels = as_numbers(frames, "frames", "pixels as a numpy array or a tensor: decode a video or picture first")
         side, shape = self.world_model.env.image_size, tuple(pixels.shape)
-        if shape[-3:] == (side, side, 3):
+        if shape[-1:] == (3,) and shape[-3:] != (3, side, side):
             pixels = pixels.movedim(-1, -3)
-        elif shape[-3:] != (3, side, side):
+        fits = tuple(pixels.shape[-3:]) == (3, side, side)
+        if pixels.ndim < 3 or pixels.shape[-3] != 3 or not (fits or (self._resize and pixels.numel())):
             raise ValueError(
                 f"frames: got shape {shape}, expected (..., {side}, {side}, 3) or (..., 3, {side}, {side})"
+                + (", or another height and width" if self._resize else "")
             )
         if not pixels.numel():
             raise ValueError(f"frames: got shape {shape}, which holds none, expected at least one frame")
-        pixels = pixels.to(module_device(self.world_model))
-        if pixels.dtype == torch.uint8:
-            return normalise(pixels)
-        if not pixels.is_floating_point() or not bool(((pixels >= 0) & (pixels <= 1)).all()):
+        if pixels.dtype != torch.uint8 and not (
+            pixels.is_floating_point() and bool(((pixels >= 0) & (pixels <= 1)).all())
+        ):
             values = pixels.double()  # of some integers torch finds no minimum
             low, high = values.min().item(), values.max().item()
             raise ValueError(
                 f"frames: got {pixels.dtype} in [{low:g}, {high:g}], expected uint8 in [0, 255] or floats in [0, 1]"
             )
-        return pixels.float()
+        return normalise((pixels if fits else resized(pixels, side)).to(module_device(self.world_model))).float()
 
     def _slots(self, slots: Array) -> Tensor:
         given = as_numbers(slots, "slots", "slots as `parse` gives them")

@@ -93,12 +93,14 @@ class ClosedLoop:
                 f"{name}: got frames of {frames.shape[2]}x{frames.shape[3]}, expected {side}x{side}, with which the "
                 "policy was trained: record at that size"
             )
-        return _resized(frames, side)
+        return resized(frames, side)
 
 
-def _resized(frames: Tensor, side: int) -> Tensor:
-    """(B, 3, H, W) to uint8 (B, 3, side, side), by what the frames of the training went through."""
+def resized(frames: Tensor, side: int) -> Tensor:
+    """(..., 3, H, W) to uint8 (..., 3, side, side), by what the frames of the training went through, to the last digit
+    (floats are bytes divided by 255, as LeRobot gives them)."""
     from playslot_rl.data.frames import resize_frames
 
-    small = resize_frames(quantise(frames).movedim(1, -1).cpu().numpy(), side)
-    return torch.from_numpy(small).movedim(-1, 1)
+    flat = quantise(frames).flatten(0, -4) if frames.ndim > 3 else quantise(frames)[None]
+    small = torch.from_numpy(resize_frames(flat.movedim(1, -1).contiguous().cpu().numpy(), side)).movedim(-1, 1)
+    return small.reshape(*frames.shape[:-2], side, side)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from playslot_rl.data.camera_names import cameras_of, full_name
 from playslot_rl.data.metadata import DATA_PATH, INFO_NAME, VIDEO_PATH, read_info
 from playslot_rl.data.places import filled, inside, note_odd_files, parquet_files
 from playslot_rl.data.problems import Problems
@@ -110,10 +111,10 @@ class Contents:
     @property
     def cameras(self) -> list[str]:
         """Names of the image and video features."""
-        return [name for name, feature in self.features.items() if feature["dtype"] in ("image", "video")]
+        return cameras_of(self.features)
 
     def camera(self, wanted: str) -> str:
-        """The camera to read: the wanted one, or the only one.
+        """The camera to read, by its full name: the wanted one, or the only one.
 
         Raises:
             DataError: there is no such camera, none at all, or several and none was named.
@@ -123,9 +124,7 @@ class Contents:
             return self.cameras[0]
         if not wanted:
             raise DataError(f"{self.name}: got {len(self.cameras)} cameras ({names}), expected one: set data.camera=")
-        if wanted not in self.cameras:
-            raise DataError(f"data.camera={wanted}: {self.name} has no such camera, expected one of: {names}")
-        return wanted
+        return full_name(wanted, self.cameras, self.name)
 
     @cached_property
     def spans(self) -> list[Span]:

@@ -1,13 +1,10 @@
-"""The model card: what the policy does, what it was trained on, how well it does, and the commands that make it again
-from its run's config, never from a folder of this machine.
+"""The model card: what the policy does, what it was trained on, how well it does, and the commands that use it and make
+it again (`playslot_rl.sharing.commands`).
 """
 
 from __future__ import annotations
 
-import json
-import shlex
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any, Final
@@ -15,112 +12,14 @@ from typing import TYPE_CHECKING, Any, Final
 import yaml
 
 from playslot_rl import keys
-from playslot_rl.config import EvaluationConfig, ExperimentConfig, to_dict
-from playslot_rl.config.compose import compose
-from playslot_rl.config.plain import flatten
-from playslot_rl.config.roles import keys_of
+from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs import ENVIRONMENTS, task_metadata
+from playslot_rl.sharing.commands import Result, frames_comment, places, rate_words, reproduce, use
 from playslot_rl.sharing.folder import LICENCE, TAGS, SharedPolicyConfig, shared_modules
 from playslot_rl.visualization.document import table
 
 if TYPE_CHECKING:
     from playslot_rl.world_model import Agent
-
-
-RUN: Final = "runs/again"
-WORLD: Final = "runs/world"
-GROUPS: Final = ("env", "render", "collect", "model", "slots", "dynamics", "behaviour", "evaluation")
-"""Parts of a config that a result depends on; intervals of logging and the like do no harm in between."""
-BEHAVIOUR: Final = ("env", "render", "collect", "model.policy", "model.action_decoder", "behaviour", "evaluation")
-"""Those a policy on the shipped world model depends on."""
-
-
-@dataclass(frozen=True)
-class Result:
-    """A measured success rate.
-
-    Attributes:
-        protocol: `simulation` or `imagination`.
-        episodes: how many, one for each seed.
-        seed: block of evaluation seeds.
-        success_rate: 0 to 1.
-        ci95: Wilson's interval.
-        mean_steps: agent steps to the first success, of the episodes that had one; None without any.
-        references: success rate and interval of other policies in simulation, on the same seeds, by name.
-    """
-
-    protocol: str
-    episodes: int
-    seed: int
-    success_rate: float
-    ci95: tuple[float, float]
-    mean_steps: float | None
-    references: dict[str, tuple[float, tuple[float, float]]]
-
-
-def reproduce(config: ExperimentConfig, source: Mapping[str, Any], results: Sequence[Result]) -> list[str]:
-    """Command lines from nothing to the evaluated policy.
-
-    Args:
-        config: of the run.
-        source: see `playslot_rl.sharing.run.read_source`.
-        results: what was measured of it.
-    """
-    seed = source.get("seed")
-    base = [f"env={config.env.name}", f"preset={config.preset}"]
-    seeded = [] if seed is None else [f"seed={seed}"]
-    evaluate = [
-        _line("evaluate", f"run={RUN}", f"protocol={r.protocol}", f"episodes={r.episodes}", f"seed={r.seed}")
-        for r in results
-    ]
-    changed, recorded, demos = changes(config, BEHAVIOUR), source.get("recorded") or {}, source.get("demos")
-    episodes = recorded.get("episodes") or demos
-    first = [f"demos={demos}"] if demos is not None and demos != episodes else []
-    if not source.get("shipped_world_model"):
-        world = source.get("world_model_seed", seed)
-        if world in (None, seed) and not first:
-            return [_line("pipeline", *base, *seeded, *changes(config, GROUPS), f"out={RUN}"), *evaluate]
-        again = [] if world is None else [f"seed={world}"]
-        collected = f"data.demos={WORLD}/data/expert"
-        return [
-            _line("pipeline", *base, *again, *changes(config, GROUPS), f"out={WORLD}"),
-            _line("train-policy", f"run={WORLD}", *base, *seeded, *first, *changed, collected, f"out={RUN}"),
-            *evaluate,
-        ]
-    count = [] if episodes is None else [f"episodes={episodes}"]
-    start = [f"seed={recorded['seed']}"] if recorded else seeded
-    where = "data/demonstrations"
-    recording = [text for text in changed if text.startswith(("env.", "render.", "collect."))]
-    return [
-        _line("collect", *base, "policy=expert", *count, *start, *recording, f"out={where}"),
-        _line("train-policy", "run=pretrained", *base, *seeded, *first, *changed, f"data.demos={where}", f"out={RUN}"),
-        *evaluate,
-    ]
-
-
-def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
-    """`key=value` of what differs from the run's preset, in some groups of keys.
-
-    Raises:
-        ConfigError: the preset or the environment is not one of this version.
-    """
-    free = keys_of(ExperimentConfig, "free")
-    preset = flatten(to_dict(compose([f"env={config.env.name}", f"preset={config.preset}"])))
-    return [
-        f"{key}={_value(value)}"
-        for key, value in flatten(to_dict(config)).items()
-        if any(key.startswith(f"{group}.") for group in groups)
-        and key not in free
-        and (key not in preset or preset[key] != value)
-    ]
-
-
-def _value(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
-
-
-def _line(command: str, *arguments: str) -> str:
-    return shlex.join(["playslot", command, *arguments])
 
 
 MARK: Final = "<!-- made by `playslot export`; remove this line to keep your own text -->"
@@ -166,10 +65,10 @@ def make_card(
         "model_name": name,
     }
     parameters = sum(p.numel() for part in shared_modules(agent).values() for p in part.parameters())
-    commands, evaluation = "Not recorded: saved from Python. `playslot export` writes the commands.", EvaluationConfig()
+    commands = "Not recorded: saved from Python. `playslot export` writes the commands."
     if experiment:
         lines = "\n".join(reproduce(experiment, policy.source, results))
-        commands, evaluation = f"```bash\n{lines}\n```\n\n{REPEATS}", experiment.evaluation
+        commands = f"{places(experiment, policy.source)}```bash\n{lines}\n```\n\n{REPEATS}"
     versions = {
         "exported with": _numbers(policy.source.get("versions", {})),
         "trained with": _numbers(policy.source.get("trained_with", {})),
@@ -184,7 +83,8 @@ def make_card(
         task=facts_table(_task(policy)),
         data=facts_table(_data(policy.source)),
         results=_results(results),
-        seed=evaluation.seed_offset,
+        use=use(policy, experiment),
+        frames=frames_comment(policy),
         commands=commands,
         versions=facts_table(versions),
     )
@@ -207,15 +107,16 @@ def _task(policy: SharedPolicyConfig) -> dict[str, str]:
 
         described = task_metadata(env)
         words, action = str(described.get("task", "")), str(described.get("action", ""))
-        rate = f"; {frames_a_second(env)} a second"
+        rate = f", each {env.frame_skip} environment steps; {frames_a_second(env)} a second"
     other = "resized by area averaging" if policy.resize else "refused"
     side = f"{env.image_size} x {env.image_size}"
     numbers = f"{env.action_dim} numbers in [-1, 1]"
     return {
         "task": words or "not described",
         "camera": f"`{policy.camera}`, {side} RGB; frames of another size are {other}",
+        "frames": rate_words(policy),
         "action": f"`{keys.FEATURE_ACTION}`, {numbers}" + (f": {action}" if action else ""),
-        "agent steps": f"at most {env.max_steps} an episode, each {env.frame_skip} environment steps{rate}",
+        "agent steps": f"at most {env.max_steps} an episode{rate}",
         "memory": "SAVi's slots are carried from frame to frame: call `reset()` before each episode",
     }
 

@@ -41,7 +41,7 @@ WEIGHTS: Final = "model.safetensors"
 LICENCE: Final = "apache-2.0"
 TAGS: Final = ("robotics", "lerobot", TYPE)
 
-OURS: Final = ("env", "model", "resize", "fingerprint", "source")
+OURS: Final = ("env", "model", "resize", "stride", "fps", "fingerprint", "source")
 """Keys of `config.json` that LeRobot does not know."""
 
 
@@ -54,6 +54,8 @@ class SharedPolicyConfig:
         model: sizes of the networks.
         camera: LeRobot feature of the frames it looks at.
         resize: frames of another size are resized by area averaging, as in training; False refuses them.
+        stride: every so-many-th frame of the demonstrations' videos was trained on, and is what it has to be shown.
+        fps: frames a second that it has to be shown, those of the videos over the stride; 0 where it is not known.
         fingerprint: first 16 hex digits of the SHA-256 of the weights file.
         source: where the weights came from (`playslot_rl.sharing.run`), plain values.
     """
@@ -62,6 +64,8 @@ class SharedPolicyConfig:
     model: ModelConfig = field(default_factory=ModelConfig)
     camera: str = keys.FEATURE_IMAGE
     resize: bool = False
+    stride: int = 1
+    fps: float = 0.0
     fingerprint: str = ""
     source: dict[str, Any] = field(default_factory=dict)
 
@@ -87,13 +91,15 @@ class SharedPolicyConfig:
             "env": to_dict(self.env),
             "model": to_dict(self.model),
             "resize": self.resize,
+            "stride": self.stride,
+            "fps": self.fps,
             "fingerprint": self.fingerprint,
             "source": self.source,
         }
 
     @classmethod
     def of(cls, camera: str, ours: dict[str, Any]) -> SharedPolicyConfig:
-        """The config of `env`, `model`, `resize`, `fingerprint` and `source` as plain values.
+        """The config of `OURS` as plain values; those that older folders do not have may be missing.
 
         Raises:
             ValueError: unknown keys, wrong types, or values outside their range.
@@ -103,6 +109,8 @@ class SharedPolicyConfig:
             model=from_dict(ModelConfig, ours["model"], "model."),
             camera=camera,
             resize=bool(ours.get("resize", False)),
+            stride=int(ours.get("stride", 1)),
+            fps=float(ours.get("fps", 0.0)),
             fingerprint=str(ours.get("fingerprint", "")),
             source=dict(ours.get("source") or {}),
         )
@@ -146,7 +154,8 @@ def read_config(folder: Path) -> SharedPolicyConfig:
     if kind != TYPE:
         raise CheckpointError(f"{path}: got a policy of type {kind!r}, expected {TYPE!r}: check the folder")
     try:
-        config = SharedPolicyConfig.of(camera_of(values["input_features"]), {key: values[key] for key in OURS})
+        ours = {key: values[key] for key in OURS if key in values}
+        config = SharedPolicyConfig.of(camera_of(values["input_features"]), ours)
         for name, stated, made in zip(("in", "out"), _shapes(values), _shapes(config.to_lerobot()), strict=True):
             if stated != made:
                 raise ValueError(f"{name}put_features: got shapes {stated}, but env and model are of {made}")

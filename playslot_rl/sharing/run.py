@@ -4,6 +4,7 @@ card. Nothing of the machine is taken along: no folder, no command line, no host
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 from dataclasses import replace
@@ -13,13 +14,16 @@ from typing import TYPE_CHECKING, Any, Final
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import data_roots
-from playslot_rl.data.metadata import read_info
+from playslot_rl.data.camera_names import cameras_of, full_name
+from playslot_rl.data.metadata import INFO_NAME, read_info
+from playslot_rl.envs import ENVIRONMENTS
 from playslot_rl.errors import CheckpointError, ConfigError, DataError, OutputError
 from playslot_rl.evaluation.success import POLICY_PROTOCOLS, run_facts
-from playslot_rl.sharing.card import Result, make_card
+from playslot_rl.sharing.card import make_card
+from playslot_rl.sharing.commands import Result
 from playslot_rl.sharing.folder import SharedPolicyConfig, require_whole, save_pretrained
 from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
-from playslot_rl.training.runs import load_agent, pretrained_folder, world_model_checkpoints
+from playslot_rl.training.runs import load_agent, pretrained_folder, run_folder, stored_view, world_model_checkpoints
 
 if TYPE_CHECKING:
     from playslot_rl.world_model import Agent
@@ -82,6 +86,11 @@ def _recorded(root: Path) -> dict[str, Any]:
         return {}
 
 
+def _elsewhere(root: Path) -> bool:
+    """Whether a data set is there that our collectors did not record."""
+    return (root / INFO_NAME).is_file() and not (root / "meta" / "playslot.json").is_file()
+
+
 def read_results(run: Path, source: dict[str, Any]) -> list[Result]:
     """Evaluations of exactly this policy, from `RUN/evaluation/*/eval_info.json`; those of an older one are left out.
 
@@ -141,14 +150,13 @@ def export_run(
         OutputError: `folder` exists, or cannot be written.
     """
     source = source or read_source(run)
+    roots = data_roots(",".join(text for text in (config.data.root, config.data.demos) if text))
+    source = {**source, "recorded_elsewhere": any(_elsewhere(Path(root.path)) for root in roots)}
     results = read_results(run, source)
     agent = load_agent(run)
-    return save_pretrained(
-        agent,
-        folder,
-        _policy(agent, config, source),
-        lambda written: make_card(folder.name, written, agent, config, results),
-    )
+    policy = _policy(run, agent, config, source)
+    made = replace(config, data=replace(config.data, camera=stored_view(run).camera))  # one of several may be exported
+    return save_pretrained(agent, folder, policy, lambda written: make_card(folder.name, written, agent, made, results))
 
 
 def require_exported(run: Path, folder: Path, config: ExperimentConfig, source: dict[str, Any]) -> None:
@@ -162,40 +170,72 @@ def require_exported(run: Path, folder: Path, config: ExperimentConfig, source: 
         OutputError: it holds another policy.
     """
     made = require_whole(folder)
-    wanted = replace(_policy(load_agent(run), config, source), fingerprint=made.fingerprint)
+    wanted = replace(_policy(run, load_agent(run), config, source), fingerprint=made.fingerprint)
     if made.source.get("fingerprints") != source["fingerprints"] or replace(made, source=source) != wanted:
         raise OutputError(
             f"out={folder}: got another policy, expected a new folder or that of run={run}: choose another"
         )
 
 
-def _policy(agent: Agent, config: ExperimentConfig, source: dict[str, Any]) -> SharedPolicyConfig:
+def _policy(run: Path, agent: Agent, config: ExperimentConfig, source: dict[str, Any]) -> SharedPolicyConfig:
     return SharedPolicyConfig(
         env=agent.world_model.env,
         model=agent.world_model.config,
-        camera=camera(config),
+        camera=camera(run, config),
         resize=config.data.resize,
+        stride=config.data.stride,
+        fps=_frame_rate(run, config),
         source=source,
     )
 
 
-def camera(config: ExperimentConfig) -> str:
+def described(run: Path | str) -> SharedPolicyConfig:
+    """What a run says of the frames that its policy looks at; its networks are not read."""
+    view, meta = stored_view(run), read_stage(checkpoint_folder(run_folder(run), "policy"), "policy").meta
+    one = "" if "," in view.camera else view.camera
+    return SharedPolicyConfig(
+        camera=str(meta.get("camera") or one or keys.FEATURE_IMAGE),
+        resize=view.resize,
+        stride=view.stride,
+        fps=float(meta.get("fps", 0.0)),
+    )
+
+
+def _frame_rate(run: Path, config: ExperimentConfig) -> float:
+    """Frames a second that a policy is shown: of its demonstrations, over the stride. 0 where older runs do not say."""
+    known = described(run).fps
+    if known:
+        return known
+    for root in data_roots(config.data.demos or config.data.root)[:1]:
+        with contextlib.suppress(DataError):
+            return float(read_info(Path(root.path))["fps"]) / config.data.stride
+    if config.env.name in ENVIRONMENTS:
+        from playslot_rl.envs.lerobot import frames_a_second
+
+        return frames_a_second(config.env) / config.data.stride
+    return 0.0
+
+
+def camera(run: Path, config: ExperimentConfig) -> str:
     """LeRobot's name of the camera a run looks at: `data.camera`, else the only one of its demonstrations.
 
-    Where the demonstrations are no longer there it is that of our own data sets.
+    Where the demonstrations are no longer there it is that of the run, or of our own data sets.
 
     Raises:
         ConfigError: there are several.
+        DataError: there is no such camera.
     """
-    names = [name.strip() for name in config.data.camera.split(",") if name.strip()]
-    if not names:
-        roots = data_roots(config.data.demos or config.data.root)
-        root = roots[0].path if roots else ""
-        try:
-            features = read_info(Path(root))["features"] if root else {}
-        except DataError:
-            features = {}
-        names = [name for name, feature in features.items() if feature["dtype"] in ("image", "video")]
+    roots = data_roots(config.data.demos or config.data.root)
+    names, where = _names(config.data.camera), str(run)
+    known = [*_names(stored_view(run).camera), described(run).camera]
+    for root in roots[:1]:
+        with contextlib.suppress(DataError):
+            known, where = cameras_of(read_info(Path(root.path))["features"]), root.path
+            names = names or known
     if len(names) > 1:
         raise ConfigError(f"data.camera: got {', '.join(names)}, expected the one the policy is to look at: name it")
-    return names[0] if names else keys.FEATURE_IMAGE
+    return full_name(names[0], known, where) if names else described(run).camera
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]

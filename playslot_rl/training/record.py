@@ -244,10 +244,15 @@ class StageRecord:
             metrics=metrics,
             steps=steps,
             seconds=seconds,
-            extra={"seed": self.config.seed, **extra},
+            extra={"seed": self.config.seed, **(self._shown() if self.role else {}), **extra},
         )
         wait()
         return done
+
+    def _shown(self) -> dict[str, Any]:
+        """What the frames are that the stage was shown: how many a second, and of which camera if it is one."""
+        several = "," in self.config.data.camera
+        return {"fps": self.data.fps} | ({} if several else {"camera": self.data.camera})
 
     def _of_stored(self, *keys: str) -> dict[str, Any]:
         """The parts of `stored` that dotted keys name, nested as there."""

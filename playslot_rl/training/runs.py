@@ -23,6 +23,7 @@ import torch
 from torch import nn
 
 from playslot_rl.config import (
+    DataConfig,
     DynamicsStageConfig,
     EnvConfig,
     ExperimentConfig,
@@ -31,6 +32,7 @@ from playslot_rl.config import (
     to_dict,
 )
 from playslot_rl.config.compose import SHIPPED, near_run
+from playslot_rl.data.camera_names import with_full_cameras
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_bytes, write_json
 from playslot_rl.storage.checkpoints import (
@@ -89,12 +91,28 @@ def run_folder(run: Path | str) -> Path:
 
 
 def store_config(config: ExperimentConfig, run: Path) -> None:
-    """Write the run's config. Called when everything fits, so that a refused command leaves the stored one as it was.
+    """Write the run's config, with cameras by their full names. Called when everything fits, so that a refused command
+    leaves the stored one as it was.
 
     Raises:
         OutputError: the folder cannot be written.
     """
-    write_json(run / "config.json", to_dict(config))
+    write_json(run / "config.json", to_dict(with_full_cameras(config)))
+
+
+def stored_view(run: Path | str) -> DataConfig:
+    """Camera, resizing and stride with which a run's frames were read; the defaults where it says nothing.
+
+    Raises:
+        CheckpointError: no such run, or its config is damaged.
+    """
+    path = run_folder(run) / "config.json"
+    data = read_json(path, "restore it").get("data", {}) if path.is_file() else {}
+    view = {key: data[key] for key in ("camera", "resize", "stride") if key in data}
+    try:
+        return from_dict(DataConfig, view, "data.")
+    except ValueError as error:
+        raise CheckpointError(f"{path} cannot be used: {error}; restore it or start a new run") from error
 
 
 def adopt_stage(checkpoint: StageCheckpoint, run: Path) -> None:

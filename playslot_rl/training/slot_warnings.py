@@ -75,12 +75,9 @@ _LEARNED: Final = "let the decoder learn its position map (model.savi.decoder_po
 
 def _less_room(savi: SAViConfig, stage: SlotsStageConfig) -> list[str]:
     """Other sizes than those of the SAVi that is started from cannot be had."""
-    if stage.start_from:
-        return []
-    return [
-        f"give slots less room by a smaller model.savi.slot_dim (now {savi.slot_dim}) and fewer "
-        f"model.savi.decoder_channels (now {list(savi.decoder_channels)})"
-    ]
+    sizes = f"model.savi.slot_dim (now {savi.slot_dim}) and fewer"
+    channels = f"model.savi.decoder_channels (now {list(savi.decoder_channels)})"
+    return [] if stage.start_from else [f"give slots less room by a smaller {sizes} {channels}"]
 
 
 def _leave_plateau(savi: SAViConfig, stage: SlotsStageConfig) -> str:

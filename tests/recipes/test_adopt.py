@@ -87,7 +87,7 @@ def test_a_set_that_nobody_prepared_becomes_a_world_model(
 def test_videos_of_two_cameras_become_a_model_that_can_be_played(tmp_path: Path) -> None:
     root = write_set(tmp_path / "set", (24, 22, 26, 24, 23), 2, ("top", "side"), (480, 640), video=True)
     run = tmp_path / "run"
-    smoke("adopt", f"data.root={root}", "data.camera=observation.images.side", f"out={run}", *QUICK)
+    smoke("adopt", f"data.root={root}", "data.camera=side", f"out={run}", *QUICK)
     config = compose([f"run={run}"], "play")
     assert (config.data.root, config.data.camera) == (str(root), "observation.images.side")
     studio = open_studio(config)

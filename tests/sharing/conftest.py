@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
+sys.path.insert(0, str(Path(__file__).parent))
 
 from playslot_rl.sharing.folder import SharedPolicyConfig, save_pretrained
 from playslot_rl.storage.atomic import write_json

@@ -15,7 +15,7 @@ from commands import ONE_CORE, contents, playslot, refused
 
 from playslot_rl.config import to_dict
 from playslot_rl.config.compose import compose
-from playslot_rl.sharing.card import reproduce
+from playslot_rl.sharing.commands import reproduce
 from playslot_rl.sharing.folder import read_config
 from playslot_rl.sharing.run import read_results, read_source
 from playslot_rl.storage.atomic import write_json

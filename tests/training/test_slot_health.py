@@ -166,7 +166,7 @@ def test_a_cure_in_use_is_not_named_again() -> None:
     "sick", [{"mask_entropy": math.log(4)}, {"slots_in_use": 1.0}, {"slots_per_object": 2.0}, {"moving_explained": 0.0}]
 )
 def test_cures_fit_into_the_stage_and_its_settings(sick: dict[str, float]) -> None:
-    """A stage of 142 steps has no room for 1,500 magnified ones, and one that starts from another none for new sizes."""
+    """142 steps have no room for 1,500 magnified ones, and a stage that starts from another none for new sizes."""
     short = SlotsStageConfig(steps=142, start_from="pretrained/block_push_easy")
     (said,) = slot_warnings(HEALTHY | sick, SAViConfig(decoder="pixel_shuffle"), short).values()
     assert "train for longer than 142 steps" in said

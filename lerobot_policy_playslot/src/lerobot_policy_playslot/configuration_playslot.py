@@ -25,6 +25,7 @@ class PlaySlotConfig(PreTrainedConfig):
         env: the task it was trained on, plain values of `playslot_rl.config.EnvConfig`.
         model: sizes of its networks, plain values of `playslot_rl.config.ModelConfig`.
         resize: resize frames of another size by area averaging; False refuses them.
+        stride, fps: it has to be shown one frame in so many of its demonstrations', so many a second (0: unknown).
         fingerprint: first 16 hex digits of the SHA-256 of `model.safetensors`; empty for fresh weights.
         source: where the weights came from.
 
@@ -35,6 +36,8 @@ class PlaySlotConfig(PreTrainedConfig):
     env: dict[str, Any] = field(default_factory=lambda: to_dict(EnvConfig()))
     model: dict[str, Any] = field(default_factory=lambda: to_dict(ModelConfig()))
     resize: bool = False
+    stride: int = 1
+    fps: float = 0.0
     fingerprint: str = ""
     source: dict[str, Any] = field(default_factory=dict)
     license: str | None = LICENCE

@@ -28,6 +28,8 @@ class PlaySlotEnv(EnvConfig):
     Attributes:
         task: `button_press`, `block_push`, `block_push_easy`, `block_reach` or `block_pick`.
         episode_length: longest episode in agent steps; None takes the task's own.
+        frame_skip: environment steps of an agent step; None takes the task's own. A policy that was trained on one
+            frame in three acts at a third of the rate: three times as many.
         image_size: side of the square frames.
         quality: `fast` or `full`, as `render.quality` of the commands.
         fps: agent steps a second, set from the task.
@@ -39,6 +41,7 @@ class PlaySlotEnv(EnvConfig):
 
     task: str | None = "button_press"
     episode_length: int | None = None
+    frame_skip: int | None = None
     image_size: int = 64
     quality: str = "fast"
     features: dict[str, PolicyFeature] = field(default_factory=dict)
@@ -59,7 +62,8 @@ class PlaySlotEnv(EnvConfig):
         from playslot_rl.config.compose import compose
 
         env = replace(compose([f"env={self.task}"]).env, image_size=self.image_size)
-        return env if self.episode_length is None else replace(env, max_steps=self.episode_length)
+        longest, skip = self.episode_length or env.max_steps, self.frame_skip or env.frame_skip
+        return replace(env, max_steps=longest, frame_skip=skip)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

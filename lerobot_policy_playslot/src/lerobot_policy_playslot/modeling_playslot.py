@@ -52,7 +52,9 @@ class PlaySlotPolicy(PreTrainedPolicy):
         """
         del kwargs
         camera = self.policy_config.camera
+        camera = camera if camera in batch else camera.rpartition(".")[2]  # renamed to the short name
         if camera not in batch:
+            camera = self.policy_config.camera
             had = ", ".join(sorted(name for name in batch if name.startswith("observation."))) or "none"
             raise ValueError(
                 f'observation: got {had}, expected {camera}: rename yours by --rename_map=\'{{"yours": "{camera}"}}\''

@@ -1,0 +1,252 @@
+"""What a model card says in commands: how its policy is used, and how it is made again.
+
+They come from the config of its run, and name no folder of this machine.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from playslot_rl import keys
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config.compose import compose, shipped
+from playslot_rl.config.plain import flatten
+from playslot_rl.config.roles import keys_of
+from playslot_rl.config.weights import data_roots
+from playslot_rl.envs import ENVIRONMENTS, RECORDED
+from playslot_rl.sharing.folder import SharedPolicyConfig
+
+RUN: Final = "runs/again"
+WORLD: Final = "runs/world"
+VIDEOS: Final = "data/videos"
+DEMOS: Final = "data/demonstrations"
+START: Final = "runs/start"
+GROUPS: Final = ("env", "render", "collect", "data", "model", "slots", "dynamics", "behaviour", "evaluation")
+"""Parts of a config that a result depends on; intervals of logging and the like do no harm in between."""
+BEHAVIOUR: Final = (
+    "env",
+    "render",
+    "collect",
+    "data",
+    "model.policy",
+    "model.action_decoder",
+    "behaviour",
+    "evaluation",
+)
+"""Those a policy on the shipped world model depends on."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """A measured success rate.
+
+    Attributes:
+        protocol: `simulation` or `imagination`.
+        episodes: how many, one for each seed.
+        seed: block of evaluation seeds.
+        success_rate: 0 to 1.
+        ci95: Wilson's interval.
+        mean_steps: agent steps to the first success, of the episodes that had one; None without any.
+        references: success rate and interval of other policies in simulation, on the same seeds, by name.
+    """
+
+    protocol: str
+    episodes: int
+    seed: int
+    success_rate: float
+    ci95: tuple[float, float]
+    mean_steps: float | None
+    references: dict[str, tuple[float, tuple[float, float]]]
+
+
+def reproduce(config: ExperimentConfig, source: Mapping[str, Any], results: Sequence[Result]) -> list[str]:
+    """Command lines from nothing (from the data sets, where these were recorded elsewhere) to the evaluated policy.
+
+    Args:
+        config: of the run.
+        source: see `playslot_rl.sharing.run.read_source`.
+        results: what was measured of it.
+    """
+    evaluate = [
+        _line("evaluate", f"run={RUN}", f"protocol={r.protocol}", f"episodes={r.episodes}", f"seed={r.seed}")
+        for r in results
+    ]
+    made = _from_recordings if recorded_elsewhere(config, source) else _from_nothing
+    return [*made(config, source), *evaluate]
+
+
+def recorded_elsewhere(config: ExperimentConfig, source: Mapping[str, Any]) -> bool:
+    """Whether the data sets are not those that our commands collect."""
+    return config.env.name in RECORDED or bool(source.get("recorded_elsewhere"))
+
+
+def _from_nothing(config: ExperimentConfig, source: Mapping[str, Any]) -> list[str]:
+    seed = source.get("seed")
+    base, seeded = _base(config), _seeded(seed)
+    changed, recorded, demos = changes(config, BEHAVIOUR), source.get("recorded") or {}, source.get("demos")
+    episodes = recorded.get("episodes") or demos
+    first = [f"demos={demos}"] if demos is not None and demos != episodes else []
+    if not source.get("shipped_world_model"):
+        world = source.get("world_model_seed", seed)
+        if world in (None, seed) and not first:
+            return [_line("pipeline", *base, *seeded, *changes(config, GROUPS), f"out={RUN}")]
+        collected = f"data.demos={WORLD}/data/expert"
+        return [
+            _line("pipeline", *base, *_seeded(world), *changes(config, GROUPS), f"out={WORLD}"),
+            _line("train-policy", f"run={WORLD}", *base, *seeded, *first, *changed, collected, f"out={RUN}"),
+        ]
+    count = [] if episodes is None else [f"episodes={episodes}"]
+    start = [f"seed={recorded['seed']}"] if recorded else seeded
+    recording = [text for text in changed if text.startswith(("env.", "render.", "collect."))]
+    return [
+        _line("collect", *base, "policy=expert", *count, *start, *recording, f"out={DEMOS}"),
+        _line("train-policy", "run=pretrained", *base, *seeded, *first, *changed, f"data.demos={DEMOS}", f"out={RUN}"),
+    ]
+
+
+def _from_recordings(config: ExperimentConfig, source: Mapping[str, Any]) -> list[str]:
+    seed, data = source.get("seed"), config.data
+    base, demos = _base(config), f"data.demos={DEMOS}"
+    behaviour = [f"demos={config.demos}"] if config.demos is not None else []
+    behaviour += [f"data.held_out={data.held_out}"] if data.held_out else []
+    if source.get("shipped_world_model"):
+        own = [*_seeded(seed), *behaviour, *changes(config, BEHAVIOUR)]
+        return [_line("train-policy", "run=pretrained", *base, *own, demos, f"out={RUN}")]
+    world, settings = source.get("world_model_seed", seed), [*changes(config, GROUPS), f"data.root={_videos(config)}"]
+    alike = world in (None, seed)
+    if alike and config.env.name not in RECORDED:
+        return [_line("pipeline", *base, *_seeded(seed), *behaviour, *settings, demos, f"out={RUN}")]
+    folder = RUN if alike else WORLD
+    among = [demos, *behaviour] if DEMOS in _videos(config).split(",") else []
+    return [
+        _line("train-slots", *base, *_seeded(world), *settings, *among, f"out={folder}"),
+        _line("train-dynamics", f"run={folder}"),
+        _line("train-policy", f"run={folder}", *([] if alike else _seeded(seed)), *behaviour, demos, f"out={RUN}"),
+    ]
+
+
+def _base(config: ExperimentConfig) -> list[str]:
+    return [f"env={config.env.name}", f"preset={config.preset}"]
+
+
+def _seeded(seed: int | None) -> list[str]:
+    return [] if seed is None else [f"seed={seed}"]
+
+
+def _videos(config: ExperimentConfig) -> str:
+    """`data.root` with names that stand for its folders."""
+    roots, demos = data_roots(config.data.root), config.data.demos
+    names = [VIDEOS if len(roots) == 1 else f"{VIDEOS}_{number}" for number in range(1, len(roots) + 1)]
+    named = [
+        root._replace(path=DEMOS if root.path == demos and len(roots) > 1 else name)
+        for root, name in zip(roots, names, strict=True)
+    ]
+    return ",".join(root.text for root in named) or VIDEOS
+
+
+def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
+    """`key=value` of what differs from the run's preset, in some groups of keys.
+
+    Raises:
+        ConfigError: the preset or the environment is not one of this version.
+    """
+    free, machine, folders = (keys_of(ExperimentConfig, role) for role in ("free", "machine", "folder"))
+    preset = flatten(to_dict(compose([f"env={config.env.name}", f"preset={config.preset}"])))
+    found = []
+    for key, value in flatten(to_dict(config)).items():
+        group, _, name = key.rpartition(".")
+        if not any(key.startswith(f"{one}.") for one in groups) or (group == "data" and key in machine | folders):
+            continue
+        # Where patience ends a stage, when it looks decides where.
+        looks = name == "validate_every" and getattr(getattr(config, group, None), "patience", 0)
+        if (key in free and not looks) or (key in preset and preset[key] == value):
+            continue
+        if key in folders and value and not shipped(str(value)):
+            value = START  # no folder of this machine
+        found.append(f"{key}={_value(value)}")
+    return found
+
+
+def _value(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+
+
+def _line(command: str, *arguments: str) -> str:
+    return shlex.join(["playslot", command, *arguments])
+
+
+def places(config: ExperimentConfig, source: Mapping[str, Any]) -> str:
+    """What the folders in the commands stand for, a paragraph; empty where the commands make them."""
+    if not recorded_elsewhere(config, source):
+        return ""
+    adopt = f"; `playslot adopt data.root={VIDEOS} out={RUN}` would choose sizes and steps anew"
+    return (
+        f"`{_videos(config).replace(',', '`, `')}` and `{DEMOS}` stand for the data sets, recorded elsewhere, whose "
+        f"fingerprints are above{adopt if config.env.name == 'video' else ''}.\n\n"
+    )
+
+
+def rate_words(policy: SharedPolicyConfig) -> str:
+    """How often the policy wants a frame."""
+    rate, stride = policy.fps, policy.stride
+    if stride == 1:
+        return f"{rate:g} a second" if rate else "as many a second as in the demonstrations"
+    of = f" of {rate * stride:g}" if rate else ""
+    now = f"{rate:g} a second" if rate else f"1 / {stride} of the demonstrations' rate"
+    return f"{now}: one frame in {stride}{of}, and each action is held until the next"
+
+
+def frames_comment(policy: SharedPolicyConfig) -> str:
+    """The same, beside a call of `act`."""
+    return f"for each frame of an episode, uint8 (H, W, 3); {rate_words(policy)}"
+
+
+def use(policy: SharedPolicyConfig, experiment: ExperimentConfig | None = None) -> str:
+    """The paragraph on LeRobot's programs, as Markdown.
+
+    Args:
+        policy: config of the model folder.
+        experiment: config of the run; None where it is not known.
+    """
+    if policy.env.name not in ENVIRONMENTS:
+        return REAL.format(camera=policy.camera, rate=rate_words(policy))
+    known = experiment or ExperimentConfig()
+    own, task = policy.env, compose([f"env={policy.env.name}"]).env
+    options = {
+        "image_size": (own.image_size, 64),
+        "quality": (known.render.quality, "fast"),
+        "frame_skip": (own.frame_skip * policy.stride, task.frame_skip),
+        "episode_length": (-(-own.max_steps // policy.stride), task.max_steps),
+    }
+    command = ["lerobot-eval", "--policy.path=THIS_FOLDER", "--env.type=playslot", f"--env.task={own.name}"]
+    command += [f"--env.{name}={value}" for name, (value, default) in options.items() if value != default]
+    if policy.camera != keys.FEATURE_IMAGE:
+        command.append(f"--rename_map={json.dumps({keys.FEATURE_IMAGE: policy.camera})}")
+    command += ["--eval.n_episodes=10", "--eval.batch_size=1", f"--seed={known.evaluation.seed_offset}"]
+    return SIMULATED.format(command=shlex.join(command))
+
+
+SIMULATED: Final = """\
+In LeRobot, with `playslot_rl` and `lerobot_policy_playslot` installed; the seed is the first of ours that no
+training has seen:
+
+```bash
+{command}
+```"""
+REAL: Final = """\
+No simulator of this task ships with `playslot_rl`: `lerobot-eval` has nothing to run it in. It is shown the frames
+of the robot, {rate}. In LeRobot's own terms, with `playslot_rl` and `lerobot_policy_playslot` installed:
+
+```python
+from lerobot.policies import make_pre_post_processors
+from lerobot_policy_playslot.modeling_playslot import PlaySlotPolicy
+
+policy = PlaySlotPolicy.from_pretrained("THIS_FOLDER")
+before, after = make_pre_post_processors(policy.config, "THIS_FOLDER")
+policy.reset()
+action = after(policy.select_action(before({{"{camera}": picture}})))  # picture (3, H, W), float in [0, 1]
+```"""

@@ -1,0 +1,318 @@
+"""What a card says can be done: its commands are accepted for every kind of run, and run (the long ones when slow tests
+do); the policy comes out again, weight for weight.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import playslot, smoke
+from recordings import FPS, trained, write_recordings
+
+from playslot_rl.config import to_dict
+from playslot_rl.config.compose import choices, compose
+from playslot_rl.config.plain import flatten
+from playslot_rl.envs import ENVIRONMENTS, PROCEDURAL, RECORDED, gym_id
+from playslot_rl.sharing.commands import GROUPS, reproduce
+from playslot_rl.sharing.folder import read_config
+from playslot_rl.storage.atomic import write_json
+
+SAME = ("device=cpu", "threads=1", "workers=1")
+"""Of this machine; no card names them."""
+
+
+def blocks(card: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", card, re.DOTALL | re.MULTILINE)
+
+
+def lines(card: str) -> list[list[str]]:
+    """The card's commands, split as a shell does."""
+    return [shlex.split(line) for block in blocks(card, "bash") for line in block.splitlines()]
+
+
+def exported(run: Path, out: Path, *settings: str) -> str:
+    smoke("export", f"run={run}", f"out={out}", *settings)
+    return (out / "README.md").read_text()
+
+
+def run_lines(card: str, folder: Path) -> list[str]:
+    """Run every command of a card in the present folder; their names."""
+    names = []
+    for program, *arguments in lines(card):
+        names.append(program if program != "playslot" else arguments[0])
+        if program == "playslot":
+            done = playslot(*arguments, *SAME)
+            assert done.code == 0, (arguments, done.err)
+            continue
+        given = [argument.replace("THIS_FOLDER", str(folder)) for argument in arguments]
+        given = ["--eval.n_episodes=1" if argument.startswith("--eval.n_") else argument for argument in given]
+        environment = {**os.environ, "HF_HUB_OFFLINE": "1"}
+        command = [str(Path(sys.executable).with_name(program)), *given, "--policy.device=cpu", "--output_dir=eval"]
+        done_there = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        assert done_there.returncode == 0, done_there.stderr[-2000:]
+    return names
+
+
+def run_python(card: str, folder: Path, size: tuple[int, int]) -> list[Any]:
+    """Run the Python blocks on a frame; the actions they end with."""
+    frame = np.random.default_rng(0).integers(0, 256, (*size, 3), dtype=np.uint8)
+    actions = []
+    for block in blocks(card, "python"):
+        import torch
+
+        names: dict[str, Any] = {"frame": frame, "picture": torch.from_numpy(frame).movedim(-1, 0).float() / 255}
+        exec(block.replace("THIS_FOLDER", str(folder)), names)
+        actions.append(np.asarray(names["action"]).reshape(-1))
+    return actions
+
+
+def policy_print(run: Path) -> str:
+    fingerprint: str = json.loads((run / "policy" / "checkpoint" / "meta.json").read_text())["fingerprint"]
+    return fingerprint
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_recordings(tmp_path_factory.mktemp("robot") / "set")
+
+
+@pytest.fixture(scope="module")
+def strided(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on every third frame, resized."""
+    return trained(tmp_path_factory.mktemp("run") / "run", recordings, "data.stride=3", "data.validation=0.2")
+
+
+def test_the_card_of_a_run_on_recordings_can_be_followed(
+    strided: Path, recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    card = exported(strided, tmp_path / "policy")
+    monkeypatch.chdir(tmp_path)
+    for name in ("videos", "demonstrations"):
+        (tmp_path / "data").mkdir(exist_ok=True)
+        shutil.copytree(recordings, tmp_path / "data" / name)
+    assert run_lines(card, tmp_path / "policy") == ["train-slots", "train-dynamics", "train-policy"]
+    assert policy_print(Path("runs/again")) == policy_print(strided)
+    actions = run_python(card, tmp_path / "policy", (80, 96))
+    assert len(actions) == 2
+    np.testing.assert_array_equal(actions[0], actions[1])
+    for wrong in ("--env.task", "playslot pipeline", str(tmp_path), "lerobot-eval --"):
+        assert wrong not in card
+
+
+def test_a_policy_of_every_third_frame_says_at_which_rate_it_acts(strided: Path, tmp_path: Path) -> None:
+    card = exported(strided, tmp_path / "policy")
+    assert "| frames | 10 a second: one frame in 3 of 30, and each action is held until the next |" in card
+    assert "uint8 (H, W, 3); 10 a second: one frame in 3 of 30" in card
+    config = read_config(tmp_path / "policy")
+    assert (config.stride, config.fps, config.resize) == (3, FPS / 3, True)
+    import playslot_rl
+
+    playslot_rl.load(strided, device="cpu").save_pretrained(tmp_path / "saved")
+    again = read_config(tmp_path / "saved")
+    assert (again.stride, again.fps, again.resize, again.camera) == (3, FPS / 3, True, "observation.images.top")
+    assert "one frame in 3 of 30" in (tmp_path / "saved" / "README.md").read_text()
+
+
+def test_frames_of_another_size_are_resized_as_those_of_the_training_to_the_last_digit(
+    strided: Path, recordings: Path, tmp_path: Path
+) -> None:
+    import torch
+    from lerobot.policies import make_pre_post_processors
+
+    import playslot_rl
+    from lerobot_policy_playslot.modeling_playslot import PlaySlotPolicy
+    from playslot_rl.data.opening import open_configured
+    from playslot_rl.data.source import open_source
+
+    small = open_configured(compose([f"run={strided}"], "play"), str(recordings))
+    large = open_source(recordings)
+    rows = np.arange(0, LAST := int(large.lengths[0]), 3)
+    assert LAST == 12
+    whole, seen = np.stack([large.frames[row] for row in rows]), small.frames[small.episode_rows(0)]
+    assert whole.shape[1:] == (80, 96, 3)
+    assert seen.shape[1:] == (64, 64, 3)
+    exported(strided, tmp_path / "policy")
+    models = [playslot_rl.load(strided, "cpu"), playslot_rl.PlaySlot.from_pretrained(tmp_path / "policy", "cpu")]
+    shared = PlaySlotPolicy.from_pretrained(tmp_path / "policy")
+    before, after = make_pre_post_processors(shared.config, str(tmp_path / "policy"))
+    for model in models:
+        slots = model.parse(seen)
+        assert torch.equal(model.parse(whole), slots)
+        assert torch.equal(model.parse(whole.transpose(0, 3, 1, 2)), slots)
+        assert torch.equal(model.parse(whole[None] / np.float32(255))[0], slots)
+        codes = torch.tensor([0, 1])
+        assert torch.equal(model.imagine(whole[0], codes), model.imagine(seen[0], codes))
+        model.reset()
+        expected = [model.act(frame) for frame in seen]
+        model.reset()
+        np.testing.assert_array_equal([model.act(frame) for frame in whole], expected)
+        shared.reset()
+        pictures = torch.from_numpy(whole).movedim(-1, 1).float() / 255
+        key = "observation.images.top"
+        acted = [after(shared.select_action(before({key: picture})))[0].numpy() for picture in pictures]
+        np.testing.assert_array_equal(acted, expected)
+    for shape in ((80, 96), (3, 80), (80, 96, 4), (0, 96, 3)):
+        with pytest.raises(ValueError, match=r"frames: got shape .*, expected \(\.\.\., 64, 64, 3\)"):
+            models[0].parse(np.zeros(shape, np.uint8))
+
+
+def test_where_the_training_did_not_resize_other_sizes_are_refused_in_one_line() -> None:
+    import playslot_rl
+
+    model = playslot_rl.load("pretrained", "cpu")
+    for refuse in (model.parse, model.act, lambda frame: model.imagine(frame, np.array([0, 1]))):
+        with pytest.raises(ValueError, match=r"frames: got shape \(80, 96, 3\), expected \(\.\.\., 64, 64, 3\)") as got:
+            refuse(np.zeros((80, 96, 3), np.uint8))
+        assert "\n" not in str(got.value)
+
+
+def policy_of(*arguments: str, **source: Any) -> tuple[Any, dict[str, Any]]:
+    known = {"seed": 0, "world_model_seed": 0, "demos": 6, "shipped_world_model": False}
+    return compose(["preset=smoke", *arguments]), known | source
+
+
+KINDS: dict[str, tuple[Any, dict[str, Any]]] = {
+    **{f"pipeline of {env}": policy_of(f"env={env}") for env in ENVIRONMENTS},
+    "shipped world model": policy_of(shipped_world_model=True, recorded={"episodes": 6, "seed": 7}, seed=7),
+    "demonstrations of a robot": policy_of(shipped_world_model=True, recorded_elsewhere=True, world_model_seed=3),
+    "resized": policy_of("data.resize=true", "env.image_size=32", "model.savi.encoder_strides=[2,2,1]"),
+    "strided": policy_of("data.stride=3", "env.max_steps=7"),
+    "a simulator's task, recorded elsewhere": policy_of(
+        "data.root=/home/me/a,/home/me/b", "data.demos=/home/me/b", "data.camera=observation.images.top",
+        "data.held_out=2", recorded_elsewhere=True,
+    ),
+    "two cameras": policy_of("env=video", "data.camera=observation.images.top,observation.images.side"),
+    "weights": policy_of("env=video", "data.root=/home/me/a:2,/home/me/b:1", "slots.start_from=/home/me/savi"),
+    "patience": policy_of("env=video", "slots.patience=2", "slots.validate_every=7", "dynamics.patience=1"),
+    "another seed, fewer demonstrations": policy_of("env=video", "demos=3", world_model_seed=4),
+    "sketchy": policy_of("env=sketchy", "data.root=/home/me/a"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_commands_are_accepted_and_bring_back_the_config(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, source = KINDS[kind]
+    monkeypatch.chdir(tmp_path)
+    last: Any = None
+    commands = [shlex.split(line)[1:] for line in reproduce(config, source, [])]
+    for command, *arguments in commands:
+        last = compose(arguments, command)
+        if command == "pipeline":
+            gym_id(last.env.name)
+        elif command != "collect":
+            assert last.data.demos or last.data.root
+        write_json(Path(last.out) / "config.json", to_dict(last))  # what the command leaves
+    assert (commands[-1][0], last.out) in (("pipeline", "runs/again"), ("train-policy", "runs/again"))
+    assert last.seed == source["seed"]
+    assert last.demos == config.demos
+    own, got = flatten(to_dict(config)), flatten(to_dict(last))
+    free = ("every", "data.root", "data.demos", "start_from", "segmented_episodes")
+    for key, value in own.items():
+        if key.startswith(tuple(f"{group}." for group in GROUPS)) and not key.endswith(free):
+            shipped = source["shipped_world_model"] and key.startswith(("model.", "slots.", "dynamics."))
+            assert shipped or got[key] == value, key
+    assert last.slots.validate_every == config.slots.validate_every or not config.slots.patience
+    assert "/home/me" not in str(commands)
+
+
+def test_every_environment_with_a_preset_is_of_some_kind() -> None:
+    assert {config.env.name for config, _ in KINDS.values()} == {*choices("env")} - {*PROCEDURAL}
+    assert {*RECORDED, *ENVIRONMENTS, *PROCEDURAL} == {*choices("env")}
+
+
+def test_the_use_of_a_simulators_policy_names_what_differs_from_the_task(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from lerobot_policy_playslot import PlaySlotEnv
+    from playslot_rl.sharing.commands import use
+    from playslot_rl.sharing.folder import SharedPolicyConfig
+
+    config = compose(["preset=paper", "env=block_push", "render.quality=full"])
+    env = replace(config.env, image_size=32, max_steps=25)
+    policy = SharedPolicyConfig(env=env, stride=3, fps=3.3, camera="observation.images.top")
+    (command,) = lines(use(policy, config))
+    options = dict(part.removeprefix("--").split("=", 1) for part in command[1:])
+    made = PlaySlotEnv(
+        task=options["env.task"],
+        image_size=int(options["env.image_size"]),
+        frame_skip=int(options["env.frame_skip"]),
+        episode_length=int(options["env.episode_length"]),
+        quality=options["env.quality"],
+    )
+    assert made.task_config() == replace(env, frame_skip=3 * env.frame_skip, max_steps=9)
+    assert json.loads(options["rename_map"]) == {"observation.images.front": "observation.images.top"}
+    plain = SharedPolicyConfig(env=compose(["env=block_push"]).env)
+    assert not [part for part in lines(use(plain))[0] if part.startswith(("--env.i", "--env.f", "--env.e", "--env.q"))]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("env", sorted(ENVIRONMENTS))
+def test_the_card_of_a_pipelines_run_can_be_followed(env: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    smoke("pipeline", f"env={env}", "out=runs/first", "seed=3")
+    card = exported(Path("runs/first"), tmp_path / "policy")
+    names = run_lines(card, tmp_path / "policy")
+    assert names == ["lerobot-eval", "pipeline", "evaluate", "evaluate"]
+    assert policy_print(Path("runs/again")) == policy_print(Path("runs/first"))
+    assert len(run_python(card, tmp_path / "policy", (64, 64))) == 1
+
+
+def adopted(tmp: Path) -> tuple[Path, Path, tuple[str, ...]]:
+    data = write_recordings(tmp / "robot", ("top", "side"))
+    quick = ("minutes=0.02", "adopt.slots=[2]", "adopt.prototypes=4", "data.camera=side")
+    smoke("adopt", f"data.root={data}", *quick, "out=runs/world")
+    smoke("train-policy", "run=runs/world", "behaviour.labelled_demos=2", "seed=5", "out=runs/first")
+    return Path("runs/first"), data, ()
+
+
+def of_two_cameras(tmp: Path) -> tuple[Path, Path, tuple[str, ...]]:
+    data = write_recordings(tmp / "robot", ("top", "side"))
+    return trained(tmp / "runs" / "first", data, "data.camera=top,side"), data, ("data.camera=side",)
+
+
+def on_the_shipped(tmp: Path) -> tuple[Path, Path, tuple[str, ...]]:
+    smoke("demo", "out=runs/first", "episodes=1", "evaluation.references=false")
+    return Path("runs/first"), Path("runs/first/data/expert"), ()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(
+    ("made", "names"),
+    [
+        (adopted, ["train-slots", "train-dynamics", "train-policy"]),
+        (of_two_cameras, ["train-slots", "train-dynamics", "train-policy"]),
+        (on_the_shipped, ["lerobot-eval", "collect", "train-policy", "evaluate", "evaluate"]),
+    ],
+)
+def test_the_card_of_another_kind_of_run_can_be_followed(
+    made: Callable[[Path], tuple[Path, Path, tuple[str, ...]]],
+    names: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run, data, chosen = made(tmp_path)
+    card = exported(run, tmp_path / "policy", *chosen)
+    if "collect" not in names:
+        for name in ("videos", "demonstrations"):
+            shutil.copytree(data, tmp_path / "data" / name)
+    if made in (adopted, of_two_cameras):
+        assert read_config(tmp_path / "policy").camera == "observation.images.side"
+    assert run_lines(card, tmp_path / "policy") == names
+    assert policy_print(Path("runs/again")) == policy_print(run)
+    assert run_python(card, tmp_path / "policy", (64, 64))
