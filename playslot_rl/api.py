@@ -243,7 +243,8 @@ class PlaySlot:
 
         Args:
             first_frame: ([B,] H, W, 3) or ([B,] 3, H, W).
-            actions: latent actions, float ([B,] P, [N,] Z), or prototypes by number, integer ([B,] P, [N]).
+            actions: latent actions, float ([B,] P, [N,] Z), or prototypes by number, integer ([B,] P, [N]); of a model
+                of mode `ground_truth` real actions, in the units of the data set.
 
         Returns:
             ([B,] P, N, D): the imagined frames, the first one not included.
@@ -260,7 +261,9 @@ class PlaySlot:
             >>> model.imagine(frame, torch.tensor([0, 0, 3, 3])).shape
             torch.Size([4, 4, 32])
         """
-        z = latent_actions(self.world_model, actions)
+        z, inverse = latent_actions(self.world_model, actions), self.world_model.inverse_dynamics
+        if inverse.config.mode == "ground_truth":
+            z = inverse.action_range.to_unit(z)
         batched = z.ndim == len(self.world_model.latent_shape) + 2
         slots = self.parse(first_frame)
         if slots.ndim not in (2, 3) or (slots.ndim == 3 and not batched):
@@ -269,7 +272,7 @@ class PlaySlot:
         slots = slots.expand(len(z), -1, -1) if slots.ndim == 2 else slots
         if len(slots) != len(z):
             raise ValueError(f"imagine: got {len(slots)} frames and {len(z)} action sequences, expected equal numbers")
-        p, v = self.world_model.inverse_dynamics.split(z)
+        p, v = inverse.split(z)
         future = self.world_model.predictor.rollout(slots[:, None], p, v)
         return future if batched else future[0]
 
@@ -301,7 +304,7 @@ class PlaySlot:
             frame: (H, W, 3) or (3, H, W).
 
         Returns:
-            (A,) in [-1, 1].
+            (A,) in the units of the demonstrations' data set; of our simulators, in [-1, 1].
 
         Raises:
             CheckpointError: the model has no policy.
@@ -321,7 +324,9 @@ class PlaySlot:
         pixels = self._frames(frame)
         if pixels.ndim != 3:
             raise ValueError(f"frame: got shape {tuple(pixels.shape)}, expected one frame, (H, W, 3) or (3, H, W)")
-        out: npt.NDArray[np.float32] = self._loop.act(pixels[None])[0].float().cpu().numpy()
+        # On the CPU, where LeRobot's pipeline computes it, too.
+        chosen = self._loop.act(pixels[None])[0].float().cpu()
+        out: npt.NDArray[np.float32] = self._loop.actor.executed(chosen).numpy()
         return out
 
     def reset(self) -> None:

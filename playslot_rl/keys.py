@@ -16,7 +16,7 @@ STATE: Final = "state_vector"
 """Proprioception: float32 (..., S), in Gymnasium's observations too: "state" is what TorchRL's `GymEnv` renames.
 LeRobot's names are its own: `FEATURE_STATE` in data sets, `agent_pos` of what its programs run."""
 ACTION: Final = "action"
-"""Real action: float32 (..., A) in [-1, 1]."""
+"""Real action: float32 (..., A) in [-1, 1]; in the robot's units (`modules.action_range`) where it is executed."""
 SLOTS: Final = "slots"
 """Object slots: float32 (..., N, D)."""
 SLOT_STATE: Final = "slot_state"

@@ -112,7 +112,7 @@ class Agent(nn.Module):
             world_model,
             LatentPolicy(config.policy, slot_dim, width, config.policy.whiten),
             ActionDecoder(config.action_decoder, width, env.action_dim, slot_dim),
-            LatentPolicy(config.policy, slot_dim, env.action_dim) if oracle else None,
+            LatentPolicy(config.policy, slot_dim, env.action_dim, acts=True) if oracle else None,
         )
 
 

@@ -54,8 +54,14 @@ def main(config: ExperimentConfig) -> None:
         clips = record.clips(own.seed_frames + own.predicted_frames)
         stage = DynamicsStage(world, clips, cached, own)
         patience = patience_of(own.patience, "mse_slot")
+        # In mode ground_truth the latents are the set's actions, in its range.
+        known = source.limits if stage.criterion.needs_actions else None
         return Training(
-            [Part("dynamics", stage, own, patience=patience)], device, said, extra={"episodes": source.episodes}
+            [Part("dynamics", stage, own, patience=patience)],
+            device,
+            said,
+            extra={"episodes": source.episodes} | ({} if known is None else {"actions": known.plain()}),
+            identity={} if known is None or known.unit else {"actions": known.said()},
         )
 
     def said(metrics: Mapping[str, float]) -> str:

@@ -74,7 +74,7 @@ def behaviour_networks(config: ExperimentConfig) -> dict[str, Any]:
 
 def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Training:
     """The frozen world model's view of the demonstrations; fresh policy, oracle and decoder on top of it."""
-    from playslot_rl.data.demonstrations import require_labelled
+    from playslot_rl.data.demonstrations import require_finite, require_labelled
     from playslot_rl.data.labels import label_demonstrations, with_copies
     from playslot_rl.seeding import global_seed
     from playslot_rl.training.fit import Part
@@ -85,6 +85,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
 
     device, split, behaviour = open_device(config), record.demos, config.behaviour
     require_labelled(behaviour.labelled_demos, split.trained.episodes)  # before anything is computed
+    require_finite(split, None if behaviour.oracle else behaviour.labelled_demos)
     world = load_world_model(parent, device)
     world.config = replace(world.config, **behaviour_networks(config))
     with global_seed(config.seed, 0, "policy"):

@@ -15,10 +15,11 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
-from torch import nn
+from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.modules.action_range import ActionRange, range_of
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.world_model import action_decoder_module, frame_parser_module
 
@@ -30,7 +31,7 @@ class Actor(TensorDictModuleBase):
     """Observation to action, with a memory that travels in the tensordict, never on the module.
 
     Reads PIXELS (n, 3, H, W), uint8 [0, 255] or float [0, 1], and the memory's keys; writes ACTION (n, A), in [-1, 1]
-    but for what is clipped by whoever executes it, and the memory's keys anew. In evaluation mode it is a function of
+    but for what `executed` clips, and the memory's keys anew. In evaluation mode it is a function of
     these inputs, so that episodes in a batch do not touch each other. `playslot_rl.acting.episodes` runs it.
 
     Args:
@@ -56,6 +57,16 @@ class Actor(TensorDictModuleBase):
         """Where its weights are."""
         first = next(self.parameters(), None)
         return torch.device("cpu") if first is None else first.device
+
+    @property
+    def action_range(self) -> ActionRange | None:
+        """What its actions are in the robot's units; None where they are in [-1, 1] there, too."""
+        return range_of(self)
+
+    def executed(self, actions: Tensor) -> Tensor:
+        """What a robot or a simulator gets for actions (n, A): clipped to [-1, 1], and in its units."""
+        clipped, known = actions.clamp(-1, 1), self.action_range
+        return clipped if known is None else known.from_unit(clipped)
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
         """The memory of new episodes, batch size [len(seeds)]; whatever is drawn depends on the seeds alone."""

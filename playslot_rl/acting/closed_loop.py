@@ -67,7 +67,7 @@ class ClosedLoop:
             name: of the frames, for messages.
 
         Returns:
-            (B, A) in [-1, 1], on the actor's device.
+            (B, A) in [-1, 1], on the actor's device; `actor.executed` gives them in the robot's units.
 
         Raises:
             ValueError: another shape, or another number of episodes than at the last call.
@@ -78,6 +78,8 @@ class ClosedLoop:
                 f"{name}: got {len(pixels)} episodes, expected {len(self._memory)} as at the last step: call reset() "
                 "before new episodes"
             )
+        # As frames of a camera lie in memory: convolutions of another layout differ in the last digit.
+        pixels = pixels.contiguous(memory_format=torch.channels_last)
         actions: Tensor = self.step(TensorDict({keys.PIXELS: pixels}, [len(pixels)])).get(keys.ACTION)
         return actions.clamp(-1, 1)
 

@@ -241,7 +241,7 @@ class _LockStep:
         return TensorDict(values, [len(running)])
 
     def _execute(self, running: Sequence[int], seen: TensorDictBase, step: int) -> None:
-        actions = seen.get(keys.ACTION).clamp(-1, 1).cpu().numpy()
+        actions = self.actor.executed(seen.get(keys.ACTION)).cpu().numpy()
         for i, action in zip(running, actions, strict=True):
             observation, reward, _, _, info = self.tasks[i].step(action)
             self.frames[i], self.rewards[i] = observation["pixels"], reward

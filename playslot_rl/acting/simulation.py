@@ -79,7 +79,8 @@ class SlotTransform(Transform):
 
 
 class ActionDecoderTransform(Transform):
-    """Turns the policy's LATENT_ACTION, with the SLOTS it was chosen at, into the ACTION the task wants, on the way in.
+    """Turns the policy's LATENT_ACTION, with the SLOTS it was chosen at, into the ACTION the task wants, on the way in,
+    in the units that it was recorded in.
 
     Args:
         action_decoder: latent action to real action, in evaluation mode.
@@ -101,6 +102,7 @@ class ActionDecoderTransform(Transform):
             return tensordict
         device = module_device(self.action_decoder)
         action: Tensor = self.action_decoder(latent.to(device), None if slots is None else slots.to(device))
+        action = self.action_decoder.action_range.from_unit(action)
         return tensordict.set(keys.ACTION, action.to(latent.device))
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
@@ -159,7 +161,7 @@ def make_simulation_env(
     """The simulated task with SLOTS as observation and LATENT_ACTION as action.
 
     The task's own keys stay (PIXELS, SUCCESS, reward, done). `action_decoder_module` on the rollout gives the real
-    actions again. Seed by `env.set_seed(seed)` before a reset.
+    actions again, in [-1, 1]. Seed by `env.set_seed(seed)` before a reset.
 
     Args:
         env_config: the task.

@@ -21,6 +21,7 @@ from playslot_rl.data.stride import ChosenFrames
 from playslot_rl.data.trimming import moving_rows, slot_motion
 from playslot_rl.errors import DataError
 from playslot_rl.frames import normalise
+from playslot_rl.modules.action_range import ActionRange
 
 FRAMES_AT_ONCE = 1024
 MotionOf = Callable[[npt.NDArray[np.int64]], Tensor]
@@ -324,9 +325,51 @@ def transitions(source: EpisodeFrames) -> Transitions:
 
 
 def real_actions(source: EpisodeFrames, rows: npt.NDArray[np.int64], width: int) -> Tensor:
-    """Real actions (M, A) in [-1, 1] of transitions.
+    """Real actions (M, A) of transitions, in [-1, 1] by the range of the data set; what lies outside is clipped.
 
     Raises:
         DataError: the data set has none, or of another width.
     """
-    return torch.from_numpy(np.array(source.require_actions(width)[rows])).clamp(-1, 1)
+    return _unit_actions(source, source.require_actions(width)[rows]).clamp(-1, 1)
+
+
+def probed_actions(source: EpisodeFrames, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float32] | None:
+    """Real actions (M, A) of transitions for a measure, scaled as they are learned; None where there are none, or some
+    that are no numbers."""
+    if source.actions is None or not np.isfinite(source.actions[rows]).all():
+        return None
+    scaled: npt.NDArray[np.float32] = _unit_actions(source, source.actions[rows]).numpy()
+    return scaled
+
+
+def _unit_actions(source: EpisodeFrames, actions: npt.NDArray[np.float32]) -> Tensor:
+    found = torch.from_numpy(np.array(actions))
+    if source.limits is None:
+        return found
+    known = ActionRange(actions.shape[-1])
+    source.limits.give(known)
+    return known.to_unit(found)
+
+
+def require_finite(demos: DemonstrationSplit, labelled: int | None = None) -> None:
+    """Refuse demonstrations whose actions are learned or measured, and are no numbers.
+
+    Args:
+        demos: those that are trained on, and those that are held out.
+        labelled: how many of them show their actions; None: all.
+
+    Raises:
+        DataError: NaN or infinite actions.
+    """
+    for source, shown in ((demos.trained, labelled), (demos.held_out, None)):
+        if source is None or source.actions is None:
+            continue
+        moves = transitions(source)
+        rows = moves.rows if shown is None else moves.rows[moves.episode < shown]
+        bad = int((~np.isfinite(source.actions[rows])).any(axis=1).sum())
+        if bad:
+            raise DataError(
+                f"{source.name}: got NaN or infinite actions in {bad} of {len(rows)} transitions that are learned from "
+                "or measured on, expected finite numbers: leave those episodes out, or lower behaviour.labelled_demos "
+                "and set behaviour.oracle=false"
+            )

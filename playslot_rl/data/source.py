@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
+from playslot_rl.data.action_limits import ActionLimits, joined_limits, limits_of
 from playslot_rl.data.agreement import open_files
 from playslot_rl.data.cache import CachePlace, build_on, cache_folder, load_cached, note_read, settings
 from playslot_rl.data.cache_entries import ENTRY_NAME, room
@@ -112,7 +113,7 @@ class EpisodeFrames:
     Attributes:
         frames: uint8 (F, H, W, 3), [0, 255], memory-mapped; index it by integers, slices or integer arrays.
         starts, lengths: int64 (E,).
-        actions: float32 (F, A), or None if the data set (or one of several) has none.
+        actions: float32 (F, A), as they were recorded, or None if the data set (or one of several) has none.
         success: bool (F,), or None.
         seeds: int64 (E,), or None.
         fingerprint: content hash, 16 hex digits.
@@ -122,6 +123,7 @@ class EpisodeFrames:
         robot: what was recorded, as the data set says; empty where it says nothing.
         name: the folder it was read from, for people.
         shares: of several sets that are drawn from with weights, which rows are whose; None draws all windows alike.
+        limits: what actions in [-1, 1] stand for; None for those of our simulators, which are so, and without actions.
     """
 
     frames: FrameRows
@@ -137,6 +139,7 @@ class EpisodeFrames:
     robot: str = ""
     name: str = ""
     shares: Shares | None = None
+    limits: ActionLimits | None = None
 
     @property
     def episodes(self) -> int:
@@ -226,6 +229,7 @@ def open_source(
         camera=camera,
         robot=str(files.info.get("robot_type") or ""),
         name=str(root),
+        limits=limits_of(files, labels["actions"]),
         **labels,
     )
 
@@ -279,17 +283,19 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
             return None
         return np.concatenate(labels)
 
+    actions = joined("actions")
     return replace(
         sources[0],
         frames=ConcatFrames(parts),
         starts=np.concatenate([s.starts + offset for s, offset in zip(sources, offsets, strict=True)]),
         lengths=np.concatenate([s.lengths for s in sources]),
-        actions=joined("actions"),
+        actions=actions,
         success=joined("success"),
         seeds=joined("seeds"),
         fingerprint=hashlib.sha256("+".join(s.fingerprint for s in sources).encode()).hexdigest()[:16],
         name=",".join(dict.fromkeys(s.name for s in sources)),
         shares=None,
+        limits=None if actions is None else joined_limits([s.limits for s in sources], actions.shape[1]),
     )
 
 

@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config.weights import is_remote
+from playslot_rl.data.action_limits import limits_of
 from playslot_rl.data.agreement import open_files
 from playslot_rl.data.cache import CachePlace, cache_folder
 from playslot_rl.data.contents import Contents, Span
@@ -195,6 +196,7 @@ def open_stream(
         raise wrong_size(files, camera, stated, image_size)
     labels = labels_of(files)
     fingerprint = files_fingerprint(files, camera, cache_folder(cache))
+    limits = limits_of(files, labels.get("actions"))
     tasks, _ = files.episodes[0].tasks, files.spans  # found from the columns, which are not kept
     files = replace(files, columns={"episode_index": files.columns["episode_index"]})
     return EpisodeFrames(
@@ -210,6 +212,7 @@ def open_stream(
         camera=camera,
         robot=str(files.info.get("robot_type") or ""),
         name=str(root),
+        limits=limits,
     )
 
 

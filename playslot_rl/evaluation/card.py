@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from playslot_rl.config import DataConfig
+from playslot_rl.data.demonstrations import probed_actions
 from playslot_rl.data.slot_cache import parse_episodes
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import spread_windows
@@ -127,7 +128,7 @@ def parse(model: WorldModel, source: EpisodeFrames, tested: Any) -> Parsed:
     real = None if source.actions is None else np.asarray(source.actions[frames])
     latents, codes, episodes = infer_latents(model.inverse_dynamics, slots, starts, lengths, real)
     rows = np.concatenate([s + np.arange(n - 1) for s, n in zip(starts, lengths, strict=True)])
-    actions = None if real is None else real[rows]
+    actions = probed_actions(source, frames[rows])
     return Parsed(source, slots, starts, tested, latents, codes, rows, frames[rows], episodes, actions)
 
 

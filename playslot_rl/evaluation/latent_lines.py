@@ -41,7 +41,7 @@ class Parsed:
         rows: row of `slots` that a transition starts from, int64 (M,).
         pixels: row of the source's frames, likewise.
         episodes: episode of each transition, int64 (M,).
-        actions: (M, A), or None.
+        actions: (M, A), scaled as they are learned, or None.
     """
 
     source: EpisodeFrames

@@ -10,7 +10,7 @@ from playslot_rl.data.cache import build_once, cache_folder
 from playslot_rl.errors import CheckpointError
 from playslot_rl.hub.session import MAIN, Pushed, open_repository, send
 from playslot_rl.sharing.card import MARK
-from playslot_rl.sharing.folder import CONFIG, FILES, WEIGHTS, require_whole
+from playslot_rl.sharing.folder import CONFIG, FILES, RANGE, WEIGHTS, files_of, require_whole
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def push_policy(
         HubError: bad names, no or bad token, offline, no network, an error of the Hub, or a tag that is taken.
     """
     config = require_whole(folder)
-    files: dict[str, Path | bytes] = {name: folder / name for name in FILES}
+    files: dict[str, Path | bytes] = {name: folder / name for name in files_of(config)}
     message = f"PlaySlot policy, weights {config.fingerprint}"
     target = branch or MAIN
     with open_repository(repo_id, folder, token=token, writing=True, revision=target, kind="model") as hub:
@@ -84,7 +84,7 @@ def pull_policy(repo_id: str, revision: str = "", cache: str | Path = "", token:
         commit = hub.commit_of(revision or MAIN)
 
         def fetch(folder: Path) -> None:
-            wanted = {path: file for path, file in hub.tree(commit).items() if path in FILES}
+            wanted = {path: file for path, file in hub.tree(commit).items() if path in (*FILES, RANGE)}
             for name in (CONFIG, WEIGHTS):
                 if name not in wanted:
                     raise CheckpointError(f"{hub.name}: got no {name}, expected a PlaySlot policy: check the name")

@@ -1,6 +1,7 @@
 """The action decoder: a_t = D_a(z_t), a three-layer MLP (paper, appendix A.4), or a_t = D_a(z_t, S_t).
 
-Shapes: latent actions (..., Z), slots (..., N, D) -> real actions (..., A) in [-1, 1].
+Shapes: latent actions (..., Z), slots (..., N, D) -> real actions (..., A) in [-1, 1]; what a robot takes instead of
+them, `action_range` says.
 
 Note: a final tanh keeps the output inside the action space; the paper does not name one. Inputs are standardised by the
 mean and scale of the training latents: their scale is free (about 0.07 here), and a decoder on raw ones underfits. With
@@ -20,6 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.config import ActionDecoderConfig
+from playslot_rl.modules.action_range import ActionRange
 from playslot_rl.modules.transformer import SlotTokenEncoder
 from playslot_rl.modules.whitening import Whitening
 from playslot_rl.shares import own_noise
@@ -36,6 +38,9 @@ class ActionDecoder(nn.Module):
         latent_dim: Z.
         action_dim: A.
         slot_dim: D of the slots that it reads beside z where `config.reads_slots`.
+
+    Attributes:
+        action_range: what its actions are in the robot's units.
     """
 
     mean: Tensor
@@ -56,6 +61,7 @@ class ActionDecoder(nn.Module):
             self.register_buffer("mean", torch.zeros(latent_dim))
             self.register_buffer("scale", torch.ones(latent_dim))
         self.layers = _mlp(latent_dim, h, action_dim)
+        self.action_range = ActionRange(action_dim)
         self.encoder: SlotTokenEncoder | None = None
         if config.reads_slots:
             self.register_buffer("trusts_slots", torch.tensor(True))
@@ -91,12 +97,12 @@ class ActionDecoder(nn.Module):
         """Latent actions (..., Z), and slots (..., N, D) if it reads them and there are some, to actions (..., A)."""
         inputs = (z - self.mean) / self.scale if self.whitening is None else self.whitening(z)
         if self.encoder is None or slots is None or not (self.training or self.acts_on_slots):
-            return torch.tanh(self.layers(inputs))
+            return self.action_range.pinned(torch.tanh(self.layers(inputs)))
         state = self.encoder(slots)
         if self.training and self.dropout:
             drawn = own_noise((*state.shape[:-1], 1), lambda shape: torch.rand(shape, device=state.device))
             state = state * (drawn >= self.dropout)
-        return torch.tanh(self.seeing(torch.cat((inputs, state), dim=-1)))
+        return self.action_range.pinned(torch.tanh(self.seeing(torch.cat((inputs, state), dim=-1))))
 
 
 def _mlp(width: int, hidden: int, out: int) -> nn.Sequential:

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from playslot_rl.config import InverseDynamicsConfig
+from playslot_rl.modules.action_range import ActionRange
 from playslot_rl.modules.quantizer import ActionQuantizer
 from playslot_rl.modules.transformer import SlotTokenEncoder
 from playslot_rl.precision import full_precision
@@ -88,6 +89,8 @@ class InverseDynamics(nn.Module):
             nn.init.constant_(self.to_variance.bias, -4.0)
             with torch.no_grad():
                 self.to_variance.weight.mul_(0.1)
+        if config.mode == "ground_truth":
+            self.action_range = ActionRange(action_dim)
         if config.mode in ("hybrid", "discrete"):
             self.quantizer = ActionQuantizer(c.latent_dim, c.n_prototypes, c.decay, c.dead_threshold, c.commitment)
 
@@ -117,7 +120,8 @@ class InverseDynamics(nn.Module):
 
         Args:
             slots: (B, T, N, D).
-            actions: real actions (B, T-1, A), needed in mode `ground_truth` only.
+            actions: real actions (B, T-1, A) in the robot's units, needed in mode `ground_truth` only; z are these in
+                [-1, 1] (`action_range`), and beyond it where they are beyond the range.
             generator: draws z in training, and at evaluation with `config.sample`.
 
         Raises:
@@ -126,7 +130,8 @@ class InverseDynamics(nn.Module):
         if self.config.mode == "ground_truth":
             if actions is None:
                 raise ValueError("mode ground_truth: got no actions, expected (B, T-1, A); use a data set with actions")
-            return self._compose(actions, actions)
+            z = self.action_range.to_unit(actions)
+            return self._compose(z, z)
         if self.config.mode == "none":
             nothing = slots.new_zeros(len(slots), slots.shape[1] - 1, 0)
             return self._compose(nothing, nothing)

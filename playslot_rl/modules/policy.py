@@ -8,6 +8,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from playslot_rl.config import PolicyConfig
+from playslot_rl.modules.action_range import ActionRange
 from playslot_rl.modules.transformer import SlotTokenEncoder
 from playslot_rl.modules.whitening import Whitening
 
@@ -23,14 +24,19 @@ class LatentPolicy(nn.Module):
         slot_dim: D.
         out_dim: Z, or A for the oracle.
         whiten: have a `whitening`, to be fitted before training.
+        acts: it gives real actions, and has their `action_range`.
     """
 
-    def __init__(self, config: PolicyConfig, slot_dim: int, out_dim: int, whiten: bool = False) -> None:
+    def __init__(
+        self, config: PolicyConfig, slot_dim: int, out_dim: int, whiten: bool = False, acts: bool = False
+    ) -> None:
         super().__init__()
         c = config
         self.encoder = SlotTokenEncoder(slot_dim, c.dim, c.layers, c.heads, c.head_dim, c.mlp_dim)
         self.head = nn.Linear(c.dim, out_dim)
         self.whitening = Whitening(out_dim) if whiten else None
+        if acts:
+            self.action_range = ActionRange(out_dim)
 
     def forward(self, slots: Tensor) -> Tensor:
         """Slots (..., N, D) to latent actions (..., Z)."""

@@ -200,7 +200,8 @@ class PlaySession:
         """
         if self.agent is None:
             return None, None
-        decoded = self.agent.action_decoder(latent[None])[0].clamp(-1, 1)
+        decoder = self.agent.action_decoder
+        decoded = decoder.action_range.from_unit(decoder(latent[None])[0].clamp(-1, 1))
         action: npt.NDArray[np.float32] = decoded.cpu().numpy().astype(np.float32)
         if self.start.twin is None:
             return action, None

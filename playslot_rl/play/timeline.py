@@ -34,7 +34,7 @@ class SceneMoment:
         frame: imagined frame, uint8 (H, W, 3).
         latent: latent action ([N,] Z) that led here; None at the start and after a touch.
         code: number of its prototype, int64 () or (N,); None where `latent` is.
-        action: decoded, float32 (A,) in [-1, 1]; None without a decoder.
+        action: decoded, float32 (A,) in the robot's units; None without a decoder.
         true: what the simulator showed after the same actions, uint8 (H, W, 3); None without one.
         label: how it came about, in words.
     """

@@ -13,6 +13,7 @@ import yaml
 
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.data.action_limits import said
 from playslot_rl.envs import ENVIRONMENTS, task_metadata
 from playslot_rl.sharing.commands import Result, frames_comment, places, rate_words, reproduce, use
 from playslot_rl.sharing.folder import LICENCE, TAGS, SharedPolicyConfig, shared_modules
@@ -111,6 +112,8 @@ def _task(policy: SharedPolicyConfig) -> dict[str, str]:
     other = "resized by area averaging" if policy.resize else "refused"
     side = f"{env.image_size} x {env.image_size}"
     numbers = f"{env.action_dim} numbers in [-1, 1]"
+    if policy.actions:
+        numbers = f"{env.action_dim} numbers, in the units of the data set: {said(policy.actions)}"
     return {
         "task": words or "not described",
         "camera": f"`{policy.camera}`, {side} RGB; frames of another size are {other}",

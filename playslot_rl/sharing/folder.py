@@ -4,6 +4,8 @@
     FOLDER/model.safetensors            `agent.*`: world model, latent policy, action decoder
     FOLDER/policy_preprocessor.json     LeRobot's pipeline before the policy
     FOLDER/policy_postprocessor.json    and the one after it
+    FOLDER/policy_postprocessor_step_1_unnormalizer_processor.safetensors
+                                        its range of the actions, where they are not in [-1, 1]
     FOLDER/README.md                    model card
 
 LeRobot 0.6.1 finds a policy's class by `type` in `config.json`; the shapes of what goes in and out are its
@@ -24,6 +26,7 @@ from torch import nn
 
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig, ModelConfig, from_dict, to_dict
+from playslot_rl.data.action_limits import said, scaled
 from playslot_rl.data.metadata import json_content
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_json, write_text
@@ -31,6 +34,7 @@ from playslot_rl.storage.folders import new_folder
 from playslot_rl.storage.tensors import load_modules, load_tensors, module_tensors, save_tensors, weights_fingerprint
 
 if TYPE_CHECKING:
+    from playslot_rl.modules.action_range import ActionRange
     from playslot_rl.world_model import Agent
 
 
@@ -41,8 +45,8 @@ WEIGHTS: Final = "model.safetensors"
 LICENCE: Final = "apache-2.0"
 TAGS: Final = ("robotics", "lerobot", TYPE)
 
-OURS: Final = ("env", "model", "resize", "stride", "fps", "fingerprint", "source")
-"""Keys of `config.json` that LeRobot does not know."""
+OURS: Final = ("env", "model", "resize", "stride", "fps", "fingerprint", "source", "actions")
+"""Keys of `config.json` that LeRobot does not know; `actions` only where they have a range of their own."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,8 @@ class SharedPolicyConfig:
         fps: frames a second that it has to be shown, those of the videos over the stride; 0 where it is not known.
         fingerprint: first 16 hex digits of the SHA-256 of the weights file.
         source: where the weights came from (`playslot_rl.sharing.run`), plain values.
+        actions: `names`, `low` and `high` of the actions, A each, in the units of the data set that they were learned
+            from; empty for those of our simulators, which are in [-1, 1].
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -68,6 +74,7 @@ class SharedPolicyConfig:
     fps: float = 0.0
     fingerprint: str = ""
     source: dict[str, Any] = field(default_factory=dict)
+    actions: dict[str, Any] = field(default_factory=dict)
 
     def features(self) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
         """LeRobot's input and output features; shapes are (3, H, W) and (A,)."""
@@ -95,6 +102,7 @@ class SharedPolicyConfig:
             "fps": self.fps,
             "fingerprint": self.fingerprint,
             "source": self.source,
+            **({"actions": self.actions} if self.actions else {}),
         }
 
     @classmethod
@@ -113,6 +121,7 @@ class SharedPolicyConfig:
             fps=float(ours.get("fps", 0.0)),
             fingerprint=str(ours.get("fingerprint", "")),
             source=dict(ours.get("source") or {}),
+            actions=dict(ours.get("actions") or {}),
         )
 
 
@@ -177,7 +186,9 @@ CARD: Final = "README.md"
 PREPROCESSOR: Final = "policy_preprocessor"
 POSTPROCESSOR: Final = "policy_postprocessor"
 FILES: Final = (CONFIG, WEIGHTS, f"{PREPROCESSOR}.json", f"{POSTPROCESSOR}.json", CARD)
-"""Everything a model folder holds."""
+"""Everything a model folder holds, beside `RANGE`."""
+RANGE: Final = f"{POSTPROCESSOR}_step_1_unnormalizer_processor.safetensors"
+"""State of LeRobot's step that gives actions in the robot's units; not there where they are in [-1, 1]."""
 ROOT: Final = "agent"
 """First part of every tensor's name, as of a LeRobot policy whose attribute `agent` is the agent."""
 
@@ -209,13 +220,13 @@ def write_weights(agent: nn.Module, path: Path) -> str:
     return weights_fingerprint(path)
 
 
-def load_weights(agent: nn.Module, path: Path, fingerprint: str) -> None:
+def load_weights(agent: nn.Module, path: Path, config: SharedPolicyConfig) -> None:
     """Load a weights file into an agent, in place; nothing is changed unless everything fits.
 
     Args:
         agent: of the sizes of the file's config.
         path: `model.safetensors`.
-        fingerprint: what the config says of the file; empty says nothing.
+        config: what it says of the file: its fingerprint (empty says nothing), and the range of the actions.
 
     Raises:
         CheckpointError: missing or damaged file, missing, unexpected or misshapen tensors, or another file than the
@@ -226,11 +237,27 @@ def load_weights(agent: nn.Module, path: Path, fingerprint: str) -> None:
     tensors = load_tensors(path)
     got = weights_fingerprint(path)
     load_modules(shared_modules(agent), tensors, str(path))
-    if fingerprint and got != fingerprint:
+    if config.fingerprint and got != config.fingerprint:
         raise CheckpointError(
-            f"{path}: got fingerprint {got}, expected {fingerprint} from its config.json: the file was changed or "
-            "damaged; export or download the policy again"
+            f"{path}: got fingerprint {got}, expected {config.fingerprint} from its config.json: the file was "
+            "changed or damaged; export or download the policy again"
         )
+    stored = ranged(agent, config)
+    if stored != config.actions:
+        raise CheckpointError(
+            f"{path}: got actions in the range {said(stored)}, expected {said(config.actions)} from its config.json: "
+            "the file was changed; export or download the policy again"
+        )
+
+
+def ranged(agent: Any, config: SharedPolicyConfig) -> dict[str, Any]:
+    """The `actions` of a config with the range that an agent's decoder has."""
+    known: ActionRange = agent.action_decoder.action_range
+    if known.unit and not scaled(config.actions):
+        return config.actions
+    low, high = known.low.tolist(), known.high.tolist()
+    names = config.actions.get("names") or [f"action_{i}" for i in range(len(low))]
+    return {**config.actions, "names": names, "low": low, "high": high}
 
 
 def save_pretrained(
@@ -241,19 +268,19 @@ def save_pretrained(
     Args:
         agent: what to store, without its slot oracle.
         folder: must not exist, or be empty.
-        config: its fingerprint is set here.
+        config: its fingerprint, and the ends of `actions`, are set here.
         card: gives the text of README.md for the config with its fingerprint.
 
     Returns:
-        The config with the fingerprint of the weights.
+        The config with both.
 
     Raises:
         OutputError: `folder` holds something, the disk is full, or it cannot be written.
     """
     with new_folder(folder) as temporary:
-        config = replace(config, fingerprint=write_weights(agent, temporary / WEIGHTS))
+        config = replace(config, fingerprint=write_weights(agent, temporary / WEIGHTS), actions=ranged(agent, config))
         write_json(temporary / CONFIG, config.to_lerobot())
-        for pipeline in make_processors("cpu"):
+        for pipeline in make_processors("cpu", config.actions):
             pipeline.save_pretrained(temporary, config_filename=f"{pipeline.name}.json")
         write_text(temporary / CARD, card(config))
     return config
@@ -269,9 +296,14 @@ def load_pretrained(folder: Path, device: torch.device | str = "cpu") -> tuple[A
         raise CheckpointError(f"{folder}: no such folder, expected a policy made by `playslot export`")
     config = read_config(folder)
     agent = build_agent(config)
-    load_weights(agent, folder / WEIGHTS, config.fingerprint)
+    load_weights(agent, folder / WEIGHTS, config)
     agent.to(device).eval().requires_grad_(False)
     return agent, config
+
+
+def files_of(config: SharedPolicyConfig) -> tuple[str, ...]:
+    """Everything a folder of such a policy holds."""
+    return (*FILES, RANGE) if scaled(config.actions) else FILES
 
 
 def require_whole(folder: Path) -> SharedPolicyConfig:
@@ -281,26 +313,29 @@ def require_whole(folder: Path) -> SharedPolicyConfig:
         CheckpointError: the folder is not whole, or its files do not belong together.
     """
     _, config = load_pretrained(folder)
-    missing = [name for name in FILES if not (folder / name).is_file()]
+    missing = [name for name in files_of(config) if not (folder / name).is_file()]
     if missing:
         raise CheckpointError(f"{folder}: {missing[0]} is missing, expected a whole policy: export it again")
     return config
 
 
-def make_processors(device: str) -> tuple[Any, Any]:
+def make_processors(device: str, actions: dict[str, Any] | None = None) -> tuple[Any, Any]:
     """LeRobot's pipelines before and after the policy: rename, add a batch dimension, move to the device; and back.
 
-    Nothing is normalised: frames go in as LeRobot gives them, floats in [0, 1], and actions come out in [-1, 1], the
-    range of the environments.
+    Frames go in as LeRobot gives them, floats in [0, 1]. The policy gives actions in [-1, 1], as LeRobot's policies do;
+    LeRobot's own normaliser turns them into those of the robot, on the CPU, where they have another range.
 
     Args:
         device: torch device of the policy.
+        actions: of its config; None or empty for [-1, 1].
     """
+    from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
     from lerobot.processor import (
         AddBatchDimensionProcessorStep,
         DeviceProcessorStep,
         PolicyProcessorPipeline,
         RenameObservationsProcessorStep,
+        UnnormalizerProcessorStep,
         policy_action_to_transition,
         transition_to_policy_action,
     )
@@ -313,8 +348,17 @@ def make_processors(device: str) -> tuple[Any, Any]:
         ],
         name=PREPROCESSOR,
     )
+    outwards: list[Any] = [DeviceProcessorStep(device="cpu")]
+    if actions and scaled(actions):
+        outwards.append(
+            UnnormalizerProcessorStep(
+                features={keys.FEATURE_ACTION: PolicyFeature(FeatureType.ACTION, (len(actions["low"]),))},
+                norm_map={FeatureType.ACTION: NormalizationMode.MIN_MAX},
+                stats={keys.FEATURE_ACTION: {"min": actions["low"], "max": actions["high"]}},
+            )
+        )
     after = PolicyProcessorPipeline(
-        steps=[DeviceProcessorStep(device="cpu")],
+        steps=outwards,
         name=POSTPROCESSOR,
         to_transition=policy_action_to_transition,
         to_output=transition_to_policy_action,

@@ -16,7 +16,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.camera_names import cameras_of, full_name
 from playslot_rl.data.metadata import INFO_NAME, read_info
-from playslot_rl.envs import ENVIRONMENTS
+from playslot_rl.envs import ENVIRONMENTS, RECORDED
 from playslot_rl.errors import CheckpointError, ConfigError, DataError, OutputError
 from playslot_rl.evaluation.success import POLICY_PROTOCOLS, run_facts
 from playslot_rl.sharing.card import make_card
@@ -186,11 +186,12 @@ def _policy(run: Path, agent: Agent, config: ExperimentConfig, source: dict[str,
         stride=config.data.stride,
         fps=_frame_rate(run, config),
         source=source,
+        actions=_actions(run, agent.world_model.env.name),
     )
 
 
 def described(run: Path | str) -> SharedPolicyConfig:
-    """What a run says of the frames that its policy looks at; its networks are not read."""
+    """What a run says of the frames that its policy looks at, and of its actions; its networks are not read."""
     view, meta = stored_view(run), read_stage(checkpoint_folder(run_folder(run), "policy"), "policy").meta
     one = "" if "," in view.camera else view.camera
     return SharedPolicyConfig(
@@ -198,7 +199,24 @@ def described(run: Path | str) -> SharedPolicyConfig:
         resize=view.resize,
         stride=view.stride,
         fps=float(meta.get("fps", 0.0)),
+        actions={key: value for key, value in (meta.get("actions") or {}).items() if key in ("names", "low", "high")},
     )
+
+
+def _actions(run: Path, env: str) -> dict[str, Any]:
+    """Names and range of a policy's actions; none for those of our simulators.
+
+    Raises:
+        CheckpointError: the policy was trained when the actions of every data set were clipped to [-1, 1].
+    """
+    checkpoint = checkpoint_folder(run, "policy")
+    meta = read_stage(checkpoint, "policy").meta
+    if env in RECORDED and "actions" not in meta:
+        raise CheckpointError(
+            f"{checkpoint}: got a policy of an earlier version, which clipped the robot's actions to [-1, 1], expected "
+            "one that knows their range: train it again by `playslot train-policy` with another out="
+        )
+    return described(run).actions
 
 
 def _frame_rate(run: Path, config: ExperimentConfig) -> float:

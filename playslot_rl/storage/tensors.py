@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +16,17 @@ from playslot_rl.storage.atomic import write_bytes
 
 LONGEST_HEADER: Final = 100_000_000
 """Bytes, as safetensors has it."""
+
+
+@runtime_checkable
+class SometimesStored(Protocol):
+    """A part of a module whose buffers are stored only where they say something, such as the range of actions."""
+
+    def expect(self, stored: bool) -> None:
+        """Learn whether they were."""
+
+    def named_buffers(self) -> Iterator[tuple[str, Tensor]]:
+        """Of `nn.Module`."""
 
 
 def module_tensors(modules: Mapping[str, nn.Module]) -> dict[str, Tensor]:
@@ -81,10 +92,22 @@ def _check_header(path: Path) -> None:
 def load_modules(modules: Mapping[str, nn.Module], tensors: Mapping[str, Tensor], where: str) -> None:
     """Copy `MODULE.NAME` tensors into the modules, in place; nothing is changed unless everything fits.
 
+    Parts that are `SometimesStored` learn whether they were.
+
     Raises:
         CheckpointError: a tensor is missing, unexpected, or of another shape.
     """
-    load_into(module_tensors(modules), tensors, where)
+    expected, parts = module_tensors(modules), dict[SometimesStored, bool]()
+    for name, module in modules.items():
+        for path, part in module.named_modules(prefix=name):
+            if not isinstance(part, SometimesStored):
+                continue
+            own = {f"{path}.{key}": value for key, value in part.named_buffers()}
+            parts[part] = stored = not own.keys().isdisjoint(tensors)
+            expected = {key: value for key, value in expected.items() if key not in own} | (own if stored else {})
+    load_into(expected, tensors, where)
+    for part, stored in parts.items():
+        part.expect(stored)
 
 
 def load_into(expected: Mapping[str, Tensor], tensors: Mapping[str, Tensor], where: str) -> None:

@@ -15,12 +15,20 @@ from torch import nn
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.roles import fixed_keys
 from playslot_rl.config.weights import data_roots
-from playslot_rl.data.demonstrations import DemonstrationSplit, episode_range, split_demonstrations, split_tested
+from playslot_rl.data.action_limits import said, scaled
+from playslot_rl.data.demonstrations import (
+    DemonstrationSplit,
+    episode_range,
+    split_demonstrations,
+    split_tested,
+    transitions,
+)
 from playslot_rl.data.opening import open_configured
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.weighted import weighted
 from playslot_rl.data.windows import Clips
 from playslot_rl.errors import CheckpointError, DataError
+from playslot_rl.modules.action_range import range_of
 from playslot_rl.processes import here, wait
 from playslot_rl.storage.atomic import explain_write_errors
 from playslot_rl.storage.checkpoints import (
@@ -144,6 +152,12 @@ class StageRecord:
         return self.demos.trained if self.role == "demos" else self.videos
 
     @cached_property
+    def actions(self) -> dict[str, Any] | None:
+        """The range of the actions that a stage learns to give, plain values; None for those of our simulators."""
+        limits = self.data.limits if self.role == "demos" else None
+        return None if limits is None else limits.plain()
+
+    @cached_property
     def prints(self) -> dict[str, str]:
         """Fingerprints of the parents, by stage."""
         return {name: checkpoint.fingerprint for name, checkpoint in self.parents.items()}
@@ -164,6 +178,9 @@ class StageRecord:
         facts: list[tuple[str, object, object]] = [("seed", self.config.seed, done.meta.get("seed", self.config.seed))]
         if self.role and self.roots:  # a finished stage can be asked for without
             facts.append(("data", self.data.fingerprint, next(iter(done.meta["data"].values()), "none")))
+        if self.role == "demos" and self.roots:
+            ends = [said(plain if scaled(plain) else None) for plain in (self.actions, done.meta.get("actions"))]
+            facts.append(("actions", ends[0], ends[1]))
         for name, got, old in facts:
             if got != old:
                 raise CheckpointError(f"{name}: got {got}, expected {old} as {path} was trained with: use another out=")
@@ -173,6 +190,8 @@ class StageRecord:
     def resumes(self) -> dict[str, Any]:
         """Plain values that a half-finished stage must share, beside its settings and the seed."""
         data: dict[str, Any] = {"data": self.data.fingerprint} if self.role else {}
+        if self.role == "demos" and scaled(self.actions):
+            data["actions"] = said(self.actions)
         if self.role == "train":
             data["data.validation"] = self.config.data.validation
             if self.config.data.stream:  # other windows than from the cache
@@ -230,6 +249,7 @@ class StageRecord:
         Raises:
             OutputError: full disk, or a folder that cannot be written.
         """
+        known = {"actions": self.actions} if self.role == "demos" else {}
         path = checkpoint_folder(self.run, self.name)
         if not here().first:
             wait()
@@ -244,7 +264,7 @@ class StageRecord:
             metrics=metrics,
             steps=steps,
             seconds=seconds,
-            extra={"seed": self.config.seed, **(self._shown() if self.role else {}), **extra},
+            extra={"seed": self.config.seed, **(self._shown() if self.role else {}), **known, **extra},
         )
         wait()
         return done
@@ -318,7 +338,15 @@ def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -
     modules: dict[str, nn.Module] = {}
     metrics: dict[str, float] = {}
     steps, seconds = 0, 0.0
+    limits = record.data.limits if record.role == "demos" else None
+    if limits is not None and here().first:
+        shown = record.data.require_actions()[transitions(record.data).rows]
+        print(f"{record.name}: {limits.line(shown)}", flush=True)
     for part in training.parts:
+        for module in part.stage.modules.values():
+            known = None if limits is None else range_of(module)
+            if limits is not None and known is not None:
+                limits.give(known)
         state, _ = fit(
             part,
             record.folder,

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.config import DynamicsStageConfig
 from playslot_rl.data.windows import Clips, IntArray
+from playslot_rl.errors import DataError
 from playslot_rl.losses.common import total_loss
 from playslot_rl.losses.dynamics import DynamicsLoss
 from playslot_rl.precision import autocast
@@ -30,6 +31,9 @@ class DynamicsStage:
         clips: of unlabelled videos, as long as seed and predicted frames.
         slots: cached slots (F, N, D) of the videos.
         config: rollout lengths, weights.
+
+    Raises:
+        DataError: mode `ground_truth`, and no actions, of another width, or such that are no numbers.
     """
 
     def __init__(
@@ -39,7 +43,13 @@ class DynamicsStage:
         self.source, self.device = clips.source, module_device(model)
         self.criterion = DynamicsLoss(model.inverse_dynamics, model.predictor, model.savi, config)
         if self.criterion.needs_actions:
-            self.source.require_actions(model.env.action_dim)
+            if not np.isfinite(self.source.require_actions(model.env.action_dim)).all():
+                raise DataError(
+                    f"{self.source.name}: got NaN or infinite actions, expected finite numbers in mode ground_truth: "
+                    "leave those episodes out"
+                )
+            if self.source.limits is not None:
+                self.source.limits.give(model.inverse_dynamics.action_range)
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:

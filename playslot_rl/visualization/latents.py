@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from playslot_rl.data.demonstrations import probed_actions
 from playslot_rl.errors import DataError
 from playslot_rl.evaluation.probes import code_table, codebook_usage, infer_latents, probe_actions
 from playslot_rl.evaluation.seeds import data_folders
@@ -24,8 +25,8 @@ class LatentData:
     Attributes:
         name: of the data set.
         codes: (M, 1) or (M, N) int64.
-        actions: (M, A) in [-1, 1]; None for a data set without actions.
-        probe: result of `probe_actions`; None without actions.
+        actions: (M, A) as they were recorded; None for a data set without actions.
+        probe: result of `probe_actions`; None without actions that are numbers.
     """
 
     name: str
@@ -54,10 +55,11 @@ def read_latents(model: WorldModel, root: Path, given: ReportInput, most_episode
     z, codes, episodes = infer_latents(model.inverse_dynamics, slots, starts, lengths, source.actions)
     if source.actions is None:
         return LatentData(root.name, codes, None, None)
-    rows = [np.asarray(source.actions[s : s + n - 1]) for s, n in zip(starts, lengths, strict=True) if n > 1]
-    actions = np.concatenate(rows)
-    several = len(np.unique(episodes)) > 1
-    return LatentData(root.name, codes, actions, probe_actions(z, actions, episodes, codes=codes) if several else None)
+    rows = np.concatenate([np.arange(s, s + n - 1) for s, n in zip(starts, lengths, strict=True) if n > 1])
+    actions, probed = np.asarray(source.actions[rows]), probed_actions(source, rows)
+    if probed is None or len(np.unique(episodes)) < 2:
+        return LatentData(root.name, codes, actions, None)
+    return LatentData(root.name, codes, actions, probe_actions(z, probed, episodes, codes=codes))
 
 
 def latent_section(given: ReportInput) -> Section:

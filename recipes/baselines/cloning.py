@@ -49,12 +49,13 @@ def model_of(
         DataError: fewer than `labelled`, or nothing moves in `demos`, in the labelled ones, or in those held out.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.data.demonstrations import require_labelled
+    from playslot_rl.data.demonstrations import require_finite, require_labelled
     from playslot_rl.errors import CheckpointError
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, require_whole
 
     if labelled is not None:
         require_labelled(labelled, demos.trained.episodes)
+    require_finite(demos, labelled)
     if not world:
         if not (checkpoint_folder(run, stage) / "meta.json").is_file():
             _require_moving(config, demos, labelled)

@@ -46,7 +46,7 @@ def main(config: ExperimentConfig) -> None:
 def _training(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl import keys
     from playslot_rl.baselines.oracles.resnet import NAME, ResNetPolicy, load_pretrained
-    from playslot_rl.data.demonstrations import moving_frames
+    from playslot_rl.data.demonstrations import moving_frames, require_finite
     from playslot_rl.losses.behaviour import BehaviourLoss
     from playslot_rl.seeding import global_seed
     from playslot_rl.training.fit import Part
@@ -60,6 +60,7 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
     def moving(source: EpisodeFrames) -> Transitions:
         return moving_frames(source, behaviour.trim_pixels, behaviour.trim_margin)
 
+    require_finite(split)
     moves = moving(split.trained)
     inputs, actions = demonstrated_frames(split.trained, moves, width, device, own.shift)
     held_out = split.held_out

@@ -62,7 +62,7 @@ def main(config: ExperimentConfig) -> None:
 def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Training:
     import torch
 
-    from playslot_rl.data.demonstrations import moving_slots, real_actions, transitions
+    from playslot_rl.data.demonstrations import moving_slots, real_actions, require_finite, transitions
     from playslot_rl.modules.policy import LatentPolicy
     from playslot_rl.seeding import global_seed
     from playslot_rl.training.fit import Part
@@ -72,9 +72,10 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
 
     device, split, width = open_device(config), record.demos, config.env.action_dim
     split.trained.require_actions(width)  # before anything is computed
+    require_finite(split)
     savi = load_savi(parent, device)
     with global_seed(config.seed, 0, record.name):
-        oracle = LatentPolicy(config.model.policy, savi.config.slot_dim, width).to(device)
+        oracle = LatentPolicy(config.model.policy, savi.config.slot_dim, width, acts=True).to(device)
 
     behaviour = config.behaviour
 

@@ -28,6 +28,7 @@ class PlaySlotConfig(PreTrainedConfig):
         stride, fps: it has to be shown one frame in so many of its demonstrations', so many a second (0: unknown).
         fingerprint: first 16 hex digits of the SHA-256 of `model.safetensors`; empty for fresh weights.
         source: where the weights came from.
+        actions: names and range of the actions in the robot's units; empty for [-1, 1].
 
     Raises:
         ValueError: unknown keys or values outside their range in `env` or `model`, or features that do not fit them.
@@ -40,6 +41,7 @@ class PlaySlotConfig(PreTrainedConfig):
     fps: float = 0.0
     fingerprint: str = ""
     source: dict[str, Any] = field(default_factory=dict)
+    actions: dict[str, Any] = field(default_factory=dict)
     license: str | None = LICENCE
 
     # LeRobot's own fields, declared again with their types, which mypy cannot read there.

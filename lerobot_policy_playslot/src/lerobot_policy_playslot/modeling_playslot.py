@@ -41,7 +41,7 @@ class PlaySlotPolicy(PreTrainedPolicy):
         self._loop.reset()
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Actions (B, A) in [-1, 1] for the present frames.
+        """Actions (B, A) in [-1, 1] for the present frames; LeRobot's postprocessor gives them in the robot's units.
 
         Args:
             batch: the policy's camera, float (B, 3, H, W) in [0, 1]; other entries are not looked at.
@@ -107,6 +107,6 @@ class PlaySlotPolicy(PreTrainedPolicy):
             CheckpointError: missing, unexpected or misshapen tensors, or a file that is not the config's.
         """
         del strict
-        load_weights(model.agent, Path(model_file), model.policy_config.fingerprint)
+        load_weights(model.agent, Path(model_file), model.policy_config)
         model.to(map_location)
         return model

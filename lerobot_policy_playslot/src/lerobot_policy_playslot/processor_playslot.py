@@ -16,8 +16,8 @@ def make_playslot_pre_post_processors(
     """Fresh pipelines; see `playslot_rl.sharing.folder.make_processors`.
 
     Args:
-        config: for its device.
-        dataset_stats: not used, nothing is normalised.
+        config: for its device, and for the range of the actions.
+        dataset_stats: not used: the range is that of the data which the policy was trained on.
     """
     del dataset_stats
-    return make_processors(str(config.device))
+    return make_processors(str(config.device), config.actions)

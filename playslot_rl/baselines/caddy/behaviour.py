@@ -185,7 +185,7 @@ def oracle_stage(
         return StateInputs(caddy.encoder, frames), actions
 
     with global_seed(config.seed, 0, ORACLE):
-        oracle = StateHead(caddy.config.encoder[-1], width).to(device)
+        oracle = StateHead(caddy.config.encoder[-1], width, acts=True).to(device)
     criterion = BehaviourLoss(oracle, behaviour.loss)
     criterion.set_keys(observation=keys.STATE_MAPS, action=keys.ACTION)
     return RegressionStage(

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from playslot_rl.baselines.caddy.action import Trunk, chosen
 from playslot_rl.baselines.caddy.encoder import Encoder, inside
+from playslot_rl.modules.action_range import ActionRange
 
 
 class StateHead(nn.Module):
@@ -29,12 +30,15 @@ class StateHead(nn.Module):
     Args:
         in_channels: C; the trunk has twice as many, as A's.
         out_dim: K + Z, or A.
+        acts: it gives real actions, and has their `action_range`.
     """
 
-    def __init__(self, in_channels: int, out_dim: int) -> None:
+    def __init__(self, in_channels: int, out_dim: int, acts: bool = False) -> None:
         super().__init__()
         self.trunk = Trunk(in_channels, 2 * in_channels)
         self.to_out = nn.Linear(2 * in_channels, out_dim)
+        if acts:
+            self.action_range = ActionRange(out_dim)
 
     def forward(self, states: Tensor) -> Tensor:
         """States (B, C, H/8, W/8) to (B, out_dim)."""

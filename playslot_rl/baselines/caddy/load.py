@@ -72,7 +72,7 @@ def load_oracle(run: Path, device: torch.device | str = "cpu") -> Actor:
     """
     done, caddy = _finished(run, ORACLE, device)
     with torch.random.fork_rng(devices=[]):
-        head = StateHead(caddy.config.encoder[-1], stage_config(done, EnvConfig, "env").action_dim)
+        head = StateHead(caddy.config.encoder[-1], stage_config(done, EnvConfig, "env").action_dim, acts=True)
     load_weights(done, {"oracle": head})
     freeze_on(head, device)
     return ReactiveActor(oracle_module(OnFrames(caddy.encoder, head), keys.PIXELS))

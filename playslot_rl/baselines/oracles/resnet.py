@@ -58,7 +58,7 @@ class ResNetPolicy(nn.Module):
         trunk.avgpool, trunk.fc = nn.Identity(), nn.Identity()
         self.trunk = trunk
         self.position = nn.Parameter(torch.randn((image_size // 32) ** 2, WIDTH) * 0.02)
-        self.head = LatentPolicy(config, WIDTH, out_dim)
+        self.head = LatentPolicy(config, WIDTH, out_dim, acts=True)
         self.register_buffer("mean", torch.tensor(_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(_STD).view(3, 1, 1), persistent=False)
 

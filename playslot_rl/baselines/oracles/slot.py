@@ -33,7 +33,7 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
     savi = load_savi(run, device)
     model, env = stage_model(done)
     with torch.random.fork_rng(devices=[]):
-        oracle = LatentPolicy(model.policy, savi.config.slot_dim, env.action_dim)
+        oracle = LatentPolicy(model.policy, savi.config.slot_dim, env.action_dim, acts=True)
     load_weights(done, {"oracle": oracle})
     freeze_on(oracle, device)
     return SlotActor(savi, oracle_module(oracle))

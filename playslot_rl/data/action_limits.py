@@ -1,0 +1,166 @@
+"""The range of a data set's actions, from its own statistics.
+
+LeRobot's `meta/stats.json` gives the smallest and the largest of each dimension. Where it says nothing that can be used
+(missing, NaN, another shape, narrower than the data) they are computed from the finite values of the data. Quantiles
+always are: LeRobot's are means over episodes, which one reading that is none carries off. Our simulators' actions are
+in [-1, 1] by definition: their sets have no range of their own.
+
+Shapes: F rows, A action width.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl import keys
+from playslot_rl.data.contents import STATS_NAME
+from playslot_rl.envs import ENVIRONMENTS, PROCEDURAL
+
+if TYPE_CHECKING:
+    from playslot_rl.data.contents import Contents
+    from playslot_rl.modules.action_range import ActionRange
+
+WIDE: Final = 3.0
+"""Smallest to largest is so many times as wide as q01 to q99 where there may be outliers."""
+FEW: Final = 0.001
+"""Share of the rows up to which values far outside q01 to q99 are outliers; more are a motion, such as a gripper's."""
+
+Floats = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class ActionLimits:
+    """What actions in [-1, 1] stand for in a data set.
+
+    Attributes:
+        names: of the dimensions, as the data set names them.
+        low, high: float32 (A,), the ends; equal where a dimension never changes.
+        smallest, largest: float32 (A,), of the data.
+        quantiles: bool (A,), where the ends are q01 and q99, because of outliers.
+    """
+
+    names: tuple[str, ...]
+    low: Floats
+    high: Floats
+    smallest: Floats
+    largest: Floats
+    quantiles: npt.NDArray[np.bool_]
+
+    @property
+    def unit(self) -> bool:
+        """Whether they are -1 and 1 in every dimension: nothing is changed then."""
+        return bool((self.low == -1).all() and (self.high == 1).all())
+
+    def give(self, known: ActionRange) -> None:
+        """Set the range of a network."""
+        import torch
+
+        known.take(torch.from_numpy(self.low), torch.from_numpy(self.high))
+
+    def said(self) -> str:
+        """Names and ends, for people."""
+        return said(self.plain())
+
+    def plain(self) -> dict[str, Any]:
+        """Plain values, for checkpoints and policies."""
+        outliers = [name for name, cut in zip(self.names, self.quantiles, strict=True) if cut]
+        ends = {"low": self.low.tolist(), "high": self.high.tolist()}
+        return {"names": list(self.names), **ends, "quantiles": outliers}
+
+    def line(self, actions: Floats) -> str:
+        """What was taken, in one line, with the share of these actions (M, A) that lie outside and are clipped."""
+        cut = []
+        for i in np.flatnonzero(self.quantiles):
+            outside = 100 * float(np.mean((actions[:, i] < self.low[i]) | (actions[:, i] > self.high[i])))
+            seen = f"{self.smallest[i]:.6g}..{self.largest[i]:.6g}"
+            cut.append(f"{self.names[i]} by quantiles (all: {seen}), {outside:.2g} % of its values clipped")
+        return "; ".join([f"actions: {self.said()}", *cut])
+
+
+def said(plain: dict[str, Any] | None) -> str:
+    """Names and ends of plain values, for people; of actions that have no range of their own, [-1, 1]."""
+    if not plain:
+        return "[-1, 1]"
+    ends = zip(plain["names"], plain["low"], plain["high"], strict=True)
+    return ", ".join(f"{name} {low:.6g}..{high:.6g}" if low < high else f"{name} {low:.6g} (constant)"
+                     for name, low, high in ends)  # fmt: skip
+
+
+def scaled(plain: dict[str, Any] | None) -> bool:
+    """Whether plain values say anything else than -1 and 1."""
+    return plain is not None and bool(plain) and (set(plain["low"]), set(plain["high"])) != ({-1.0}, {1.0})
+
+
+def limits_of(files: Contents, actions: Floats | None) -> ActionLimits | None:
+    """The range of a data set's actions (F, A); None without any, and for sets of our own simulators."""
+    if actions is None or str(files.info.get("robot_type") or "") in (*ENVIRONMENTS, *PROCEDURAL):
+        return None
+    values = np.where(np.isfinite(actions), actions, np.nan)
+    names, stated = _names(files.features[keys.FEATURE_ACTION], values.shape[1]), _stated(files, values.shape[1])
+    first, last = _ends(values, 0.01)
+    smallest, largest = _ends(values, 0.0)
+    if stated is not None and (stated[0] <= smallest).all() and (stated[1] >= largest).all():
+        smallest, largest = stated
+    span = last - first
+    far = ((values < first - span) | (values > last + span)).sum(axis=0)
+    outlying = (largest - smallest > WIDE * span) & (far > 0) & (far <= max(2, FEW * len(values)))
+    low, high = np.where(outlying, first, smallest), np.where(outlying, last, largest)
+    return ActionLimits(names, low, high, smallest, largest, outlying)
+
+
+def joined_limits(parts: Sequence[ActionLimits | None], width: int) -> ActionLimits | None:
+    """The range that covers those of several data sets; one without counts as -1 to 1. None where none has any."""
+    known = [part for part in parts if part is not None]
+    if not known:
+        return None
+    one, names = np.ones(width, np.float32), known[0].names
+    every = [ActionLimits(names, -one, one, -one, one, one < 0) if part is None else part for part in parts]
+    low, high = np.min([p.low for p in every], axis=0), np.max([p.high for p in every], axis=0)
+    smallest, largest = np.min([p.smallest for p in every], axis=0), np.max([p.largest for p in every], axis=0)
+    return ActionLimits(names, low, high, smallest, largest, (low > smallest) | (high < largest))
+
+
+def _ends(values: Floats, beyond: float) -> tuple[Floats, Floats]:
+    """Values between which all but a share at either end lie, of each dimension; 0 where none is finite."""
+    found = np.zeros((2, values.shape[1]), np.float32)
+    for i, column in enumerate(values.T):
+        known = np.sort(column[~np.isnan(column)])
+        if len(known):
+            cut = math.ceil(beyond * (len(known) - 1))
+            found[:, i] = known[cut], known[-1 - cut]
+    return found[0], found[1]
+
+
+def _stated(files: Contents, width: int) -> tuple[Floats, Floats] | None:
+    """Smallest and largest by `meta/stats.json`, if they can be used."""
+    try:
+        stats = json.loads((files.root / STATS_NAME).read_text())[keys.FEATURE_ACTION]
+        with np.errstate(over="ignore"):
+            low, high = (np.asarray(stats[name], np.float64).astype(np.float32).reshape(-1) for name in ("min", "max"))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    usable = len(low) == len(high) == width and np.isfinite([low, high]).all() and (low <= high).all()
+    return (low, high) if usable else None
+
+
+def _names(feature: dict[str, Any], width: int) -> tuple[str, ...]:
+    """Names of the dimensions: a list, or a dict of lists or of numbers; numbered where there are others."""
+    given = feature.get("names")
+    if isinstance(given, dict):
+        values = list(given.values())
+        if all(isinstance(value, list) for value in values):
+            given = [name for value in values for name in value]
+        elif all(isinstance(value, int) for value in values):
+            given = sorted(given, key=given.__getitem__)
+        else:
+            given = list(given)
+    if not isinstance(given, list) or len(given) != width or len(set(map(str, given))) != width:
+        return tuple(f"action_{i}" for i in range(width))
+    return tuple(" ".join(str(name).split())[:64] or f"action_{i}" for i, name in enumerate(given))
