@@ -33,14 +33,14 @@ def main(config: ExperimentConfig) -> None:
     """
     if importlib.util.find_spec("nicegui") is None:
         raise ConfigError("play: got no NiceGUI, expected the extra `play`: make setup, or pip install nicegui==3.18.0")
-    from playslot_rl.play.server import HOST, choose_port, serve
+    from playslot_rl.play.gate import Gate
+    from playslot_rl.play.server import choose_port, serve
 
     choose_port(config.port)  # one that is taken is refused before the model is loaded
     studio = open_studio(config)
-    port = choose_port(config.port)  # again: loading took seconds, in which another may have taken it
-    address = f"http://{HOST}:{port}"
-    print(f"{studio.title}: {address}  (Ctrl-C ends it; recordings go to {studio.out})", flush=True)
-    serve(studio, port, config.play.show)
+    gate = Gate(choose_port(config.port))  # again: loading took seconds, in which another may have taken it
+    print(f"{studio.title}: {gate.address}  (Ctrl-C ends it; recordings go to {studio.out})", flush=True)
+    serve(studio, gate, config.play.show)
     print("stopped", flush=True)
 
 
@@ -51,13 +51,41 @@ def open_studio(config: ExperimentConfig) -> Studio:
 
     if not config.run:
         raise ConfigError("run: got nothing, expected a run or a shipped model, such as run=pretrained")
-    model = load(parent_run(config, Path()), str(open_device(config)), config.seed)
+    run = parent_run(config, Path())
+    model = load(run, str(open_device(config)), config.seed)
     world, agent = model.world_model, model.agent
     recorded, simulated = recorded_starts(config, world, agent), simulated_starts(config, world)
     if recorded is None and simulated is None:
         print("no data set and no simulator to start from: upload a picture, or give data.root=", flush=True)
     out = Path(config.out or "runs") / "play"
-    return Studio(world, agent, recorded, simulated, out, config.run, config.play.fps, squeezes=config.data.resize)
+    return Studio(
+        world, agent, recorded, simulated, out, config.run, config.play.fps,
+        squeezes=config.data.resize, horizon=trained_horizon(run), camera=run_camera(config, recorded),
+    )  # fmt: skip
+
+
+def trained_horizon(run: str) -> int:
+    """Steps that the run's predictor was trained to predict; 0 for an exported policy, which does not say it."""
+    from playslot_rl.config import DynamicsStageConfig
+    from playslot_rl.sharing.folder import is_model_folder
+    from playslot_rl.training.runs import stage_config, world_model_checkpoints
+
+    if is_model_folder(Path(run)):
+        return 0
+    dynamics = world_model_checkpoints(run)["dynamics"]
+    return stage_config(dynamics, DynamicsStageConfig, "dynamics").predicted_frames
+
+
+def run_camera(config: ExperimentConfig, recorded: RecordedStarts | None) -> str:
+    """The feature that the run's frames come from, as far as it is known; of several cameras the first."""
+    from playslot_rl import keys
+
+    if recorded is not None:
+        return recorded.source.camera
+    named = config.data.camera.split(",")[0].strip()
+    if not named:
+        return keys.FEATURE_IMAGE
+    return named if "." in named else f"observation.images.{named}"
 
 
 def simulated_starts(config: ExperimentConfig, world: WorldModel) -> SimulatedStarts | None:

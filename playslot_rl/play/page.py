@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import logging
 import time
 from collections.abc import Awaitable, Callable
@@ -16,15 +15,15 @@ from nicegui import events, ui
 from playslot_rl.errors import PlaySlotError, explain
 from playslot_rl.play import pictures
 from playslot_rl.play.gallery import Gallery
-from playslot_rl.play.recording import Shown, record
+from playslot_rl.play.prototype_panel import PrototypePanel
+from playslot_rl.play.record_panel import RecordPanel
 from playslot_rl.play.start_panel import StartPanel
 from playslot_rl.play.starts import Start
 from playslot_rl.play.studio import Studio
 from playslot_rl.play.time_panel import TimePanel
+from playslot_rl.play.timeline import Frame
 
 TICK_S: Final = 0.02
-REST_S: Final = 0.7
-"""Seconds without a step after which the prototypes' animations are made anew."""
 ME: Final = "me"
 GAP: Final = 4
 
@@ -32,8 +31,6 @@ HELP: Final = (
     "Keys: 0-9 prototypes, U undo, R reset, space free play, M masks. Click a slot in the picture or in the strip to "
     "choose it."
 )
-STYLE: Final = ".pixels img { image-rendering: pixelated } .proto img { image-rendering: pixelated; width: 66px }"
-AWAY: Final = "<script>window.addEventListener('blur', () => emitEvent('away'))</script>"
 
 
 class PlayPage:
@@ -57,16 +54,15 @@ class PlayPage:
         self.donor = 0
         self._due = self._moved = 0.0
         self._lock = asyncio.Lock()
-        self._stale = False
         self.starts = StartPanel(studio, self._start, self._halt)
         self.time = TimePanel(self.session, self._work, self._halt)
+        self.record = RecordPanel(self.session, studio, self._work)
+        self.prototypes = PrototypePanel(self.session, gallery, self._on_down, self._on_up)
 
     # --- layout ----------------------------------------------------------------------------------------------------
 
     def build(self) -> None:
         """Lay the page out; the session begins when it is there."""
-        ui.add_css(STYLE)
-        ui.page_title("playslot play")
         with ui.row().classes("w-full no-wrap items-start gap-6 p-2"):
             with ui.column().classes("gap-2"):
                 self._build_scene()
@@ -75,20 +71,20 @@ class PlayPage:
                 self._build_steering()
                 self.time.build()
                 self._build_touch()
-                self._build_record()
-        ui.keyboard(on_key=self._on_key, repeating=False)
-        ui.add_body_html(AWAY)
-        ui.on("away", self._on_up)  # a key that is let go in another window is never told of
+                self.record.build()
+        ui.keyboard(on_key=self._on_key, repeating=False, ignore=["input", "select", "textarea"])
+        ui.on("away", self._on_up)
         self.ticker = ui.timer(TICK_S, self._tick, active=False)
         ui.timer(0.4, self._refresh_previews)
         ui.timer(0.05, self._begin, once=True)
-        ui.context.client.on_delete(self.close)
 
     def _build_scene(self) -> None:
         side, n = self.studio.world_model.env.image_size, self.studio.world_model.slot_shape[0]
         watched = ["mousedown", "mousemove"] if self.session.per_slot else ["mousedown"]
         ui.label(self.studio.title).classes("text-lg font-medium")
         self.status = ui.label("starting ...").mark("status")
+        self.beyond = ui.label("").classes("text-sm text-orange-700").mark("beyond")
+        self.beyond.set_visibility(False)
         with ui.row().classes("no-wrap gap-3"):
             with ui.column().classes("gap-1"):
                 ui.label("imagined").classes("text-sm text-gray-500")
@@ -97,7 +93,7 @@ class PlayPage:
                 )
                 self.scene.classes("pixels").style("width: 384px").on("mouseleave", lambda _: self._point(None))
             with ui.column().classes("gap-1") as self.true_column:
-                ui.label("simulator, the decoded actions").classes("text-sm text-gray-500")
+                self.true_title = ui.label("").classes("text-sm text-gray-500").mark("beside")
                 self.true = ui.interactive_image(size=(side, side)).classes("pixels").style("width: 384px")
         width = n * side + (n - 1) * GAP
         self.strip = ui.interactive_image(size=(width, side), on_mouse=self._on_strip, events=["mousedown"])
@@ -109,20 +105,10 @@ class PlayPage:
         ui.label(HELP).classes("text-sm text-gray-500")
 
     def _build_steering(self) -> None:
-        self.protos: list[Any] = []
-        with ui.row().classes("items-start gap-1"):
-            for number in range(len(self.session.prototypes)):
-                button = ui.button(color="white").props("dense no-caps padding=2px")
-                with button, ui.column().classes("gap-0 items-center proto"):
-                    self.protos.append(ui.image().style("width: 66px; height: 66px"))
-                    ui.label(str(number)).classes("text-black text-xs")
-                button.mark(f"prototype-{number}").tooltip(f"prototype {number}: key {number}")
-                button.on("mousedown", lambda _, k=number: self._on_down(k))
-                for event in ("mouseup", "mouseleave"):
-                    button.on(event, lambda _: self._on_up())
-        with ui.row().classes("items-center gap-4"):
-            ui.label("variability")
-            slider = ui.slider(min=-3, max=3, step=0.1, value=0, on_change=self._outdate).props("label")
+        self.prototypes.build()
+        with ui.row().classes("items-center gap-4 no-wrap"):
+            ui.label("variability").classes("whitespace-nowrap")
+            slider = ui.slider(min=-3, max=3, step=0.1, value=0, on_change=self.prototypes.outdate).props("label")
             slider.classes("w-48").mark("variability").bind_value(self, "variability")
             if not self.session.varies:
                 slider.disable()
@@ -137,21 +123,15 @@ class PlayPage:
             if self.session.planner is not None:
                 ui.button("Goal", on_click=self._on_goal).props("dense no-caps").mark("goal")
             self.free_switch = ui.switch("free play", on_change=self._on_free).mark("free")
-            ui.slider(min=1, max=15, step=1, value=self.fps).props("label").classes("w-32").bind_value(self, "fps")
-            ui.label("frames a second").classes("text-sm")
+            with ui.row().classes("items-center gap-2 no-wrap"):  # a label stays with its slider
+                ui.slider(min=1, max=15, step=1, value=self.fps).props("label").classes("w-32").bind_value(self, "fps")
+                ui.label("frames a second").classes("text-sm whitespace-nowrap")
 
     def _build_touch(self) -> None:
         with ui.row().classes("items-center gap-2"):
             self.which = ui.label("no slot chosen").mark("which")
             for title, work in (("Freeze or let go", self._freeze), ("Remove", self._remove), ("Swap", self._swap)):
                 ui.button(title, on_click=work).props("dense no-caps").mark(title.split()[0].lower())
-
-    def _build_record(self) -> None:
-        with ui.row().classes("items-center gap-2"):
-            kinds = {"imagined": "imagined frames", "true": "true frames"}
-            self.shown = ui.select(kinds, value="imagined").props("dense")
-            ui.button("Record", on_click=self._on_record).props("dense no-caps").mark("record")
-            self.recorded = ui.label("").classes("text-sm").mark("recorded")
 
     # --- doing -----------------------------------------------------------------------------------------------------
 
@@ -167,6 +147,8 @@ class PlayPage:
                 drawn = await self.studio.do(self._paint)
                 self.begun = True  # only now: the mouse needs to know what it points at
             except Exception as error:
+                if self.closed:
+                    return False  # what it was about is gone
                 self._halt()
                 known = isinstance(error, (PlaySlotError, ValueError))
                 if not known:
@@ -186,8 +168,9 @@ class PlayPage:
         look = session.look()
         self._owner = look.owner
         found = {"scene": pictures.encode(pictures.with_masks(look, self.chosen) if self.masks else look.frame)}
-        if session.now.true is not None:
-            found["true"] = pictures.encode(session.now.true)
+        beside = session.now.recorded if session.now.true is None else session.now.true
+        if beside is not None:
+            found["beside"] = pictures.encode(beside)
         found["strip"] = pictures.encode(pictures.strip(look, session, self.chosen, GAP))
         return found
 
@@ -195,16 +178,14 @@ class PlayPage:
         session, timeline = self.session, self.session.timeline
         self.scene.set_source(self.gallery.put("scene", drawn["scene"]))
         self.strip.set_source(self.gallery.put("strip", drawn["strip"]))
-        self.true_column.set_visibility("true" in drawn)
-        self.curve_title.set_visibility("true" in drawn)
-        self.curve.set_visibility("true" in drawn)
-        branch = timeline.branch()
-        if "true" in drawn:
-            self.true.set_source(self.gallery.put("true", drawn["true"]))
+        branch, now = timeline.branch(), session.now
+        self._show_beside(drawn.get("beside"))
+        for element in (self.curve_title, self.curve):
+            element.set_visibility(now.true is not None)
+        if now.true is not None:
             self.curve.set_content(pictures.error_curve([moment.error for moment in branch], session.now.depth))
         # The list of branches is long, and nobody reads it while it grows.
         self.time.show(len(branch), branches=not self.ticker.active)
-        now = session.now
         error = "" if now.error is None else f", error {now.error:.3f}"
         self.status.set_text(f"{session.start.title}; moment {now.depth}, {now.label}{error}")
         if self.chosen is None:
@@ -212,7 +193,24 @@ class PlayPage:
         else:
             frozen = ", frozen" if self.chosen in now.frozen else ""
             self.which.set_text(f"slot {self.chosen + 1}{frozen}")
-        self._outdate()
+        horizon = self.studio.horizon
+        self.beyond.set_visibility(0 < horizon < now.steps)
+        self.beyond.set_text(f"step {now.steps}: past the {horizon} steps that the model was trained to predict")
+        self.prototypes.outdate()
+
+    def _show_beside(self, picture: bytes | None) -> None:
+        """What stands beside the imagined scene: the simulator, or the recorded episode."""
+        now, recorded = self.session.now, self.session.start.recorded
+        self.true_column.set_visibility(now.true is not None or recorded is not None)
+        self.true.set_visibility(picture is not None)
+        if picture is not None:
+            self.true.set_source(self.gallery.put("beside", picture))
+        if now.true is not None:
+            self.true_title.set_text("simulator, the decoded actions")
+        elif picture is not None:
+            self.true_title.set_text(f"recorded at the same step ({now.steps}): it goes on by its own actions")
+        else:
+            self.true_title.set_text("the recorded episode has ended")
 
     @property
     def target(self) -> int | None:
@@ -253,28 +251,25 @@ class PlayPage:
         self.free_switch.set_value(False)
         self._run()
 
-    def _outdate(self) -> None:
-        """The prototypes' animations no longer show what they would do."""
-        self._stale, self._moved = True, time.monotonic()
-
     async def _refresh_previews(self) -> None:
-        """The prototypes' animations, when the player has paused; one after the other, so that a key waits for one."""
-        paused = time.monotonic() - self._moved > REST_S and not self.ticker.active
-        if not self._stale or not paused or self.closed or not self.begun:
+        """The prototypes' animations, when the player has paused."""
+        if self.closed or not self.begun or self.ticker.active or not self.prototypes.due:
             return
-        self._stale, slot = False, self.target
         self.time.show(len(self.session.timeline.branch()), branches=True)
-        for number in range(len(self.protos)):
-            async with self._lock:
-                if self._stale or self.closed:
-                    return
-                content = await self.studio.do(functools.partial(self._animate, number, slot))
-            if not self.closed:
-                self.protos[number].set_source(self.gallery.put(f"prototype-{number}", content, "image/gif"))
+        slot = self.target
 
-    def _animate(self, number: int, slot: int | None) -> bytes:
-        """The small animation of a prototype, of one slot where each has its own; in the worker."""
-        return pictures.animated(self.session.preview([number], self.variability, slot)[0])
+        def preview(number: int) -> tuple[Frame, bytes]:
+            frames = self.session.preview([number], self.variability, slot)[0]
+            return frames[1:], pictures.animated(frames)
+
+        async def animate(number: int) -> tuple[Frame, bytes] | None:
+            async with self._lock:
+                if self.closed or self.prototypes.stale:
+                    return None
+                made = await self.studio.do(lambda: preview(number))
+            return None if self.closed else made
+
+        await self.prototypes.refresh(animate)
 
     async def _begin(self) -> None:
         if not await self.starts.first():
@@ -363,7 +358,7 @@ class PlayPage:
         """The mouse is over a slot, or has left the picture."""
         before, self.under = self.target, slot
         if self.target != before:
-            self._outdate()
+            self.prototypes.outdate()
 
     async def _on_strip(self, event: events.MouseEventArguments) -> None:
         if not self.begun:
@@ -397,10 +392,3 @@ class PlayPage:
         self.donor = (self.donor + 1) % len(donors)
         scene = donors[self.donor]
         await self._touch(lambda slot: self.session.swap(slot, scene[slot], f"another scene ({self.donor})"))
-
-    async def _on_record(self) -> None:
-        shown: Shown = "true" if self.shown.value == "true" else "imagined"
-        made: list[str] = []
-        self.recorded.set_text("recording ...")
-        done = await self._work(lambda: made.append(str(record(self.session, self.studio.out, shown))))
-        self.recorded.set_text(f"written: {made[0]}" if done else "")

@@ -100,18 +100,18 @@ def animated(frames: Frame, fps: float = ANIMATION_FPS, scale: int = 1, last_s: 
 
 
 def session_animation(path: Sequence[SceneMoment], fps: float) -> bytes:
-    """The moments of a path as an endless GIF: imagined, and beside it what is true where there is a simulator.
+    """The moments of a path as an endless GIF: imagined, and beside it the simulator, or what was recorded.
 
     Of a path of more than `MOST_PICTURES` moments, every so many-th, at the speed of the session.
     """
     stride = -(-len(path) // MOST_PICTURES)
     path = path[::stride]
-    both = all(moment.true is not None for moment in path)
-    clips = [np.stack([moment.frame for moment in path])]
-    if both:
-        clips.append(np.stack([moment.true for moment in path if moment.true is not None]))
-    columns = ["imagined", "simulator"][: len(clips)]
-    pictures = side_by_side(np.stack(clips)[None], columns, [], scale=3)
+    clips = {"imagined": [moment.frame for moment in path]}
+    for name, frames in (("simulator", [m.true for m in path]), ("recorded", [m.recorded for m in path])):
+        there = [frame for frame in frames if frame is not None]
+        if len(there) == len(path):
+            clips[name] = there
+    pictures = side_by_side(np.stack([np.stack(frames) for frames in clips.values()])[None], list(clips), [], scale=3)
     whites = []
     for picture in pictures:
         ground = Image.new("RGBA", picture.size, (255, 255, 255, 255))

@@ -34,13 +34,14 @@ LOCK: Final = ".lock"
 REPO: Final = "playslot_rl/played"
 
 
-def record(session: PlaySession, parent: Path, shown: Shown = "imagined") -> Path:
+def record(session: PlaySession, parent: Path, shown: Shown = "imagined", camera: str = keys.FEATURE_IMAGE) -> Path:
     """Write the path from the session's start to its present moment.
 
     Args:
         session: with at least one step on that path.
         parent: the recording becomes a folder `recording-NNN` in it, whole or not there.
         shown: the data set's frames: imagined, or those of the simulator.
+        camera: feature that they become: the model's own, so that the recording goes with its data.
 
     Returns:
         The folder: `session.gif`, `session.json` and the data set in `dataset`.
@@ -59,7 +60,7 @@ def record(session: PlaySession, parent: Path, shown: Shown = "imagined") -> Pat
     # Another `playslot play` may record into the same folder: one after the other, each its number.
     with locked(parent / LOCK), new_folder(final := _free(parent)) as folder:
         write_bytes(folder / ANIMATION, session_animation(path, session.start.fps))
-        _write_set(folder / DATA_SET, session, path, shown)
+        _write_set(folder / DATA_SET, session, path, shown, camera)
         about = {
             "start": session.start.title,
             "frames": shown,
@@ -75,7 +76,9 @@ def _free(parent: Path) -> Path:
     return parent / f"recording-{max([0, *taken]) + 1:03d}"
 
 
-def columns(session: PlaySession, path: Sequence[SceneMoment], shown: Shown) -> dict[str, npt.NDArray[Any]]:
+def columns(
+    session: PlaySession, path: Sequence[SceneMoment], shown: Shown, camera: str = keys.FEATURE_IMAGE
+) -> dict[str, npt.NDArray[Any]]:
     """LeRobot features of a path with T steps, (T + 1, ...): row t is a frame and the actions that followed it.
 
     A touch makes no row: the frame before the next step is the touched one. The last row's actions are padding.
@@ -96,7 +99,7 @@ def columns(session: PlaySession, path: Sequence[SceneMoment], shown: Shown) -> 
         latents.append(latent.reshape(-1))
         codes.append(code)
     found = {
-        keys.FEATURE_IMAGE: np.stack([frame for frame in frames if frame is not None]),
+        camera: np.stack([frame for frame in frames if frame is not None]),
         keys.FEATURE_LATENT: _padded(np.stack(latents).astype(np.float32)),
         keys.FEATURE_CODE: _padded(np.stack(codes).astype(np.int64)),
         keys.FEATURE_DONE: (index >= len(steps) - 1)[:, None],
@@ -112,31 +115,31 @@ def _padded(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return np.concatenate([rows, np.zeros_like(rows[:1])])
 
 
-def _features(values: dict[str, npt.NDArray[Any]]) -> dict[str, dict[str, Any]]:
-    image = {"dtype": "image", "shape": values[keys.FEATURE_IMAGE].shape[1:], "names": ["height", "width", "channels"]}
-    found: dict[str, dict[str, Any]] = {keys.FEATURE_IMAGE: image}
+def _features(values: dict[str, npt.NDArray[Any]], camera: str) -> dict[str, dict[str, Any]]:
+    image = {"dtype": "image", "shape": values[camera].shape[1:], "names": ["height", "width", "channels"]}
+    found: dict[str, dict[str, Any]] = {camera: image}
     for name, column in values.items():
-        if name != keys.FEATURE_IMAGE:
+        if name != camera:
             found[name] = {"dtype": str(column.dtype), "shape": column.shape[1:], "names": None}
     return found
 
 
-def _write_set(root: Path, session: PlaySession, path: Sequence[SceneMoment], shown: Shown) -> None:
+def _write_set(root: Path, session: PlaySession, path: Sequence[SceneMoment], shown: Shown, camera: str) -> None:
     """A data set of one episode at `root`."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    values = columns(session, path, shown)
+    values = columns(session, path, shown, camera)
     with quiet_datasets():
         dataset = LeRobotDataset.create(
             REPO,
             fps=max(1, round(session.start.fps)),
-            features=_features(values),
+            features=_features(values, camera),
             root=root,
             robot_type=session.world_model.env.name,
             use_videos=False,
             video_backend="pyav",
         )
-        frames = values.pop(keys.FEATURE_IMAGE)
+        frames = values.pop(camera)
         with (
             finalising(dataset),
             contextlib.closing(ImageSetWriter(dataset.meta, dataset.root, session.start.task)) as writer,

@@ -1,17 +1,16 @@
-"""The local web server of the page: bound to this machine, nothing from outside."""
+"""The local web server of the page: bound to this machine, for those whom the gate lets in, nothing from outside."""
 
 from __future__ import annotations
 
 import contextlib
 import socket
-from collections.abc import Callable
 from typing import Final
 
 from playslot_rl.errors import ConfigError
 from playslot_rl.play.gallery import PATH, Gallery
+from playslot_rl.play.gate import HOST, Gate, GateMiddleware
 from playslot_rl.play.studio import Studio
 
-HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 8080
 TRIED: Final = 20
 """Ports looked at from the default one on."""
@@ -44,18 +43,6 @@ def choose_port(port: int) -> int:
     )
 
 
-def page_root(studio: Studio) -> Callable[[], None]:
-    """The function that builds each client's page."""
-
-    def root() -> None:
-        from playslot_rl.play.page import PlayPage
-
-        serve_pictures()
-        PlayPage(studio, Gallery()).build()
-
-    return root
-
-
 def serve_pictures() -> None:
     """Tell the server of the galleries, once."""
     from nicegui import app
@@ -73,33 +60,61 @@ def serve_pictures() -> None:
         app.add_api_route(PATH, picture, methods=["GET"], include_in_schema=False)
 
 
-def serve(studio: Studio, port: int, show: bool) -> None:
+def serve_nothing_else() -> None:
+    """Answer paths that are not there with a plain 404; NiceGUI makes a page for each."""
+    from nicegui import app
+    from starlette.requests import Request
+    from starlette.responses import PlainTextResponse
+
+    async def missing(request: Request, error: Exception) -> PlainTextResponse:
+        del request, error
+        return PlainTextResponse("playslot play: there is no such page, expected /\n", status_code=404)
+
+    app.add_exception_handler(404, missing)
+
+
+def close_to_others(gate: Gate) -> None:
+    """Put the gate before everything that the server serves, its WebSocket too."""
+    from nicegui import app, core
+
+    core.sio.eio.cors_allowed_origins = gate.origins
+    build = app.build_middleware_stack
+    # The outermost of all: behind NiceGUI's own middleware a refusal would be cached as its assets are.
+    app.build_middleware_stack = lambda: GateMiddleware(build(), gate)  # type: ignore[method-assign]
+
+
+def serve(studio: Studio, gate: Gate, show: bool) -> None:
     """Serve the page until Ctrl-C; what is being recorded is finished.
 
     Args:
         studio: closed at the end.
-        port: that is free.
-        show: open it in the browser too.
+        gate: who may come in, and the port, which is free.
+        show: open the page in the browser too.
 
     Raises:
         ConfigError: another program has just taken the port.
     """
     from nicegui import ui
 
+    from playslot_rl.play.pages import Pages
+
+    ui.page("/")(Pages(studio).show)
+    serve_pictures()
+    serve_nothing_else()
+    close_to_others(gate)
     try:
         with contextlib.suppress(KeyboardInterrupt):
             ui.run(
-                page_root(studio),
                 host=HOST,
-                port=port,
+                port=gate.port,
                 title="playslot play",
-                show=show,
+                show=gate.path if show else False,
                 reload=False,
                 show_welcome_message=False,
                 message_history_length=200,
             )
     except SystemExit as error:  # the web server's, which has said why
         if error.code:
-            raise ConfigError(f"port={port}: got a taken one, expected a free one: choose another") from None
+            raise ConfigError(f"port={gate.port}: got a taken one, expected a free one: choose another") from None
     finally:
         studio.close()

@@ -112,14 +112,20 @@ class PlaySession:
         present = tuple(range(self.world_model.slot_shape[0]))
         true = None if start.twin is None or self.agent is None else start.twin.first
         self.start = start
-        frame = self._draw(state, present)
-        self.timeline = Timeline(SceneMoment(0, None, 0, state, present, frozenset(), frame, true=true))
+        frame, recorded = self._draw(state, present), self._recorded(0)
+        self.timeline = Timeline(
+            SceneMoment(0, None, 0, state, present, frozenset(), frame, true=true, recorded=recorded)
+        )
 
     def close(self) -> None:
-        """Free the simulator."""
+        """Free the simulator and the moments; there are none until the session begins again."""
         start = getattr(self, "start", None)
-        if start is not None and start.twin is not None:
-            start.twin.close()
+        if start is not None:
+            if start.twin is not None:
+                start.twin.close()
+            del self.start, self.timeline
+        self._look = None
+        self._imagination = ImaginationSession(self.world_model)
 
     # --- steps -----------------------------------------------------------------------------------------------------
 
@@ -208,16 +214,22 @@ class PlaySession:
         past = [moment.action for moment in self.timeline.path() if moment.action is not None]
         return action, self.start.twin.follow([*past, action])
 
+    def _recorded(self, step: int) -> Frame | None:
+        return None if self.start.recorded is None else self.start.recorded.at(step)
+
     def _land(self, label: str, **found: Any) -> SceneMoment:
         """Add the imagination's present state to the timeline."""
         now, state = self.now, self._imagination.state
         whole = {"present": now.present, "frozen": now.frozen, "true": now.true, **found}
+        steps = now.steps + ("latent" in found)
         moment = SceneMoment(
             number=len(self.timeline.moments),
             parent=now.number,
             depth=now.depth + 1,
             state=state,
             frame=self._draw(state, whole["present"], len(self.timeline.moments)),
+            recorded=self._recorded(steps),
+            steps=steps,
             label=label,
             **whole,
         )

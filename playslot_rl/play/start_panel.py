@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Awaitable, Callable
 from typing import Final
 
 from nicegui import events, ui
 
+from playslot_rl.play.gate import MOST_BYTES
 from playslot_rl.play.starts import Start, picture_start
 from playslot_rl.play.studio import Studio
 
-MOST_BYTES: Final = 50_000_000
-"""Of an uploaded picture."""
 REFUSED: Final = f"got no picture, or one above {MOST_BYTES // 1_000_000} MB, expected a PNG or JPEG file"
 """What the browser does not send."""
 
@@ -33,6 +33,14 @@ class StartPanel:
     def build(self) -> None:
         """Lay the row out."""
         sources = self.studio.sources
+        # The web framework remembers a few thousand upload routes of pages that are gone, and what they can reach.
+        me = weakref.ref(self)
+
+        async def uploaded(event: events.UploadEventArguments) -> None:
+            panel = me()
+            if panel is not None:
+                await panel._on_upload(event)
+
         with ui.row().classes("items-center gap-2"):
             self.source = ui.select(sources or {"": "no data set, no simulator"}, value=next(iter(sources), ""))
             self.source.props("dense").mark("source")
@@ -43,7 +51,7 @@ class StartPanel:
             ui.upload(
                 label="or a picture",
                 auto_upload=True,
-                on_upload=self._on_upload,
+                on_upload=uploaded,
                 max_file_size=MOST_BYTES,
                 on_rejected=lambda: ui.notify(REFUSED, type="warning"),
             ).props("accept=image/* dense flat bordered").classes("w-44").style("max-height: 56px; min-height: 0").mark(

@@ -18,7 +18,7 @@ from torch import Tensor
 from playslot_rl.acting.episodes import Task
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.data.frames import resize_frames
-from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.source import EpisodeFrames, FrameRows
 from playslot_rl.data.windows import spread_evenly
 from playslot_rl.episode_seeds import redraw_stride
 from playslot_rl.errors import DataError, RenderError
@@ -37,6 +37,25 @@ MAX_PIXELS: Final = 64 * 2**20
 
 
 @dataclass(frozen=True)
+class Recorded:
+    """How an episode went on when it was recorded, by its own actions.
+
+    Attributes:
+        frames: of the data set.
+        first: row of the frame that is started from.
+        count: frames from there to the episode's end.
+    """
+
+    frames: FrameRows
+    first: int
+    count: int
+
+    def at(self, step: int) -> Frame | None:
+        """The frame uint8 (H, W, 3) that many steps on; None after the end."""
+        return np.array(self.frames[self.first + step]) if step < self.count else None
+
+
+@dataclass(frozen=True)
 class Start:
     """A first frame, parsed.
 
@@ -47,6 +66,7 @@ class Start:
         fps: agent steps a second.
         task: the task in words.
         twin: the simulator in the same state; None where there is none.
+        recorded: what was recorded from here on; None without a recording, and beside a simulator.
     """
 
     title: str
@@ -55,6 +75,7 @@ class Start:
     fps: float = 10.0
     task: str = "playing in imagination"
     twin: Twin | None = None
+    recorded: Recorded | None = None
 
 
 @torch.no_grad()
@@ -97,7 +118,8 @@ class RecordedStarts:
         return int(self.source.lengths[episode])
 
     def start(self, episode: int, step: int) -> Start:
-        """Start at a frame of an episode; with the simulator where it runs the recorded episode again.
+        """Start at a frame of an episode; with the simulator where it runs the recorded episode again, else with what
+        was recorded after it.
 
         Raises:
             ValueError: there is no such frame.
@@ -112,7 +134,9 @@ class RecordedStarts:
         title = f"episode {episode}, frame {step} of {self.length(episode)}"
         slots = parse_last(self.model, frames, self.seed)
         task = self.source.task or "playing in imagination"
-        return Start(title, frames[-1].copy(), slots, self.source.fps, task, self._twin(episode, rows, frames[-1]))
+        twin = self._twin(episode, rows, frames[-1])
+        recorded = Recorded(self.source.frames, int(rows[-1]), self.length(episode) - step) if twin is None else None
+        return Start(title, frames[-1].copy(), slots, self.source.fps, task, twin, recorded)
 
     def _twin(self, episode: int, rows: npt.NDArray[np.int64], seen: Frame) -> Twin | None:
         """The episode run again to this frame, if it can be drawn and shows what was recorded."""

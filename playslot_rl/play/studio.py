@@ -16,6 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from playslot_rl import keys
 from playslot_rl.errors import DataError
 from playslot_rl.play.session import PlaySession
 from playslot_rl.play.starts import RecordedStarts, SimulatedStarts, Start, parse_last
@@ -35,6 +36,8 @@ class Studio:
         title: of the model, for the page.
         fps: of free play, at first.
         squeezes: the model's frames were squeezed into squares (`data.resize`), and uploaded pictures are likewise.
+        horizon: steps that the model was trained to predict; 0 where that is not known.
+        camera: feature that recordings carry.
         drivers: further ones that may take over, such as planners, by name.
 
     Attributes:
@@ -56,8 +59,10 @@ class Studio:
         fps: float = 8.0,
         drivers: dict[str, Driver] | None = None,
         squeezes: bool = False,
+        horizon: int = 0,
+        camera: str = keys.FEATURE_IMAGE,
     ) -> None:
-        self.squeezes = squeezes
+        self.squeezes, self.horizon, self.camera = squeezes, horizon, camera
         self.world_model, self.agent, self.out, self.title, self.fps = world_model.eval(), agent, out, title, fps
         self.recorded, self.simulated, self.drivers = recorded, simulated, dict(drivers or {})
         self._worker = ThreadPoolExecutor(1, "play")

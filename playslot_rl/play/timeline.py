@@ -36,6 +36,9 @@ class SceneMoment:
         code: number of its prototype, int64 () or (N,); None where `latent` is.
         action: decoded, float32 (A,) in the robot's units; None without a decoder.
         true: what the simulator showed after the same actions, uint8 (H, W, 3); None without one.
+        recorded: the recorded episode's frame of the same time, uint8 (H, W, 3); None where a simulator stands beside,
+            where nothing was recorded, and after the episode's end.
+        steps: latent actions that led here; touches take no time.
         label: how it came about, in words.
     """
 
@@ -50,6 +53,8 @@ class SceneMoment:
     code: Tensor | None = None
     action: npt.NDArray[np.float32] | None = None
     true: Frame | None = None
+    recorded: Frame | None = None
+    steps: int = 0
     label: str = "start"
 
     @property

@@ -9,8 +9,8 @@ from typing import Any
 from nicegui import ui
 from nicegui.testing import User, user_simulation
 
-from playslot_rl.play.gallery import Gallery
 from playslot_rl.play.page import PlayPage
+from playslot_rl.play.pages import Pages
 from playslot_rl.play.server import serve_pictures
 from playslot_rl.play.studio import Studio
 
@@ -22,19 +22,20 @@ MOUSE: dict[str, Any] = {
 def simulate(studio: Studio, script: Callable[[User, list[PlayPage]], Awaitable[None]]) -> list[PlayPage]:
     """Open the page and follow a script; the pages that were built."""
     pages: list[PlayPage] = []
+    shared = Pages(studio)
 
-    def root() -> None:
+    async def root() -> None:
         serve_pictures()
-        pages.append(PlayPage(studio, Gallery()))
-        pages[-1].build()
+        await shared.show()
+        pages.extend(page for page in shared.open if page not in pages)
 
     async def run() -> None:
         async with user_simulation(root) as user:
             await user.open("/")
-            await until(lambda: pages[0].begun)
+            await until(lambda: bool(pages) and pages[0].begun)
             await script(user, pages)
-            for page in pages:
-                page.close()
+            for page in list(shared.open):
+                shared.leave(page)
 
     asyncio.run(run())
     return pages

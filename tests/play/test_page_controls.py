@@ -68,14 +68,14 @@ def test_previews_are_made_anew_for_the_slot_that_the_mouse_moves_to(studio_of_m
         page, owner = pages[0], pages[0].session.look().owner
         slots = sorted(set(owner.flatten().tolist()))[:2]
         page._point(slots[0])
-        page._stale = False
+        page.prototypes.stale = False
         page._point(slots[0])
-        assert not page._stale, "the same slot"
+        assert not page.prototypes.stale, "the same slot"
         page._point(slots[1])
-        assert page._stale
-        page._stale = False
+        assert page.prototypes.stale
+        page.prototypes.stale = False
         page._point(None)
-        assert page._stale
+        assert page.prototypes.stale
 
     simulate(studio_of_many, script)
 
