@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 from urllib.parse import parse_qsl, urlencode
 
+from playslot_rl.play.picture import MOST_BYTES
+
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -21,8 +23,6 @@ NAMES: Final = (HOST, "localhost")
 """What the page's own address may call this machine."""
 TOKEN: Final = "token"
 """The part of the printed address that holds the token."""
-MOST_BYTES: Final = 50_000_000
-"""Of an uploaded picture."""
 MOST_BODY: Final = MOST_BYTES + 100_000
 """Of a request: a picture, and what a form puts round it."""
 HEADERS: Final = [

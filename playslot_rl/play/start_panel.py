@@ -8,7 +8,7 @@ from typing import Final
 
 from nicegui import events, ui
 
-from playslot_rl.play.gate import MOST_BYTES
+from playslot_rl.play.picture import MOST_BYTES
 from playslot_rl.play.starts import Start, picture_start
 from playslot_rl.play.studio import Studio
 

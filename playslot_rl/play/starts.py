@@ -5,7 +5,6 @@ Shapes: N slots, D slot width, E episodes, T frames, H W image height and width.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
@@ -17,12 +16,12 @@ from torch import Tensor
 
 from playslot_rl.acting.episodes import Task
 from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.data.frames import resize_frames
 from playslot_rl.data.source import EpisodeFrames, FrameRows
 from playslot_rl.data.windows import spread_evenly
 from playslot_rl.episode_seeds import redraw_stride
-from playslot_rl.errors import DataError, RenderError
+from playslot_rl.errors import RenderError
 from playslot_rl.frames import to_float
+from playslot_rl.play.picture import read_picture
 from playslot_rl.play.twin import Twin
 from playslot_rl.world_model import WorldModel, module_device
 
@@ -33,7 +32,6 @@ SAME: Final = 2.0
 CLIPS: Final = 24
 CLIP_FRAMES: Final = 16
 SIMULATED_CLIPS: Final = 4
-MAX_PIXELS: Final = 64 * 2**20
 
 
 @dataclass(frozen=True)
@@ -246,27 +244,5 @@ def picture_start(
     Raises:
         DataError: it is no picture, or too large.
     """
-    from PIL import Image, UnidentifiedImageError
-
-    side = model.env.image_size
-    try:
-        with Image.open(io.BytesIO(content)) as image:
-            if image.width * image.height > MAX_PIXELS:
-                raise DataError(
-                    f"{name}: got {image.width}x{image.height} pixels, expected at most {MAX_PIXELS // 2**20} million: "
-                    "make it smaller"
-                )
-            pixels = np.asarray(image.convert("RGB"))
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(
-            f"{name}: got no picture that can be read, expected a PNG or JPEG file: choose another"
-        ) from error
-    if not whole:
-        height, width = pixels.shape[:2]
-        cut = min(height, width)
-        top, left = (height - cut) // 2, (width - cut) // 2
-        pixels = pixels[top : top + cut, left : left + cut]
-    frame = resize_frames(pixels[None], side)[0]
+    frame = read_picture(content, name, model.env.image_size, whole)
     return Start(name, frame, parse_last(model, frame[None], seed))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from served import served
+from served import OUTPUT, served
 
 from playslot_rl.datasets.verify import verify
 
@@ -130,6 +130,43 @@ def test_hold_upload_and_touch(server: tuple[str, Path, subprocess.Popen[str]], 
         assert picture(page) != before
 
 
+def test_space_plays_and_presses_nothing_that_has_the_focus(server: tuple[str, Path, subprocess.Popen[str]]) -> None:
+    """After a click on a button or a switch, and where the keyboard has put the focus; in a number it is typed."""
+    address, folder, _ = server
+    with chromium() as browser:
+        page, _ = open_page(browser, address)
+        plays = page.locator("[role=switch]", has_text="free play")
+
+        def toggled(focus: Callable[[], Any]) -> None:
+            """Space after something got the focus plays, and space once more ends it."""
+            focus()
+            for wanted in ("true", "false"):
+                page.keyboard.press("Space")
+                wait(page, lambda: plays.get_attribute("aria-checked") == wanted)
+                page.wait_for_timeout(700)  # what else it might have done
+                assert plays.get_attribute("aria-checked") == wanted
+
+        page.locator(".pixels").first.click(position={"x": 190, "y": 190})
+        wait(page, lambda: re.search(r"slot \d", page.inner_text("body")) is not None)
+        page.get_by_text("Remove", exact=True).click()
+        wait(page, lambda: says(page, "removed"))
+        page.locator(".pixels").first.click(position={"x": 30, "y": 30})
+        wait(page, lambda: re.search(r"slot \d", page.inner_text("body")) is not None)
+        page.get_by_text("Remove", exact=True).focus()
+        toggled(page.get_by_text("Remove", exact=True).evaluate_handle("e => e.closest('button')").as_element().focus)
+        page.get_by_text("Reset", exact=True).click()
+        toggled(lambda: page.get_by_role("switch", name="masks").focus())
+        assert page.get_by_role("switch", name="masks").get_attribute("aria-checked") == "false"
+        page.get_by_text("Record", exact=True).click()
+        wait(page, lambda: says(page, "written: "))
+        toggled(lambda: None)
+        assert not says(page, "removed;")
+        assert [path.name for path in (folder / "runs" / "play").iterdir() if path.is_dir()] == ["recording-001"]
+        assert "token" not in page.url
+        page.reload()
+        wait(page, lambda: moment(page) == 0)
+
+
 def test_a_user_plays_records_and_leaves(server: tuple[str, Path, subprocess.Popen[str]]) -> None:
     address, folder, process = server
     with chromium() as browser:
@@ -154,15 +191,19 @@ def test_a_user_plays_records_and_leaves(server: tuple[str, Path, subprocess.Pop
         other.close()
         page.get_by_text("Record", exact=True).click()
         wait(page, lambda: "written: " in page.inner_text("body"))
-        assert hosts == {address.removeprefix("http://")}, "nothing from outside"
-    recording = folder / "runs" / "play" / "recording-001"
+        assert hosts == {address.removeprefix("http://").partition("/")[0]}, "nothing from outside"
+    recording = folder / "runs" / "play" / "recording-002"  # another one is of the test before
     result = verify(recording / "dataset")
     assert result.ok, result.lines()
     assert result.frames >= 6
     assert (recording / "session.gif").is_file()
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     assert "Traceback" not in err
-    assert out.splitlines()[-1] == "stopped"
-    assert sorted(path.name for path in (folder / "runs" / "play").iterdir()) == [".lock", "recording-001"]
+    assert (folder / OUTPUT).read_text().splitlines()[-1] == "stopped"
+    assert sorted(path.name for path in (folder / "runs" / "play").iterdir()) == [
+        ".lock",
+        "recording-001",
+        "recording-002",
+    ]

@@ -8,6 +8,7 @@ import re
 import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 from urllib.parse import urlencode
 
 import pytest
@@ -16,6 +17,7 @@ pytest.importorskip("nicegui", reason="the extra `play` is not installed")
 
 import socketio
 from nicegui import __version__ as nicegui_version
+from picture_file import png
 from served import served
 
 from playslot_rl.play.gate import MOST_BODY, Gate
@@ -215,6 +217,34 @@ def test_no_path_leads_to_a_file_of_this_machine(server: Server, path: str) -> N
     assert status in (403, 404, 405), path
     assert "set-cookie" not in headers
     assert not re.search(rb"root:|import |GIF8|http://", content), content[:100]
+
+
+def test_an_uploaded_picture_is_bounded_in_bytes_and_pixels_and_its_name_is_no_path(server: Server) -> None:
+    async def script() -> None:
+        page = await server.open_page()
+        await page.hears("moment 0, start")
+        path = next(
+            found[0] for said in page.seen if (found := re.search(r"/_nicegui/client/[0-9a-f-]+/upload/\d+", said))
+        )
+
+        async def upload(name: str, content: bytes, **how: Any) -> int:
+            head = f'--x\r\nContent-Disposition: form-data; name="f"; filename="{name}"\r\n\r\n'.encode()
+            body = head + content + b"\r\n--x--\r\n"
+            kind = "multipart/form-data; boundary=x"
+            return (await asyncio.to_thread(server.ask, path, "POST", body, Content_Type=kind, **how))[0]
+
+        assert await upload("no.png", png(9, 9), known=False) == 403
+        assert await upload("no.png", png(9, 9), Origin="http://evil.example") == 403
+        assert await upload("bomb.png", png(50_000, 50_000)) == 200
+        await page.hears("bomb.png: got too many pixels, expected at most 64 million: make it smaller")
+        assert await upload("large.png", png(9000, 9000)) == 200
+        await page.hears("large.png: got 9000x9000 pixels, expected at most 64 million: make it smaller")
+        assert await upload("../../../cat.png", png(9, 9, bytes(28 * 9))) == 200
+        await page.hears("cat.png; moment 0, start")
+        assert not any("../cat" in said or "no.png" in said for said in page.seen)
+        await page.socket.disconnect()
+
+    asyncio.run(script())
 
 
 def test_an_unknown_path_is_not_there_and_no_page(server: Server) -> None:
