@@ -10,7 +10,6 @@ Shapes: F rows, A action width.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.data.contents import STATS_NAME
+from playslot_rl.data.metadata import STATS_NAME, json_content
 from playslot_rl.envs import ENVIRONMENTS, PROCEDURAL
 
 if TYPE_CHECKING:
@@ -141,7 +140,7 @@ def _ends(values: Floats, beyond: float) -> tuple[Floats, Floats]:
 def _stated(files: Contents, width: int) -> tuple[Floats, Floats] | None:
     """Smallest and largest by `meta/stats.json`, if they can be used."""
     try:
-        stats = json.loads((files.root / STATS_NAME).read_text())[keys.FEATURE_ACTION]
+        stats = json_content(files.root / STATS_NAME)[keys.FEATURE_ACTION]
         with np.errstate(over="ignore"):
             low, high = (np.asarray(stats[name], np.float64).astype(np.float32).reshape(-1) for name in ("min", "max"))
     except (OSError, ValueError, KeyError, TypeError):

@@ -54,7 +54,7 @@ def with_full_cameras(config: ExperimentConfig) -> ExperimentConfig:
     Names stay as they were typed where the data sets are not there (yet) to be asked, or do not know them: whoever
     reads them says what is wrong.
     """
-    from playslot_rl.data.contents import read_info
+    from playslot_rl.data.metadata import read_info
 
     data = config.data
     typed = [name.strip() for name in data.camera.split(",") if name.strip()]
