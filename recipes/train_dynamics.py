@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import open_device, open_run, parent_run, require_parent
+
+if TYPE_CHECKING:
+    from playslot_rl.training.stage_dynamics import DynamicsStage
 
 
 def main(config: ExperimentConfig) -> None:
@@ -54,15 +58,8 @@ def main(config: ExperimentConfig) -> None:
         clips = record.clips(own.seed_frames + own.predicted_frames)
         stage = DynamicsStage(world, clips, cached, own)
         patience = patience_of(own.patience, "mse_slot")
-        # In mode ground_truth the latents are the set's actions, in its range.
-        known = source.limits if stage.criterion.needs_actions else None
-        return Training(
-            [Part("dynamics", stage, own, patience=patience)],
-            device,
-            said,
-            extra={"episodes": source.episodes} | ({} if known is None else {"actions": known.plain()}),
-            identity={} if known is None or known.unit else {"actions": known.said()},
-        )
+        part, read = Part("dynamics", stage, own, patience=patience), _actions_read(stage)
+        return Training([part], device, said, extra={"episodes": source.episodes, **read}, identity=read)
 
     def said(metrics: Mapping[str, float]) -> str:
         return (
@@ -71,3 +68,15 @@ def main(config: ExperimentConfig) -> None:
         )
 
     run_stage(record, prepare)
+
+
+def _actions_read(stage: DynamicsStage) -> dict[str, Any]:
+    """The range of the actions that are the latents in mode `ground_truth`, after saying it; empty in other modes."""
+    from playslot_rl.processes import here
+
+    source = stage.source
+    if not stage.criterion.needs_actions or source.limits is None:
+        return {}
+    if here().first:
+        print(f"dynamics: {source.limits.line(source.require_actions())}", flush=True)
+    return {"actions": source.limits.plain()}

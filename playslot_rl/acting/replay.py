@@ -21,7 +21,7 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import ExpertActor, PlannedActor
 from playslot_rl.acting.episodes import Moment, TaskPool, record
 from playslot_rl.frames import normalise
-from playslot_rl.modules.action_range import ActionRange
+from playslot_rl.modules.action_range import ActionRange, range_of
 from playslot_rl.world_model import Agent
 
 
@@ -70,9 +70,9 @@ class ReplayActor(PlannedActor):
         self.agent, self.performed = agent, performed
 
     @property
-    def action_range(self) -> ActionRange:
+    def action_range(self) -> ActionRange | None:
         """Of the decoder."""
-        return self.agent.action_decoder.action_range
+        return range_of(self.agent.action_decoder)
 
     @torch.no_grad()
     def reset(self, seeds: Sequence[int]) -> TensorDict:
