@@ -153,6 +153,26 @@ def check_video() -> Check:
     return Check("PyAV", "ok", f"{av.__version__}, h264 yuv444p written and read")
 
 
+def check_torchcodec() -> Check:
+    """Whether torchcodec loads, with which LeRobot decodes videos where it can; this package reads them by PyAV."""
+    try:
+        version = importlib.metadata.version("torchcodec")
+    except importlib.metadata.PackageNotFoundError:
+        return Check("torchcodec", "ok", "not installed (not needed: PyAV reads videos)")
+    # In a process of its own, since what it says of libraries that are missing goes on for eighty lines.
+    code = "import torchcodec.decoders"
+    try:
+        loads = not subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, timeout=120, check=False
+        ).returncode
+    except subprocess.TimeoutExpired:
+        loads = False
+    if loads:
+        return Check("torchcodec", "ok", f"{version} loads (LeRobot reads videos by it, this package by PyAV)")
+    found = f"{version} does not load here, pyav is used (LeRobot's own reader takes it with video_backend='pyav')"
+    return Check("torchcodec", "ok", found)
+
+
 def check_ffmpeg() -> Check:
     """A system FFmpeg is never needed, since PyAV brings its own."""
     path = shutil.which("ffmpeg")
@@ -215,6 +235,7 @@ def main(config: ExperimentConfig) -> int:
         lambda: check_torch(config.device),
         check_rendering,
         check_video,
+        check_torchcodec,
         check_ffmpeg,
         lambda: check_disk(Path(config.out or ".").resolve()),
         check_cores,

@@ -16,6 +16,8 @@ Stream = Literal["collection", "evaluation", "training", "development"]
 """Recorded data; measured success; what a method that acts learns from; the points of its learning curve."""
 
 LARGEST_SEED: Final = 2**32 - 1
+LARGEST_DRAW: Final = 2**63 - 1
+"""Of seeds that only shuffle what is there."""
 EPISODES: Final = 1_000_000
 """Episodes of one seed in one stream."""
 

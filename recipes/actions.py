@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import pkgutil
+import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -106,6 +107,19 @@ def run_action(actions: Mapping[str, Action], options: argparse.Namespace) -> in
         raise KeyboardInterrupt(
             str(error) or "interrupted; no data set was changed, run the same command again"
         ) from error
+
+
+def whole(smallest: int, largest: int) -> Callable[[str], int]:
+    """The type of an option that takes whole numbers from `smallest` to `largest`."""
+
+    def parse(text: str) -> int:
+        value = int(text) if re.fullmatch(r"[+-]?[0-9]{1,100}", text.strip()) else None
+        if value is None or not smallest <= value <= largest:
+            said = text if len(text) <= 40 else f"{text[:40]}..."
+            raise argparse.ArgumentTypeError(f"got {said!r}, expected a whole number from {smallest} to {largest}")
+        return value
+
+    return parse
 
 
 JSON: Final[Argument] = ("--json", {"action": "store_true", "help": "print one JSON object instead of text"})

@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from playslot_rl.recipes.actions import JSON, Action, Argument, make_parser, run_action
+from playslot_rl.episode_seeds import LARGEST_DRAW
+from playslot_rl.recipes.actions import JSON, Action, Argument, make_parser, run_action, whole
 
 
 def parser(kind: type[argparse.ArgumentParser] = argparse.ArgumentParser) -> argparse.ArgumentParser:
@@ -33,6 +34,8 @@ def fractions(text: str) -> dict[str, float]:
             value = float(share)
         except ValueError:
             raise argparse.ArgumentTypeError(f"got {part!r}, expected NAME=SHARE as in train=0.9,val=0.1") from None
+        if not 0 < value <= 1:
+            raise argparse.ArgumentTypeError(f"got {part!r}, expected a share above 0, 1 at most")
         if not name or name in shares:
             raise argparse.ArgumentTypeError(f"got {text!r}, expected different names as in train=0.9,val=0.1")
         shares[name] = value
@@ -100,7 +103,15 @@ ACTIONS: Final[dict[str, Action]] = {
                     "help": "shares of the episodes, together 1",
                 },
             ),
-            ("--seed", {"type": int, "default": 0, "metavar": "N", "help": "which episodes go where (default 0)"}),
+            (
+                "--seed",
+                {
+                    "type": whole(0, LARGEST_DRAW),
+                    "default": 0,
+                    "metavar": "N",
+                    "help": "which episodes go where (default 0)",
+                },
+            ),
         ),
     ),
     "viz": Action(
@@ -116,7 +127,12 @@ ACTIONS: Final[dict[str, Action]] = {
             ROOT,
             (
                 "--episodes",
-                {"type": int, "default": 6, "metavar": "N", "help": "episodes to show, evenly spread (default 6)"},
+                {
+                    "type": whole(1, 10**6),
+                    "default": 6,
+                    "metavar": "N",
+                    "help": "episodes to show, evenly spread (default 6)",
+                },
             ),
         ),
         (

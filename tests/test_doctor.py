@@ -19,7 +19,7 @@ from playslot_rl.threads import available_cores, set_threads
 def test_all_is_well_here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert doctor.main(ExperimentConfig(data=DataConfig(cache=str(tmp_path / "cache")), device="cpu")) == 0
     out = capsys.readouterr().out
-    for name in ("Python", "packages", "torch", "rendering", "PyAV", "FFmpeg", "disk", "cores", "cache"):
+    for name in ("Python", "packages", "torch", "rendering", "PyAV", "torchcodec", "FFmpeg", "disk", "cores", "cache"):
         assert f" {name} " in out
     assert "drew a 64x64 frame" in out
     assert "everything essential works" in out
@@ -95,3 +95,24 @@ def test_threads() -> None:
     with pytest.raises(ValueError, match="threads: got -1, expected 0"):
         set_threads(-1)
     assert available_cores() >= 1
+
+
+def test_a_torchcodec_that_does_not_load_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "torchcodec").mkdir()
+    (tmp_path / "torchcodec" / "__init__.py").write_text("raise RuntimeError('no library\\n' * 80)")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "0.9.0")
+    found = doctor.check_torchcodec()
+    assert found.status == "ok"
+    assert "0.9.0 does not load here, pyav is used" in found.found
+    assert "\n" not in found.line()
+    (tmp_path / "torchcodec" / "__init__.py").write_text("")
+    (tmp_path / "torchcodec" / "decoders.py").write_text("")
+    assert "0.9.0 loads" in doctor.check_torchcodec().found
+
+
+def test_the_doctor_prints_no_traceback(capfd: pytest.CaptureFixture[str]) -> None:
+    print(doctor.check_torchcodec().line())
+    out, err = capfd.readouterr()
+    assert (out.count("\n"), err) == (1, "")
+    assert "Traceback" not in out

@@ -18,7 +18,7 @@ from typing import Any, Final, cast
 
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.arguments import require_digits, require_folders, require_once, require_plain
-from playslot_rl.config.memory import require_memory
+from playslot_rl.config.machine import require_machine
 from playslot_rl.config.methods import MethodName, canonical_method
 from playslot_rl.config.plain import flatten, nearest, type_hints
 from playslot_rl.config.planning import GOALS, PLANNERS, PROPOSALS
@@ -98,7 +98,7 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         else:
             groups = tuple(f"{group}={pairs[group]}" for group in GROUPS if group in pairs)
             config = from_dict(ExperimentConfig, _merge(_presets(groups), _typed(pairs)))
-        require_memory(config, {key: value for key, value in pairs.items() if key not in GROUPS})
+        require_machine(config, {key: value for key, value in pairs.items() if key not in GROUPS})
     except ConfigError:
         raise
     except ValueError as error:

@@ -10,7 +10,8 @@ import numpy as np
 
 from playslot_rl.datasets.assemble import assemble, choose
 from playslot_rl.datasets.verify import Verification, require_sound, require_verified
-from playslot_rl.errors import DataError
+from playslot_rl.episode_seeds import LARGEST_DRAW
+from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.storage.folders import new_folder, require_free
 
 
@@ -49,9 +50,12 @@ def split(root: str | Path, out: str | Path, fractions: Mapping[str, float], *, 
         seed: of the draw.
 
     Raises:
+        ConfigError: a negative or absurd seed.
         DataError: a name that is no folder name, shares that do not add up, too few episodes, or a damaged data set.
         OutputError: `out` exists, or the disk is full.
     """
+    if not 0 <= seed <= LARGEST_DRAW:
+        raise ConfigError(f"seed: got {seed}, expected a whole number from 0 to {LARGEST_DRAW}")
     target = Path(out)
     for name, share in fractions.items():
         if not name.replace("-", "").replace("_", "").isalnum() or not 0 < share <= 1:

@@ -22,7 +22,7 @@ import pytest
 from playslot_rl import cli
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import compose
-from playslot_rl.config.memory import machine_memory, needs
+from playslot_rl.config.machine import machine_memory, needs
 from playslot_rl.config.roles import Bounds, Checked
 from playslot_rl.errors import ConfigError
 
@@ -188,12 +188,28 @@ def test_the_estimate_is_of_what_would_be_allocated() -> None:
         assert 0.5 * weights < least <= weights
 
 
+def test_threads_are_bounded_by_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("playslot_rl.config.machine.available_cores", lambda: 2)
+    assert compose(["threads=64"]).threads == 64
+    with pytest.raises(ConfigError, match=r"^threads: got 65, expected at most 64 for 2 cores: use 2$"):
+        compose(["threads=65"])
+    monkeypatch.setattr("playslot_rl.config.machine.available_cores", lambda: 100)
+    assert compose(["threads=800"]).threads == 800
+
+
+def test_a_comparison_on_other_machines_is_left_to_them() -> None:
+    slurm = ["hydra.launcher=submitit_slurm", "slots.batch_size=1000000000", "threads=1000"]
+    assert compose(slurm, "compare").slots.batch_size == 10**9
+    with pytest.raises(ConfigError, match="need at least"):
+        compose(["hydra.launcher=joblib", *slurm[1:2]], "compare")
+
+
 @pytest.mark.parametrize("preset", ["smoke", "compact", "paper"])
 def test_shipped_presets_and_stored_runs_are_never_refused_for_memory(
     preset: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert machine_memory() > 10**8
-    monkeypatch.setattr("playslot_rl.config.memory.machine_memory", lambda: 1000)
+    monkeypatch.setattr("playslot_rl.config.machine.machine_memory", lambda: 1000)
     assert compose([f"preset={preset}", "seed=3", "device=cpu"]).seed == 3
     with pytest.raises(ConfigError, match=r"^slots\.batch_size=2: got sizes with which the windows of a batch need"):
         compose([f"preset={preset}", "slots.batch_size=2", "device=cpu"])

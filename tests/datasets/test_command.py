@@ -18,7 +18,9 @@ from damage import CAMERA, ROWS, edit_json, frames_of, keep_rows
 from playslot_rl import cli
 from playslot_rl.data.contents import read_contents
 from playslot_rl.data.problems import Problems
+from playslot_rl.datasets.split import split
 from playslot_rl.datasets.viz import episode_frames, spread
+from playslot_rl.errors import ConfigError
 from playslot_rl.recipes import dataset as command
 
 pytestmark = pytest.mark.slow  # together they take a minute; make test-all runs them
@@ -232,3 +234,38 @@ def test_a_damaged_data_set_is_not_shown(broken: Path, capsys: pytest.CaptureFix
     assert "run `playslot dataset repair` on it first" in capsys.readouterr().err
     assert not broken.with_name("broken.html").exists()
     shutil.rmtree(broken)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--seed", "-1"],
+        ["--seed", "nan"],
+        ["--seed", "1_000"],
+        ["--seed", "1e3"],
+        ["--seed", "9" * 23],
+        ["--seed", "9" * 5000],
+        ["--fractions", "a=nan"],
+        ["--fractions", "a=inf,b=0.5"],
+        ["--fractions", "a=-0.5,b=1.5"],
+        ["--fractions", "a=1e308"],
+    ],
+    ids=lambda options: " ".join(options)[:40],
+)
+def test_numbers_of_options_have_bounds(
+    images: Path, tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = [] if "--fractions" in options else ["--fractions", "a=0.5,b=0.5"]
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["dataset", "split", str(images), "--out", str(tmp_path / "parts"), *more, *options])
+    assert ended.value.code == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert f"argument {options[0]}: got " in err
+    assert len(err) < 300
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_split_has_a_seed_of_its_own(images: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="seed: got -1, expected a whole number from 0"):
+        split(images, tmp_path / "parts", {"a": 0.5, "b": 0.5}, seed=-1)

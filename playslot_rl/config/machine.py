@@ -1,4 +1,4 @@
-"""The least memory that sizes need, estimated before anything is allocated.
+"""What this machine can run: threads by its cores, and the least memory that sizes need, before any is allocated.
 
 Every estimate is a lower bound: weights in fp32 with their gradients and Adam's two moments, and of a batch only what
 is certainly there at once. So what is refused would not have run, and what is not may still be too large.
@@ -19,10 +19,14 @@ from playslot_rl.config.sizes import shown
 from playslot_rl.config.stages import DynamicsStageConfig, StageConfig
 from playslot_rl.config.video import VideoStageConfig
 from playslot_rl.errors import ConfigError
+from playslot_rl.threads import available_cores
 
+ELSEWHERE: Final = frozenset({"submitit_slurm", "ray"})
+"""Launchers whose jobs run on other machines."""
 _WEIGHT: Final = 16
 """Bytes of a trained weight: itself, its gradient and two moments."""
 _FLOAT: Final = 4
+_THREADS, _THREADS_A_CORE = 64, 8
 _LARGEST_ACCELERATOR: Final = 300 * 10**9
 """A batch may lie on an accelerator, whose memory is known only once torch is loaded."""
 _DRIVERS: Final = ("/dev/nvidiactl", "/dev/kfd", "/dev/dxg", "/System/Library/Frameworks/Metal.framework")
@@ -57,16 +61,22 @@ def machine_memory() -> int:
     return min(size for size in known if size > 0)
 
 
-def require_memory(config: ExperimentConfig, typed: Mapping[str, str]) -> None:
-    """Refuse typed sizes that cannot fit.
+def require_machine(config: ExperimentConfig, typed: Mapping[str, str]) -> None:
+    """Refuse typed sizes that cannot fit, and typed threads that would only wait for one another.
 
     Args:
-        config: of the command.
+        config: of the command. A comparison that a launcher runs on other machines is left to them.
         typed: dotted keys and values that were typed; what none of them changes was accepted when it was made.
 
     Raises:
         ConfigError: with the estimate and what there is.
     """
+    if {config.compare.launcher, config.compare_video.launcher} & ELSEWHERE:
+        return
+    cores = available_cores()
+    most = max(_THREADS, _THREADS_A_CORE * cores)
+    if "threads" in typed and config.threads > most:
+        raise ConfigError(f"threads: got {config.threads}, expected at most {most} for {cores} cores: use {cores}")
     memory = machine_memory()
     aside = config.device != "cpu" and any(Path(driver).exists() for driver in _DRIVERS)
     for need in needs(config):
