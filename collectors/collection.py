@@ -10,7 +10,7 @@ from playslot_rl.collectors.export import META_NAME, export
 from playslot_rl.collectors.journal import SPEC_NAME, Journal, journal_path, read_spec
 from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.config import CollectorConfig, ExperimentConfig
-from playslot_rl.errors import DataError, OutputError
+from playslot_rl.errors import ConfigError, DataError, OutputError
 from playslot_rl.progress import StageProgress
 from playslot_rl.threads import available_cores
 
@@ -106,7 +106,12 @@ def collect(
     journal = Journal(folder, spec)
     with journal.lock():
         if not is_complete(out, spec):  # another process may have finished it while this one was starting
-            _record_missing(journal, workers or available_cores(), config.collector, shown)
+            try:
+                _record_missing(journal, workers or available_cores(), config.collector, shown)
+            except ConfigError:
+                if len(journal.missing()) == episodes:
+                    journal.remove()  # no other command would go on with it
+                raise
             if shown:
                 print(f"collect: exporting {episodes} episodes to {out}", file=sys.stderr, flush=True)
             export(journal, out)

@@ -47,24 +47,27 @@ class CollectionSpec:
         """Check the request and name it.
 
         Raises:
-            ConfigError: unknown policy or environment, an expert of an environment without one, too few or too many
-                episodes or steps, or a seed beyond 32 bits.
+            ConfigError: unknown policy or environment, an expert of an environment without one, actions of another
+                width than the environment's, too few or too many episodes or steps, or a seed beyond 32 bits.
         """
         if policy not in OFFSETS:
             near = difflib.get_close_matches(policy, OFFSETS, n=1)
             hint = f"; did you mean policy={near[0]}?" if near else "; choose one of these"
             raise ConfigError(f"unknown policy: got {policy!r}, expected one of {', '.join(sorted(OFFSETS))}{hint}")
         if config.env.name not in PROCEDURAL:
+            from playslot_rl.envs import pixel_task
+
             gym_id(config.env.name)
+            pixel_task.check_actions(config.env)
         elif policy != "random":
             raise ConfigError(
                 f"policy: got {policy} for env={config.env.name}, expected random: its shapes move by themselves; "
                 "leave policy out"
             )
         else:
-            from playslot_rl.envs.grid_shapes import check_actions
+            from playslot_rl.envs import grid_shapes
 
-            check_actions(config.env)
+            grid_shapes.check_actions(config.env)
         if not 1 <= episodes <= EPISODES // 2:
             raise ConfigError(f"episodes: got {episodes}, expected 1 to {EPISODES // 2}; split larger sets over seeds")
         if steps < 2:

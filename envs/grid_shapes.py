@@ -120,11 +120,15 @@ def generate(seeds: Iterable[int], steps: int, env: EnvConfig) -> Clips:
 
 
 def check_actions(env: EnvConfig) -> None:
-    """Check that the width of the action is two for each object.
+    """Check that the width of the action is two for each object, and that an object fits into a frame.
 
     Raises:
         ConfigError: it is not.
     """
+    if env.grid.size > env.image_size:
+        raise ConfigError(
+            f"env.grid.size: got {env.grid.size}, expected at most the {env.image_size} pixels of env.image_size"
+        )
     expected = 2 * env.grid.objects
     if env.action_dim != expected:
         raise ConfigError(

@@ -37,6 +37,18 @@ class Observation(dict[str, npt.NDArray[Any]]):
         return self[keys.STATE]
 
 
+def check_actions(env: EnvConfig) -> None:
+    """Check the width of the action.
+
+    Raises:
+        ConfigError: `env.action_dim` is not 4.
+    """
+    if env.action_dim != ACTION_DIM:
+        raise ConfigError(
+            f"env.action_dim: got {env.action_dim}, expected {ACTION_DIM} for {env.name}: leave env.action_dim out"
+        )
+
+
 class PixelTask(gym.Env[Observation, Action]):
     """A task seen by one camera.
 
@@ -62,8 +74,7 @@ class PixelTask(gym.Env[Observation, Action]):
     """Bodies of an object that stay where they are and look like ground."""
 
     def __init__(self, config: EnvConfig, render_mode: str | None) -> None:
-        if config.action_dim != ACTION_DIM:
-            raise ConfigError(f"env.action_dim: got {config.action_dim}, expected {ACTION_DIM} for {config.name}")
+        check_actions(config)
         self.config, self.render_mode = config, render_mode
         size = config.image_size
         space = gym.spaces.Dict(

@@ -291,6 +291,35 @@ def test_bad_requests_are_refused(arguments: tuple[str, int, int, int], message:
         CollectionSpec.make(config(), *arguments)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"action_dim": 9},
+        {"name": "block_push", "action_dim": 9},
+        {"name": "grid_shapes", "action_dim": 9},
+        {"name": "grid_shapes", "action_dim": 4, "grid": {"size": 1000}},
+    ],
+)
+def test_a_refused_request_leaves_nothing(changes: dict[str, Any], tmp_path: Path) -> None:
+
+    wanted = from_dict(ExperimentConfig, {"env": changes, "logging": {"progress": False}})
+    with pytest.raises(ConfigError, match=r"env\.(action_dim|grid.size): got (9|1000), expected"):
+        collect(wanted, "random", 1, 3, tmp_path / "data", seed=0, workers=1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_request_refused_by_the_environment_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from playslot_rl.collectors import recording
+
+    def refuse(*_: object) -> Any:
+        raise ConfigError("env: got what only the simulator knows, expected another")
+
+    monkeypatch.setattr(recording, "record_into", refuse)
+    with pytest.raises(ConfigError, match="only the simulator knows"):
+        small(tmp_path / "data")
+    assert list(tmp_path.iterdir()) == []
+
+
 # --- kills ----------------------------------------------------------------------------------------------------------
 
 PROGRAM = """
