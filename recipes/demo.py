@@ -8,7 +8,7 @@ from dataclasses import replace
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.episode_seeds import LARGEST_SEED
 from playslot_rl.errors import ConfigError
-from playslot_rl.recipes import evaluate, train_policy
+from playslot_rl.recipes import evaluate, inspect, train_policy
 from playslot_rl.recipes.pipeline import collect_demos
 from playslot_rl.recipes.run import open_run, parent_run
 
@@ -17,7 +17,9 @@ FIRST_SEED = 7
 
 
 def main(config: ExperimentConfig) -> None:
-    """Collect demonstrations, train policy and decoder, evaluate under both protocols, write the report."""
+    """Collect demonstrations, train policy and decoder, inspect the world model on them, evaluate under both protocols,
+    write the report.
+    """
     from playslot_rl.envs import gym_id
     from playslot_rl.training.runs import store_config, world_model_checkpoints
 
@@ -35,6 +37,8 @@ def main(config: ExperimentConfig) -> None:
         store_config(config, folder)
     config = replace(config, data=collect_demos(config, folder))
     train_policy.main(config)
+    shown = replace(config.data, root=config.data.demos)
+    inspect.main_if_needed(replace(config, run=name, out="", episodes=None, data=shown))
     evaluate.main_if_needed(replace(config, run=name, out=""))
     print(f"demo: {time.monotonic() - began:.0f} s")
     print(f"open {folder / 'report.html'}", flush=True)

@@ -109,12 +109,20 @@ def main_if_needed(config: ExperimentConfig) -> None:
     due = [protocol for protocol in POLICY_PROTOCOLS if not measured(run, protocol, facts)]
     for protocol in due:
         main(replace(config, protocol=protocol), report=False)
-    if due or not (run / "report.html").is_file():
+    if due or not renewed(run):
         from playslot_rl.recipes.run import open_device
         from playslot_rl.training.runs import load_agent
         from playslot_rl.visualization.report import write_report
 
         print(f"report: {write_report(run, agent=load_agent(run, open_device(config)))}", flush=True)
+
+
+def renewed(run: Path) -> bool:
+    """Whether the run has a report that is not older than its report card."""
+    from playslot_rl.evaluation.card import RESULT
+
+    report, card = run / "report.html", run / RESULT
+    return report.is_file() and not (card.is_file() and card.stat().st_mtime_ns > report.stat().st_mtime_ns)
 
 
 def measured(run: Path, protocol: str, facts: dict[str, Any]) -> bool:

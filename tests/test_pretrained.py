@@ -7,11 +7,14 @@ renews the policy too.
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+import playslot_rl
 from playslot_rl.config.compose import compose
 from playslot_rl.storage.checkpoints import read_stage
 from playslot_rl.training.runs import load_agent, load_world_model, pretrained_folder
@@ -73,6 +76,17 @@ def test_it_loads_and_has_the_sizes_of_the_compact_preset(env: str) -> None:
 def test_its_policy_was_trained_on_it(env: str) -> None:
     agent = load_agent(f"pretrained/{env}")
     assert agent.action_decoder.reads_slots
+
+
+def test_every_shipped_model_acts_as_the_page_on_python_says(repository: Path) -> None:
+    page = (repository / "docs" / "python.md").read_text()
+    named = re.findall(r"`load\(\"(pretrained[^\"]*)\"\)`", page)
+    assert set(named) == {"pretrained", *(f"pretrained/{env}" for env in ENVS if env != "button_press")}
+    frame = np.zeros((64, 64, 3), np.uint8)
+    for name in named:
+        action = playslot_rl.load(name, device="cpu").act(frame)
+        assert action.shape == (4,)
+        assert np.abs(action).max() <= 1.0
 
 
 @pytest.mark.slow

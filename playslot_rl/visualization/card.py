@@ -173,10 +173,16 @@ def _prototype_table(table: Sequence[Mapping[str, Any]]) -> list[Block]:
     return [Table(["prototype", "moves most", "mean displacement", "standard deviation"], rows, caption)]
 
 
+def _videos(given: ReportInput) -> str:
+    """A data set to inspect on: of the run's own the demonstrations first, else what its config names."""
+    own = [f"{given.shown}/data/{path.parts[-3]}" for path in sorted(given.run.glob("data/*/meta/info.json"))]
+    return next(filter(None, [*own, given.config.data.demos, given.config.data.root]), "SET")
+
+
 def card_section(given: ReportInput) -> Section:
     """The stored card; a note where there is none, or that of another world model."""
     title, path = "Report card", given.run / RESULT
-    command = given.command("inspect", "data.root=SET")
+    command = given.command("inspect", f"data.root={_videos(given)}")
     if not path.is_file():
         return Section(title, [Missing("There is no report card of the world model yet.", command)])
     result = json.loads(path.read_text())

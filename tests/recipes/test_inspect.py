@@ -39,6 +39,35 @@ def test_a_pipelines_run_has_a_card_and_its_report_a_section(pipeline: tuple[Pat
     assert str(run) not in page
 
 
+@pytest.mark.slow
+def test_a_demo_has_a_card_of_its_demonstrations_and_its_report_a_section(tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    arguments = ("preset=smoke", "env.max_steps=8", "collect.expert_steps=8", f"out={out}", "episodes=2", "workers=1")
+    said = playslot("demo", *arguments)
+    assert said.code == 0, said.err
+    assert written(out)["data"] == "expert"
+    assert "report card: " in said.out
+    report = (out / "report.md").read_text()
+    section = report.partition("## Report card")[2].partition("\n## ")[0]
+    assert all(measure.name in section for measure in MEASURES.values())
+    shutil.rmtree(out / "inspect")  # as a demo of an earlier version left it: the card is made, the report renewed
+    (out / "report.md").write_text("")
+    again = playslot("demo", *arguments)
+    assert again.code == 0, again.err
+    assert "measured before" in again.out
+    assert section == (out / "report.md").read_text().partition("## Report card")[2].partition("\n## ")[0]
+
+
+def test_a_report_without_a_card_names_data_that_are_there(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(run.parent)
+    shutil.rmtree(run / "inspect")
+    smoke("evaluate", "run=run", "protocol=imagination", "episodes=1")
+    command = re.search(r"`playslot (inspect run=run data\.root=run/data/expert)`", (run / "report.md").read_text())
+    assert command is not None
+    smoke(*command[1].split())
+    assert written(run)["data"] == "expert"
+
+
 def test_a_card_repeats_and_follows_the_set(run: Path, demos: Path) -> None:
     smoke("inspect", f"run={run}", f"data.root={demos}")
     first = written(run)
