@@ -15,8 +15,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl import keys
-
 EPISODES_AT_ONCE: Final = 32
 """Episodes in a row group."""
 
@@ -38,7 +36,7 @@ class ImageSetWriter:
     """Appends episodes to a data set that LeRobot has just created.
 
     Args:
-        meta: LeRobot's metadata of it (`LeRobotDatasetMetadata`); one image feature, `keys.FEATURE_IMAGE`.
+        meta: LeRobot's metadata of it (`LeRobotDatasetMetadata`); one image feature.
         root: its folder.
         task: of every frame.
     """
@@ -47,6 +45,7 @@ class ImageSetWriter:
         from lerobot.datasets.feature_utils import get_hf_features_from_features
 
         self.meta, self.root, self.task = meta, root, task
+        (self._image,) = meta.image_keys
         self.schema = get_hf_features_from_features(meta.features).arrow_schema
         self._columns: list[dict[str, Any]] = []
         self._file: Any = None
@@ -75,7 +74,7 @@ class ImageSetWriter:
             "index": first + index,
             "task_index": np.full(count, self.meta.get_task_index(self.task)),
         }
-        self._columns.append({**full, keys.FEATURE_IMAGE: images})
+        self._columns.append({**full, self._image: images})
         place = {
             "data/chunk_index": self._chunk,
             "data/file_index": self._number,
@@ -131,7 +130,7 @@ class ImageSetWriter:
         stats: dict[str, Any] = compute_episode_stats(flat, features)
         sampled = frames[sample_indices(len(frames))].transpose(0, 3, 1, 2)
         image = get_feature_stats(sampled, axis=(0, 2, 3), keepdims=True)
-        stats[keys.FEATURE_IMAGE] = {
+        stats[self._image] = {
             name: value if name == "count" else np.squeeze(value / 255.0, axis=0) for name, value in image.items()
         }
         return stats

@@ -142,7 +142,7 @@ def test_space_plays_and_presses_nothing_that_has_the_focus(server: tuple[str, P
             focus()
             for wanted in ("true", "false"):
                 page.keyboard.press("Space")
-                wait(page, lambda: plays.get_attribute("aria-checked") == wanted)
+                wait(page, lambda: plays.get_attribute("aria-checked") == wanted)  # noqa: B023
                 page.wait_for_timeout(700)  # what else it might have done
                 assert plays.get_attribute("aria-checked") == wanted
 
@@ -152,8 +152,7 @@ def test_space_plays_and_presses_nothing_that_has_the_focus(server: tuple[str, P
         wait(page, lambda: says(page, "removed"))
         page.locator(".pixels").first.click(position={"x": 30, "y": 30})
         wait(page, lambda: re.search(r"slot \d", page.inner_text("body")) is not None)
-        page.get_by_text("Remove", exact=True).focus()
-        toggled(page.get_by_text("Remove", exact=True).evaluate_handle("e => e.closest('button')").as_element().focus)
+        toggled(page.locator("button", has_text="Remove").focus)
         page.get_by_text("Reset", exact=True).click()
         toggled(lambda: page.get_by_role("switch", name="masks").focus())
         assert page.get_by_role("switch", name="masks").get_attribute("aria-checked") == "false"
