@@ -79,7 +79,8 @@ class StageProgress:
         loss = f"loss {values['loss']:.5f}" if values and "loss" in values else ""
         if self._bar is not None:
             info = f"{loss}  {speed}" if loss or self.unit == "episodes" else None
-            self._bar.update(self._task, completed=done, **({} if info is None else {"info": info.strip()}))
+            shown = {} if info is None else {"info": info.strip()}
+            self._bar.update(self._task, completed=done, total=self.total, **shown)
         elif self._due(done):
             left = format_seconds((self.total - done) / max(rate, 1e-9))
             count = f"{'step ' if self.unit == 'steps' else ''}{done}/{self.total}"

@@ -8,9 +8,11 @@ What was chosen, and why, is written to `RUN/adopt.json` as soon as it is known:
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,22 +23,24 @@ from playslot_rl.data.windows import IntArray, split_episodes
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.recipes import inspect, train_dynamics, train_slots
 from playslot_rl.recipes.adopt_decisions import Decisions
+from playslot_rl.recipes.adopt_plan import SHARES, Plan
 from playslot_rl.recipes.adopt_trials import (
+    TIMED_STEPS,
     choose_prototypes,
     choose_slots,
+    paced,
     scheduled,
     seconds_a_step,
-    steps_within,
     too_short,
     with_prototypes,
     with_slots,
 )
 from playslot_rl.recipes.run import open_run
+from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
 from playslot_rl.training.runs import slots_checkpoint, stage_model
 
-SHARES: Final = {"slots_trials": 0.18, "slots": 0.42, "dynamics_trial": 0.06, "dynamics": 0.28}
-"""Of the time; the rest is for looking, parsing and the report card. A stage has the share of a trial that is left out,
-too."""
+if TYPE_CHECKING:
+    from playslot_rl.training.pace import Pace
 
 
 def main(config: ExperimentConfig) -> None:
@@ -53,6 +57,7 @@ def main(config: ExperimentConfig) -> None:
         raise ConfigError(
             f"data.root: got {config.data.root or 'nothing'}, expected one data set, such as data.root=SET"
         )
+    began = time.monotonic()
     run = open_run(config)
     seen = survey(config.data.root, config.data.camera)
     least = shortest(config)
@@ -62,16 +67,35 @@ def main(config: ExperimentConfig) -> None:
             "half of them: record longer episodes"
         )
     asked = {"minutes": config.minutes, "seed": config.seed, "preset": config.preset, **to_dict(config.adopt)}
-    decide = Decisions(run, {"data.root": config.data.root, "camera": seen.camera, **asked})
-    config = _for_frames(config, seen, decide)
-    budget = {name: 60 * config.minutes * share for name, share in SHARES.items()}
+    decide = Decisions(run, {"data.root": config.data.root, "camera": seen.camera, **asked}, began)
+    config = replace(_for_frames(config, seen, decide), out=str(run), run="")
+    kept = -(-seen.lengths // config.data.stride)
+    plan = Plan(decide, 60 * config.minutes, int(kept.sum()), len(kept), seen.action_dim > 0)
 
-    config = _chosen_slots(replace(config, out=str(run), run=""), run, decide, budget)
-    train_slots.main(config)
-    config = _chosen_prototypes(config, run, decide, budget)
-    train_dynamics.main(config)
+    config, milliseconds = _chosen_slots(config, run, plan)
+    _train(train_slots.main, config, "slots", milliseconds, plan)
+    a_frame = plan.parsing(config, milliseconds)
+    config, milliseconds = _chosen_prototypes(config, run, plan, plan.afterwards(a_frame))
+    _train(train_dynamics.main, config, "dynamics", milliseconds, plan)
+    episodes = decide("episodes of the report card", lambda: plan.card_episodes(a_frame))
     print(f"look at it: playslot play run={run} data.root={config.data.root}", flush=True)
-    inspect.main_if_needed(replace(config, run=str(run), out=""))
+    inspect.main_if_needed(replace(config, run=str(run), out="", episodes=episodes))
+
+
+def _train(
+    train: Callable[[ExperimentConfig, Pace], None],
+    config: ExperimentConfig,
+    stage: str,
+    milliseconds: int,
+    plan: Plan,
+) -> None:
+    """Train a stage in the time that its steps were planned to take."""
+    own: Any = getattr(config, stage)
+    before = plan.decide.spent
+    train(config, paced(own.steps, milliseconds, getattr(own, "teacher_steps", 0)))
+    meta = read_stage(checkpoint_folder(Path(config.out), stage), stage).meta
+    if plan.decide.spent > before + 1:  # not one that was finished before
+        plan.decide.note(before + float(meta["seconds"]))
 
 
 def _for_frames(config: ExperimentConfig, seen: Survey, decide: Decisions) -> ExperimentConfig:
@@ -142,22 +166,27 @@ def savi_for(savi: SAViConfig, size: int) -> SAViConfig:
     return replace(savi, decoder_channels=widths, encoder_strides=strides)
 
 
-def _chosen_slots(config: ExperimentConfig, run: Path, decide: Decisions, budget: dict[str, float]) -> ExperimentConfig:
-    """The config with the number of slots and with the steps that fit."""
-    trials, tried = run / "trials", config.adopt.slots
+def _chosen_slots(config: ExperimentConfig, run: Path, plan: Plan) -> tuple[ExperimentConfig, int]:
+    """The config with the number of slots and with the steps that fit, and milliseconds of a step."""
+    trials, tried, decide = run / "trials", config.adopt.slots, plan.decide
     milliseconds = decide(
         "milliseconds a step of SAVi", lambda: _timed(with_slots(config, max(tried)), "slots", trials)
     )
-    of_one = steps_within(budget["slots_trials"] / len(tried), milliseconds / 1000)
-    few = too_short(of_one, "the scene is not taken apart", config.model.savi.n_slots)
-    left_out = Choice(tried[0], "as asked for") if len(tried) == 1 else few
-    slots = decide("slots", lambda: left_out or choose_slots(config, trials, of_one))
+    a_frame, all_shares = plan.parsing(config, milliseconds), sum(SHARES.values())
+    # Afterwards all frames are parsed, steps of the dynamics timed, a report card made.
+    afterwards = plan.afterwards(a_frame) + plan.frames * a_frame + TIMED_STEPS * milliseconds / 1000
+    if "slots" not in decide.made:
+        plan.warn(milliseconds, afterwards)
+    share = (plan.left() - afterwards) * SHARES["slots_trials"] / all_shares / len(tried)
+    slots = decide("slots", lambda: _try_slots(config, trials, plan.trial("slots", share, milliseconds), milliseconds))
     if slots != max(tried):
         milliseconds = decide(
             f"milliseconds a step with {slots} slots", lambda: _timed(with_slots(config, slots), "slots", trials)
         )
-    seconds = budget["slots"] + (budget["slots_trials"] if left_out else 0.0)
-    steps = steps_within(seconds, milliseconds / 1000)
+    own = SHARES["slots"] + (0.0 if (trials / f"slots_{slots}").is_dir() else SHARES["slots_trials"])
+    rest = SHARES["dynamics_trial"] + SHARES["dynamics"]
+    seconds = (plan.left() - afterwards) * own / (own + rest)
+    steps = plan.steps("SAVi", run, "slots", seconds, milliseconds, plan.seconds * own)
     if steps < config.slots.steps / 2:
         enough = math.ceil(config.slots.steps * milliseconds / 1000 / 60 / SHARES["slots"])
         print(
@@ -165,21 +194,37 @@ def _chosen_slots(config: ExperimentConfig, run: Path, decide: Decisions, budget
             f"{config.slots.steps} would take minutes={enough}",
             flush=True,
         )
-    return scheduled(with_slots(config, slots), "slots", steps, config.adopt.patience)
+    return scheduled(with_slots(config, slots), "slots", steps, config.adopt.patience), milliseconds
+
+
+def _try_slots(config: ExperimentConfig, trials: Path, steps: int, milliseconds: int) -> Choice:
+    tried = config.adopt.slots
+    if len(tried) == 1:
+        return Choice(tried[0], "as asked for")
+    few = too_short(steps, "the scene is not taken apart", config.model.savi.n_slots)
+    return few or choose_slots(config, trials, steps, milliseconds)
+
+
+def _try_prototypes(config: ExperimentConfig, run: Path, steps: int, milliseconds: int) -> Choice:
+    few = too_short(steps, "one prototype holds all", config.model.inverse_dynamics.n_prototypes)
+    return few or choose_prototypes(config, run, run / "trials" / "prototypes", steps, milliseconds)
 
 
 def _chosen_prototypes(
-    config: ExperimentConfig, run: Path, decide: Decisions, budget: dict[str, float]
-) -> ExperimentConfig:
-    """The config with the number of prototypes and with the steps that fit."""
-    trials, child = run / "trials", replace(config, run=str(run))
+    config: ExperimentConfig, run: Path, plan: Plan, afterwards: float
+) -> tuple[ExperimentConfig, int]:
+    """The config with the number of prototypes and with the steps that fit, and milliseconds of a step."""
+    trials, child, decide = run / "trials", replace(config, run=str(run)), plan.decide
     milliseconds = decide("milliseconds a step of the dynamics", lambda: _timed(child, "dynamics", trials))
-    of_trial = steps_within(budget["dynamics_trial"], milliseconds / 1000)
-    few = too_short(of_trial, "one prototype holds all", config.model.inverse_dynamics.n_prototypes)
-    prototypes = decide("prototypes", lambda: few or choose_prototypes(config, run, trials / "prototypes", of_trial))
-    seconds = budget["dynamics"] + (budget["dynamics_trial"] if few else 0.0)
-    steps = steps_within(seconds, milliseconds / 1000)
-    return scheduled(with_prototypes(config, prototypes), "dynamics", steps, config.adopt.patience)
+    trial, own = SHARES["dynamics_trial"], SHARES["dynamics"]
+    share = (plan.left() - afterwards) * trial / (trial + own)
+    prototypes = decide(
+        "prototypes", lambda: _try_prototypes(config, run, plan.trial("prototypes", share, milliseconds), milliseconds)
+    )
+    few = not (trials / "prototypes").is_dir()
+    seconds, before = plan.left() - afterwards, plan.seconds * (own + (trial if few else 0.0))
+    steps = plan.steps("the dynamics", run, "dynamics", seconds, milliseconds, before)
+    return scheduled(with_prototypes(config, prototypes), "dynamics", steps, config.adopt.patience), milliseconds
 
 
 def _timed(config: ExperimentConfig, stage: str, trials: Path) -> Choice:

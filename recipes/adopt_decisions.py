@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
@@ -20,12 +21,16 @@ class Decisions:
     Args:
         run: the run folder.
         facts: what the decisions depend on.
+        began: `time.monotonic()` when this process began with the work.
+
+    Attributes:
+        made: what was decided.
 
     Raises:
         ConfigError: the run was begun with other facts.
     """
 
-    def __init__(self, run: Path, facts: dict[str, Any]) -> None:
+    def __init__(self, run: Path, facts: dict[str, Any], began: float) -> None:
         self.path = run / NAME
         stored: dict[str, Any] = json.loads(self.path.read_text()) if self.path.is_file() else {}
         facts = json.loads(json.dumps(facts))
@@ -36,13 +41,24 @@ class Decisions:
                     "another out="
                 )
         self.facts, self.made = facts, dict[str, Any](stored.get("choices", {}))
+        self._before, self._began = float(stored.get("spent", 0.0)), began
+
+    @property
+    def spent(self) -> float:
+        """Seconds of wall clock, with those of earlier processes up to the last that they noted."""
+        return self._before + time.monotonic() - self._began
+
+    def note(self, least: float = 0.0) -> None:
+        """Write what is spent, which is so many seconds at least: a process that was killed noted less than it took."""
+        self._before += max(0.0, least - self.spent)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(self.path, {"facts": self.facts, "choices": self.made, "spent": round(self.spent, 1)})
 
     def __call__(self, name: str, decide: Callable[[], Choice]) -> int:
         """The value of a decision, made now if it was not made before; it is said and written."""
         if name not in self.made:
             value, reason = decide()
             self.made[name] = {"value": value, "reason": reason}
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            write_json(self.path, {"facts": self.facts, "choices": self.made})
+            self.note()
         print(f"{name}: {self.made[name]['value']} ({self.made[name]['reason']})", flush=True)
         return int(self.made[name]["value"])

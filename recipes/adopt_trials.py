@@ -9,10 +9,13 @@ import contextlib
 import io
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.survey import Choice
+
+if TYPE_CHECKING:
+    from playslot_rl.training.pace import Pace
 
 TIMED_STEPS: Final = 24
 SHORTEST: Final = 20
@@ -64,8 +67,10 @@ def seconds_a_step(config: ExperimentConfig, stage: str, out: Path) -> float:
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
 
     timed = scheduled(config, stage, TIMED_STEPS)
+    once: dict[str, Any] = {"validate_every": TIMED_STEPS, "checkpoint_every": TIMED_STEPS}
     if stage == "dynamics":  # steps with a teacher are much cheaper than rollouts
-        timed = replace(timed, dynamics=replace(timed.dynamics, teacher_steps=0))
+        once["teacher_steps"] = 0
+    timed = replace(timed, **{stage: replace(getattr(timed, stage), **once)})
     with _quietly():
         (train_slots if stage == "slots" else train_dynamics).main(replace(timed, out=str(out)))
     return float(read_stage(checkpoint_folder(out, stage), stage).meta["seconds"]) / TIMED_STEPS
@@ -78,13 +83,25 @@ def too_short(steps: int, what: str, preset: int) -> Choice | None:
     return Choice(preset, f"the preset's: the time is enough for {steps} steps of a trial, and below {TELLING} {what}")
 
 
-def choose_slots(config: ExperimentConfig, out: Path, steps: int) -> Choice:
+CUT_SHORT: Final = 0.8
+"""Share of a trial's planned steps, with fewer of which, for want of time, it cannot be compared with others."""
+
+
+def paced(steps: int, milliseconds: float, settled: int = 0) -> Pace:
+    """The time that so many steps were planned to take."""
+    from playslot_rl.training.pace import Pace
+
+    return Pace(steps * milliseconds / 1000, SHORTEST, settled)
+
+
+def choose_slots(config: ExperimentConfig, out: Path, steps: int, milliseconds: float) -> Choice:
     """The smallest number of slots that reconstructs held-out clips nearly as well as the best of those tried.
 
     Args:
         config: with everything else chosen.
         out: folder of the trials.
         steps: of each.
+        milliseconds: of a step.
     """
     from playslot_rl.recipes import train_slots
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
@@ -93,15 +110,20 @@ def choose_slots(config: ExperimentConfig, out: Path, steps: int) -> Choice:
     for slots in sorted(config.adopt.slots):
         folder = out / f"slots_{slots}"
         with _quietly():
-            train_slots.main(scheduled(replace(with_slots(config, slots), out=str(folder)), "slots", steps))
-        errors[slots] = float(read_stage(checkpoint_folder(folder, "slots"), "slots").meta["metrics"]["mse"])
+            trial = scheduled(replace(with_slots(config, slots), out=str(folder)), "slots", steps)
+            train_slots.main(trial, paced(steps, milliseconds))
+        meta = read_stage(checkpoint_folder(folder, "slots"), "slots").meta
+        if meta["steps"] < CUT_SHORT * steps:
+            preset = config.model.savi.n_slots
+            return Choice(preset, f"the preset's: the time was enough for {meta['steps']} of {steps} steps of a trial")
+        errors[slots] = float(meta["metrics"]["mse"])
     enough = min(errors.values()) * (1 + config.adopt.tolerance)
     slots = min(slots for slots, error in errors.items() if error <= enough)
     listed = ", ".join(f"{slots}: {error:.5f}" for slots, error in errors.items())
     return Choice(slots, f"held-out squared error after {steps} steps by number of slots: {listed}")
 
 
-def choose_prototypes(config: ExperimentConfig, run: Path, out: Path, steps: int) -> Choice:
+def choose_prototypes(config: ExperimentConfig, run: Path, out: Path, steps: int, milliseconds: float) -> Choice:
     """As many prototypes as carry nearly all transitions when there are more than enough.
 
     Args:
@@ -109,6 +131,7 @@ def choose_prototypes(config: ExperimentConfig, run: Path, out: Path, steps: int
         run: whose slots the trial builds on.
         out: folder of the trial.
         steps: of it.
+        milliseconds: of a step.
     """
     import numpy as np
 
@@ -123,7 +146,7 @@ def choose_prototypes(config: ExperimentConfig, run: Path, out: Path, steps: int
     many = config.adopt.prototypes
     trial = scheduled(with_prototypes(config, many), "dynamics", steps)
     with _quietly():
-        train_dynamics.main(replace(trial, run=str(run), out=str(out)))
+        train_dynamics.main(replace(trial, run=str(run), out=str(out)), paced(steps, milliseconds))
     model = load_world_model(out, config.device or "cpu")
     source = open_videos(config, config.data.root, "adopt")
     slots = slot_cache(

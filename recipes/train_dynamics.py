@@ -11,11 +11,16 @@ from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import open_device, open_run, parent_run, require_parent
 
 if TYPE_CHECKING:
+    from playslot_rl.training.pace import Pace
     from playslot_rl.training.stage_dynamics import DynamicsStage
 
 
-def main(config: ExperimentConfig) -> None:
+def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
     """Train the dynamics into `RUN/dynamics`; killed, the same command carries on; finished, it says so.
+
+    Args:
+        config: of the command.
+        pace: the time that it has (`adopt`); None trains as many steps as the config says.
 
     Raises:
         CheckpointError: no finished slots stage, or the run was begun otherwise.
@@ -57,8 +62,8 @@ def main(config: ExperimentConfig) -> None:
         )
         clips = record.clips(own.seed_frames + own.predicted_frames)
         stage = DynamicsStage(world, clips, cached, own)
-        patience = patience_of(own.patience, "mse_slot")
-        part, read = Part("dynamics", stage, own, patience=patience), _actions_read(stage)
+        part = Part("dynamics", stage, own, patience=patience_of(own.patience, "mse_slot"), pace=pace)
+        read = _actions_read(stage)
         return Training([part], device, said, extra={"episodes": source.episodes, **read}, identity=read)
 
     def said(metrics: Mapping[str, float]) -> str:

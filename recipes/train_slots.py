@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.run import open_device, open_run
 
+if TYPE_CHECKING:
+    from playslot_rl.training.pace import Pace
 
-def main(config: ExperimentConfig) -> None:
+
+def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
     """Train SAVi into `RUN/slots`; killed, the same command carries on; finished, it says so.
+
+    Args:
+        config: of the command.
+        pace: the time that it has (`adopt`); None trains as many steps as the config says.
 
     Raises:
         DataError, OutputError, CheckpointError, TrainingError: see `playslot_rl.errors`.
@@ -35,14 +44,14 @@ def main(config: ExperimentConfig) -> None:
         device, source = open_device(config), record.data
         with global_seed(config.seed, 0, "slots"):
             savi = SAVi(config.model.savi, config.env.image_size).to(device)
-        patience = patience_of(own.patience, "mse")
         known = validation_scores(config) if here().first else None
         started: dict[str, str] = {}
         if own.start_from:
             warm_start(savi, load_savi(own.start_from, device), own.start_from)
             started = {"started_from": slots_checkpoint(own.start_from).fingerprint}
+        stage = SlotsStage(savi, record.clips(own.clip_frames), own, known)
         return Training(
-            [Part("slots", SlotsStage(savi, record.clips(own.clip_frames), own, known), own, patience=patience)],
+            [Part("slots", stage, own, patience=patience_of(own.patience, "mse"), pace=pace)],
             device,
             lambda metrics: f"slots: {metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {record.folder}",
             extra={"episodes": source.episodes, "agent_steps": int((source.lengths - 1).sum()), **started},

@@ -32,6 +32,10 @@ looking."""
 REPEATS: Final = (
     "On one machine a seeded run repeats bit for bit on the CPU; another processor or library rounds differently."
 )
+CLOCKED: Final = (
+    "The steps of this training followed the clock (`playslot adopt`): these commands train those that were planned, "
+    "with another outcome."
+)
 PROTOCOL_NAMES: Final = {"simulation": "in simulation (closed loop)", "imagination": "in imagination (open loop)"}
 
 REFERENCES: Final = {
@@ -69,7 +73,8 @@ def make_card(
     commands = "Not recorded: saved from Python. `playslot export` writes the commands."
     if experiment:
         lines = "\n".join(reproduce(experiment, policy.source, results))
-        commands = f"{places(experiment, policy.source)}```bash\n{lines}\n```\n\n{REPEATS}"
+        repeats = CLOCKED if policy.source.get("clocked") else REPEATS
+        commands = f"{places(experiment, policy.source)}```bash\n{lines}\n```\n\n{repeats}"
     versions = {
         "exported with": _numbers(policy.source.get("versions", {})),
         "trained with": _numbers(policy.source.get("trained_with", {})),

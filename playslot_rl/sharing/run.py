@@ -54,6 +54,7 @@ def read_source(run: Path) -> dict[str, Any]:
         "seed": meta.get("seed"),
         "world_model_seed": parents["slots"].meta.get("seed"),
         "commit": meta.get("commit", ""),
+        "clocked": any(parent.meta.get("clocked", False) for parent in parents.values()),
         "shipped_world_model": _is_shipped(str(policy.config.get("env", {}).get("name", "")), prints),
         "trained_with": {"playslot_rl": meta.get("version", ""), "torch": meta.get("torch", "")},
         "recorded": _recorded(Path(str(meta.get("data_root", "")))),

@@ -42,6 +42,7 @@ class TrainingState:
         metrics: the last validation's numbers.
         best: those of the best validation, where a training stops early; else empty.
         stale: validations since then.
+        planned: steps that it ends after, where the clock has changed them; 0 leaves those of its config.
     """
 
     step: int = 0
@@ -49,6 +50,7 @@ class TrainingState:
     metrics: dict[str, float] = field(default_factory=dict)
     best: dict[str, float] = field(default_factory=dict)
     stale: int = 0
+    planned: int = 0
 
 
 ADDED: Final[Mapping[str, Any]] = {
@@ -156,8 +158,8 @@ class TrainingCheckpoints:
         restore_optimizer(optimizer, load_tensors(last / "optimizer.safetensors"), str(last), list(parameters))
         if average:
             load_into(average, load_tensors(last / "average.safetensors"), str(last))
-        best, stale = stored.get("best", {}), stored.get("stale", 0)
-        return TrainingState(stored["step"], stored["seconds"], stored["metrics"], best, stale)
+        best, stale, planned = stored.get("best", {}), stored.get("stale", 0), stored.get("planned", 0)
+        return TrainingState(stored["step"], stored["seconds"], stored["metrics"], best, stale, planned)
 
     def _write(self, step: int, files: Mapping[str, Mapping[str, Tensor]], state: Mapping[str, Any]) -> Path:
         """Write `step_STEP` of tensors `NAME.safetensors` and a `state.json`; keep the newest two.

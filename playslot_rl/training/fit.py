@@ -29,6 +29,7 @@ from playslot_rl.training.averages import WeightAverage
 from playslot_rl.training.batches import GlobalBatches
 from playslot_rl.training.compiling import compile_parts, release_parts
 from playslot_rl.training.logging import Watch, finite
+from playslot_rl.training.pace import Pace
 from playslot_rl.training.patience import Patience
 from playslot_rl.training.stage import Stage, WatchedStage
 
@@ -45,6 +46,7 @@ class Part:
         lr_key: config key of the learning rate, for messages; empty means `NAME.optim.lr`.
         identity: further plain values that a resumed one must share.
         patience: ends the training before `config.steps`, with the weights of the best validation; None does not.
+        pace: changes `config.steps` as the clock says; None does not.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Part:
     lr_key: str = ""
     identity: Mapping[str, Any] = field(default_factory=dict)
     patience: Patience | None = None
+    pace: Pace | None = None
 
     @property
     def key(self) -> str:
@@ -106,7 +109,7 @@ def fit(
     wait()  # until all have looked, and what is there is there for all
     run.meet()
     if not run.ended:
-        progress = StageProgress(part.name, start, config.steps, logging.progress, config.log_every * 10)
+        progress = StageProgress(part.name, start, run.steps, logging.progress, config.log_every * 10)
         with run.watch.running(logging, start), run.compiled(), progress:
             while not run.ended:
                 run.advance(run.state.step, progress)
@@ -136,13 +139,19 @@ class _Run:
         self.watch = Watch(part.name, folder, self.checkpoints, cure)
         self.state = self.checkpoints.resume(part.stage.modules, self.optimizer, self.parameters, self._averaged)
         self._began = time.monotonic() - self.state.seconds
+        self._looked, self._validation, self._validating = (self.state.step, self.state.seconds), 0.0, 0.0
         self._train_mode(True)
+
+    @property
+    def steps(self) -> int:
+        """Of the whole training, as it is planned now."""
+        return self.state.planned or self.config.steps
 
     @property
     def ended(self) -> bool:
         """Whether there is nothing left to do."""
         patient = self.patience is None or not self.patience.ended(self.state)
-        return self.state.step >= self.config.steps or not patient
+        return self.state.step >= self.steps or not patient
 
     @property
     def _averaged(self) -> Mapping[str, Tensor] | None:
@@ -179,8 +188,9 @@ class _Run:
         """One step, and whatever is due after it."""
         config, done = self.config, step + 1
         values = self._step(step)
-        last = done == config.steps
         self.state = replace(self.state, step=done, seconds=time.monotonic() - self._began)
+        self._keep_pace()
+        last, progress.total = done == self.steps, self.steps
         if done == 1 or done % config.log_every == 0 or last:
             numbers = {key: float(value) for key, value in values.items()}
             self._log("train", done, numbers)
@@ -188,7 +198,10 @@ class _Run:
         else:
             progress.update(done, {})
         if done % config.validate_every == 0 or last:
+            began = time.monotonic()
             self.state = replace(self.state, metrics=self._validate(done))
+            self._validation = time.monotonic() - began
+            self._validating += self._validation
             self._log("validation", done, self.state.metrics)
             self._look(done)
             self._judge()
@@ -197,8 +210,19 @@ class _Run:
             if here().first:
                 self.checkpoints.save(self.state, self.stage.modules, self.optimizer, self.parameters, self._averaged)
 
+    def _keep_pace(self) -> None:
+        """Plan anew if it is time to: from the steps since the last look, and what came between them."""
+        pace, (done, spent), state = self.part.pace, self._looked, self.state
+        if pace is None or not pace.due(state.step - done, state.seconds - spent, self.steps):
+            return
+        # Validations come now and then, but evenly over all steps.
+        a_step = (state.seconds - spent - self._validating) / (state.step - done)
+        a_step += self._validation / self.config.validate_every
+        planned = pace.steps(state.step, state.seconds, a_step, self.steps, self._validation)
+        self.state, self._looked, self._validating = replace(state, planned=planned), (state.step, state.seconds), 0.0
+
     def _step(self, step: int) -> dict[str, Tensor | float]:
-        rate = learning_rate(self.config.optim, step, self.config.steps)
+        rate = learning_rate(self.config.optim, step, self.steps)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)

@@ -337,7 +337,7 @@ def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -
         wait()
     modules: dict[str, nn.Module] = {}
     metrics: dict[str, float] = {}
-    steps, seconds = 0, 0.0
+    steps, seconds, clocked = 0, 0.0, False
     limits = record.data.limits if record.role == "demos" else None
     if limits is not None and here().first:
         shown = record.data.require_actions()[transitions(record.data).rows]
@@ -360,6 +360,7 @@ def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -
         metrics |= {f"{prefix}{key}": value for key, value in state.metrics.items()}
         modules |= part.stage.modules
         steps, seconds = steps or state.step, seconds + state.seconds
-    done = record.save(modules, metrics, steps, seconds, training.extra)
+        clocked = clocked or state.planned not in (0, part.config.steps)
+    done = record.save(modules, metrics, steps, seconds, {**training.extra, **({"clocked": True} if clocked else {})})
     print(training.line(metrics), flush=True)
     return done

@@ -274,8 +274,8 @@ def test_the_card_of_a_pipelines_run_can_be_followed(env: str, tmp_path: Path, m
 def adopted(tmp: Path) -> tuple[Path, Path, tuple[str, ...]]:
     data = write_recordings(tmp / "robot", ("top", "side"))
     quick = ("minutes=0.02", "adopt.slots=[2]", "adopt.prototypes=4", "data.camera=side")
-    smoke("adopt", f"data.root={data}", *quick, "out=runs/world")
-    smoke("train-policy", "run=runs/world", "behaviour.labelled_demos=2", "seed=5", "out=runs/first")
+    smoke("adopt", f"data.root={data}", *quick, "out=runs/mine")
+    smoke("train-policy", "run=runs/mine", "behaviour.labelled_demos=2", "seed=5", "out=runs/first")
     return Path("runs/first"), data, ()
 
 
