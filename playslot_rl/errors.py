@@ -81,7 +81,7 @@ def explain(error: BaseException) -> str:
                 return line.format(f" for {where}" if where else "")
         cause = cause.__cause__ or cause.__context__
     text = " ".join(str(error).split()) or "no message"
-    if isinstance(error, PlaySlotError):
+    if isinstance(error, PlaySlotError) or (isinstance(error, ValueError | TypeError) and _said_here(error, text)):
         return text
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "allocate memory" in text:
         return (
@@ -91,3 +91,12 @@ def explain(error: BaseException) -> str:
         wanted = "expected a path that can be read and written: choose another, or mend this one"
         return f"got {type(error).__name__}: {text}, {wanted}"
     return f"{type(error).__name__}: {text} (unexpected; {DEBUG}=1 shows where)"
+
+
+def _said_here(error: BaseException, text: str) -> bool:
+    """Whether this package raised an error in its own words, for a user to act on."""
+    where = error.__traceback__
+    while where is not None and where.tb_next is not None:
+        where = where.tb_next
+    ours = where is not None and str(where.tb_frame.f_globals.get("__name__", "")).startswith("playslot_rl.")
+    return ours and "got " in text and ", expected " in text

@@ -282,6 +282,34 @@ def test_an_error_is_one_line_and_an_exit_code(
     assert err.count("\n") == 1
 
 
+def test_what_the_library_says_itself_is_expected(
+    recipe: Callable[[str, Recipe], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Errors in its own words, of whichever class; what others raise in the same words is not."""
+    from playslot_rl.config.plain import check
+
+    recipe("demo", lambda config: check(False, "clip", 3, "more frames"))
+    assert cli.main(["demo"]) == 1
+    assert capsys.readouterr().err == "playslot demo: error: clip: got 3, expected more frames\n"
+    recipe("demo", raising(ValueError("clip: got 3, expected more frames")))
+    assert cli.main(["demo"]) == 1
+    assert "(unexpected; PLAYSLOT_DEBUG=1 shows where)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 4 bytes.")]
+)
+def test_too_little_memory_is_one_line(
+    error: Exception, recipe: Callable[[str, Recipe], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe("demo", raising(error))
+    assert cli.main(["demo"]) == 1
+    err = capsys.readouterr().err
+    assert "got too little memory" in err
+    assert "expected enough for these sizes: choose smaller ones" in err
+    assert "unexpected" not in err
+
+
 def test_a_wrapped_full_disk_is_still_a_full_disk(
     recipe: Callable[[str, Recipe], None], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -144,9 +144,10 @@ class PredictorConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check(self.dim % 2 == 0, f"{self.group}dim", self.dim, "an even number: sines and cosines of a position")
         check(
             self.project_out or self.heads * self.head_dim == self.dim,
-            "model.predictor.head_dim",
+            f"{self.group}head_dim",
             self.head_dim,
             f"dim / heads with project_out=false, dim {self.dim} and {self.heads} heads",
         )

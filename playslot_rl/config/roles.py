@@ -143,7 +143,7 @@ def keys_of(cls: type, wanted: Role) -> frozenset[str]:
 def without(config: Any, unwanted: Role) -> dict[str, Any]:
     """Nested plain dict of a config, less the keys and groups that have a role."""
     values = to_dict(config)
-    for key in keys_of(type(config), unwanted):
+    for key in keys_of(type(config), unwanted):  # type: ignore[arg-type]
         *groups, name = key.split(".")
         level = values
         for group in groups:

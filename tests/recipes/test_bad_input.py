@@ -51,6 +51,18 @@ def test_an_unknown_collector_policy_or_device_is_refused(videos: Path, tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("device", ["meta", "cuda:99", "cpu:x"])
+def test_a_device_that_computes_nothing_is_refused_before_anything_is_written(
+    device: str, videos: Path, tmp_path: Path
+) -> None:
+    done = playslot("train-slots", "preset=smoke", f"out={tmp_path / 'new'}", f"data.root={videos}", f"device={device}")
+    assert done.code == 1
+    assert_one_line(done.err, "train-slots")
+    assert f"device={device}: " in done.err
+    assert "use device=cpu" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("command", ["collect", "train-slots", "train-dynamics", "train-policy", "evaluate"])
 def test_a_command_without_its_folder_is_refused(command: str) -> None:
     refused(command, message="(out|run): got nothing, expected")
