@@ -48,7 +48,7 @@ class _BoundsError(ValueError):
 
 
 def json_content(path: Path) -> Any:
-    """What a JSON file holds; a byte-order mark before it is passed over.
+    """What a JSON file holds (`parsed`).
 
     Raises:
         OSError: it cannot be read.
@@ -57,12 +57,21 @@ def json_content(path: Path) -> Any:
     size = path.stat().st_size
     if size > LONGEST_JSON:
         raise ValueError(f"{size} bytes, expected at most {LONGEST_JSON}")
+    return parsed(path.read_bytes())
+
+
+def parsed(content: bytes) -> Any:
+    """What JSON says; a byte-order mark before it is passed over.
+
+    Raises:
+        ValueError: it is no JSON, or nested too deeply.
+    """
     try:
-        content = json.loads(path.read_bytes())
-        json.dumps(content, ensure_ascii=False).encode()  # halves of characters could not be printed
+        values = json.loads(content)
+        json.dumps(values, ensure_ascii=False).encode()  # halves of characters could not be printed
     except RecursionError as error:
         raise ValueError("lists in lists without an end") from error
-    return content
+    return values
 
 
 def damaged(error: BaseException) -> str:

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from playslot_rl.data.metadata import FORMAT_TAG
+from playslot_rl.data.metadata import FORMAT_TAG, damaged, parsed, read_info
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, HubError, OutputError
 from playslot_rl.hub.layout import LOCAL_RECORD, SCHEME, HubRecord, is_pulled, read_record, require_plain
@@ -147,16 +147,21 @@ def _choose(hub: Repository, revision: str | None) -> tuple[str, str, str]:
 def _check_version(hub: Repository, partial: Path, commit: str) -> None:
     """Look at the metadata before gigabytes are fetched."""
     try:
-        version = str(json.loads(hub.read(INFO, commit, partial))["codebase_version"])
+        version = str(parsed(hub.read(INFO, commit, partial))["codebase_version"])
     except (ValueError, KeyError, TypeError) as error:
         shutil.rmtree(partial, ignore_errors=True)
-        raise DataError(f"{hub.name}: got a damaged {INFO} ({error!r}), expected LeRobot's metadata") from error
+        raise DataError(f"{hub.name}: got a damaged {INFO} ({damaged(error)}), expected LeRobot's metadata") from error
     if not version.startswith("v3."):
         shutil.rmtree(partial, ignore_errors=True)
         raise DataError(
             f"{hub.name}: got LeRobot format {version}, expected v3.0: ask for another revision, or convert it by "
             "LeRobot's convert_dataset_v21_to_v30"
         )
+    try:
+        read_info(partial)
+    except DataError as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise DataError(f"{hub.name}: {str(error).replace(f'{partial}/', '')}") from error
 
 
 def _check_room(root: Path, partial: Path, wanted: Mapping[str, RepoFile]) -> None:
