@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from playslot_rl.collectors.export import META_NAME, export
-from playslot_rl.collectors.journal import SPEC_NAME, Journal, journal_path, read_spec
+from playslot_rl.collectors.journal import SPEC_NAME, Journal, journal_path, read_spec, remove_leftover
 from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.config import CollectorConfig, ExperimentConfig
 from playslot_rl.errors import ConfigError, DataError, OutputError
@@ -98,8 +98,7 @@ def collect(
     shown = config.logging.progress
     folder = journal_path(out)
     if is_complete(out, spec):
-        if (folder / SPEC_NAME).is_file():
-            Journal(folder, spec).remove()  # killed between the rename and this
+        remove_leftover(folder, spec)  # of a process that was killed after the rename
         if shown:
             print(f"collect: {out} is complete ({episodes} episodes), nothing to do", file=sys.stderr)
         return out

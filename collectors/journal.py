@@ -206,8 +206,19 @@ class Journal:
         return [i for i in range(self.spec.episodes) if self.path(i).name not in there]
 
     def remove(self) -> None:
-        """Delete the journal."""
+        """Delete the journal: the record of what it is goes after all episodes, so that a kill leaves one of ours."""
+        order = {SPEC_NAME: 1, LOCK_NAME: 2}
+        for path in sorted(self.folder.iterdir(), key=lambda path: order.get(path.name, 0)):
+            path.unlink(missing_ok=True)
         shutil.rmtree(self.folder)
+
+
+def remove_leftover(folder: Path, spec: CollectionSpec) -> None:
+    """Delete what is left of the journal of a finished collection, if anything is: the rest of a killed removal."""
+    if (folder / SPEC_NAME).is_file():
+        Journal(folder, spec).remove()
+    elif folder.is_dir() and {path.name for path in folder.iterdir()} <= {LOCK_NAME}:
+        shutil.rmtree(folder)
 
 
 def read_spec(path: Path) -> dict[str, Any]:

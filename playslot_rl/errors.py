@@ -61,12 +61,12 @@ def require_type(given: object, what: str, *kinds: type, expected: str) -> None:
 
 
 _SYSTEM: Final = {
-    errno.ENOSPC: ("got a full disk{}, expected free space: free some and run the same command again"),
-    errno.EDQUOT: ("got a used-up disk quota{}, expected free space: free some and run the same command again"),
-    errno.EROFS: ("got a read-only file system{}, expected one that can be written: choose another folder"),
-    errno.EACCES: ("got no permission{}, expected it: change it or choose another folder"),
-    errno.EMFILE: ("got too many open files{}, expected a higher limit: raise it (`ulimit -n 4096`) and run again"),
-    errno.ENFILE: ("got too many open files{} on this machine, expected fewer: end other programs and run again"),
+    errno.ENOSPC: "got a full disk{}, expected free space: free some and run the same command again",
+    errno.EDQUOT: "got a used-up disk quota{}, expected free space: free some and run the same command again",
+    errno.EROFS: "got a read-only file system{}, expected one that can be written: choose another folder",
+    errno.EACCES: "got no permission{}, expected it: change it or choose another folder",
+    errno.ENFILE: "got too many open files{} on this machine, expected fewer: end other programs and run again",
+    errno.EMFILE: "got too many open files{}, expected a higher limit: raise it (`ulimit -n 4096`) and run again",
 }
 """What a user can act on, whichever library ran into it; the place goes into the braces."""
 

@@ -247,10 +247,11 @@ def convert_sketchy(
     require_free(out)
     found = find_demonstrations(source, tags)[:episodes]
     train, held_out = split_episodes(len(found))
-    with new_folder(out) as temporary, quiet_datasets():
-        _write(temporary / "train", found[:train], cameras, image_size, storage)
-        if held_out:
-            _write(temporary / "eval", found[train:], cameras, image_size, storage)
+    with new_folder(out) as temporary:
+        for name, part in (("train", found[:train]), ("eval", found[train:])):
+            with quiet_datasets():  # once each: reading a set back makes `datasets` loud again
+                if part:
+                    _write(temporary / name, part, cameras, image_size, storage)
     return {"train": train, "eval": held_out}
 
 

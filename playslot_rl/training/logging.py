@@ -10,6 +10,7 @@ import importlib
 import json
 import math
 import os
+import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,8 @@ class _TensorBoardLogger:
     def __init__(self, folder: Path, resumed: int) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
+        # Its thread prints an error that is raised here, too, at the next entry.
+        self._hook, threading.excepthook = threading.excepthook, self._unless_written
         self._writer: Any = SummaryWriter(str(folder), purge_step=resumed + 1 if resumed else None)
 
     def log(self, values: Mapping[str, float], step: int) -> None:
@@ -74,7 +77,15 @@ class _TensorBoardLogger:
             self._writer.add_image(name, picture, step, dataformats="HWC")
 
     def close(self) -> None:
-        self._writer.close()
+        try:
+            self._writer.flush()  # raises what the thread ran into
+            self._writer.close()
+        finally:
+            threading.excepthook = self._hook
+
+    def _unless_written(self, args: threading.ExceptHookArgs) -> None:
+        if not (issubclass(args.exc_type, OSError) and "_AsyncWriter" in type(args.thread).__name__):
+            self._hook(args)
 
 
 class _RunLogger:

@@ -164,6 +164,24 @@ def test_second_process_is_refused_and_a_dead_ones_lock_is_free(
     assert_whole(out, 3, reference)
 
 
+@pytest.mark.parametrize(
+    "left", [(), ("lock",), ("lock", "collection.json"), ("collection.json", "episode_000001.npz")]
+)
+def test_a_removal_of_the_journal_that_was_killed_is_ended(
+    recorded: Path, tmp_path: Path, left: tuple[str, ...]
+) -> None:
+    out = tmp_path / "data"
+    journal = begin(recorded, out)
+    small(out, 3)
+    shutil.copytree(recorded, journal.folder)
+    (journal.folder / "lock").touch()
+    for path in journal.folder.iterdir():
+        if path.name not in left:
+            path.unlink()
+    small(out, 3)
+    assert not journal.folder.exists()
+
+
 def test_journal_removed_by_another_process_is_noticed(recorded: Path, tmp_path: Path) -> None:
     journal = begin(recorded, tmp_path / "data")
     original = fcntl.flock

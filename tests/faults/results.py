@@ -9,8 +9,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
+
 TIMES = re.compile(r"(^|_)(seconds|began|started|ended|time|used|pulled|created|rate_fps|steps_per_second)(_|$)")
 """Keys of JSON files whose values are times."""
+OF_THE_DAY = ("command", "commit", "machine")
 SPENT = re.compile(r"\b\d+(\.\d+)? ?(s|ms|min|h|seconds|minutes)\b")
 PASSING = (".lock", ".log")
 
@@ -40,6 +43,9 @@ def _content(path: Path) -> bytes:
     if path.suffix in (".json", ".jsonl"):
         lines = [path.read_text()] if path.suffix == ".json" else path.read_text().splitlines()
         return json.dumps([_timeless(json.loads(line)) for line in lines], sort_keys=True).encode()
+    if path.suffix == ".parquet":  # its header names the day's fingerprint of the library that wrote it
+        table = pq.ParquetFile(path).read()
+        return repr((table.schema.remove_metadata(), table.to_pylist())).encode()
     if path.suffix in (".md", ".html"):
         return SPENT.sub("some time", path.read_text()).encode()
     return path.read_bytes()
@@ -47,7 +53,9 @@ def _content(path: Path) -> bytes:
 
 def _timeless(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _timeless(inner) for key, inner in value.items() if not TIMES.search(key) and key != "command"}
+        return {
+            key: _timeless(inner) for key, inner in value.items() if not TIMES.search(key) and key not in OF_THE_DAY
+        }
     if isinstance(value, list):
         return [_timeless(inner) for inner in value]
     return value

@@ -13,7 +13,7 @@ from sketchy_layout import name_of, write_sketchy
 def test_a_converted_data_set_trains_and_compares_on_both_cameras(tmp_path: Path) -> None:
     source, out = write_sketchy(tmp_path / "download"), tmp_path / "set"
     done = playslot("convert", "env=sketchy", f"data.root={source}", f"out={out}", *ONE_CORE)
-    assert done.code == 0, done.err
+    assert (done.code, done.err) == (0, "")
     assert "train (4 episodes)" in done.out
     assert "eval (1 episodes)" in done.out
     cameras = "data.camera=observation.images.front_left,observation.images.front_right"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from playslot_rl.errors import OutputError
-from playslot_rl.storage.atomic import explain_write_errors, replace_dir, write_bytes, write_json, write_text
+from playslot_rl.errors import OutputError, explain
+from playslot_rl.storage.atomic import alone, explain_write_errors, replace_dir, write_bytes, write_json, write_text
 
 
 def test_a_failed_write_leaves_the_old_content_and_no_temporary(
@@ -27,6 +27,44 @@ def test_a_failed_write_leaves_the_old_content_and_no_temporary(
     assert "\n" not in str(caught.value)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_writer_left_is_written_over(tmp_path: Path) -> None:
+    (tmp_path / ".file.txt.tmp-0").write_text("half of something longer")
+    write_text(tmp_path / "file.txt", "whole")
+    assert (tmp_path / "file.txt").read_text() == "whole"
+    assert [path.name for path in tmp_path.iterdir()] == ["file.txt"]
+
+
+def test_what_another_process_is_writing_is_left_to_it(tmp_path: Path) -> None:
+    with (tmp_path / ".file.txt.tmp-0").open("w") as others:
+        assert alone(others.fileno())
+        others.write("theirs")
+        write_text(tmp_path / "file.txt", "ours")
+    assert (tmp_path / "file.txt").read_text() == "ours"
+    assert (tmp_path / ".file.txt.tmp-0").read_text() == "theirs"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    ("number", "line"),
+    [
+        (errno.ENOSPC, "got a full disk for /data/x, expected free space"),
+        (errno.EDQUOT, "got a used-up disk quota for /data/x, expected free space"),
+        (errno.EROFS, "got a read-only file system for /data/x, expected one that can be written"),
+        (errno.EACCES, "got no permission for /data/x, expected it"),
+        (errno.EMFILE, "got too many open files for /data/x, expected a higher limit"),
+        (errno.ENFILE, "got too many open files for /data/x on this machine, expected fewer"),
+    ],
+)
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_what_the_system_refuses_is_one_line_whoever_ran_into_it(number: int, line: str, wrapped: bool) -> None:
+    refused = OSError(number, os.strerror(number), "/data/x")
+    error: Exception = refused
+    if wrapped:
+        error = RuntimeError("a library's own words")
+        error.__cause__ = refused
+    assert explain(error).startswith(line)
 
 
 def test_json_refuses_numbers_it_cannot_hold(tmp_path: Path) -> None:

@@ -23,6 +23,21 @@ def test_a_folder_appears_whole_and_leftovers_of_a_kill_go(tmp_path: Path) -> No
     assert [entry.name for entry in final.parent.iterdir()] == ["made"]
 
 
+def test_two_that_make_one_folder_leave_each_other_alone(tmp_path: Path) -> None:
+    final = tmp_path / "made"
+
+    def second() -> None:
+        with new_folder(final) as temporary:
+            (temporary / "file").write_text("second")
+            with new_folder(final) as other:
+                (other / "file").write_text("first")
+
+    with pytest.raises(OutputError, match="is there already, expected none; choose another out="):
+        second()
+    assert (final / "file").read_text() == "first"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["made"]
+
+
 def test_an_error_leaves_nothing_and_keeps_what_was_there(tmp_path: Path) -> None:
     final = tmp_path / "made"
     final.mkdir()
