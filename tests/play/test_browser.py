@@ -104,6 +104,13 @@ def test_hold_upload_and_touch(server: tuple[str, Path, subprocess.Popen[str]], 
         assert moment(page) == left, "a key that is let go in another window, too"
         page.keyboard.up("1")
 
+        assert not page.locator(".q-uploader__subtitle").is_visible(), "nothing is uploaded, so it says no bytes"
+        rate, label = (
+            page.locator("[role=slider]").nth(1).bounding_box(),
+            page.get_by_text("frames a second").bounding_box(),
+        )
+        assert rate["y"] < label["y"] + label["height"] / 2 < rate["y"] + rate["height"], "beside its slider"
+
         true = page.locator(".pixels").nth(1)
         assert true.is_visible()
         Image.fromarray(np.full((96, 128, 3), 90, np.uint8)).save(tmp_path / "grey.png")

@@ -103,12 +103,12 @@ class Page:
     seen: list[str]
 
     async def hears(self, text: str) -> None:
-        """Wait until the browser was told of a text, a minute at most: other jobs may have the cores."""
-        for _ in range(600):
+        """Wait until the browser was told of a text, three minutes at most: other jobs may have the cores."""
+        for _ in range(1800):
             if any(text in said for said in self.seen):
                 return
             await asyncio.sleep(0.1)
-        raise AssertionError(f"not told of {text!r} for a minute, but of: {self.seen[-3:]}")
+        raise AssertionError(f"not told of {text!r} for three minutes, but of: {self.seen[-3:]}")
 
 
 @pytest.fixture(scope="module")
