@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from fake_hub import READ_TOKEN, FakeHub, Fault
 
 from playslot_rl.sharing.card import MARK
-from playslot_rl.sharing.folder import FILES, SharedPolicyConfig, load_pretrained, save_pretrained
+from playslot_rl.sharing.folder import FILES, RANGE, SharedPolicyConfig, load_pretrained, save_pretrained
 from playslot_rl.testing import tiny_agent
 
 pytestmark = pytest.mark.slow  # a process of its own imports torch and huggingface_hub
@@ -26,8 +27,9 @@ def folder(tmp_path: Path) -> Path:
     return write(tmp_path / "policy", seed=0)
 
 
-def write(folder: Path, seed: int) -> Path:
+def write(folder: Path, seed: int, high: float = 1.0) -> Path:
     agent = tiny_agent(seed=seed)
+    agent.action_decoder.action_range.take(-torch.ones(4), torch.full((4,), high))
     config = SharedPolicyConfig(env=agent.world_model.env, model=agent.world_model.config)
     save_pretrained(agent, folder, config, lambda written: f"{HEADER}{MARK}\nweights {written.fingerprint}\n")
     return folder
@@ -52,6 +54,17 @@ def test_a_pushed_policy_is_whole_in_one_commit_and_comes_back(
     assert "error" not in pulled, pulled
     assert {path.name for path in Path(pulled["folder"]).iterdir()} == set(FILES)
     assert load_pretrained(Path(pulled["folder"]))[1] == load_pretrained(folder)[1]
+
+
+def test_the_range_of_a_robots_actions_goes_along(hub: FakeHub, client: Client, tmp_path: Path) -> None:
+    folder = write(tmp_path / "arm", seed=0, high=90.0)
+    assert "error" not in push(client, folder)
+    assert RANGE in hub.repositories[NAME].files()
+    pulled = Path(client("pull_policy", repo_id="owner/press", cache=tmp_path / "cache")["folder"])
+    assert {path.name for path in pulled.iterdir()} == {*FILES, RANGE}
+    assert load_pretrained(pulled)[1].actions["high"] == [90.0] * 4
+    (folder / RANGE).unlink()
+    assert f"{RANGE} is missing, expected a whole policy" in push(client, folder)["error"]
 
 
 def test_the_same_push_again_changes_nothing_and_a_new_policy_replaces_the_old(

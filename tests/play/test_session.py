@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -147,6 +148,21 @@ def test_a_swapped_slot_comes_from_elsewhere_and_the_past_is_forgotten(session: 
     assert int(session.now.state[keys.HISTORY_LENGTH]) == 1
     with pytest.raises(ValueError, match="swap: got a slot of shape"):
         session.swap(3, other[:5])
+
+
+def test_actions_are_decoded_into_the_robots_units(agent: Agent, recorded: RecordedStarts) -> None:
+    robots = deepcopy(agent)
+    robots.action_decoder.action_range.take(
+        torch.tensor([-90.0, 7.3, 0.0, -1.0]), torch.tensor([90.0, 7.3, 100.0, 1.0])
+    )
+    played, plain = PlaySession(robots.world_model, robots), PlaySession(agent.world_model, agent)
+    played.begin(recorded.start(1, 3))
+    plain.begin(recorded.start(1, 3))
+    real, unit = played.press(2).action, plain.press(2).action
+    assert real is not None
+    assert unit is not None
+    assert np.allclose(real, [90 * unit[0], 7.3, 50 * unit[2] + 50, unit[3]], atol=1e-5)
+    assert real[1] == np.float32(7.3)
 
 
 def test_actions_go_to_one_slot_where_each_has_its_own(many: WorldModel) -> None:

@@ -19,6 +19,7 @@ from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.data.source import open_source
 from playslot_rl.envs.pixel_task import PixelTask
+from playslot_rl.sharing.folder import RANGE
 from playslot_rl.storage.tensors import load_tensors
 
 TASK = ("env=video", "env.action_dim=6")
@@ -113,7 +114,9 @@ def test_the_decoder_learns_what_the_robot_did(trained: tuple[Path, Done]) -> No
     assert (np.abs(said[0].detach().numpy() - middle)[usual] < 2 * spread[usual]).all()
 
 
-def test_lerobot_steps_an_exported_policy_to_the_last_digit(policy: Path, frames: np.ndarray[Any, Any]) -> None:
+def test_lerobot_steps_an_exported_policy_to_the_last_digit(
+    policy: Path, frames: np.ndarray[Any, Any], tmp_path: Path
+) -> None:
     from lerobot.configs import PreTrainedConfig
     from lerobot.envs import preprocess_observation
     from lerobot.policies import make_pre_post_processors
@@ -136,6 +139,10 @@ def test_lerobot_steps_an_exported_policy_to_the_last_digit(policy: Path, frames
             assert np.array_equal(after(said)[0].numpy(), wanted)
     assert (expected[:, CONSTANT] == np.float32(VALUE)).all()
     assert np.abs(expected).max() > 1
+    network.save_pretrained(tmp_path)
+    fresh[1].save_pretrained(tmp_path, config_filename="policy_postprocessor.json")
+    assert (tmp_path / RANGE).read_bytes() == (policy / RANGE).read_bytes()
+    assert np.array_equal(acted(playslot_rl.PlaySlot.from_pretrained(tmp_path, "cpu"), frames), expected)
 
 
 def test_the_run_and_the_exported_policy_give_the_same(
