@@ -31,6 +31,9 @@ WIDE: Final = 3.0
 FEW: Final = 0.001
 """Share of the rows up to which values far outside q01 to q99 are outliers; more are a motion, such as a gripper's."""
 
+HUGE: Final = 1e30
+"""Numbers that no robot knows: with them float32 would overflow."""
+
 Floats = npt.NDArray[np.float32]
 
 
@@ -101,7 +104,7 @@ def limits_of(files: Contents, actions: Floats | None) -> ActionLimits | None:
     """The range of a data set's actions (F, A); None without any, and for sets of our own simulators."""
     if actions is None or str(files.info.get("robot_type") or "") in (*ENVIRONMENTS, *PROCEDURAL):
         return None
-    values = np.where(np.isfinite(actions), actions, np.nan)
+    values = np.where(np.abs(actions) < HUGE, actions, np.nan)
     names, stated = _names(files.features[keys.FEATURE_ACTION], values.shape[1]), _stated(files, values.shape[1])
     first, last = _ends(values, 0.01)
     smallest, largest = _ends(values, 0.0)
@@ -143,9 +146,9 @@ def _stated(files: Contents, width: int) -> tuple[Floats, Floats] | None:
         stats = json_content(files.root / STATS_NAME)[keys.FEATURE_ACTION]
         with np.errstate(over="ignore"):
             low, high = (np.asarray(stats[name], np.float64).astype(np.float32).reshape(-1) for name in ("min", "max"))
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError):
         return None
-    usable = len(low) == len(high) == width and np.isfinite([low, high]).all() and (low <= high).all()
+    usable = len(low) == len(high) == width and (np.abs([low, high]) < HUGE).all() and (low <= high).all()
     return (low, high) if usable else None
 
 
@@ -162,4 +165,5 @@ def _names(feature: dict[str, Any], width: int) -> tuple[str, ...]:
             given = list(given)
     if not isinstance(given, list) or len(given) != width or len(set(map(str, given))) != width:
         return tuple(f"action_{i}" for i in range(width))
-    return tuple(" ".join(str(name).split())[:64] or f"action_{i}" for i, name in enumerate(given))
+    plain = ["".join(c if c.isprintable() else " " for c in str(name)) for name in given]
+    return tuple(" ".join(name.split())[:64] or f"action_{i}" for i, name in enumerate(plain))

@@ -74,6 +74,7 @@ def test_a_dimensions_range_is_what_the_statistics_say(tmp_path: Path) -> None:
         {"min": [0.0, 0.0, 0.0], "max": [0.0, 0.0, 0.0]},
         {"min": [-1e300, 7.3, 0.0], "max": [1e300, 7.3, 100.0]},
         {"mean": [0.0, 7.3, 50.0]},
+        {"min": [-(10**400), 7, 0], "max": [10**400, 8, 100]},
     ],
 )
 def test_statistics_that_cannot_be_used_are_computed_from_the_data(tmp_path: Path, stats: Any) -> None:
@@ -155,6 +156,7 @@ def test_other_types_than_float32_are_read(tmp_path: Path, dtype: str) -> None:
         (["a", "a", "b"], ("action_0", "action_1", "action_2")),
         ("abc", ("action_0", "action_1", "action_2")),
         (["a\nb", " ", 5], ("a b", "action_1", "5")),
+        (["\x1b[2Ja", "b\u202e", "c"], ("[2Ja", "b", "c")),
     ],
 )
 def test_the_dimensions_are_named_as_the_set_names_them(tmp_path: Path, names: Any, expected: tuple[str, ...]) -> None:
