@@ -25,7 +25,6 @@ from playslot_rl.recipes import inspect, train_dynamics, train_slots
 from playslot_rl.recipes.adopt_decisions import Decisions
 from playslot_rl.recipes.adopt_plan import SHARES, Plan
 from playslot_rl.recipes.adopt_trials import (
-    TIMED_STEPS,
     choose_prototypes,
     choose_slots,
     paced,
@@ -174,7 +173,7 @@ def _chosen_slots(config: ExperimentConfig, run: Path, plan: Plan) -> tuple[Expe
     )
     a_frame, all_shares = plan.parsing(config, milliseconds), sum(SHARES.values())
     # Afterwards all frames are parsed, steps of the dynamics timed, a report card made.
-    afterwards = plan.afterwards(a_frame) + plan.frames * a_frame + TIMED_STEPS * milliseconds / 1000
+    afterwards = plan.afterwards(a_frame) + plan.frames * a_frame + plan.timing(milliseconds)
     if "slots" not in decide.made:
         plan.warn(milliseconds, afterwards)
     share = (plan.left() - afterwards) * SHARES["slots_trials"] / all_shares / len(tried)
@@ -228,5 +227,5 @@ def _chosen_prototypes(
 
 
 def _timed(config: ExperimentConfig, stage: str, trials: Path) -> Choice:
-    seconds = seconds_a_step(config, stage, trials / f"time_{stage}_{config.model.savi.n_slots}")
+    seconds = seconds_a_step(config, stage, trials / f"time_{stage}_{config.model.savi.n_slots}", config.minutes)
     return Choice(max(1, round(1000 * seconds)), "measured here, the first steps included")

@@ -9,7 +9,7 @@ from typing import Final
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.survey import Choice
 from playslot_rl.recipes.adopt_decisions import Decisions
-from playslot_rl.recipes.adopt_trials import SHORTEST, TIMED_STEPS, steps_within
+from playslot_rl.recipes.adopt_trials import FEWEST_TIMED, SHORTEST, TIMED_SHARE, TIMED_STEPS, steps_within
 
 SHARES: Final = {"slots_trials": 0.18, "slots": 0.42, "dynamics_trial": 0.06, "dynamics": 0.28}
 """Of the time; the rest is for looking, parsing and the report card. A stage has the share of a trial that is left out,
@@ -84,6 +84,11 @@ class Plan:
         fits = steps_within(seconds, milliseconds / 1000)
         return self.decide(key, lambda: Choice(fits, f"{max(0.0, seconds):.0f} s at {milliseconds:.0f} ms a step"))
 
+    def timing(self, milliseconds: float) -> float:
+        """Seconds in which the step of a stage is measured."""
+        whole = TIMED_STEPS * milliseconds / 1000
+        return max(whole * FEWEST_TIMED / TIMED_STEPS, min(whole, self.seconds * TIMED_SHARE))
+
     def trial(self, of: str, seconds: float, milliseconds: float) -> int:
         """Steps of a trial."""
         fits = steps_within(seconds, milliseconds / 1000)
@@ -91,7 +96,7 @@ class Plan:
 
     def warn(self, milliseconds: float, afterwards: float) -> None:
         """Say it where not even the shortest trainings fit."""
-        need = self.decide.spent + afterwards + (2 * SHORTEST + TIMED_STEPS) * milliseconds / 1000
+        need = self.decide.spent + afterwards + 2 * SHORTEST * milliseconds / 1000
         if need > self.seconds:
             print(
                 f"note: minutes={self.seconds / 60:g} are too few for the shortest trainings on this machine: it will "

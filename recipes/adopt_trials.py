@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from playslot_rl.training.pace import Pace
 
 TIMED_STEPS: Final = 24
+FEWEST_TIMED: Final = 2
+TIMED_SHARE: Final = 0.03
+"""Of the time, which they may take: then fewer do."""
 SHORTEST: Final = 20
 """Steps of a training at least, however little time there is."""
 CARRIED: Final = 0.95
@@ -61,10 +64,13 @@ def scheduled(config: ExperimentConfig, stage: str, steps: int, patience: int = 
     return replace(config, **{stage: replace(own, **changes)})
 
 
-def seconds_a_step(config: ExperimentConfig, stage: str, out: Path) -> float:
-    """Seconds that a step takes, measured; nothing else of that training is kept in mind."""
+def seconds_a_step(config: ExperimentConfig, stage: str, out: Path, minutes: float) -> float:
+    """Seconds that a step takes, measured in a small part of `minutes`; nothing else of that training is kept."""
     from playslot_rl.recipes import train_dynamics, train_slots
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+    from playslot_rl.training.pace import Pace
+
+    pace = Pace(60 * minutes * TIMED_SHARE, FEWEST_TIMED)
 
     timed = scheduled(config, stage, TIMED_STEPS)
     once: dict[str, Any] = {"validate_every": TIMED_STEPS, "checkpoint_every": TIMED_STEPS}
@@ -72,8 +78,9 @@ def seconds_a_step(config: ExperimentConfig, stage: str, out: Path) -> float:
         once["teacher_steps"] = 0
     timed = replace(timed, **{stage: replace(getattr(timed, stage), **once)})
     with _quietly():
-        (train_slots if stage == "slots" else train_dynamics).main(replace(timed, out=str(out)))
-    return float(read_stage(checkpoint_folder(out, stage), stage).meta["seconds"]) / TIMED_STEPS
+        (train_slots if stage == "slots" else train_dynamics).main(replace(timed, out=str(out)), pace)
+    meta = read_stage(checkpoint_folder(out, stage), stage).meta
+    return float(meta["seconds"]) / float(meta["steps"])
 
 
 def too_short(steps: int, what: str, preset: int) -> Choice | None:
