@@ -170,6 +170,7 @@ def _compare_keys(overrides: Sequence[str], command: str) -> list[str]:
             hydra.append(argument.strip())
         else:
             kept.append(argument)
+    require_once([argument.partition("=")[0].strip().lstrip("+") for argument in hydra])
     inside = ",".join(quoted(argument) for argument in hydra)
     return [*kept, f"{group}.hydra=[{inside}]"] if hydra else kept
 

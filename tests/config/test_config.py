@@ -91,6 +91,8 @@ def test_a_key_is_typed_once(twice: tuple[str, ...]) -> None:
         compose(["episodes=3", *twice])
     with pytest.raises(ConfigError, match=r"^compare\.seeds: got it 2 times"):
         compose(["seeds=1", "compare.seeds=[2]"], "compare")
+    with pytest.raises(ConfigError, match=r"^hydra\.launcher\.n_jobs: got it 2 times"):
+        compose(["hydra.launcher=joblib", "hydra.launcher.n_jobs=1", "hydra.launcher.n_jobs=2"], "compare")
 
 
 @pytest.mark.parametrize(
