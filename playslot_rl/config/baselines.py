@@ -233,7 +233,7 @@ class DreamerConfig(OnlineConfig):
     frame_size: int = field(default=0, metadata=at_least(0, "0 (the environment's) or pixels"))
     depth: int = field(default=16, metadata=COUNT)
     mults: tuple[int, ...] = field(default=(2, 3, 4, 4), metadata=COUNT)
-    kernel: int = field(default=5, metadata=between(1, 31, "1 to 31"))
+    kernel: int = field(default=5, metadata=within(lambda value: value % 2 == 1, "an odd number, 1 to 31", 1, 31))
     belief: int = field(default=2048, metadata=COUNT)
     blocks: int = field(default=8, metadata=COUNT)
     categoricals: int = field(default=32, metadata=COUNT)

@@ -172,8 +172,7 @@ def _baselines(config: ExperimentConfig) -> Iterator[Need]:
     keys = ("baselines.sold.starts", "baselines.sold.horizon")
     yield Need(keys, "imagined rollouts", imagined * _FLOAT, host=False)
     imagined = dreamer.horizon * dreamer.batch_size * (dreamer.belief + state)
-    keys = ("baselines.dreamer.horizon",)
-    yield Need(keys, "imagined rollouts", imagined * _FLOAT, host=False)
+    yield Need(("baselines.dreamer.horizon",), "imagined rollouts", imagined * _FLOAT, host=False)
 
 
 def _acting(name: str, own: OnlineConfig, row: float, episode: int) -> Iterator[Need]:

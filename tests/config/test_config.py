@@ -143,6 +143,7 @@ def test_a_folder_in_the_home_folder_may_be_written_with_a_tilde(monkeypatch: py
             "baselines.slotformer.predictor.dim=33",
             "baselines.slotformer.predictor.dim: got 33, expected an even number",
         ),
+        ("baselines.dreamer.kernel=2", "baselines.dreamer.kernel: got 2, expected an odd number, 1 to 31"),
         ("baselines.dreamer.mults=[]", r"baselines.dreamer.mults: got \(\), expected at least one"),
         ("baselines.caddy.temperature=[1]", r"baselines.caddy.temperature: got \(1.0,\), expected two numbers"),
         ("slots.optim.lr=nan", r"optim.lr: got nan, expected a finite number, 0 or more \(of slots.optim\)"),
