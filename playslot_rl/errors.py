@@ -84,9 +84,7 @@ def explain(error: BaseException) -> str:
     if isinstance(error, PlaySlotError) or (isinstance(error, ValueError | TypeError) and _said_here(error, text)):
         return text
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "allocate memory" in text:
-        return (
-            f"got too little memory ({text}), expected enough for these sizes: choose a smaller batch or smaller sizes"
-        )
+        return f"got too little memory ({text}), expected enough for these sizes: choose smaller ones"
     if isinstance(error, OSError) and error.errno is not None and error.filename is not None:
         wanted = "expected a path that can be read and written: choose another, or mend this one"
         return f"got {type(error).__name__}: {text}, {wanted}"

@@ -113,7 +113,7 @@ class EnvConfig(Checked):
     name: str = "button_press"
     image_size: int = field(default=64, metadata=within((32, 64, 128).__contains__, "32, 64 or 128", 32, 128))
     action_dim: int = field(default=4, metadata=between(1, 4096, "1 to 4096"))
-    frame_skip: int = field(default=5, metadata=at_least(1, largest=1000))
+    frame_skip: int = field(default=5, metadata=at_least(1, largest=100))
     max_steps: int = field(default=20, metadata=at_least(2, largest=10**6))
     warmup_steps: int = field(default=12, metadata=at_least(0, "0 or more", 10_000))
     grid: GridConfig = field(default_factory=GridConfig)
