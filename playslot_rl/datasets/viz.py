@@ -132,14 +132,22 @@ def spread(total: int, wanted: int) -> list[int]:
     return sorted({int(i) for i in np.round(np.linspace(0, total - 1, min(wanted, total)))})
 
 
+def ordinal(number: int) -> str:
+    """A number from 1 on as 1st, 2nd, 3rd, 4th, 11th, 21st, ..."""
+    ending = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
+    return f"{number}{ending}"
+
+
 def _names(chosen: Sequence[int]) -> str:
     return ", ".join(map(str, chosen))
 
 
 def _curves(contents: Contents) -> list[str]:
-    """Features worth a curve: actions, rewards and success, else every vector of numbers."""
-    wanted = (keys.FEATURE_ACTION, keys.FEATURE_REWARD, keys.FEATURE_SUCCESS, "reward", "success")
-    return [name for name in wanted if name in contents.columns and contents.columns[name].ndim <= 2]
+    """Features worth a curve: actions, states and whatever else was observed as numbers, rewards and success."""
+    observed = [name for name in contents.columns if name.startswith("observation.")]
+    wanted = (keys.FEATURE_ACTION, *observed, keys.FEATURE_REWARD, keys.FEATURE_SUCCESS, "reward", "success")
+    columns = {name: contents.numbers(name) for name in wanted}
+    return [name for name, values in columns.items() if values is not None and values.ndim <= 2]
 
 
 def _clips(contents: Contents, chosen: Sequence[int]) -> list[Clip]:
@@ -174,7 +182,7 @@ def _caption(contents: Contents, clip: Clip) -> str:
         f"{clip.span.length} frames, {clip.span.length / contents.fps:.1f} s",
         *(task.rstrip(".") for task in clip.episode.tasks),
     ]
-    seeds, solved = contents.columns.get(keys.FEATURE_SEED), contents.columns.get(keys.FEATURE_SUCCESS)
+    seeds, solved = contents.numbers(keys.FEATURE_SEED), contents.numbers(keys.FEATURE_SUCCESS)
     if seeds is not None:
         parts.append(f"seed {int(seeds[clip.span.start])}")
     if solved is not None:
@@ -193,7 +201,7 @@ def _camera_pictures(contents: Contents, clip: Clip, camera: str, frames: npt.ND
     at = spread(len(small), STRIP)
     strip = png(image_grid(small[at][None], columns=[str(t) for t in at], scale=max(1, scale // 2)))
     name, rate = f"episode-{clip.span.index}-{camera}", contents.fps / every
-    shown = f"{contents.fps:g} fps" if every == 1 else f"every {every}th frame"
+    shown = f"{contents.fps:g} fps" if every == 1 else f"every {ordinal(every)} frame"
     alt = f"Episode {clip.span.index} from {camera}"
     alt_strip = f"Frames {_names(at)} of episode {clip.span.index} from {camera}"
     return [

@@ -255,20 +255,33 @@ def curve_chart(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[A
     Raises:
         ValueError: there is nothing to draw.
     """
+    return figure_bytes(curve_figure(panels, theme), theme)
+
+
+def curve_figure(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[Any, Any]]], theme: Theme) -> Figure:
+    """The figure of `curve_chart`: at most three panels in a row, legends beside them."""
     if not panels:
         raise ValueError("curve_chart: got no feature, expected at least one")
-    figure = new_figure(3.1 * len(panels), 2.2)
+    columns = min(3, len(panels))
+    rows = -(-len(panels) // columns)
+    figure = new_figure(3.9 * columns, 2.2 * rows)
     for index, (name, lines) in enumerate(panels.items()):
-        axes = figure.add_subplot(1, len(panels), index + 1)
+        axes = figure.add_subplot(rows, columns, index + 1)
         for number, (label, values) in enumerate(lines.items()):
             colour = theme.series[number % len(theme.series)]
-            axes.plot(np.arange(len(values)), values, color=colour, linewidth=1.3, label=label)
-        axes.set_title(name, fontsize=10)
+            axes.plot(np.arange(len(values)), values, color=colour, linewidth=1.3, label=_literal(label))
+        axes.set_title(_literal(name), fontsize=10)
         axes.set_xlabel("frame", fontsize=9)
         style_axes(axes, theme)
         if 1 < len(lines) <= len(theme.series):
-            axes.legend(frameon=False, labelcolor=theme.text, fontsize=7, ncols=2)
-    return figure_bytes(figure, theme)
+            beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+            axes.legend(frameon=False, labelcolor=theme.text, fontsize=7, **beside)
+    return figure
+
+
+def _literal(name: str) -> str:
+    """A name from a data set as it is: a dollar sign would begin a formula."""
+    return name.replace("$", r"\$")
 
 
 def loss_names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
