@@ -105,12 +105,7 @@ def collect(
     journal = Journal(folder, spec)
     with journal.lock():
         if not is_complete(out, spec):  # another process may have finished it while this one was starting
-            try:
-                _record_missing(journal, workers or available_cores(), config.collector, shown)
-            except ConfigError:
-                if len(journal.missing()) == episodes:
-                    journal.remove()  # no other command would go on with it
-                raise
+            _record_missing(journal, workers or available_cores(), config.collector, shown)
             if shown:
                 print(f"collect: exporting {episodes} episodes to {out}", file=sys.stderr, flush=True)
             export(journal, out)
@@ -133,6 +128,11 @@ def _record_missing(journal: Journal, workers: int, settings: CollectorConfig, s
     if shown and len(missing) < total:
         say(f"{total - len(missing)} of {total} episodes are there already")
     done = total - len(missing)
-    with StageProgress(f"collect {journal.spec.policy}", done, total, shown, unit="episodes") as progress:
-        for count, _ in enumerate(record_into(journal, missing, workers, settings, say), done + 1):
-            progress.update(count)
+    try:
+        with StageProgress(f"collect {journal.spec.policy}", done, total, shown, unit="episodes") as progress:
+            for count, _ in enumerate(record_into(journal, missing, workers, settings, say), done + 1):
+                progress.update(count)
+    except ConfigError:
+        if len(journal.missing()) == total:
+            journal.remove()  # no other command would go on with it
+        raise

@@ -274,8 +274,7 @@ def curve_figure(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[
         axes.set_xlabel("frame", fontsize=9)
         style_axes(axes, theme)
         if 1 < len(lines) <= len(theme.series):
-            beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
-            axes.legend(frameon=False, labelcolor=theme.text, fontsize=7, **beside)
+            axes.legend(frameon=False, labelcolor=theme.text, fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
