@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from playslot_rl.collectors.export import META_NAME, export
 from playslot_rl.collectors.journal import SPEC_NAME, Journal, journal_path, read_spec, remove_leftover
 from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.config import CollectorConfig, ExperimentConfig
+from playslot_rl.data.metadata import INFO_NAME, json_content
 from playslot_rl.errors import ConfigError, DataError, OutputError
 from playslot_rl.progress import StageProgress
 from playslot_rl.threads import available_cores
@@ -34,9 +34,9 @@ def is_complete(out: Path, spec: CollectionSpec) -> bool:
     if differs:
         raise OutputError(f"{out} was collected with other settings ({differs}); repeat them or choose another out=")
     try:
-        info = json.loads((out / "meta" / "info.json").read_text())
+        info = json_content(out / INFO_NAME)
         counts = info["total_episodes"], info["total_frames"]
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(
             f"{out}: got no readable meta/info.json ({error}); delete the folder and collect again"
         ) from error

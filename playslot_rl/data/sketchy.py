@@ -30,6 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
+from playslot_rl.data.metadata import LARGEST_PICTURE
 from playslot_rl.errors import ConfigError, DataError, OutputError
 from playslot_rl.progress import quiet_datasets
 from playslot_rl.storage.atomic import write_json
@@ -139,10 +140,12 @@ def _image(path: Path, step: int, example: dict[str, Value], camera: str, size: 
         known = ", ".join(key for key, feature in CAMERAS.items() if feature in example) or "none"
         raise DataError(f"{path}: step {step} has no picture {name}, expected one: it has these cameras: {known}")
     try:
-        with Image.open(io.BytesIO(value[0])) as image:
+        with Image.open(io.BytesIO(value[0]), formats=("JPEG", "PNG")) as image:
+            if image.width * image.height > LARGEST_PICTURE:  # by its header: nothing has been decoded
+                raise OSError(f"{image.width}x{image.height} pixels")
             # The paper resizes whole frames, without a crop; boxes average all pixels, so nothing flickers.
             return np.asarray(image.convert("RGB").resize((size, size), Image.Resampling.BOX))
-    except OSError as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise DataError(f"{path}: step {step}: {name} cannot be decoded, expected a JPEG: download it again") from error
 
 

@@ -153,12 +153,24 @@ def test_a_damaged_record_leaves_nothing(source: Path) -> None:
     refused(source, f"{name_of(2)}: record . has a wrong checksum")
 
 
+def blank(width: int, height: int) -> bytes:
+    """A picture of one colour whose pixels take hundreds of times what its file does."""
+    import io
+
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.new("1", (width, height)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"actions": np.zeros(6)}, "step 1 has 6 values under actions, expected 7"),
         ({"actions": b"x"}, "under actions, expected 7 numbers"),
         ({"pixels/basket_front_left": b"no picture"}, "step 1: pixels/basket_front_left cannot be decoded"),
+        ({"pixels/basket_front_left": blank(9000, 9000)}, "cannot be decoded, expected a JPEG"),
     ],
 )
 def test_timesteps_of_another_layout_are_refused(source: Path, change: dict[str, object], message: str) -> None:
