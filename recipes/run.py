@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import SHIPPED, shipped
+from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import CheckpointError, ConfigError, OutputError
 
 if TYPE_CHECKING:
@@ -92,7 +93,16 @@ def _is_run(folder: Path) -> bool:
             return False
         return isinstance(values, dict) and {"preset", "env", "model"} <= values.keys()
     collected = [*(folder / "data").glob("*/meta/info.json"), *(folder / "data").glob("*.journal")]
-    return bool(collected) or any((folder / known).exists() for known in OURS)
+    stages = {*METHODS, *(stage for method in METHODS.values() for stage in (method.stage, method.model) if stage)}
+    known = any((folder / name).exists() for name in OURS) or any(_is_begun(folder / stage) for stage in stages)
+    return bool(collected) or known
+
+
+def _is_begun(stage: Path) -> bool:
+    """Whether a folder is what a kill leaves of a stage that had not begun to train: empty, or with its lock."""
+    from playslot_rl.training.record import LOCK
+
+    return stage.is_dir() and {path.name for path in stage.iterdir()} <= {LOCK}
 
 
 def open_device(config: ExperimentConfig) -> torch.device:

@@ -66,7 +66,11 @@ class _TensorBoardLogger:
 
         # Its thread prints an error that is raised here, too, at the next entry.
         self._hook, threading.excepthook = threading.excepthook, self._unless_written
-        self._writer: Any = SummaryWriter(str(folder), purge_step=resumed + 1 if resumed else None)
+        try:
+            self._writer: Any = SummaryWriter(str(folder), purge_step=resumed + 1 if resumed else None)
+        except BaseException:
+            threading.excepthook = self._hook
+            raise
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         for name, value in values.items():

@@ -18,6 +18,10 @@ from commands import ONE_CORE, assert_one_line, contents, playslot, refused, smo
 from torch import Tensor
 
 from playslot_rl import cli
+from playslot_rl.config.compose import compose
+from playslot_rl.config.methods import METHODS, method_stage
+from playslot_rl.errors import OutputError
+from playslot_rl.recipes.run import open_run
 from playslot_rl.seeding import StepGenerators
 from playslot_rl.storage.locks import locked
 from playslot_rl.training import record
@@ -163,6 +167,20 @@ def test_a_new_run_is_one_commands_too(
     assert "another command is training" in done.err
     assert json.loads((run / "config.json").read_text())["seed"] == 0
     assert weights(run, "slots") == weights(shared_run, "slots")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_kill_before_the_first_file_of_a_run_leaves_no_foreign_folder(tmp_path: Path, method: str) -> None:
+    for names in ((), ("training.lock",)):
+        out = tmp_path / f"{method}{len(names)}"
+        (out / method_stage(method)).mkdir(parents=True)
+        for name in names:
+            (out / method_stage(method) / name).touch()
+        assert open_run(compose([f"out={out}"])) == out
+        (out / method_stage(method) / "photo.png").touch()
+        if method_stage(method) not in ("slots", "dynamics", "policy"):
+            with pytest.raises(OutputError, match="got a folder that holds something else"):
+                open_run(compose([f"out={out}"]))
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -243,6 +244,24 @@ def test_tensorboard_logs_are_written(tmp_path: Path) -> None:
     assert [event.step for event in events.Scalars("toy/train/loss")] == [1, 2, 4, 6, 8, 10, 12]
     rows = [row for row in History(tmp_path / "metrics.jsonl").read() if row["split"] == "validation"]
     assert [row["step"] for row in rows] == [4, 8, 12]
+
+
+def test_a_disk_that_fills_under_tensorboard_is_raised_and_not_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from tensorboard.summary.writer.record_writer import RecordWriter
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    printed: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", printed.append)
+    monkeypatch.setattr(RecordWriter, "write", full)
+    logging = LoggingConfig(backend="tensorboard", progress=False)
+    with pytest.raises(OSError, match="No space left"):
+        fit(Part("toy", ToyStage(), toy_config()), tmp_path, seed=3, logging=logging)
+    assert printed == []
+    assert threading.excepthook == printed.append
 
 
 def test_a_missing_logging_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
