@@ -147,7 +147,7 @@ class PlayPage:
                 drawn = await self.studio.do(self._paint)
                 self.begun = True  # only now: the mouse needs to know what it points at
             except Exception as error:
-                if self.closed:
+                if self._left():
                     return False  # what it was about is gone
                 self._halt()
                 known = isinstance(error, (PlaySlotError, ValueError))
@@ -278,6 +278,10 @@ class PlayPage:
     async def _start(self, start: Callable[[], Start]) -> bool:
         """Have the session begin at a start, which the worker makes."""
         return await self._work(lambda: self.session.begin(start()), begins=True)
+
+    def _left(self) -> bool:
+        """Whether the client has gone meanwhile."""
+        return self.closed
 
     def close(self) -> None:
         """The client is gone: no more steps; the simulator is freed by the worker."""
