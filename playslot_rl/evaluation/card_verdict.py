@@ -92,7 +92,8 @@ def _words(missing: Sequence[str], known: Mapping[str, Line]) -> str:
     """What is wrong with a group: its first part that has words, and of that the part which is wrong itself."""
     key = next(key for key in missing if key in WORDS)
     deeper = next((g for g in NEEDS.get(key, ()) if not any(_worth(part, known) for part in g)), None)
-    if deeper is not None and key in known and known[key].value is not None and not worthless(key, known[key].value):
+    value = known[key].value if key in known else None
+    if deeper is not None and value is not None and not worthless(key, value):
         return _words(deeper, known)
     return WORDS[key]
 

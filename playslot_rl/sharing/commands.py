@@ -162,7 +162,8 @@ def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
         if not any(key.startswith(f"{one}.") for one in groups) or (group == "data" and key in machine | folders):
             continue
         # Where patience ends a stage, when it looks decides where.
-        looks = name == "validate_every" and getattr(getattr(config, group, None), "patience", 0)
+        stage: Any = getattr(config, group, None)
+        looks = name == "validate_every" and bool(getattr(stage, "patience", 0))
         if (key in free and not looks) or (key in preset and preset[key] == value):
             continue
         if key in folders and value and not shipped(str(value)):
