@@ -73,7 +73,7 @@ class CompareVideoConfig(Checked):
     clips: int = field(default=64, metadata=at_least(2))
     pictures: int = field(default=3, metadata=at_least(1))
     budget_minutes: float = field(default=0.0, metadata=at_least(0, "0 (the preset's steps) or more", YEAR_MINUTES))
-    rates: tuple[float, ...] = field(default=(0.3, 1.0, 3.0), metadata=above_zero())
+    rates: tuple[float, ...] = field(default=(0.3, 1.0, 3.0), metadata=above_zero(largest=1e40))
     trial_steps: int = field(default=150, metadata=at_least(2))
     processes: int = field(default=1, metadata=role("machine") | between(1, 1024, "at least 1, 1024 at most"))
     launcher: str = ""
