@@ -110,7 +110,9 @@ TABLE: Final[dict[str, Row]] = {
          *SMOKE),
         WORLD,
     ),
-    "compare-video": Row(("compare-video", "methods=svg,slotformer", "run=run", VIDEOS, "out=out", *SMOKE), WORLD),
+    "compare-video": Row(
+        ("compare-video", "methods=svg,slotformer", "run=run", VIDEOS, "out=out", *SMOKE), WORLD, passing=("video.md",)
+    ),
     "demo": Row(("demo", "episodes=2", "out=out", *SMOKE), ()),
     "dataset merge": Row(
         ("dataset", "merge", "run/data/random", "run/data/expert", "--out", "out"), quick=3, done=THERE

@@ -35,6 +35,7 @@ def test_every_writing_command_is_in_the_table() -> None:
     assert not typed & NOT_HERE.keys()
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", QUICK)
 def test_killed_at_some_writes_the_same_command_carries_on(lab: Open, name: str) -> None:
     _kill(made := lab(name), made.points()[: TABLE[name].quick])
