@@ -23,6 +23,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 LONGEST = (
     "training/test_several_processes.py",
     "recipes/test_compare_video.py",
+    "faults/test_every_command.py",
     "baselines/online/test_players.py",
     "recipes/test_compare.py",
     "recipes/test_several_processes.py",

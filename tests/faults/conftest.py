@@ -27,15 +27,19 @@ def children(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Children]:
     server.close()
 
 
-@pytest.fixture
-def lab(
-    children: Children, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, worker_id: str
-) -> Callable[..., Lab]:
-    """A row of the table that has run once, undisturbed."""
+@pytest.fixture(scope="session")
+def lab(children: Children, tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Callable[..., Lab]:
+    """A row of the table that has run once, undisturbed; its tests share a folder, unless they name one."""
+    known: dict[str, Lab] = {}
 
     def open_lab(name: str, root: Path | None = None) -> Lab:
-        made = Lab(TABLE[name], children, finished_pipeline(tmp_path_factory, worker_id)[0], root or tmp_path / "work")
+        if root is None and name in known:
+            return known[name]
+        finished = finished_pipeline(tmp_path_factory, worker_id)[0]
+        made = Lab(TABLE[name], children, finished, root or tmp_path_factory.mktemp("lab") / "work")
         made.undisturbed()
+        if root is None:
+            known[name] = made
         return made
 
     return open_lab
