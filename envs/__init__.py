@@ -97,10 +97,11 @@ def task_config(env: EnvConfig | str | None = None) -> EnvConfig:
     if isinstance(env, str):
         default = "", EnvConfig(env)
         return block_ids().get(gym_id(env), default)[1]
-    if not isinstance(env, EnvConfig | None):
+    given: Any = EnvConfig() if env is None else env
+    if not isinstance(given, EnvConfig):
         known = ", ".join(sorted(ENVIRONMENTS))
-        raise ConfigError(f"env: got {type(env).__name__}, expected an EnvConfig or a name, one of {known}")
-    return env or EnvConfig()
+        raise ConfigError(f"env: got {type(given).__name__}, expected an EnvConfig or a name, one of {known}")
+    return given
 
 
 def make_env(env: EnvConfig | str | None = None, render: RenderConfig | None = None) -> gym.Env[Any, Any]:
