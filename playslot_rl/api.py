@@ -28,7 +28,7 @@ from torch import Tensor
 
 from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop, resized
-from playslot_rl.acting.imagination import ImaginationEnv, ImaginationSession, latent_actions
+from playslot_rl.acting.imagination import ImaginationEnv, ImaginationSession, Reward, latent_actions
 from playslot_rl.config import ExperimentConfig, RenderConfig
 from playslot_rl.devices import named_device, probed
 from playslot_rl.errors import CheckpointError, require_type
@@ -334,12 +334,15 @@ class PlaySlot:
         if self._loop is not None:
             self._loop.reset()
 
-    def imagination(self, batch_size: Sequence[int] = (), horizon: int = 0) -> ImaginationEnv:
+    def imagination(
+        self, batch_size: Sequence[int] = (), horizon: int = 0, reward: Reward | None = None
+    ) -> ImaginationEnv:
         """The world model as a TorchRL environment (`playslot_rl.acting.imagination`).
 
         Args:
             batch_size: episodes imagined at once.
             horizon: steps after which an episode is truncated; 0 never does.
+            reward: (..., 1) of the slots (..., N, D) that a step leads to; without there is none.
 
         Examples:
             >>> PlaySlot.untrained().imagination([2]).rollout(3)["slots"].shape
@@ -349,7 +352,8 @@ class PlaySlot:
         sizes = as_numbers(batch_size, "batch_size", "a list of numbers, such as [2]")
         if sizes.ndim != 1 or (sizes < 1).any() or (sizes.numel() and sizes.is_floating_point()):
             raise ValueError(f"batch_size: got {batch_size!r}, expected numbers from 1 on, such as [2]")
-        return ImaginationEnv(self.world_model, batch_size, horizon=horizon, generator=self._generator())
+        generator = self._generator()
+        return ImaginationEnv(self.world_model, batch_size, horizon=horizon, generator=generator, reward=reward)
 
     def session(self) -> ImaginationSession:
         """Imagination step by step: reset from frames or slots, step by latent actions or prototypes, go back."""

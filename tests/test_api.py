@@ -279,3 +279,8 @@ def test_a_device_that_computes_nothing_is_refused(device: str) -> None:
 def test_a_batch_of_imagined_episodes_has_whole_sizes(model: PlaySlot, sizes: object) -> None:
     with pytest.raises(ValueError, match=r"^batch_size: got .*, expected numbers from 1 on"):
         model.imagination(sizes)  # type: ignore[arg-type]
+
+
+def test_imagination_has_the_reward_that_it_is_given(model: PlaySlot) -> None:
+    rollout = model.imagination([2], reward=lambda slots: slots.sum(dim=(-2, -1))[..., None]).rollout(3)
+    torch.testing.assert_close(rollout["next", "reward"][..., 0], rollout["next", "slots"].sum(dim=(-2, -1)))
