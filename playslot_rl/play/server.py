@@ -12,6 +12,8 @@ from playslot_rl.play.gate import HOST, Gate, GateMiddleware
 from playslot_rl.play.studio import Studio
 
 DEFAULT_PORT: Final = 8080
+PATIENCE_S: Final = 10.0
+"""Seconds after which a browser that does not answer has gone: a busy machine, or an import, may take some."""
 TRIED: Final = 20
 """Ports looked at from the default one on."""
 
@@ -112,6 +114,7 @@ def serve(studio: Studio, gate: Gate, show: bool) -> None:
                 reload=False,
                 show_welcome_message=False,
                 message_history_length=200,
+                reconnect_timeout=PATIENCE_S,
             )
     except SystemExit as error:  # the web server's, which has said why
         if error.code:
