@@ -28,6 +28,7 @@ from playslot_rl import keys
 from playslot_rl.config import EnvConfig, ModelConfig, from_dict, to_dict
 from playslot_rl.data.action_limits import said, scaled
 from playslot_rl.data.metadata import json_content
+from playslot_rl.envs import RECORDED
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_json, write_text
 from playslot_rl.storage.folders import new_folder
@@ -46,7 +47,7 @@ LICENCE: Final = "apache-2.0"
 TAGS: Final = ("robotics", "lerobot", TYPE)
 
 OURS: Final = ("env", "model", "resize", "stride", "fps", "fingerprint", "source", "actions")
-"""Keys of `config.json` that LeRobot does not know; `actions` only where they have a range of their own."""
+"""Keys of `config.json` that LeRobot does not know; `actions` only where they may have a range of their own."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ class SharedPolicyConfig:
             "fps": self.fps,
             "fingerprint": self.fingerprint,
             "source": self.source,
-            **({"actions": self.actions} if self.actions else {}),
+            **({"actions": self.actions} if self.actions or self.env.name in RECORDED else {}),
         }
 
     @classmethod
@@ -168,6 +169,8 @@ def read_config(folder: Path) -> SharedPolicyConfig:
         for name, stated, made in zip(("in", "out"), _shapes(values), _shapes(config.to_lerobot()), strict=True):
             if stated != made:
                 raise ValueError(f"{name}put_features: got shapes {stated}, but env and model are of {made}")
+        if config.env.name in RECORDED and "actions" not in ours:
+            raise ValueError("got a policy that clips the robot's actions to [-1, 1]: train it again")
         return config
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)

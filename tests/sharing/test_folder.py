@@ -176,6 +176,20 @@ def test_a_policy_exported_by_the_first_version_loads_and_acts_as_then(tmp_path:
     assert (tmp_path / "again" / weights).read_bytes() == (OLD / weights).read_bytes()
 
 
+def test_a_recordings_policy_of_an_earlier_version_is_refused(
+    agent: Agent, config: SharedPolicyConfig, folder: Path, tmp_path: Path
+) -> None:
+    robots = tmp_path / "robots"
+    save_pretrained(agent, robots, replace(config, env=replace(config.env, name="video")), lambda _: "")
+    assert load_pretrained(robots)[1].actions == {}, "actions in [-1, 1] are known to be so"
+    values = json.loads((robots / "config.json").read_text())
+    del values["actions"]
+    (robots / "config.json").write_text(json.dumps(values))
+    with pytest.raises(CheckpointError, match=r"clips the robot's actions to \[-1, 1\]: train it again"):
+        load_pretrained(robots)
+    assert "actions" not in json.loads((folder / "config.json").read_text())
+
+
 def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="no such folder"):
         load_pretrained(tmp_path / "none")
