@@ -103,7 +103,9 @@ TABLE: Final[dict[str, Row]] = {
     "evaluate in imagination": Row(("evaluate", "run=run", "protocol=imagination", "episodes=2", *ONE_CORE), ALL),
     "inspect": Row(("inspect", "run=run", VIDEOS, "episodes=4", *ONE_CORE), ALL),
     "plan": Row(
-        ("plan", "run=run", "planner=cem", "goals=ahead", "plan.seconds=0.2", "episodes=1", *ONE_CORE), ALL
+        ("plan", "run=run", "planner=cem", "goals=ahead", "plan.seconds=0.2", "episodes=1", *ONE_CORE),
+        ALL,
+        passing=("run/planning/",),  # a search by the clock
     ),
     "export": Row(("export", "run=run", "out=out", *ONE_CORE), ALL, quick=3),
     "pipeline": Row(("pipeline", "episodes=2", "out=out", *SMOKE), (), heavy=True),
