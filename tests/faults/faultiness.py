@@ -11,6 +11,7 @@ import os
 import resource
 import signal
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,8 @@ class Faults:
     def __init__(self, root: Path, asked: dict[str, Any]) -> None:
         self.root, self.asked = str(root.resolve()) + os.sep, asked
         self.seen: list[tuple[str, str]] = []
-        self._busy = False
+        self._ended = False
+        self._inside = threading.local()  # another thread's write hides none of this one's
 
     def begin(self) -> None:
         """Set everything up."""
@@ -48,7 +50,7 @@ class Faults:
 
     def end(self, place: Path, modules: list[str]) -> None:
         """The command has ended: say what it wrote and imported, or die before anybody hears that it has."""
-        self._busy = True
+        self._ended = True
         if not self.asked:
             (place / WRITES).write_text(json.dumps(self.seen))
             (place / "modules.json").write_text(json.dumps(modules))
@@ -57,15 +59,15 @@ class Faults:
 
     def _hook(self, event: str, arguments: tuple[Any, ...]) -> None:
         kind = "made" if event == "open" and _to_write(*arguments[1:3]) else EVENTS.get(event)
-        if kind is None or self._busy:
+        if kind is None or self._ended or getattr(self._inside, "hook", False):
             return
-        self._busy = True
+        self._inside.hook = True
         try:
             path = _path(event, arguments)
             if path.startswith(self.root):
                 self._at(kind, path)
         finally:
-            self._busy = False
+            self._inside.hook = False
 
     def _at(self, kind: str, path: str) -> None:
         number = len(self.seen)

@@ -81,7 +81,7 @@ def _any_set(root: Path) -> None:
 
 
 TABLE: Final[dict[str, Row]] = {
-    "collect": Row(("collect", "env=grid_shapes", "episodes=3", "out=out", *SMOKE), (), quick=3),
+    "collect": Row(("collect", "env=grid_shapes", "episodes=3", "out=out", *SMOKE), ()),
     "collect a simulator": Row(("collect", "policy=expert", "episodes=2", "out=out", *SMOKE), (), heavy=True),
     "convert": Row(
         ("convert", "env=sketchy", "data.root=download", "out=out", *ONE_CORE), (), prepare=_download, done=THERE

@@ -10,6 +10,7 @@ import multiprocessing
 import re
 import signal
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -53,6 +54,11 @@ def finished_pipeline(tmp_path_factory: pytest.TempPathFactory, worker_id: str) 
     done = Done(**json.loads(said.read_text()))
     assert done.code == 0, done.err
     return run, done
+
+
+def instead(first: Sequence[object], *later: object) -> list[object]:
+    """Arguments, each key once: a later one takes the place of an earlier one."""
+    return list({str(argument).partition("=")[0]: argument for argument in (*first, *later)}.values())
 
 
 def smoke(command: str, *arguments: object) -> Done:

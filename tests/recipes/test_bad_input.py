@@ -178,7 +178,7 @@ def test_a_run_with_stages_of_its_own_takes_no_others(
         ("train-slots", "seed=1", "seed: got 1, expected 0"),
         ("train-dynamics", "model.predictor.dim=64", "model.predictor.dim: got 64, expected 32"),
         ("train-dynamics", "dynamics.optim.lr=1", "dynamics.optim.lr: got 1.0, expected 0.001"),
-        ("train-policy", "behaviour.labelled_demos=2", "policy.labelled_demos: got 2, expected 3"),
+        ("train-policy", "behaviour.labelled_demos=2", "behaviour.labelled_demos: got 2, expected 3"),
         ("train-policy", "model.policy.dim=64", "model.policy.dim: got 64, expected 32"),
     ],
 )

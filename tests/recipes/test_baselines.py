@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import ONE_CORE, contents, killed_at_first_checkpoint, refused, smoke, weights
+from commands import ONE_CORE, contents, instead, killed_at_first_checkpoint, refused, smoke, weights
 
 from playslot_rl.config import to_dict
 from playslot_rl.config.compose import compose
@@ -68,7 +68,7 @@ def test_a_finished_slot_oracle_does_not_ask_for_what_it_has_none_of(
     again = _command("slot_oracle", shared_run, run, "demos=4")
     done = smoke(*again, "behaviour.finetune_steps=7", "behaviour.decoder_steps=9", "behaviour.labelled_demos=1")
     assert "slot_oracle: finished before" in done.out
-    refused(*again, "behaviour.whiten=false", message="slot_oracle.whiten: got False, expected True")
+    refused(*again, "behaviour.whiten=false", message="behaviour.whiten: got False, expected True")
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -108,7 +108,7 @@ def test_a_threshold_that_leaves_nothing_is_refused_before_anything_is_trained(
     shared_run: Path, tmp_path: Path, method: str
 ) -> None:
     key = "behaviour.trim" if method == "slot_oracle" else "behaviour.trim_pixels"
-    refused(*_command(method, shared_run, tmp_path / "x", f"{key}=1"),
+    refused(*instead(_command(method, shared_run, tmp_path / "x"), f"{key}=1"),
             message=rf"{key}: got 1, which leaves none of \d+ transitions, expected less than")  # fmt: skip
     assert not (tmp_path / "x").exists()
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import ONE_CORE, Done, assert_one_line, contents, playslot
+from commands import ONE_CORE, Done, assert_one_line, contents, instead, playslot
 
 from playslot_rl.comparison.launch import comparison_lock
 from playslot_rl.config.compare import LAUNCHERS
@@ -166,7 +166,7 @@ def test_what_cannot_be_compared_is_refused_before_anything_is_computed(
     shared_run: Path, tmp_path: Path, typed: str, message: str, code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(LAUNCHERS, "ray", "a_module_that_is_not_installed")
-    done = playslot(*_arguments(shared_run, tmp_path / "out", "methods=playslot"), typed)
+    done = playslot(*map(str, instead(_arguments(shared_run, tmp_path / "out", "methods=playslot"), typed)))
     assert done.code == code
     assert_one_line(done.err, "compare")
     assert message in done.err

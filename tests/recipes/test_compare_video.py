@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import contents, playslot, refused, run_jobs_here, smoke
+from commands import contents, instead, playslot, refused, run_jobs_here, smoke
 
 from playslot_rl.comparison.launch import sweep_command
 from playslot_rl.comparison.video_plan import VideoJob, in_steps, video_job_config
@@ -270,7 +270,7 @@ def test_numbers_of_objects_have_one_table(tmp_path: Path) -> None:
 def test_what_cannot_be_varied_is_refused(tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
     out = tmp_path / "out"
     first = ("compare-video", "env=button_press", "methods=playslot", f"out={out}")
-    refused(*first, *arguments, message=message)
+    refused(*instead(first, *arguments), message=message)
     assert not out.exists()
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from commands import killed_at_first_checkpoint
+from commands import instead, killed_at_first_checkpoint
 
 from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.baselines.dreamer.actor import load_actor
@@ -95,7 +95,7 @@ def test_a_run_without_an_actor_is_refused(tmp_path: Path) -> None:
 def test_what_cannot_be_learned_from_is_refused_before_anything_is_written(
     tmp_path: Path, override: str, message: str
 ) -> None:
-    config = compose([*SMOKE, f"out={tmp_path / 'run'}", override])
+    config = compose(list(map(str, instead(SMOKE, f"out={tmp_path / 'run'}", override))))
     with pytest.raises(ConfigError, match=message):
         online.main(config)
     assert not (tmp_path / "run").exists()

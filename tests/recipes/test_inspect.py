@@ -86,7 +86,9 @@ def test_a_shipped_model_is_inspected_into_a_run_of_its_own(tmp_path: Path, vide
     assert written(tmp_path / "new")["run"] == "pretrained"
     smoke("inspect", *arguments)  # into the same one
     refused("inspect", "run=pretrained", f"data.root={videos}", message="out: got nothing, expected")
-    refused("inspect", "run=pretrained", f"data.root={videos}", f"out={videos}", message="holds something else")
+    refused(
+        "inspect", "run=pretrained", f"data.root={videos}", f"out={videos}", message="got a place inside the data set"
+    )
 
 
 def test_the_report_says_how_to_make_a_card_that_is_missing(run: Path) -> None:

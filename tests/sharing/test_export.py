@@ -196,7 +196,7 @@ def test_a_folder_that_another_export_or_a_damage_left_is_refused(run: Path, tmp
     out = tmp_path / "press"
     exported(run, out)
     command = ("export", f"run={run}", f"out={out}")
-    refused(*command, "data.camera=observation.images.top", message="got another policy, expected a new folder")
+    refused(*command, "data.camera=top", message="has no such camera, expected one of: observation.images.front")
     refused(*command, "data.resize=true", message="got another policy, expected a new folder")
     (out / "policy_postprocessor.json").unlink()
     refused(*command, message="policy_postprocessor.json is missing, expected a whole policy")
