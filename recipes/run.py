@@ -77,7 +77,9 @@ def open_run(config: ExperimentConfig) -> Path:
         raise ConfigError("out: got nothing, expected the run folder to write, such as out=runs/first")
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"out={folder}: got a file, expected a folder: choose another out=")
-    if folder.is_dir() and any(folder.iterdir()) and not _is_run(folder):
+    # A process killed while it wrote the first file leaves its temporary name, which the next one takes.
+    found = [path for path in folder.iterdir() if ".config.json.tmp-" not in path.name] if folder.is_dir() else []
+    if found and not _is_run(folder):
         raise OutputError(f"out={folder}: got a folder that holds something else, expected a run: choose another out=")
     return folder
 

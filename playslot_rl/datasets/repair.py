@@ -7,8 +7,10 @@ are made anew from the rows and frames. A parquet file without a footer cannot b
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,7 @@ from playslot_rl.datasets.statistics import differing
 from playslot_rl.datasets.verify import LOOSE_CAMERA, Verification, episode_statistics, verify
 from playslot_rl.datasets.video_copy import frame_count
 from playslot_rl.errors import DataError, OutputError
-from playslot_rl.storage.atomic import explain_write_errors, fsync_folder
+from playslot_rl.storage.atomic import alone, explain_write_errors, fsync_folder
 from playslot_rl.storage.folders import new_folder, require_free
 
 JOURNAL_SUFFIX = ".journal"
@@ -75,13 +77,18 @@ def repair(root: str | Path, out: str | Path | None = None) -> RepairResult:
 
     Raises:
         DataError: there is no whole episode, or no metadata to begin with.
-        OutputError: `out` exists, or the disk is full.
+        OutputError: `out` exists, another command repairs in the same place, or the disk is full.
     """
     folder = Path(root)
-    if out is None:
-        _undo_half_rename(folder)
-    else:
+    if out is not None:
         require_free(Path(out), "--out ")
+        return _repair(folder, Path(out))
+    _undo_half_rename(folder)
+    with _held(folder):
+        return _repair(folder, None)
+
+
+def _repair(folder: Path, out: Path | None) -> RepairResult:
     before = verify(folder)
     journal = folder.with_name(folder.name + JOURNAL_SUFFIX)
     beside = journal if journal.is_dir() else None
@@ -95,8 +102,8 @@ def repair(root: str | Path, out: str | Path | None = None) -> RepairResult:
         more = f"; {_journal_note(beside)}" if beside else "; record it again"
         raise DataError(f"{folder}: got no whole episode to restore ({(lost or before.errors)[0]}), expected one{more}")
     stated = int(contents.info["total_episodes"])
-    repaired = Path(out) if out is not None else folder.with_name(f"{folder.name}.repaired")
-    with new_folder(repaired, key="--out ") as temporary:
+    repaired = _beside(folder) if out is None else out
+    with new_folder(repaired, replace=out is None, key="--out ") as temporary:
         assemble([choice], temporary, "playslot dataset repair")
         result = verify(temporary)
         if not result.ok:
@@ -109,7 +116,11 @@ def repair(root: str | Path, out: str | Path | None = None) -> RepairResult:
     damaged = _free_name(folder)
     with explain_write_errors(folder):
         folder.rename(damaged)
-        repaired.rename(folder)
+        try:
+            repaired.rename(folder)
+        except FileNotFoundError:
+            if not folder.is_dir():  # else another command, which took this one for killed, has done it
+                raise
         fsync_folder(folder.absolute().parent)
     return RepairResult(folder, result, stated, tuple(lost), damaged, beside)
 
@@ -123,9 +134,29 @@ def _journal_note(journal: Path) -> str:
 
 def _undo_half_rename(folder: Path) -> None:
     """A kill between the two renames left no `folder`, but the repaired one beside it."""
-    repaired = folder.with_name(f"{folder.name}.repaired")
+    repaired = _beside(folder)
     if not folder.exists() and repaired.is_dir() and verify(repaired).ok:
         repaired.rename(folder)
+
+
+@contextlib.contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Keep other commands from repairing a data set in its place inside the block."""
+    if not folder.is_dir():
+        yield  # whoever reads it says so
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        if not alone(handle):
+            raise OutputError(f"{folder}: another command repairs it, expected none: wait for that one to end")
+        yield
+    finally:
+        os.close(handle)
+
+
+def _beside(folder: Path) -> Path:
+    """Where the repaired one waits for its place; nobody else's name, so that what a kill left there is replaced."""
+    return folder.with_name(f".{folder.name}.repaired")
 
 
 def _free_name(folder: Path) -> Path:

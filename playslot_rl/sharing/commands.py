@@ -92,7 +92,11 @@ def _from_nothing(config: ExperimentConfig, source: Mapping[str, Any]) -> list[s
     first = [f"demos={demos}"] if demos is not None and demos != episodes else []
     if not source.get("shipped_world_model"):
         world = source.get("world_model_seed", seed)
-        if world in (None, seed) and not first:
+        whole = demos is None or episodes in (
+            demos,
+            demos + config.data.held_out,
+        )  # what the pipeline itself keeps apart
+        if world in (None, seed) and whole:
             return [_line("pipeline", *base, *seeded, *changes(config, GROUPS), f"out={RUN}")]
         collected = f"data.demos={WORLD}/data/expert"
         return [

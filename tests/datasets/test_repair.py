@@ -190,8 +190,16 @@ def test_without_metadata_or_of_another_version_it_says_so(broken: Path) -> None
         repair(broken)
 
 
+def test_a_kill_before_the_first_rename_is_no_obstacle(broken: Path, images: Path) -> None:
+    shutil.copytree(images, broken.with_name(".broken.repaired"))
+    (broken / "meta" / "stats.json").unlink()
+    assert repair(broken).damaged == broken.with_name("broken.damaged")
+    assert verify(broken).ok
+    assert not broken.with_name(".broken.repaired").exists()
+
+
 def test_a_kill_between_the_two_renames_is_finished_by_the_next_repair(broken: Path, images: Path) -> None:
-    shutil.copytree(images, broken.with_name("broken.repaired"))
+    shutil.copytree(images, broken.with_name(".broken.repaired"))
     broken.rename(broken.with_name("broken.damaged"))
     assert "nothing to repair" in repair(broken).lines()[0]
     assert verify(broken).ok

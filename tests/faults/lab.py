@@ -79,6 +79,9 @@ class Lab:
     def assert_whole(self, what: object) -> None:
         """Everything is there, and nothing else."""
         found = contents(self.root, self.row.passing)
+        if self.row.clocked:
+            assert not [name for name in found if ".tmp-" in name or name.endswith(".journal")], what
+            return
         wrong = {name for name in found.keys() | self.whole.keys() if found.get(name) != self.whole.get(name)}
         assert not wrong, (what, {name: (self.whole.get(name), found.get(name)) for name in sorted(wrong)})
 

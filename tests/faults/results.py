@@ -16,6 +16,7 @@ TIMES = re.compile(r"(^|_)(seconds|began|started|ended|time|used|pulled|created|
 OF_THE_DAY = ("command", "commit", "machine")
 SPENT = re.compile(r"\b\d+(\.\d+)? ?(s|ms|min|h|seconds|minutes)\b")
 PASSING = (".lock", ".log")
+"""Names of a fingerprint's cache are made of times, too."""
 
 
 def contents(root: Path, passing: Iterable[str] = ()) -> dict[str, str]:
@@ -28,7 +29,7 @@ def contents(root: Path, passing: Iterable[str] = ()) -> dict[str, str]:
     found = {}
     for path in sorted(root.rglob("*")):
         name = str(path.relative_to(root))
-        if "/logs/" in f"/{name}/" or path.suffix in PASSING:
+        if "/logs/" in f"/{name}/" or "cache/fingerprints/" in name or path.suffix in PASSING:
             continue
         if path.is_dir():
             found[name] = "folder"

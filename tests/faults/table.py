@@ -24,6 +24,7 @@ class Row:
         passing: parts of names whose content depends on the day.
         prepare: puts more into the work folder.
         heavy: it takes long; fewer faults are enough, as its parts have rows of their own.
+        clocked: how much it trains depends on the clock: what it leaves is only looked through for what is half-made.
         done: what the same command answers in one line where it is finished; empty ends with 0.
     """
 
@@ -33,6 +34,7 @@ class Row:
     passing: tuple[str, ...] = ()
     prepare: Callable[[Path], object] = lambda root: None
     heavy: bool = False
+    clocked: bool = False
     done: str = ""
 
     def lay(self, root: Path, finished: Path) -> None:
@@ -113,8 +115,8 @@ TABLE: Final[dict[str, Row]] = {
         ("adopt", "data.root=any", "out=out", "minutes=0.02", "adopt.slots=[2,3]", "adopt.prototypes=4", *SMOKE),
         (),
         prepare=_any_set,
-        passing=("adopt.json",),
         heavy=True,
+        clocked=True,
     ),
     "compare": Row(
         ("compare", "methods=slot_oracle,lapo", "demos=2", "seeds=0", "run=run", VIDEOS, DEMOS, "episodes=2", "out=out",
