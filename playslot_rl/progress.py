@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import sys
 import time
 from collections.abc import Iterator, Mapping
 from types import TracebackType
 from typing import Any, Final, Literal, Self
 
+PICTURE_WRITER: Final = "lerobot.datasets.image_writer"
 PLAIN_EVERY_S: Final = 10.0
 """Seconds between lines where no number of steps is given."""
 
@@ -98,13 +100,18 @@ class StageProgress:
 
 @contextlib.contextmanager
 def quiet_datasets() -> Iterator[None]:
-    """Without the progress bar that `datasets` draws for every episode."""
+    """Without the progress bar that `datasets` draws for every episode, and without LeRobot's line about a picture that
+    cannot be written: the episode that lacks it cannot be saved.
+    """
     import datasets
 
-    shown = datasets.utils.logging.is_progress_bar_enabled()
+    shown, pictures = datasets.utils.logging.is_progress_bar_enabled(), logging.getLogger(PICTURE_WRITER)
     datasets.disable_progress_bars()
+    level = pictures.level
+    pictures.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
+        pictures.setLevel(level)
         if shown:
             datasets.enable_progress_bars()

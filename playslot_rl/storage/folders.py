@@ -108,7 +108,7 @@ def _made(temporary: Path) -> int:
 
 
 def remove_leftovers(final: Path) -> None:
-    """Remove what processes that were killed while they made `final` have left."""
+    """Remove what processes that were killed while they made `final` have left; its name may be a pattern."""
     for leftover in final.parent.glob(f".{final.name}.tmp-*"):
         with contextlib.suppress(OSError):
             handle = os.open(leftover, os.O_RDONLY)

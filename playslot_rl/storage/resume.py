@@ -23,7 +23,7 @@ from playslot_rl.config.plain import flatten
 from playslot_rl.config.spelling import typed_key
 from playslot_rl.errors import CheckpointError, OutputError
 from playslot_rl.storage.atomic import write_json
-from playslot_rl.storage.folders import new_folder
+from playslot_rl.storage.folders import new_folder, remove_leftovers
 from playslot_rl.storage.tensors import load_into, load_modules, load_tensors, module_tensors, save_tensors
 
 FORMAT = "playslot_rl.training/1"
@@ -185,9 +185,8 @@ class TrainingCheckpoints:
         """
         if self.folder.exists() and not self.folder.is_dir():
             raise OutputError(f"{self.folder} is a file, expected a folder of checkpoints: use another out=")
-        # A killed process leaves its unfinished folder; no one else writes here.
-        for leftover in self.folder.glob(".step_*.tmp-*"):
-            shutil.rmtree(leftover, ignore_errors=True)
+        # A killed process leaves its unfinished folder; that of one that is writing is left alone.
+        remove_leftovers(self.folder / "step_*")
         last = self.last()
         if last is None:
             return None

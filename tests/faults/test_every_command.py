@@ -75,7 +75,7 @@ def test_a_disk_that_fills_while_a_command_writes_is_one_line(lab: Open, name: s
         made = lab(name, disk / "work")
         for share in (0.5,) if TABLE[name].heavy else (0.2, 0.9):
             made.lay()
-            room = int(made.size * share)
+            room = int(max(0, made.size) * share)
             (disk / "ballast").write_bytes(bytes(max(0, _free(disk) - room)))
             made.refuses_or_ends(f"{share:.0%} of the room", after=(disk / "ballast").unlink)
 

@@ -19,6 +19,7 @@ from toy_stage import ToyStage, toy_config, train
 import playslot_rl.storage.resume as resume_module
 from playslot_rl.config import LoggingConfig
 from playslot_rl.errors import CheckpointError, ConfigError, OutputError, TrainingError
+from playslot_rl.storage.atomic import alone
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.logging import History
@@ -103,6 +104,20 @@ def test_what_a_kill_left_half_written_is_removed(tmp_path: Path) -> None:
     assert start == 0
     assert not leftover.exists()
     assert all(row["step"] <= 12 for row in History(tmp_path / "metrics.jsonl").read())
+
+
+def test_what_another_process_is_writing_is_left_alone(tmp_path: Path) -> None:
+    written = tmp_path / "checkpoints" / ".step_00000099.tmp-0123"
+    written.mkdir(parents=True)
+    handle = os.open(written, os.O_RDONLY)
+    assert alone(handle)
+    try:
+        train(tmp_path)
+        assert written.exists()
+    finally:
+        os.close(handle)
+    train(tmp_path)
+    assert not written.exists()
 
 
 def test_a_finished_stage_is_not_trained_again(tmp_path: Path) -> None:
