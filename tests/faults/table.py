@@ -88,7 +88,7 @@ TABLE: Final[dict[str, Row]] = {
     "convert": Row(
         ("convert", "env=sketchy", "data.root=download", "out=out", *ONE_CORE), (), prepare=_download, done=THERE
     ),
-    "train-slots": Row(("train-slots", VIDEOS, "out=out", *SMOKE), quick=3),
+    "train-slots": Row(("train-slots", VIDEOS, "out=out", *SMOKE)),
     "train-dynamics": Row(("train-dynamics", "run=run", VIDEOS, *ONE_CORE), ("config.json", "data", "slots")),
     "train-policy": Row(("train-policy", "run=run", DEMOS, *ONE_CORE), WORLD),
     "train-baseline svg": Row(("train-baseline", "method=svg", VIDEOS, "out=out", *SMOKE)),
