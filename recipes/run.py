@@ -78,7 +78,8 @@ def open_run(config: ExperimentConfig) -> Path:
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"out={folder}: got a file, expected a folder: choose another out=")
     # A process killed while it wrote the first file leaves its temporary name, which the next one takes.
-    found = [path for path in folder.iterdir() if ".config.json.tmp-" not in path.name] if folder.is_dir() else []
+    begun = tuple(f".{name}.tmp-" for name in ("config.json", *OURS))
+    found = [path for path in folder.iterdir() if not path.name.startswith(begun)] if folder.is_dir() else []
     if found and not _is_run(folder):
         raise OutputError(f"out={folder}: got a folder that holds something else, expected a run: choose another out=")
     return folder

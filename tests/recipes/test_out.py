@@ -10,6 +10,9 @@ from pathlib import Path
 import pytest
 from commands import assert_one_line, contents, playslot
 
+from playslot_rl.config.compose import compose
+from playslot_rl.errors import OutputError
+
 COMMANDS = [
     "collect", "convert", "train-slots", "train-dynamics", "train-policy", "train-baseline", "evaluate", "inspect",
     "plan", "export", "play", "pipeline", "adopt", "compare", "compare-video", "demo",
@@ -160,3 +163,18 @@ def test_a_parent_that_is_read_only_is_one_line(
     assert_one_line(done.err, command)
     assert "expected a writable folder" in done.err
     assert list(closed.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("left", "ours"), [(".config.json.tmp-0", True), (".adopt.json.tmp-1", True), (".x.tmp-0", False)]
+)
+def test_what_a_kill_in_a_runs_first_file_left_is_nobody_elses(tmp_path: Path, left: str, ours: bool) -> None:
+    from playslot_rl.recipes.run import open_run
+
+    (tmp_path / left).write_text("{")
+    config = compose(["preset=smoke", f"out={tmp_path}"])
+    if ours:
+        assert open_run(config) == tmp_path
+    else:
+        with pytest.raises(OutputError, match="holds something else"):
+            open_run(config)
