@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from playslot_rl.config import EnvConfig, ExperimentConfig, RenderConfig, from_dict
+from playslot_rl.config.plain import nearest
 from playslot_rl.envs import PROCEDURAL, gym_id
 from playslot_rl.episode_seeds import EPISODES, LARGEST_SEED, episode_seed
 from playslot_rl.errors import ConfigError
@@ -51,8 +51,7 @@ class CollectionSpec:
                 width than the environment's, too few or too many episodes or steps, or a seed beyond 32 bits.
         """
         if policy not in OFFSETS:
-            near = difflib.get_close_matches(policy, OFFSETS, n=1)
-            hint = f"; did you mean policy={near[0]}?" if near else "; choose one of these"
+            hint = nearest(policy, OFFSETS, "policy=") or "; choose one of these"
             raise ConfigError(f"unknown policy: got {policy!r}, expected one of {', '.join(sorted(OFFSETS))}{hint}")
         if config.env.name not in PROCEDURAL:
             from playslot_rl.envs import pixel_task

@@ -6,10 +6,10 @@ loaded when first used.
 
 from __future__ import annotations
 
-import difflib
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
+from playslot_rl.config.plain import nearest
 from playslot_rl.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -82,8 +82,7 @@ def gym_id(name: str) -> str:
         known = ", ".join(sorted(ENVIRONMENTS))
         raise ConfigError(f"env={name}: got an environment without a simulator, expected one of {known}")
     if name not in ENVIRONMENTS:
-        near = difflib.get_close_matches(name, ENVIRONMENTS, n=1)
-        hint = f"; did you mean env={near[0]}?" if near else "; choose one of these"
+        hint = nearest(name, ENVIRONMENTS, "env=") or "; choose one of these"
         raise ConfigError(f"unknown environment: got {name!r}, expected one of {', '.join(sorted(ENVIRONMENTS))}{hint}")
     return ENVIRONMENTS[name][0]
 

@@ -98,7 +98,9 @@ def check_torch(device: str = "") -> Check:
     try:
         import torch
 
-        name = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        from playslot_rl.devices import named_device
+
+        name = str(named_device(device))
         total = float(torch.ones(8, 8, device=name).matmul(torch.ones(8, 8, device=name)).sum())
     except Exception as error:  # noqa: BLE001  a broken torch fails with whatever its libraries raise
         return Check("torch", "FAIL", _one_line(error), "choose device=cpu" if device else _REINSTALL)
