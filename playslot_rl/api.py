@@ -72,14 +72,13 @@ def load(run: str | Path = "pretrained", device: str = "", seed: int = 0) -> Pla
     if is_model_folder(Path(run)):
         return PlaySlot.from_pretrained(run, device, seed=seed)
     target = probed(named_device(device))
-    resize = stored_view(run).resize
     if not (checkpoint_folder(run_folder(run), "policy") / "meta.json").is_file():
-        return PlaySlot(load_world_model(run, target), None, seed, resize)
+        return PlaySlot(load_world_model(run, target), None, seed, stored_view(run).resize)
     from playslot_rl.sharing.run import described
 
-    agent = load_agent(run, target)
-    model = PlaySlot(agent.world_model, agent, seed, resize)
-    model._policy = described(run)
+    agent, policy = load_agent(run, target), described(run)
+    model = PlaySlot(agent.world_model, agent, seed, policy.resize)
+    model._policy = policy
     return model
 
 

@@ -146,12 +146,13 @@ def _run(name: str, options: argparse.Namespace) -> int:
     from playslot_rl.envs.rendering import import_mujoco
     from playslot_rl.storage.folders import require_outside
 
-    read = [root.path for text in (config.data.root, config.data.demos) for root in data_roots(text)]
-    written = {"out=": config.out, "data.cache=": config.data.cache, "--json ": getattr(options, "json", None)}
-    for key, place in written.items():
+    roots = [root.path for text in (config.data.root, config.data.demos) for root in data_roots(text)]
+    read = [root for root in roots if not is_remote(root)]
+    for key, place in (("out=", config.out), ("data.cache=", config.data.cache)):
         if place and place != config.run:
-            local = [root for root in read if not is_remote(root)]
-            require_outside(place, local, key, "file" if key == "--json " else "folder")
+            require_outside(place, read, key)
+    if getattr(options, "json", None):
+        require_outside(options.json, read, "--json ", "file")
     if processes.launched().world > 1:
         processes.start(config.device)
     import_mujoco()  # torchrl imports it too, and would fail without our cure

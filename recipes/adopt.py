@@ -227,5 +227,5 @@ def _chosen_prototypes(
 
 
 def _timed(config: ExperimentConfig, stage: str, trials: Path) -> Choice:
-    seconds = seconds_a_step(config, stage, trials / f"time_{stage}_{config.model.savi.n_slots}", config.minutes)
+    seconds = seconds_a_step(config, stage, trials / f"time_{stage}_{config.model.savi.n_slots}")
     return Choice(max(1, round(1000 * seconds)), "measured here, the first steps included")

@@ -64,14 +64,13 @@ def scheduled(config: ExperimentConfig, stage: str, steps: int, patience: int = 
     return replace(config, **{stage: replace(own, **changes)})
 
 
-def seconds_a_step(config: ExperimentConfig, stage: str, out: Path, minutes: float) -> float:
-    """Seconds that a step takes, measured in a small part of `minutes`; nothing else of that training is kept."""
+def seconds_a_step(config: ExperimentConfig, stage: str, out: Path) -> float:
+    """Seconds that a step takes, measured in a small part of the minutes; nothing else of that training is kept."""
     from playslot_rl.recipes import train_dynamics, train_slots
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
     from playslot_rl.training.pace import Pace
 
-    pace = Pace(60 * minutes * TIMED_SHARE, FEWEST_TIMED)
-
+    pace = Pace(60 * config.minutes * TIMED_SHARE, FEWEST_TIMED)
     timed = scheduled(config, stage, TIMED_STEPS)
     once: dict[str, Any] = {"validate_every": TIMED_STEPS, "checkpoint_every": TIMED_STEPS}
     if stage == "dynamics":  # steps with a teacher are much cheaper than rollouts

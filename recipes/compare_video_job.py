@@ -95,16 +95,16 @@ def _trial(job: VideoJob, config: ExperimentConfig, rate: float, steps: int, pro
 
     config = in_steps(config, job.method, steps)
     own = training_of(config, job.method)
-    out = job.trial(rate)
+    out, failed = job.trial(rate), {"rate": rate, "psnr": None, "seconds_a_step": None}
     changes: dict[str, Any] = {"checkpoint_every": steps, "validate_every": steps}
     try:
         changes["optim"] = replace(own.optim, lr=own.optim.lr * rate)
     except ValueError as error:  # beyond the bounds of a rate
-        return {"rate": rate, "psnr": None, "seconds_a_step": None, "error": str(error)}
+        return failed | {"error": str(error)}
     try:
         _train(job, replace(with_training(config, job.method, **changes), out=str(out)), processes)
     except TrainingError as error:
-        return {"rate": rate, "psnr": None, "seconds_a_step": None, "error": str(error)}
+        return failed | {"error": str(error)}
     done = read_stage(checkpoint_folder(out, job.stage), job.stage)
     return {
         "rate": rate,

@@ -14,6 +14,7 @@ def main(config: ExperimentConfig) -> None:
         ConfigError: another environment, no `data.root` or `out`, or an unknown camera.
         DataError, OutputError: see `playslot_rl.data.sketchy.convert_sketchy`.
     """
+    from playslot_rl.data.camera_names import camera_list
     from playslot_rl.data.sketchy import PAPER_CAMERAS, convert_sketchy
 
     if config.env.name != "sketchy":
@@ -21,7 +22,7 @@ def main(config: ExperimentConfig) -> None:
     for name, value in (("data.root", config.data.root), ("out", config.out)):
         if not value:
             raise ConfigError(f"{name}: got nothing, expected a folder, such as {name}=data/sketchy")
-    cameras = [name.strip() for name in config.data.camera.split(",") if name.strip()] or PAPER_CAMERAS
+    cameras = camera_list(config.data.camera) or PAPER_CAMERAS
     made = convert_sketchy(
         config.data.root,
         config.out,

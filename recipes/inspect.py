@@ -19,7 +19,6 @@ from playslot_rl.recipes.run import existing_run, open_device, open_run, parent_
 
 if TYPE_CHECKING:
     from playslot_rl.data.source import EpisodeFrames
-    from playslot_rl.evaluation.card_verdict import Conclusion
     from playslot_rl.world_model import WorldModel
 
 
@@ -38,6 +37,7 @@ def main(config: ExperimentConfig) -> None:
         OutputError: the result cannot be written.
     """
     from playslot_rl.evaluation.card import DEFAULT_EPISODES, FOLDER, card_json, make_card, write_card
+    from playslot_rl.evaluation.card_verdict import concluded
     from playslot_rl.training.runs import load_world_model
     from playslot_rl.visualization.card import card_document
     from playslot_rl.visualization.document import write_document
@@ -118,7 +118,7 @@ def main_if_needed(config: ExperimentConfig) -> None:
     moves) that is said, and the rest of a pipeline goes on. The last line is the verdict in every case.
     """
     from playslot_rl.evaluation.card import RESULT
-    from playslot_rl.evaluation.card_verdict import Conclusion
+    from playslot_rl.evaluation.card_verdict import Conclusion, concluded
 
     stored = stored_result(Path(config.run) / RESULT, facts(config, config.run))
     if stored is not None:
@@ -128,13 +128,6 @@ def main_if_needed(config: ExperimentConfig) -> None:
         main(config)
     except DataError as error:
         print(f"inspect: not made\n{Conclusion(False, str(error))}", flush=True)
-
-
-def concluded(result: Mapping[str, Any]) -> Conclusion:
-    """The verdict of a stored card, also of one from before there were any."""
-    from playslot_rl.evaluation.card_verdict import conclude
-
-    return conclude(result["lines"], result["details"].get("code_counts", []))
 
 
 def describe(result: Mapping[str, Any]) -> str:

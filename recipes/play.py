@@ -60,11 +60,11 @@ def open_studio(config: ExperimentConfig) -> Studio:
     out = Path(config.out or "runs") / "play"
     return Studio(
         world, agent, recorded, simulated, out, config.run, config.play.fps,
-        squeezes=config.data.resize, horizon=trained_horizon(run), camera=run_camera(config, recorded),
+        squeezes=config.data.resize, horizon=predicted_frames(run), camera=run_camera(config, recorded),
     )  # fmt: skip
 
 
-def trained_horizon(run: str) -> int:
+def predicted_frames(run: str) -> int:
     """Steps that the run's predictor was trained to predict; 0 for an exported policy, which does not say it."""
     from playslot_rl.config import DynamicsStageConfig
     from playslot_rl.sharing.folder import is_model_folder

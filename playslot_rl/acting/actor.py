@@ -61,7 +61,8 @@ class Actor(TensorDictModuleBase):
     @property
     def action_range(self) -> ActionRange | None:
         """What its actions are in the robot's units; None where they are in [-1, 1] there, too."""
-        return range_of(self)
+        agent = getattr(self, "agent", None)  # whose inverse dynamics may have a range, too
+        return range_of(self if agent is None else agent.action_decoder)
 
     def executed(self, actions: Tensor) -> Tensor:
         """What a robot or a simulator gets for actions (n, A): clipped to [-1, 1], and in its units."""

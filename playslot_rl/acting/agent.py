@@ -17,7 +17,6 @@ from torch import Tensor
 from playslot_rl import keys
 from playslot_rl.acting.actor import PlannedActor, SlotActor
 from playslot_rl.acting.imagination import ImaginationEnv
-from playslot_rl.modules.action_range import ActionRange, range_of
 from playslot_rl.world_model import Agent, action_decoder_module, latent_policy_module, oracle_module
 
 
@@ -102,11 +101,6 @@ class ImaginationActor(PlannedActor):
         super().__init__(steps, agent.world_model.env.action_dim, (keys.PREDICTED_SLOTS,), (keys.PIXELS,))
         self.agent = agent
         self._generator: torch.Generator | None = None
-
-    @property
-    def action_range(self) -> ActionRange | None:
-        """Of the decoder."""
-        return range_of(self.agent.action_decoder)
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
         """Nothing imagined yet; initial slots that are sampled depend on the first seed."""

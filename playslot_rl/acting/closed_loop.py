@@ -15,7 +15,7 @@ from torch import Tensor
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
-from playslot_rl.frames import quantise
+from playslot_rl.frames import to_uint8
 
 
 class ClosedLoop:
@@ -103,6 +103,6 @@ def resized(frames: Tensor, side: int) -> Tensor:
     (floats are bytes divided by 255, as LeRobot gives them)."""
     from playslot_rl.data.frames import resize_frames
 
-    flat = quantise(frames).flatten(0, -4) if frames.ndim > 3 else quantise(frames)[None]
-    small = torch.from_numpy(resize_frames(flat.movedim(1, -1).contiguous().cpu().numpy(), side)).movedim(-1, 1)
-    return small.reshape(*frames.shape[:-2], side, side)
+    pictures = to_uint8(frames)
+    small = resize_frames(pictures.reshape(-1, *pictures.shape[-3:]), side)
+    return torch.from_numpy(small).movedim(-1, -3).reshape(*frames.shape[:-2], side, side)

@@ -20,7 +20,6 @@ from playslot_rl.acting.planners import Cost, Planner, Search, latent_statistics
 from playslot_rl.acting.planners.costs import GoalCost, NearProposal, goal_distance, parse_goal
 from playslot_rl.acting.planners.size import SearchSize
 from playslot_rl.config.planning import PlanConfig
-from playslot_rl.modules.action_range import ActionRange, range_of
 from playslot_rl.seeding import step_generator
 from playslot_rl.world_model import Agent, action_decoder_module, frame_parser_module
 
@@ -81,11 +80,6 @@ class PlanningActor(Actor):
         self.parser = frame_parser_module(agent.world_model.savi)
         self.decoder = action_decoder_module(agent.action_decoder)
         self.frames_seen = min(plan.history, agent.world_model.config.predictor.context)
-
-    @property
-    def action_range(self) -> ActionRange | None:
-        """Of the decoder."""
-        return range_of(self.agent.action_decoder)
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
         """Nothing seen and nothing planned; the goals are there."""

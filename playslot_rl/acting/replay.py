@@ -21,7 +21,6 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import ExpertActor, PlannedActor
 from playslot_rl.acting.episodes import Moment, TaskPool, record
 from playslot_rl.frames import normalise
-from playslot_rl.modules.action_range import ActionRange, range_of
 from playslot_rl.world_model import Agent
 
 
@@ -68,11 +67,6 @@ class ReplayActor(PlannedActor):
         env = agent.world_model.env
         super().__init__(env.max_steps, env.action_dim)
         self.agent, self.performed = agent, performed
-
-    @property
-    def action_range(self) -> ActionRange | None:
-        """Of the decoder."""
-        return range_of(self.agent.action_decoder)
 
     @torch.no_grad()
     def reset(self, seeds: Sequence[int]) -> TensorDict:

@@ -30,10 +30,10 @@ def require_begun_alike(jobs: Iterable[VideoJob], asked: CompareVideoConfig) -> 
     """
     wanted = to_dict(asked)
     for job in jobs:
-        tried = [job.trial(rate) for rate in asked.rates if makes_trials(asked)]
+        tried = [job.trial(rate) for rate in asked.rates] if makes_trials(asked) else []
         for folder, names in [*((trial, TRIED_WITH) for trial in tried), (job.run, TRAINED_WITH)]:
             stored = _begun_with(folder)
-            for name, got, old in _differences(stored, wanted, names) if stored else ():
+            for name, got, old in _differences(stored, wanted, names):
                 raise _other(name, got, old, folder)
 
 
@@ -75,9 +75,10 @@ def _differences(
 ) -> Iterator[tuple[str, Any, Any]]:
     """Key, wanted and stored value of settings that differ."""
     for name in names:
-        if name == "tested" and (stored["test"] or wanted["test"]):
-            if bool(stored["test"]) != bool(wanted["test"]):  # then no episodes are kept back for it
-                yield "test", wanted["test"] or "nothing", stored["test"] or "nothing"
+        test, old = wanted["test"], stored.get("test", wanted["test"])
+        if name == "tested" and (old or test):
+            if bool(old) != bool(test):  # then no episodes are kept back for it
+                yield "test", test or "nothing", old or "nothing"
         elif stored.get(name, wanted[name]) != wanted[name]:
             yield name, wanted[name], stored[name]
 

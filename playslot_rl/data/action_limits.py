@@ -20,7 +20,6 @@ import numpy.typing as npt
 
 from playslot_rl import keys
 from playslot_rl.data.metadata import STATS_NAME, json_content
-from playslot_rl.envs import ENVIRONMENTS, PROCEDURAL
 
 if TYPE_CHECKING:
     from playslot_rl.data.contents import Contents
@@ -45,7 +44,6 @@ class ActionLimits:
         names: of the dimensions, as the data set names them.
         low, high: float32 (A,), the ends; equal where a dimension never changes.
         smallest, largest: float32 (A,), of the data.
-        quantiles: bool (A,), where the ends are q01 and q99, because of outliers.
     """
 
     names: tuple[str, ...]
@@ -53,12 +51,11 @@ class ActionLimits:
     high: Floats
     smallest: Floats
     largest: Floats
-    quantiles: npt.NDArray[np.bool_]
 
     @property
-    def unit(self) -> bool:
-        """Whether they are -1 and 1 in every dimension: nothing is changed then."""
-        return bool((self.low == -1).all() and (self.high == 1).all())
+    def quantiles(self) -> npt.NDArray[np.bool_]:
+        """bool (A,), where the ends are q01 and q99, because of outliers."""
+        return (self.low > self.smallest) | (self.high < self.largest)
 
     def give(self, known: ActionRange) -> None:
         """Set the range of a network."""
@@ -102,19 +99,20 @@ def scaled(plain: dict[str, Any] | None) -> bool:
 
 def limits_of(files: Contents, actions: Floats | None) -> ActionLimits | None:
     """The range of a data set's actions (F, A); None without any, and for sets of our own simulators."""
+    from playslot_rl.envs import ENVIRONMENTS, PROCEDURAL  # with Gymnasium
+
     if actions is None or str(files.info.get("robot_type") or "") in (*ENVIRONMENTS, *PROCEDURAL):
         return None
     values = np.where(np.abs(actions) < HUGE, actions, np.nan)
     names, stated = _names(files.features[keys.FEATURE_ACTION], values.shape[1]), _stated(files, values.shape[1])
-    first, last = _ends(values, 0.01)
-    smallest, largest = _ends(values, 0.0)
+    first, last, smallest, largest = _ends(values, 0.01)
     if stated is not None and (stated[0] <= smallest).all() and (stated[1] >= largest).all():
         smallest, largest = stated
     span = last - first
     far = ((values < first - span) | (values > last + span)).sum(axis=0)
     outlying = (largest - smallest > WIDE * span) & (far > 0) & (far <= max(2, FEW * len(values)))
     low, high = np.where(outlying, first, smallest), np.where(outlying, last, largest)
-    return ActionLimits(names, low, high, smallest, largest, outlying)
+    return ActionLimits(names, low, high, smallest, largest)
 
 
 def joined_limits(parts: Sequence[ActionLimits | None], width: int) -> ActionLimits | None:
@@ -123,21 +121,22 @@ def joined_limits(parts: Sequence[ActionLimits | None], width: int) -> ActionLim
     if not known:
         return None
     one, names = np.ones(width, np.float32), known[0].names
-    every = [ActionLimits(names, -one, one, -one, one, one < 0) if part is None else part for part in parts]
+    every = [ActionLimits(names, -one, one, -one, one) if part is None else part for part in parts]
     low, high = np.min([p.low for p in every], axis=0), np.max([p.high for p in every], axis=0)
     smallest, largest = np.min([p.smallest for p in every], axis=0), np.max([p.largest for p in every], axis=0)
-    return ActionLimits(names, low, high, smallest, largest, (low > smallest) | (high < largest))
+    return ActionLimits(names, low, high, smallest, largest)
 
 
-def _ends(values: Floats, beyond: float) -> tuple[Floats, Floats]:
-    """Values between which all but a share at either end lie, of each dimension; 0 where none is finite."""
-    found = np.zeros((2, values.shape[1]), np.float32)
+def _ends(values: Floats, beyond: float) -> Floats:
+    """Values between which all but a share at either end lie, and the smallest and largest, (4, A); 0 where none is
+    finite."""
+    found = np.zeros((4, values.shape[1]), np.float32)
     for i, column in enumerate(values.T):
         known = np.sort(column[~np.isnan(column)])
         if len(known):
             cut = math.ceil(beyond * (len(known) - 1))
-            found[:, i] = known[cut], known[-1 - cut]
-    return found[0], found[1]
+            found[:, i] = known[cut], known[-1 - cut], known[0], known[-1]
+    return found
 
 
 def _stated(files: Contents, width: int) -> tuple[Floats, Floats] | None:

@@ -59,7 +59,7 @@ def row_faults(contents: Contents, span: Span) -> list[tuple[str, str]]:
                 f"got timestamp {got:.6g} at frame {worst}, expected {worst / contents.fps:.6g} (frame / fps)",
             )
         )
-    unknown = set(contents.columns["task_index"][rows].tolist()) - set(contents.tasks)
+    unknown = set(np.unique(contents.columns["task_index"][rows]).tolist()) - contents.tasks.keys()
     if unknown:
         faults.append(("task_index", f"got task_index {sorted(unknown)}, expected one of {TASKS_NAME}"))
     for name, values in contents.columns.items():
@@ -163,7 +163,8 @@ def _check_metadata(contents: Contents, episode: Episode, span: Span, problems: 
             "dataset_from_index",
             f"episode {span.index}: got dataset_from_index, dataset_to_index {place}, expected {span.start, span.stop}",
         )
-    words = {contents.tasks.get(int(n)) for n in contents.columns["task_index"][span.start : span.stop]}
+    numbers = np.unique(contents.columns["task_index"][span.start : span.stop])
+    words = {contents.tasks.get(number) for number in numbers.tolist()}
     if words != set(episode.tasks):
         got = sorted(map(str, words))
         problems.error(
@@ -193,13 +194,14 @@ def _check_places(contents: Contents, problems: Problems) -> None:
     order = [span.index for span in contents.spans]
     if order != sorted(order):
         problems.error("episode order", f"got rows of episodes in the order {order[:6]}..., expected ascending")
+    is_file = functools.cache(Path.is_file)  # thousands of episodes name the same few files
     for episode in contents.episodes:
         chunk, file = (episode.row.get(f"meta/episodes/{name}_index") for name in ("chunk", "file"))
         if chunk is not None and file is not None:
             place = filled(EPISODES_PATH, chunk, file)
             if place is None:
                 problems.error("damaged episode row", f"episode {episode.index}: got no place of its metadata")
-            elif not (path := contents.root / place).is_file():
+            elif not is_file(path := contents.root / place):
                 problems.warning(
                     "meta/episodes", f"episode {episode.index}: names {path}, which is not there: LeRobot's own "
                     "merge_datasets leaves such rows, and its split_dataset fails on them",

@@ -10,6 +10,7 @@ from typing import Any
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import data_roots
+from playslot_rl.data.metadata import CAMERAS, read_info
 from playslot_rl.errors import DataError
 
 
@@ -43,9 +44,14 @@ def full_name(wanted: str, cameras: Sequence[str], where: str) -> str:
     )
 
 
+def camera_list(text: str) -> list[str]:
+    """The names in a text such as `top,side`."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
 def cameras_of(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Names of the image and video features."""
-    return [name for name, feature in features.items() if feature["dtype"] in ("image", "video")]
+    return [name for name, feature in features.items() if feature["dtype"] in CAMERAS]
 
 
 def with_full_cameras(config: ExperimentConfig) -> ExperimentConfig:
@@ -54,10 +60,8 @@ def with_full_cameras(config: ExperimentConfig) -> ExperimentConfig:
     Names stay as they were typed where the data sets are not there (yet) to be asked, or do not know them: whoever
     reads them says what is wrong.
     """
-    from playslot_rl.data.metadata import read_info
-
     data = config.data
-    typed = [name.strip() for name in data.camera.split(",") if name.strip()]
+    typed = camera_list(data.camera)
     for root in () if not typed else (*data_roots(data.root), *data_roots(data.demos)):
         with contextlib.suppress(DataError):
             known = cameras_of(read_info(Path(root.path).expanduser())["features"])

@@ -20,7 +20,7 @@ from playslot_rl.data.camera_names import cameras_of, full_name
 from playslot_rl.data.metadata import DATA_PATH, INFO_NAME, VIDEO_PATH, read_info
 from playslot_rl.data.places import filled, inside, note_odd_files, parquet_files
 from playslot_rl.data.problems import Problems
-from playslot_rl.data.tables import Array, Episode, episodes_of, read_columns, read_table, read_tasks
+from playslot_rl.data.tables import Array, Episode, episodes_of, holds_numbers, read_columns, read_table, read_tasks
 from playslot_rl.errors import DataError
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class Contents:
     def numbers(self, name: str) -> Array | None:
         """A feature's column, if it is there and holds numbers."""
         values = self.columns.get(name)
-        return values if values is not None and values.dtype.kind in "fiub" else None
+        return values if values is not None and holds_numbers(values) else None
 
     @property
     def fps(self) -> float:

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.metadata import LARGEST_PICTURE, stated_size
-from playslot_rl.data.places import inside, plain_relative
+from playslot_rl.data.places import inside, is_plain_path
 from playslot_rl.data.problems import Problems
 from playslot_rl.data.tables import WRONG_COLUMN, Array
 from playslot_rl.errors import DataError
@@ -191,7 +191,7 @@ def _stored_bytes(root: Path, cell: dict[str, Any]) -> bytes:
     if cell.get("bytes"):
         return bytes(cell["bytes"])
     path: Path = root / cell["path"]
-    if not plain_relative(cell["path"]) or not inside(root, path):
+    if not is_plain_path(cell["path"]) or not inside(root, path):
         raise ValueError("it names a file that is not of the data set")
     return path.read_bytes()
 

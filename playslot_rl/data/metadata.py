@@ -26,7 +26,9 @@ VIDEO_PATH: Final = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index
 EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 PLACE: Final = ("index", "episode_index", "task_index")
 """Columns that say where a row stands in its data set: they change when data sets are merged or split."""
-REQUIRED: Final = ("timestamp", "frame_index", *PLACE)
+WHOLE: Final = ("frame_index", *PLACE)
+"""Columns of whole numbers."""
+REQUIRED: Final = ("timestamp", *WHOLE)
 
 FASTEST: Final = 10_000
 """Frames a second."""
@@ -40,7 +42,8 @@ LONGEST_JSON: Final = 2**28
 """Bytes."""
 NUMBERS: Final = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 """Types of features whose values are numbers."""
-OTHERS: Final = ("image", "video", "string", "large_string", "language")
+CAMERAS: Final = ("image", "video")
+OTHERS: Final = (*CAMERAS, "string", "large_string", "language")
 
 
 class _BoundsError(ValueError):
@@ -149,9 +152,14 @@ def _short(value: Any) -> str:
     return text if len(text) < 60 else f"{text[:60]}..."
 
 
+def _positive(value: Any, high: int) -> bool:
+    """Whether this is a number above 0, `high` at most; NaN is none."""
+    return not isinstance(value, bool) and isinstance(value, int | float) and 0 < value <= high
+
+
 def _check(info: Mapping[str, Any]) -> None:
     fps = info.get("fps")
-    if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= FASTEST:  # NaN is not
+    if not _positive(fps, FASTEST):
         raise _BoundsError(f"fps {_short(fps)}, expected a number above 0, at most {FASTEST}")
     for name in ("total_frames", "total_episodes", "total_tasks"):
         if name in info or name != "total_tasks":
@@ -160,7 +168,7 @@ def _check(info: Mapping[str, Any]) -> None:
         _named("chunks_size", info["chunks_size"], 1, 10**6)
     for name in ("data_files_size_in_mb", "video_files_size_in_mb"):
         size = info.get(name)
-        if size is not None and (isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size <= 10**6):
+        if size is not None and not _positive(size, 10**6):
             raise _BoundsError(f"{name} {_short(size)}, expected megabytes above 0, at most {10**6}")
     for name, fields in (("data_path", ()), ("video_path", ("video_key",))):
         if info.get(name) is not None and not checked_template(info[name], fields):
@@ -198,12 +206,12 @@ def _check_feature(name: str, feature: Any) -> None:
         raise _BoundsError(f"shape {_short(shape)} of {name}, expected a list of at most 8 numbers")
     for number in shape:
         _named(f"shape {_short(shape)} of {name}:", number, 1, LARGEST_VALUE)
-    camera = dtype in ("image", "video")
+    camera = dtype in CAMERAS
     if camera and len(shape) not in (2, 3):
         raise _BoundsError(f"shape {_short(shape)} of the camera {name}, expected height, width and channels")
     if math.prod(shape) > LARGEST_VALUE or (camera and math.prod(stated_size(feature)) > LARGEST_PICTURE):
         raise _BoundsError(f"shape {_short(shape)} of {name}, expected at most {LARGEST_VALUE} numbers in a frame")
-    index, single = name in REQUIRED and name != "timestamp", shape in ([], [1])
+    index, single = name in WHOLE, shape in ([], [1])
     if name in REQUIRED and not (single and re.fullmatch(r"u?int\d+" if index else r"float\d+", dtype)):
         raise _BoundsError(f"{name} as {_short(dtype)} {_short(shape)}, expected one {'int64' if index else 'float32'}")
     if not isinstance(feature.get("names") or [], list | dict):

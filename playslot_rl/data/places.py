@@ -10,8 +10,8 @@ import codecs
 import os
 import re
 from collections.abc import Iterator
-from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, TypeGuard
 
 from playslot_rl.data.problems import Problems
 
@@ -33,14 +33,14 @@ def is_plain(name: str) -> bool:
     return bool(name) and printable and name not in (".", "..") and len(name.encode()) <= _LONGEST_NAME
 
 
-def is_plain_path(path: str) -> bool:
-    """Whether a path with slashes leads to a place below where it begins."""
-    return len(path) <= _LONGEST_PATH and all(map(is_plain, path.split("/")))
+def is_plain_path(path: Any) -> TypeGuard[str]:
+    """Whether this is a path with slashes that leads to a place below where it begins."""
+    return isinstance(path, str) and len(path) <= _LONGEST_PATH and all(map(is_plain, path.split("/")))
 
 
 def checked_template(template: Any, fields: tuple[str, ...]) -> bool:
     """Whether a template has `file_index` and `fields`, at most `chunk_index` too, and its paths stay below a root."""
-    if not isinstance(template, str) or not is_plain_path(template):
+    if not is_plain_path(template):
         return False
     found = {match[1] for match in _FIELD.finditer(template)}
     needed = {"file_index", *fields}
@@ -122,8 +122,3 @@ def _files(root: Path) -> Iterator[Path]:
         for folder, folders, files in os.walk(root / name):
             yield from (Path(folder) / entry for entry in sorted(files))
             yield from (Path(folder) / entry for entry in sorted(folders) if (Path(folder) / entry).is_symlink())
-
-
-def plain_relative(path: Any) -> bool:
-    """Whether a path from a data set's cells leads to a place below its folder."""
-    return isinstance(path, str) and not PurePosixPath(path).is_absolute() and is_plain_path(path)

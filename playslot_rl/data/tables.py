@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.data.metadata import MOST, NUMBERS, OTHERS, REQUIRED, damaged, whole
+from playslot_rl.data.metadata import CAMERAS, MOST, NUMBERS, OTHERS, WHOLE, damaged, whole
 from playslot_rl.data.places import inside
 from playslot_rl.data.problems import Problems
 
@@ -60,7 +60,7 @@ def read_columns(
         opened: a file as pyarrow takes one.
     """
     features = info["features"]
-    names = [name for name, feature in features.items() if feature["dtype"] not in ("image", "video")]
+    names = [name for name, feature in features.items() if feature["dtype"] not in CAMERAS]
     files, parts = [], []
     for path in paths:
         rows = _columns(path, names, features, problems, opened)
@@ -147,16 +147,21 @@ def _columns(
     return rows
 
 
+def holds_numbers(values: Array) -> bool:
+    """Whether a column holds numbers, truth values among them."""
+    return values.dtype.kind in "fiub"
+
+
 def _check_kind(name: str, values: Array, dtype: str) -> None:
     """Refuse text for numbers and numbers for text; other numbers than stated are still numbers.
 
     Raises:
         ValueError: what was got.
     """
-    stated, stored = bool(NUMBERS.fullmatch(dtype)), values.dtype.kind in "fiub"
+    stated, stored = bool(NUMBERS.fullmatch(dtype)), holds_numbers(values)
     if stated != stored and (stated or dtype in OTHERS):
         raise ValueError(f"values of type {'text or records' if values.dtype == object else values.dtype} for {dtype}")
-    if name in REQUIRED and name != "timestamp" and values.dtype.kind not in "iu":
+    if name in WHOLE and values.dtype.kind not in "iu":
         raise ValueError(f"values of type {values.dtype} for whole numbers")
 
 

@@ -7,10 +7,8 @@ are made anew from the rows and frames. A parquet file without a footer cannot b
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,8 +23,8 @@ from playslot_rl.datasets.statistics import differing
 from playslot_rl.datasets.verify import LOOSE_CAMERA, Verification, episode_statistics, verify
 from playslot_rl.datasets.video_copy import frame_count
 from playslot_rl.errors import DataError, OutputError
-from playslot_rl.storage.atomic import alone, explain_write_errors, fsync_folder
-from playslot_rl.storage.folders import new_folder, require_free
+from playslot_rl.storage.atomic import explain_write_errors, fsync_folder
+from playslot_rl.storage.folders import held, new_folder, require_free
 
 JOURNAL_SUFFIX = ".journal"
 
@@ -84,7 +82,11 @@ def repair(root: str | Path, out: str | Path | None = None) -> RepairResult:
         require_free(Path(out), "--out ")
         return _repair(folder, Path(out))
     _undo_half_rename(folder)
-    with _held(folder):
+    if not folder.is_dir():
+        return _repair(folder, None)  # which says so
+    with held(folder) as free:
+        if not free:
+            raise OutputError(f"{folder}: another command repairs it, expected none: wait for that one to end")
         return _repair(folder, None)
 
 
@@ -137,21 +139,6 @@ def _undo_half_rename(folder: Path) -> None:
     repaired = _beside(folder)
     if not folder.exists() and repaired.is_dir() and verify(repaired).ok:
         repaired.rename(folder)
-
-
-@contextlib.contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    """Keep other commands from repairing a data set in its place inside the block."""
-    if not folder.is_dir():
-        yield  # whoever reads it says so
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        if not alone(handle):
-            raise OutputError(f"{folder}: another command repairs it, expected none: wait for that one to end")
-        yield
-    finally:
-        os.close(handle)
 
 
 def _beside(folder: Path) -> Path:

@@ -23,6 +23,7 @@ from playslot_rl.datasets.info import info
 from playslot_rl.datasets.verify import require_sound
 from playslot_rl.errors import ConfigError
 from playslot_rl.storage.atomic import write_text
+from playslot_rl.storage.folders import require_outside
 from playslot_rl.visualization.charts import DARK, LIGHT, curve_chart
 from playslot_rl.visualization.document import Block, Document, Picture, Section, Table, Text, to_html
 from playslot_rl.visualization.grid import animation, image_grid, png
@@ -71,13 +72,11 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
     Raises:
         ConfigError: fewer than one episode.
         DataError: the data set is damaged.
-        OutputError: the file cannot be written.
+        OutputError: the file lies in a data set, or cannot be written.
     """
-
     contents = require_sound(root)
     target = Path(out) if out is not None else contents.root.with_name(f"{contents.root.absolute().name}.html")
-    if target.resolve().is_relative_to(contents.root.resolve()):
-        raise ConfigError(f"--out: got {target} inside the data set, expected a file outside: a push would upload it")
+    require_outside(target, [contents.root], "--out ", "file")
     chosen = spread(len(contents.spans), episodes)
     summary = info(root)
     about = Table(["fact", "value"], summary.facts())

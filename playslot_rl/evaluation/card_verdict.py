@@ -98,6 +98,11 @@ def _words(missing: Sequence[str], known: Mapping[str, Line]) -> str:
     return WORDS[key]
 
 
+def concluded(result: Mapping[str, Any]) -> Conclusion:
+    """The verdict of a stored card, also of one from before there were any."""
+    return conclude(result["lines"], result["details"].get("code_counts", []))
+
+
 def conclude(lines: Sequence[Mapping[str, Any]], code_counts: Sequence[int] = ()) -> Conclusion:
     """The verdict on a world model.
 

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from playslot_rl.data.metadata import FORMAT_TAG, damaged, parsed, read_info
+from playslot_rl.data.metadata import FORMAT_TAG, INFO_NAME, damaged, parsed, read_info
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, HubError, OutputError
 from playslot_rl.hub.layout import LOCAL_RECORD, SCHEME, HubRecord, is_pulled, read_record, require_plain
@@ -22,7 +22,6 @@ from playslot_rl.storage.locks import locked
 if TYPE_CHECKING:
     from huggingface_hub import RepoFile
 
-INFO = "meta/info.json"
 SPARE = 64 << 20
 """Bytes to leave free on the disk."""
 
@@ -91,8 +90,8 @@ def pull(repo_id: str, root: Path, *, revision: str | None = None, token: str | 
         listed = hub.tree(commit)
         require_plain((path for path in listed if path.startswith(("data/", "meta/", "videos/"))), hub.name)
         wanted = {path: file for path, file in listed.items() if is_pulled(path)}
-        if INFO not in wanted:
-            raise DataError(f"{hub.name}: got no {INFO} at {name}, expected a LeRobot data set: check the name")
+        if INFO_NAME not in wanted:
+            raise DataError(f"{hub.name}: got no {INFO_NAME} at {name}, expected a LeRobot data set: check the name")
         with explain_write_errors(root):
             root.parent.mkdir(parents=True, exist_ok=True)
         lock = root.with_name(f".{root.name}.pull.lock")
@@ -147,10 +146,12 @@ def _choose(hub: Repository, revision: str | None) -> tuple[str, str, str]:
 def _check_version(hub: Repository, partial: Path, commit: str) -> None:
     """Look at the metadata before gigabytes are fetched."""
     try:
-        version = str(parsed(hub.read(INFO, commit, partial))["codebase_version"])
+        version = str(parsed(hub.read(INFO_NAME, commit, partial))["codebase_version"])
     except (ValueError, KeyError, TypeError) as error:
         shutil.rmtree(partial, ignore_errors=True)
-        raise DataError(f"{hub.name}: got a damaged {INFO} ({damaged(error)}), expected LeRobot's metadata") from error
+        raise DataError(
+            f"{hub.name}: got a damaged {INFO_NAME} ({damaged(error)}), expected LeRobot's metadata"
+        ) from error
     if not version.startswith("v3."):
         shutil.rmtree(partial, ignore_errors=True)
         raise DataError(

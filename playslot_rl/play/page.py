@@ -194,8 +194,10 @@ class PlayPage:
             frozen = ", frozen" if self.chosen in now.frozen else ""
             self.which.set_text(f"slot {self.chosen + 1}{frozen}")
         horizon = self.studio.horizon
-        self.beyond.set_visibility(0 < horizon < now.steps)
-        self.beyond.set_text(f"step {now.steps}: past the {horizon} steps that the model was trained to predict")
+        past = 0 < horizon < now.steps
+        self.beyond.set_visibility(past)
+        if past:
+            self.beyond.set_text(f"step {now.steps}: past the {horizon} steps that the model was trained to predict")
         self.prototypes.outdate()
 
     def _show_beside(self, picture: bytes | None) -> None:

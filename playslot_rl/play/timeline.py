@@ -7,6 +7,7 @@ H W image height and width. "[N,]" is there with one latent action per slot.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -57,7 +58,7 @@ class SceneMoment:
     steps: int = 0
     label: str = "start"
 
-    @property
+    @cached_property  # drawn again at every step, of all moments
     def error(self) -> float | None:
         """Root mean squared difference of the imagined frame to the true one, of [0, 1]; None without one."""
         if self.true is None:

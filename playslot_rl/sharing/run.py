@@ -7,15 +7,16 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl import keys
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.config.weights import data_roots
-from playslot_rl.data.camera_names import cameras_of, full_name
-from playslot_rl.data.metadata import INFO_NAME, read_info
+from playslot_rl.data.camera_names import camera_list, cameras_of, full_name
+from playslot_rl.data.metadata import INFO_NAME, RECORD_NAME, read_info
 from playslot_rl.envs import ENVIRONMENTS, RECORDED
 from playslot_rl.errors import CheckpointError, ConfigError, DataError, OutputError
 from playslot_rl.evaluation.success import POLICY_PROTOCOLS, run_facts
@@ -81,7 +82,7 @@ def _is_shipped(env: str, prints: dict[str, str]) -> bool:
 def _recorded(root: Path) -> dict[str, Any]:
     """How our collectors recorded the demonstrations, where they are still there; else empty."""
     try:
-        spec = json.loads((root / "meta" / "playslot.json").read_text())["spec"]
+        spec = json.loads((root / RECORD_NAME).read_text())["spec"]
         return {name: spec[name] for name in ("policy", "episodes", "steps", "seed", "noise")}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
@@ -89,7 +90,7 @@ def _recorded(root: Path) -> dict[str, Any]:
 
 def _elsewhere(root: Path) -> bool:
     """Whether a data set is there that our collectors did not record."""
-    return (root / INFO_NAME).is_file() and not (root / "meta" / "playslot.json").is_file()
+    return (root / INFO_NAME).is_file() and not (root / RECORD_NAME).is_file()
 
 
 def read_results(run: Path, source: dict[str, Any]) -> list[Result]:
@@ -179,21 +180,33 @@ def require_exported(run: Path, folder: Path, config: ExperimentConfig, source: 
 
 
 def _policy(run: Path, agent: Agent, config: ExperimentConfig, source: dict[str, Any]) -> SharedPolicyConfig:
+    meta, env = _meta(run), agent.world_model.env
+    if env.name in RECORDED and "actions" not in meta:
+        raise CheckpointError(
+            f"{checkpoint_folder(run, 'policy')}: got a policy of an earlier version, which clipped the robot's "
+            "actions to [-1, 1], expected one that knows their range: train it again by `playslot train-policy` with "
+            "another out="
+        )
+    view, demos = stored_view(run), _demonstrations(config)
+    own = _described(view, meta)
     return SharedPolicyConfig(
-        env=agent.world_model.env,
+        env=env,
         model=agent.world_model.config,
-        camera=camera(run, config),
+        camera=_camera(run, config, [*camera_list(view.camera), own.camera], demos),
         resize=config.data.resize,
         stride=config.data.stride,
-        fps=_frame_rate(run, config),
+        fps=own.fps or _frame_rate(config, demos),
         source=source,
-        actions=_actions(run, agent.world_model.env.name),
+        actions=own.actions,
     )
 
 
 def described(run: Path | str) -> SharedPolicyConfig:
-    """What a run says of the frames that its policy looks at, and of its actions; its networks are not read."""
-    view, meta = stored_view(run), read_stage(checkpoint_folder(run_folder(run), "policy"), "policy").meta
+    """What a run says of the frames that its policy looks at, and of its actions; its networks are not made."""
+    return _described(stored_view(run), _meta(run))
+
+
+def _described(view: DataConfig, meta: Mapping[str, Any]) -> SharedPolicyConfig:
     one = "" if "," in view.camera else view.camera
     return SharedPolicyConfig(
         camera=str(meta.get("camera") or one or keys.FEATURE_IMAGE),
@@ -204,30 +217,23 @@ def described(run: Path | str) -> SharedPolicyConfig:
     )
 
 
-def _actions(run: Path, env: str) -> dict[str, Any]:
-    """Names and range of a policy's actions; none for those of our simulators.
-
-    Raises:
-        CheckpointError: the policy was trained when the actions of every data set were clipped to [-1, 1].
-    """
-    checkpoint = checkpoint_folder(run, "policy")
-    meta = read_stage(checkpoint, "policy").meta
-    if env in RECORDED and "actions" not in meta:
-        raise CheckpointError(
-            f"{checkpoint}: got a policy of an earlier version, which clipped the robot's actions to [-1, 1], expected "
-            "one that knows their range: train it again by `playslot train-policy` with another out="
-        )
-    return described(run).actions
+def _meta(run: Path | str) -> Mapping[str, Any]:
+    return read_stage(checkpoint_folder(run_folder(run), "policy"), "policy").meta
 
 
-def _frame_rate(run: Path, config: ExperimentConfig) -> float:
-    """Frames a second that a policy is shown: of its demonstrations, over the stride. 0 where older runs do not say."""
-    known = described(run).fps
-    if known:
-        return known
+def _demonstrations(config: ExperimentConfig) -> tuple[str, dict[str, Any]] | None:
+    """The first data set of the demonstrations and its metadata; None where it is not there any more."""
     for root in data_roots(config.data.demos or config.data.root)[:1]:
         with contextlib.suppress(DataError):
-            return float(read_info(Path(root.path))["fps"]) / config.data.stride
+            return root.path, read_info(Path(root.path))
+    return None
+
+
+def _frame_rate(config: ExperimentConfig, demos: tuple[str, dict[str, Any]] | None) -> float:
+    """Frames a second of the demonstrations, over the stride: for older runs, which do not say it. 0 where nobody
+    knows."""
+    if demos is not None:
+        return float(demos[1]["fps"]) / config.data.stride
     if config.env.name in ENVIRONMENTS:
         from playslot_rl.envs.lerobot import frames_a_second
 
@@ -235,26 +241,19 @@ def _frame_rate(run: Path, config: ExperimentConfig) -> float:
     return 0.0
 
 
-def camera(run: Path, config: ExperimentConfig) -> str:
+def _camera(run: Path, config: ExperimentConfig, known: Sequence[str], demos: tuple[str, dict[str, Any]] | None) -> str:
     """LeRobot's name of the camera a run looks at: `data.camera`, else the only one of its demonstrations.
 
-    Where the demonstrations are no longer there it is that of the run, or of our own data sets.
+    Where the demonstrations are no longer there it is that of the run, or of our own data sets: the last one `known`.
 
     Raises:
         ConfigError: there are several.
         DataError: there is no such camera.
     """
-    roots = data_roots(config.data.demos or config.data.root)
-    names, where = _names(config.data.camera), str(run)
-    known = [*_names(stored_view(run).camera), described(run).camera]
-    for root in roots[:1]:
-        with contextlib.suppress(DataError):
-            known, where = cameras_of(read_info(Path(root.path))["features"]), root.path
-            names = names or known
+    names, where, otherwise = camera_list(config.data.camera), str(run), known[-1]
+    if demos is not None:
+        known, where = cameras_of(demos[1]["features"]), demos[0]
+        names = names or [*known]
     if len(names) > 1:
         raise ConfigError(f"data.camera: got {', '.join(names)}, expected the one the policy is to look at: name it")
-    return full_name(names[0], known, where) if names else described(run).camera
-
-
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]
+    return full_name(names[0], known, where) if names else otherwise

@@ -67,21 +67,24 @@ def fsync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def alone(handle: int) -> bool:
-    """Whether no other process holds an open file or folder; this one then does, until it closes it or ends.
+def lock(handle: int, *, shared: bool = False, without_locks: bool = True) -> bool:
+    """Whether an open file or folder now is this process's until it closes it or ends: alone, or shared with others.
 
-    Where the system or the file system has no such locks nobody is known to hold anything.
+    Args:
+        handle: the open file or folder.
+        shared: with all that share it; waits for one that has it alone.
+        without_locks: the answer on a file system that has no locks, where nobody knows.
     """
     try:
         import fcntl
     except ImportError:
         return True
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, fcntl.LOCK_SH if shared else fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:
-        return True
+        return without_locks
     return True
 
 
@@ -121,7 +124,7 @@ def _free_temporary(path: Path) -> tuple[Path, BinaryIO]:
     for number in itertools.count():
         temporary = path.with_name(f".{path.name}.tmp-{number}")
         file = temporary.open("ab")
-        if alone(file.fileno()) and is_open_at(file.fileno(), temporary):
+        if lock(file.fileno()) and is_open_at(file.fileno(), temporary):
             file.truncate(0)
             return temporary, file
         file.close()

@@ -19,7 +19,6 @@ import torch
 from torch import nn
 
 from playslot_rl.config.plain import flatten
-from playslot_rl.config.spelling import typed_key
 from playslot_rl.errors import CheckpointError
 from playslot_rl.precision import native_bf16
 from playslot_rl.storage.atomic import write_json
@@ -199,7 +198,7 @@ def require_config(checkpoint: StageCheckpoint, wanted: Mapping[str, Any]) -> No
     stored, keys = flatten(checkpoint.config), flatten(wanted).keys()
     difference = first_difference({key: stored[key] for key in stored.keys() & keys}, wanted)
     if difference is not None:
-        key, old, new = typed_key(difference[0]), *difference[1:]
+        key, old, new = difference
         raise CheckpointError(
             f"{key}: got {new}, expected {old}, with which {checkpoint.path} was trained: "
             f"leave {key} as it was, or use another out="

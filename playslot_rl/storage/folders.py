@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from playslot_rl.errors import OutputError
-from playslot_rl.storage.atomic import alone, explain_write_errors, replace_dir, temporary_name
+from playslot_rl.storage.atomic import explain_write_errors, lock, replace_dir, temporary_name
 
 
 def require_free(out: Path, key: str = "out=") -> None:
@@ -85,35 +85,37 @@ def new_folder(final: Path, *, replace: bool = False, create: bool = True, key: 
     with explain_write_errors(final):
         final.parent.mkdir(parents=True, exist_ok=True)
         remove_leftovers(final)
-        handle = _made(temporary) if create else None
-        try:
-            yield temporary
-            if not replace:
-                require_free(final, key)
-                if final.is_dir():
-                    final.rmdir()  # empty
-            replace_dir(temporary, final)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-            if handle is not None:
-                os.close(handle)
+        if create:
+            temporary.mkdir()
+        with held(temporary) if create else contextlib.nullcontext():  # no other process takes it for a leftover
+            try:
+                yield temporary
+                if not replace:
+                    require_free(final, key)
+                    if final.is_dir():
+                        final.rmdir()  # empty
+                replace_dir(temporary, final)
+            finally:
+                shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _made(temporary: Path) -> int:
-    """Make a folder and hold it, so that no other process takes it for a leftover."""
-    temporary.mkdir()
-    handle = os.open(temporary, os.O_RDONLY)
-    alone(handle)
-    return handle
+@contextlib.contextmanager
+def held(folder: Path) -> Iterator[bool]:
+    """Keep a folder to this process inside the block; gives whether it was free.
+
+    Raises:
+        OSError: it cannot be opened.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        yield lock(handle)
+    finally:
+        os.close(handle)
 
 
 def remove_leftovers(final: Path) -> None:
     """Remove what processes that were killed while they made `final` have left; its name may be a pattern."""
     for leftover in final.parent.glob(f".{final.name}.tmp-*"):
-        with contextlib.suppress(OSError):
-            handle = os.open(leftover, os.O_RDONLY)
-            try:
-                if alone(handle):
-                    shutil.rmtree(leftover, ignore_errors=True)
-            finally:
-                os.close(handle)
+        with contextlib.suppress(OSError), held(leftover) as free:
+            if free:
+                shutil.rmtree(leftover, ignore_errors=True)

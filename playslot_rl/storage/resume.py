@@ -95,7 +95,7 @@ def first_difference(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> tu
         if key.rpartition(".")[-1] == "precision" and right.get(key) == "auto":
             continue  # whatever this processor is good at: a run goes on on another one
         if left.get(key, _ABSENT) != right.get(key, _ABSENT):
-            return key, left.get(key, _ABSENT), right.get(key, _ABSENT)
+            return typed_key(key), left.get(key, _ABSENT), right.get(key, _ABSENT)
     return None
 
 
@@ -202,7 +202,7 @@ class TrainingCheckpoints:
             raise CheckpointError(f"{path} is damaged (no {', '.join(sorted(missing))}): {cure}")
         difference = first_difference(stored["identity"], self.identity)
         if difference is not None:
-            key, old, new = typed_key(difference[0]), *difference[1:]
+            key, old, new = difference
             raise CheckpointError(
                 f"{key}: got {new}, expected {old}, with which {self.folder.parent} was begun: "
                 f"set {key} back, use another out=, or delete that folder"

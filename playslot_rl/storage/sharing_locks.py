@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from playslot_rl.storage.atomic import temporary_name
+from playslot_rl.storage.atomic import is_open_at, lock, temporary_name
 
 NAME: Final = "in_use.lock"
 """Of the file in the folder; its time says when the folder was last taken."""
@@ -35,12 +35,8 @@ def share(folder: Path) -> int | None:
         return None
     except OSError:
         return -1 if folder.is_dir() else None
-    _lock(handle, alone=False)
-    try:
-        there = path.stat().st_ino == os.fstat(handle).st_ino
-    except FileNotFoundError:
-        there = False
-    if not there:  # removed by the process that had it alone
+    lock(handle, shared=True)
+    if not is_open_at(handle, path):  # removed by the process that had it alone
         os.close(handle)
         return None
     with contextlib.suppress(OSError):
@@ -66,7 +62,7 @@ def alone(folder: Path) -> Iterator[bool]:
         yield False
         return
     try:
-        yield _lock(handle, alone=True)
+        yield lock(handle, without_locks=False)
     finally:
         os.close(handle)
 
@@ -90,17 +86,3 @@ def remove_unused(folder: Path) -> bool:
         folder.rename(hidden)
     shutil.rmtree(hidden, ignore_errors=True)
     return not hidden.exists()
-
-
-def _lock(handle: int, *, alone: bool) -> bool:
-    try:
-        import fcntl
-    except ImportError:
-        return True
-    try:
-        fcntl.flock(handle, (fcntl.LOCK_EX | fcntl.LOCK_NB) if alone else fcntl.LOCK_SH)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        return not alone
-    return True

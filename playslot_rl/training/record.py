@@ -15,7 +15,7 @@ from torch import nn
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.roles import fixed_keys
 from playslot_rl.config.weights import data_roots
-from playslot_rl.data.action_limits import said, scaled
+from playslot_rl.data.action_limits import ActionLimits, said, scaled
 from playslot_rl.data.demonstrations import (
     DemonstrationSplit,
     episode_range,
@@ -151,11 +151,15 @@ class StageRecord:
         """What the stage learns from."""
         return self.demos.trained if self.role == "demos" else self.videos
 
+    @property
+    def limits(self) -> ActionLimits | None:
+        """The range of the actions that a stage learns to give; None for those of our simulators."""
+        return self.data.limits if self.role == "demos" else None
+
     @cached_property
     def actions(self) -> dict[str, Any] | None:
-        """The range of the actions that a stage learns to give, plain values; None for those of our simulators."""
-        limits = self.data.limits if self.role == "demos" else None
-        return None if limits is None else limits.plain()
+        """That range, plain values."""
+        return None if self.limits is None else self.limits.plain()
 
     @cached_property
     def prints(self) -> dict[str, str]:
@@ -338,14 +342,13 @@ def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -
     modules: dict[str, nn.Module] = {}
     metrics: dict[str, float] = {}
     steps, seconds, clocked = 0, 0.0, False
-    limits = record.data.limits if record.role == "demos" else None
+    limits = record.limits
     if limits is not None and here().first:
         shown = record.data.require_actions()[transitions(record.data).rows]
         print(f"{record.name}: {limits.line(shown)}", flush=True)
     for part in training.parts:
-        for module in part.stage.modules.values():
-            known = None if limits is None else range_of(module)
-            if limits is not None and known is not None:
+        if limits is not None:
+            for known in filter(None, map(range_of, part.stage.modules.values())):
                 limits.give(known)
         state, _ = fit(
             part,

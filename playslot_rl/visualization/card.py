@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from playslot_rl.evaluation.card import RESULT, Card
-from playslot_rl.evaluation.card_verdict import conclude
+from playslot_rl.evaluation.card_verdict import concluded
 from playslot_rl.evaluation.effect_lines import Replayed
 from playslot_rl.visualization.charts import usage_chart
 from playslot_rl.visualization.document import Block, Document, Missing, Picture, Section, Table, Text
@@ -40,7 +40,7 @@ def verdict_text(result: Mapping[str, Any]) -> str:
     """`verdict: usable: replay 0.82; 12 good, 5 fair, 2 bad`."""
     counts = {v: sum(one["verdict"] == v for one in result["lines"]) for v in VERDICTS}
     counted = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
-    return f"{conclude(result['lines'], result['details'].get('code_counts', []))}; {counted}"
+    return f"{concluded(result)}; {counted}"
 
 
 def told_text(result: Mapping[str, Any]) -> str:

@@ -155,11 +155,11 @@ def test_past_the_trained_horizon_the_page_says_so(agent: Agent, robots: Recorde
 
 
 def test_the_horizon_is_that_of_the_runs_dynamics(tmp_path: Path) -> None:
-    assert play.trained_horizon("pretrained/block_push_easy") == 24
-    assert play.trained_horizon("pretrained/button_press") == 18
+    assert play.predicted_frames("pretrained/block_push_easy") == 24
+    assert play.predicted_frames("pretrained/button_press") == 18
     run = tmp_path / "run"
     shutil.copytree(pretrained_folder("button_press"), run)
-    assert play.trained_horizon(str(run)) == 18
+    assert play.predicted_frames(str(run)) == 18
 
 
 def test_the_page_says_which_prototypes_do_the_same(studio: Studio) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from playslot_rl.errors import OutputError, explain
-from playslot_rl.storage.atomic import alone, explain_write_errors, replace_dir, write_bytes, write_json, write_text
+from playslot_rl.storage.atomic import explain_write_errors, lock, replace_dir, write_bytes, write_json, write_text
 
 
 def test_a_failed_write_leaves_the_old_content_and_no_temporary(
@@ -38,7 +38,7 @@ def test_what_a_killed_writer_left_is_written_over(tmp_path: Path) -> None:
 
 def test_what_another_process_is_writing_is_left_to_it(tmp_path: Path) -> None:
     with (tmp_path / ".file.txt.tmp-0").open("w") as others:
-        assert alone(others.fileno())
+        assert lock(others.fileno())
         others.write("theirs")
         write_text(tmp_path / "file.txt", "ours")
     assert (tmp_path / "file.txt").read_text() == "ours"

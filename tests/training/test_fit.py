@@ -19,7 +19,7 @@ from toy_stage import ToyStage, toy_config, train
 import playslot_rl.storage.resume as resume_module
 from playslot_rl.config import LoggingConfig
 from playslot_rl.errors import CheckpointError, ConfigError, OutputError, TrainingError
-from playslot_rl.storage.atomic import alone
+from playslot_rl.storage.atomic import lock
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.logging import History
@@ -110,7 +110,7 @@ def test_what_another_process_is_writing_is_left_alone(tmp_path: Path) -> None:
     written = tmp_path / "checkpoints" / ".step_00000099.tmp-0123"
     written.mkdir(parents=True)
     handle = os.open(written, os.O_RDONLY)
-    assert alone(handle)
+    assert lock(handle)
     try:
         train(tmp_path)
         assert written.exists()
