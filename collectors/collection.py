@@ -11,8 +11,8 @@ from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.config import CollectorConfig, ExperimentConfig
 from playslot_rl.data.metadata import INFO_NAME, json_content
 from playslot_rl.errors import ConfigError, DataError, OutputError
-from playslot_rl.progress import StageProgress
-from playslot_rl.threads import available_cores
+from playslot_rl.runtime.progress import StageProgress
+from playslot_rl.runtime.threads import available_cores
 
 
 def is_complete(out: Path, spec: CollectionSpec) -> bool:

@@ -26,8 +26,8 @@ from playslot_rl.collectors.journal import RecordedEpisode
 from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.envs import make_env, task_env
 from playslot_rl.envs.torchrl import TensorView, View, wrap
-from playslot_rl.episode_seeds import redraw_stride
 from playslot_rl.errors import ConfigError
+from playslot_rl.seeds.episodes import redraw_stride
 
 EPISODE_INDEX: Final = "episode_index"
 REDRAWN: Final = "redrawn"

@@ -22,7 +22,7 @@ from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.envs import PROCEDURAL, task_metadata
 from playslot_rl.envs.grid_shapes import METADATA
 from playslot_rl.errors import OutputError
-from playslot_rl.progress import quiet_datasets
+from playslot_rl.runtime.progress import quiet_datasets
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.folders import new_folder
 

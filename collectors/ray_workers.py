@@ -14,7 +14,7 @@ from playslot_rl.collectors.episodes import EpisodeCollector, TaskMaker, collect
 from playslot_rl.collectors.journal import Journal, encode
 from playslot_rl.collectors.recording import Report
 from playslot_rl.errors import PlaySlotError
-from playslot_rl.ray_cluster import RayCluster, worker_cannot_start
+from playslot_rl.runtime.ray_cluster import RayCluster, worker_cannot_start
 
 
 class RemoteEpisodeCollector(EpisodeCollector):

@@ -19,7 +19,6 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from playslot_rl.children import begin_worker, worker_context
 from playslot_rl.collectors.episodes import EpisodeCollector, record
 from playslot_rl.collectors.journal import Journal, RecordedEpisode
 from playslot_rl.collectors.spec import CollectionSpec
@@ -28,6 +27,7 @@ from playslot_rl.envs import PROCEDURAL
 from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.envs.rendering import check_rendering
 from playslot_rl.errors import PlaySlotError
+from playslot_rl.runtime.children import begin_worker, worker_context
 
 AHEAD = 2
 """Episodes in a worker's hands: while it records one, the next is there already."""

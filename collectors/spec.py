@@ -8,8 +8,8 @@ from typing import Any, Literal
 from playslot_rl.config import EnvConfig, ExperimentConfig, RenderConfig, from_dict
 from playslot_rl.config.plain import nearest
 from playslot_rl.envs import PROCEDURAL, gym_id
-from playslot_rl.episode_seeds import EPISODES, LARGEST_SEED, episode_seed
 from playslot_rl.errors import ConfigError
+from playslot_rl.seeds.episodes import EPISODES, LARGEST_SEED, episode_seed
 
 FORMAT = 1
 OFFSETS = {"random": 0, "expert": EPISODES // 2}

@@ -30,11 +30,11 @@ from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop, resized
 from playslot_rl.acting.imagination import ImaginationEnv, ImaginationSession, Reward, latent_actions
 from playslot_rl.config import ExperimentConfig, RenderConfig
-from playslot_rl.devices import named_device, probed
 from playslot_rl.errors import CheckpointError, require_type
 from playslot_rl.frames import as_numbers, normalise
 from playslot_rl.modules.inverse_dynamics import LatentActions
 from playslot_rl.modules.savi import Decoded
+from playslot_rl.runtime.devices import named_device, probed
 from playslot_rl.world_model import Agent, WorldModel, module_device
 
 if TYPE_CHECKING:

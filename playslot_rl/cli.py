@@ -113,7 +113,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _alone(name: str) -> int:
     """Refuse several processes; 0 where there is one."""
-    from playslot_rl.processes import launched
+    from playslot_rl.runtime.processes import launched
 
     if launched().world == 1:
         return 0
@@ -141,9 +141,9 @@ def _run(name: str, options: argparse.Namespace) -> int:
         from playslot_rl import doctor
 
         return doctor.main(config)
-    from playslot_rl import processes
     from playslot_rl.config.weights import data_roots, is_remote
     from playslot_rl.envs.rendering import import_mujoco
+    from playslot_rl.runtime import processes
     from playslot_rl.storage.folders import require_outside
 
     roots = [root.path for text in (config.data.root, config.data.demos) for root in data_roots(text)]
@@ -191,7 +191,7 @@ def _fail(name: str, message: str, code: int, patience_s: float = OWN_PATIENCE_S
     """Print one line. Of several processes the first one with an error of its own does: what all of them got is said by
     rank 0, and the others are ended by the launcher while they wait, or find it said.
     """
-    from playslot_rl.processes import claim, launched
+    from playslot_rl.runtime.processes import claim, launched
 
     rank = launched().rank
     if rank:

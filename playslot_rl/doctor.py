@@ -18,7 +18,7 @@ from typing import Final, Literal
 from packaging.requirements import Requirement
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.threads import available_cores
+from playslot_rl.runtime.threads import available_cores
 
 Status = Literal["ok", "warn", "FAIL"]
 
@@ -98,7 +98,7 @@ def check_torch(device: str = "") -> Check:
     try:
         import torch
 
-        from playslot_rl.devices import named_device
+        from playslot_rl.runtime.devices import named_device
 
         name = str(named_device(device))
         total = float(torch.ones(8, 8, device=name).matmul(torch.ones(8, 8, device=name)).sum())
@@ -106,7 +106,7 @@ def check_torch(device: str = "") -> Check:
         return Check("torch", "FAIL", _one_line(error), "choose device=cpu" if device else _REINSTALL)
     if total != 512.0:
         return Check("torch", "FAIL", f"a product of ones sums to {total}, expected 512", _REINSTALL)
-    from playslot_rl.precision import resolve_precision
+    from playslot_rl.runtime.precision import resolve_precision
 
     what = torch.cuda.get_device_name() if name.startswith("cuda") else f"{torch.get_num_threads()} threads"
     chosen = resolve_precision("auto", torch.device(name).type)

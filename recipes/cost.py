@@ -35,9 +35,9 @@ def main(config: ExperimentConfig) -> str:
     """The two tables, in Markdown; progress goes to standard error."""
     import torch
 
-    from playslot_rl.allocator import tune_allocator
+    from playslot_rl.runtime.allocator import tune_allocator
+    from playslot_rl.runtime.threads import set_threads
     from playslot_rl.speed.cost import STAGES, Machine, stage_cost
-    from playslot_rl.threads import set_threads
 
     tune_allocator()
     set_threads(config.threads)
@@ -93,7 +93,7 @@ def measured(config: ExperimentConfig, costs: Sequence[StageCost], device: torch
     """
     import torch
 
-    from playslot_rl.precision import native_bf16
+    from playslot_rl.runtime.precision import native_bf16
     from playslot_rl.speed.cost import stage_config
     from playslot_rl.speed.step import time_step
 

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from playslot_rl.episode_seeds import LARGEST_DRAW
 from playslot_rl.recipes.actions import JSON, Action, Argument, make_parser, run_action, whole
+from playslot_rl.seeds.episodes import LARGEST_DRAW
 
 
 def parser(kind: type[argparse.ArgumentParser] = argparse.ArgumentParser) -> argparse.ArgumentParser:

@@ -6,11 +6,11 @@ import time
 from dataclasses import replace
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.episode_seeds import LARGEST_SEED
 from playslot_rl.errors import ConfigError
 from playslot_rl.recipes import evaluate, inspect, train_policy
 from playslot_rl.recipes.pipeline import collect_demos
 from playslot_rl.recipes.run import open_run, parent_run
+from playslot_rl.seeds.episodes import LARGEST_SEED
 
 FIRST_SEED = 7
 """Added to `seed`: the shipped model was trained on videos of the base seeds 0 and 1, and the demo sees new ones."""

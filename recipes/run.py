@@ -114,10 +114,10 @@ def open_device(config: ExperimentConfig) -> torch.device:
     Raises:
         ConfigError: no such device.
     """
-    from playslot_rl.allocator import tune_allocator
-    from playslot_rl.devices import named_device, probed
-    from playslot_rl.processes import own_device
-    from playslot_rl.threads import set_threads
+    from playslot_rl.runtime.allocator import tune_allocator
+    from playslot_rl.runtime.devices import named_device, probed
+    from playslot_rl.runtime.processes import own_device
+    from playslot_rl.runtime.threads import set_threads
 
     tune_allocator()
     set_threads(config.threads)

@@ -28,7 +28,7 @@ def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
     """
     from playslot_rl.data.cache import Cache
     from playslot_rl.data.slot_cache import slot_cache
-    from playslot_rl.seeding import global_seed
+    from playslot_rl.seeds.draws import global_seed
     from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
     from playslot_rl.training.fit import Part
     from playslot_rl.training.patience import patience_of
@@ -77,7 +77,7 @@ def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
 
 def _actions_read(stage: DynamicsStage) -> dict[str, Any]:
     """The range of the actions that are the latents in mode `ground_truth`, after saying it; empty in other modes."""
-    from playslot_rl.processes import here
+    from playslot_rl.runtime.processes import here
 
     source = stage.source
     if not stage.criterion.needs_actions or source.limits is None:

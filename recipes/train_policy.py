@@ -76,7 +76,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
     """The frozen world model's view of the demonstrations; fresh policy, oracle and decoder on top of it."""
     from playslot_rl.data.demonstrations import require_finite, require_labelled
     from playslot_rl.data.labels import label_demonstrations, with_copies
-    from playslot_rl.seeding import global_seed
+    from playslot_rl.seeds.draws import global_seed
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
     from playslot_rl.training.runs import load_world_model, trained_horizon

@@ -23,8 +23,8 @@ def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
     """
     from playslot_rl.evaluation.slots import validation_scores
     from playslot_rl.modules.savi import SAVi
-    from playslot_rl.processes import here
-    from playslot_rl.seeding import global_seed
+    from playslot_rl.runtime.processes import here
+    from playslot_rl.seeds.draws import global_seed
     from playslot_rl.training.fit import Part
     from playslot_rl.training.patience import patience_of
     from playslot_rl.training.record import StageRecord, Training, run_stage

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from playslot_rl import doctor
-from playslot_rl.allocator import tune_allocator
 from playslot_rl.config import DataConfig, ExperimentConfig
-from playslot_rl.threads import available_cores, set_threads
+from playslot_rl.runtime.allocator import tune_allocator
+from playslot_rl.runtime.threads import available_cores, set_threads
 
 
 def test_all_is_well_here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -70,7 +70,7 @@ def test_little_disk_space_is_found(free: float, status: str, tmp_path: Path, mo
 def test_the_allocator_setting_is_accepted_and_changes_no_result() -> None:
     # In a process of its own, since it cannot be undone.
     code = (
-        "from playslot_rl.allocator import tune_allocator\n"
+        "from playslot_rl.runtime.allocator import tune_allocator\n"
         "print(tune_allocator(), tune_allocator(), len(bytes(300_000_000)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

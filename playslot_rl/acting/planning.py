@@ -20,7 +20,7 @@ from playslot_rl.acting.planners import Cost, Planner, Search, latent_statistics
 from playslot_rl.acting.planners.costs import GoalCost, NearProposal, goal_distance, parse_goal
 from playslot_rl.acting.planners.size import SearchSize
 from playslot_rl.config.planning import PlanConfig
-from playslot_rl.seeding import step_generator
+from playslot_rl.seeds.draws import step_generator
 from playslot_rl.world_model import Agent, action_decoder_module, frame_parser_module
 
 Goals = Callable[[Sequence[int]], Tensor]

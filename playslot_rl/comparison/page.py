@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config.methods import LATENT_MODELS, METHODS
-from playslot_rl.progress import format_seconds
+from playslot_rl.runtime.progress import format_seconds
 from playslot_rl.visualization.charts import METHOD_STYLES, Theme, legend, new_figure, step_axis, style_axes
 from playslot_rl.visualization.document import table
 

@@ -15,10 +15,10 @@ from collections.abc import Iterator
 from functools import partial
 from typing import IO, Final
 
-from playslot_rl.children import end_with_parent
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.spelling import spelled
 from playslot_rl.errors import PlaySlotError
+from playslot_rl.runtime.children import end_with_parent
 
 PATIENCE_S: Final = 30.0
 """What torchrun is given to end its processes when the job is interrupted."""

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.comparison.video_clips import sheet_name
-from playslot_rl.progress import format_seconds
+from playslot_rl.runtime.progress import format_seconds
 from playslot_rl.visualization.charts import VIDEO_STYLES, Theme, legend, new_figure, style_axes
 from playslot_rl.visualization.document import table
 from playslot_rl.visualization.grid import image_grid

@@ -8,7 +8,7 @@ from typing import Final, Literal, get_args
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import OPEN_FRACTION, SEED, YEAR_MINUTES, Checked, above_zero, at_least, between, role
-from playslot_rl.episode_seeds import EPISODES
+from playslot_rl.seeds.episodes import EPISODES
 
 VideoMethod = Literal["svg", "caddy", "slotformer", "ocvp_seq", "playslot", "playslot_m"]
 VIDEO_METHODS: Final[tuple[VideoMethod, ...]] = get_args(VideoMethod)

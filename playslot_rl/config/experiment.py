@@ -29,7 +29,7 @@ from playslot_rl.config.roles import (
 )
 from playslot_rl.config.sizes import is_amount
 from playslot_rl.config.stages import BehaviourStageConfig, DynamicsStageConfig, SlotsStageConfig
-from playslot_rl.episode_seeds import EPISODES, EVALUATION
+from playslot_rl.seeds.episodes import EPISODES, EVALUATION
 
 WORKERS = at_least(0, "0 (one per core) or more", 1024)
 
@@ -130,7 +130,7 @@ class EvaluationConfig(Checked):
 
     Attributes:
         references: also run the random, expert and slot-oracle references.
-        seed_offset: first number of the episodes of small seeds (`playslot_rl.episode_seeds`), above all collections'.
+        seed_offset: first number of the episodes of small seeds (`playslot_rl.seeds.episodes`), above all collections'.
             Below that only the records of the training data sets, which are looked at, keep episodes apart.
     """
 

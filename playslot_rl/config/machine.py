@@ -19,7 +19,7 @@ from playslot_rl.config.sizes import shown
 from playslot_rl.config.stages import DynamicsStageConfig, StageConfig
 from playslot_rl.config.video import VideoStageConfig
 from playslot_rl.errors import ConfigError
-from playslot_rl.threads import available_cores
+from playslot_rl.runtime.threads import available_cores
 
 ELSEWHERE: Final = frozenset({"submitit_slurm", "ray"})
 """Launchers whose jobs run on other machines."""

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final, Literal
 
 from playslot_rl.config.plain import check, to_dict, type_hints
-from playslot_rl.episode_seeds import EPISODES, LARGEST_SEED
+from playslot_rl.seeds.episodes import EPISODES, LARGEST_SEED
 
 Role = Literal["call", "machine", "free", "folder"]
 """`call`: what one invocation does; a stored run does not hand it on.

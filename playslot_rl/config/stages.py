@@ -7,8 +7,7 @@ from typing import Literal
 
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import COUNT, NOT_NEGATIVE, RATE, Checked, above_zero, at_least, below_one, between, role
-
-Precision = Literal["fp32", "bf16", "auto"]
+from playslot_rl.runtime.precision import Precision as Precision
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,8 @@ from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.frames import rgb_frames, sized
 from playslot_rl.data.metadata import stated_size
 from playslot_rl.errors import PlaySlotError
+from playslot_rl.runtime.threads import available_cores
 from playslot_rl.storage.atomic import explain_write_errors, write_text
-from playslot_rl.threads import available_cores
 
 UNIT_FRAMES: Final = 2048
 """Frames of a unit, about: some seconds of work."""

@@ -32,7 +32,7 @@ import numpy.typing as npt
 from playslot_rl import keys
 from playslot_rl.data.metadata import LARGEST_PICTURE
 from playslot_rl.errors import ConfigError, DataError, OutputError
-from playslot_rl.progress import quiet_datasets
+from playslot_rl.runtime.progress import quiet_datasets
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.folders import new_folder, require_free
 

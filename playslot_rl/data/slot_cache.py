@@ -21,7 +21,7 @@ from playslot_rl.data.cache_entries import ENTRY_NAME, room
 from playslot_rl.data.source import ConcatFrames, EpisodeFrames
 from playslot_rl.data.stream import streams_of
 from playslot_rl.frames import normalise
-from playslot_rl.seeding import step_generator
+from playslot_rl.seeds.draws import step_generator
 from playslot_rl.storage.atomic import write_json
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ import numpy as np
 
 from playslot_rl.datasets.assemble import assemble, choose
 from playslot_rl.datasets.verify import Verification, require_sound, require_verified
-from playslot_rl.episode_seeds import LARGEST_DRAW
 from playslot_rl.errors import ConfigError, DataError
+from playslot_rl.seeds.episodes import LARGEST_DRAW
 from playslot_rl.storage.folders import new_folder, require_free
 
 

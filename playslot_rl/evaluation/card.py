@@ -27,7 +27,7 @@ from playslot_rl.evaluation.probes import infer_latents
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.frames import normalise
 from playslot_rl.modules.savi.health import MOVING, SlotHealth
-from playslot_rl.seeding import global_seed
+from playslot_rl.seeds.draws import global_seed
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.training.logging import finite
 from playslot_rl.world_model import WorldModel, module_device

@@ -28,7 +28,7 @@ from playslot_rl.evaluation.replay import (
     same_mover,
     squared_change,
 )
-from playslot_rl.seeding import derived_seed
+from playslot_rl.seeds.draws import derived_seed
 from playslot_rl.world_model import WorldModel, module_device
 
 STEPS = 5

@@ -16,7 +16,7 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.evaluation.card_lines import ACTIONS, MEASURES, Line, line
 from playslot_rl.evaluation.probes import codebook_usage, participation_ratio, probe_actions, repaired
 from playslot_rl.frames import normalise
-from playslot_rl.seeding import derived_seed, step_generator
+from playslot_rl.seeds.draws import derived_seed, step_generator
 from playslot_rl.world_model import WorldModel, module_device
 
 NOISE = 0.02

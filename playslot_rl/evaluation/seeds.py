@@ -9,8 +9,8 @@ from typing import Any
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import data_roots
-from playslot_rl.episode_seeds import episode_seed
 from playslot_rl.errors import ConfigError, DataError
+from playslot_rl.seeds.episodes import episode_seed
 
 
 def first_seed(config: ExperimentConfig, seed: int) -> int:

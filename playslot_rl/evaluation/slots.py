@@ -19,13 +19,13 @@ import torch
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs import PROCEDURAL, RECORDED, make_env
 from playslot_rl.envs.grid_shapes import generate
-from playslot_rl.episode_seeds import episode_seed
 from playslot_rl.evaluation.objects import adjusted_rand_index
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.frames import psnr, to_float
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.modules.savi.health import owners
+from playslot_rl.seeds.episodes import episode_seed
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.training.runs import load_savi, slots_checkpoint
 from playslot_rl.world_model import module_device

@@ -31,8 +31,8 @@ from playslot_rl.config.methods import method_stage
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
+from playslot_rl.runtime.threads import available_cores
 from playslot_rl.storage.atomic import write_json
-from playslot_rl.threads import available_cores
 from playslot_rl.world_model import Agent
 
 POLICY_PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")

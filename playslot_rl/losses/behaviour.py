@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from playslot_rl import keys
-from playslot_rl.shares import averaged
+from playslot_rl.runtime.shares import averaged
 
 
 class _CloningLoss(LossModule):

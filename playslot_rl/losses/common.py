@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from playslot_rl.frames import psnr
-from playslot_rl.shares import averaged, own_noise
+from playslot_rl.runtime.shares import averaged, own_noise
 
 
 def total_loss(losses: TensorDictBase | Mapping[str, Tensor]) -> Tensor:

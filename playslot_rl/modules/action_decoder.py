@@ -24,7 +24,7 @@ from playslot_rl.config import ActionDecoderConfig
 from playslot_rl.modules.action_range import ActionRange
 from playslot_rl.modules.transformer import SlotTokenEncoder
 from playslot_rl.modules.whitening import Whitening
-from playslot_rl.shares import own_noise
+from playslot_rl.runtime.shares import own_noise
 
 SAME = 1e-6
 """Standard deviation up to which numbers count as the same."""

@@ -17,8 +17,8 @@ from playslot_rl.config import InverseDynamicsConfig
 from playslot_rl.modules.action_range import ActionRange
 from playslot_rl.modules.quantizer import ActionQuantizer
 from playslot_rl.modules.transformer import SlotTokenEncoder
-from playslot_rl.precision import full_precision
-from playslot_rl.shares import own_noise
+from playslot_rl.runtime.precision import full_precision
+from playslot_rl.runtime.shares import own_noise
 
 
 class LatentActions(NamedTuple):

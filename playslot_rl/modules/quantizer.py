@@ -9,7 +9,7 @@ Note: the authors' EMA keeps 5 % of the old value a step and never revives a dea
 whose EMA cluster size falls below a threshold by a random latent of the batch.
 
 The codebook's start, its average and the revival are those of the global batch, whatever share of it is computed here
-(`playslot_rl.shares`): every process runs them on the latents of all, so that all have the same codebook.
+(`playslot_rl.runtime.shares`): every process runs them on the latents of all, so that all have the same codebook.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from vector_quantize_pytorch import VectorQuantize
 
-from playslot_rl.processes import here
-from playslot_rl.shares import all_rows, share
+from playslot_rl.runtime.processes import here
+from playslot_rl.runtime.shares import all_rows, share
 
 
 class ActionQuantizer(nn.Module):

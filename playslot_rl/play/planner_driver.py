@@ -17,7 +17,7 @@ from playslot_rl.acting.planners import CEMPlanner, Search, latent_statistics, s
 from playslot_rl.acting.planners.costs import DynamicsDistance, GoalCost
 from playslot_rl.acting.planning import policy_plan
 from playslot_rl.config.planning import PlanConfig
-from playslot_rl.seeding import step_generator
+from playslot_rl.seeds.draws import step_generator
 from playslot_rl.world_model import Agent
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from playslot_rl.errors import DataError
 from playslot_rl.play.pictures import session_animation
 from playslot_rl.play.session import PlaySession
 from playslot_rl.play.timeline import SceneMoment
-from playslot_rl.progress import quiet_datasets
+from playslot_rl.runtime.progress import quiet_datasets
 from playslot_rl.storage.atomic import explain_write_errors, write_bytes, write_json
 from playslot_rl.storage.folders import new_folder
 from playslot_rl.storage.locks import locked

@@ -18,11 +18,11 @@ from playslot_rl.acting.episodes import Task
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.data.source import EpisodeFrames, FrameRows
 from playslot_rl.data.windows import spread_evenly
-from playslot_rl.episode_seeds import redraw_stride
 from playslot_rl.errors import RenderError
 from playslot_rl.frames import to_float
 from playslot_rl.play.picture import read_picture
 from playslot_rl.play.twin import Twin
+from playslot_rl.seeds.episodes import redraw_stride
 from playslot_rl.world_model import WorldModel, module_device
 
 Frame = npt.NDArray[np.uint8]

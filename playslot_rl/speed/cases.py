@@ -23,7 +23,7 @@ from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.predictors.cocvp import COCVP
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.modules.savi.decoder import BroadcastDecoder
-from playslot_rl.precision import autocast, native_bf16
+from playslot_rl.runtime.precision import autocast, native_bf16
 from playslot_rl.training.fit import build_adam, clip_gradients, trainable_parameters
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ class Variant:
         collapse: collapsed first layer of the decoder.
         precision: of convolutions and transformers; `auto` is what this processor is fastest in.
         channels_last: memory format of the convolutions' maps.
-        allocator: keep freed memory (`playslot_rl.allocator`).
+        allocator: keep freed memory (`playslot_rl.runtime.allocator`).
         cached: rollout with cached keys and values; of a search, our own planner.
         decoded_frames: predicted frames decoded for the image loss; 0 decodes all.
         shipped: the world model that ships for ButtonPress, in the place of `Sizes.model`.

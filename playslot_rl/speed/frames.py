@@ -27,10 +27,10 @@ from playslot_rl.data.source import open_source
 from playslot_rl.data.stream import open_stream
 from playslot_rl.data.windows import Clips, sample_windows
 from playslot_rl.frames import normalise
-from playslot_rl.progress import quiet_datasets
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.runtime.progress import quiet_datasets
+from playslot_rl.runtime.threads import available_cores
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.speed.cases import Sizes
-from playslot_rl.threads import available_cores
 
 _FPS = 10
 

@@ -16,11 +16,11 @@ from multiprocessing.context import ForkServerProcess
 from statistics import median
 from typing import Any
 
-from playslot_rl.allocator import tune_allocator
-from playslot_rl.children import worker_context
 from playslot_rl.errors import PlaySlotError
+from playslot_rl.runtime.allocator import tune_allocator
+from playslot_rl.runtime.children import worker_context
+from playslot_rl.runtime.threads import set_threads
 from playslot_rl.speed.cases import Sizes, Variant
-from playslot_rl.threads import set_threads
 
 
 def serve(pipe: Connection[Any, Any], variant: Variant, sizes: Sizes, threads: int) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from playslot_rl.config import BlocksConfig, EnvConfig
+from playslot_rl.runtime.threads import available_cores
 from playslot_rl.speed.cases import (
     Sizes,
     computed_here,
@@ -18,7 +19,6 @@ from playslot_rl.speed.cases import (
     savi_variants,
 )
 from playslot_rl.speed.plan import plan_variants
-from playslot_rl.threads import available_cores
 from playslot_rl.visualization import document
 
 TARGETS: Final = {
@@ -63,9 +63,9 @@ def measure(
     Raises:
         PlaySlotError: a child died. RenderError: no GL backend.
     """
-    from playslot_rl.allocator import tune_allocator
     from playslot_rl.envs import block_config
-    from playslot_rl.precision import resolve_precision
+    from playslot_rl.runtime.allocator import tune_allocator
+    from playslot_rl.runtime.precision import resolve_precision
     from playslot_rl.speed.frames import render_seconds, sampling_rates
     from playslot_rl.speed.race import race
     from playslot_rl.speed.sets import set_rates

@@ -15,12 +15,12 @@ from statistics import median
 import torch
 from torch import Tensor, nn
 
-from playslot_rl import processes
 from playslot_rl.config import SlotsStageConfig
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.processes import free_port
-from playslot_rl.seeding import StepGenerators
-from playslot_rl.shares import own_rows
+from playslot_rl.runtime import processes
+from playslot_rl.runtime.processes import free_port
+from playslot_rl.runtime.shares import own_rows
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.speed.cases import OPTIM, Sizes, Step, Variant, build_savi, slots_loss, training_step
 from playslot_rl.speed.race import Child, start
 from playslot_rl.training.batches import GlobalBatches

@@ -18,7 +18,7 @@ import torch
 
 from playslot_rl.config import ExperimentConfig, Precision
 from playslot_rl.losses.common import total_loss
-from playslot_rl.precision import autocast
+from playslot_rl.runtime.precision import autocast
 from playslot_rl.speed.cost import begin, config_group, fresh_agent, parts, stage_config
 from playslot_rl.training.compiling import compile_parts
 from playslot_rl.training.fit import build_adam

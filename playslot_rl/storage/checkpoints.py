@@ -20,7 +20,7 @@ from torch import nn
 
 from playslot_rl.config.plain import flatten
 from playslot_rl.errors import CheckpointError
-from playslot_rl.precision import native_bf16
+from playslot_rl.runtime.precision import native_bf16
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.folders import new_folder
 from playslot_rl.storage.resume import first_difference, read_json

@@ -2,8 +2,8 @@
 
     L = 1/n sum_i L_i,   n = processes x `optim.accumulate`
 
-Each share of the rows is computed by itself (`playslot_rl.shares`); gradients and numbers of all processes are averaged
-by one flat sum, between the backward pass and the clipping. With one share nothing is added to the plain loop.
+Each share of the rows is computed by itself (`playslot_rl.runtime.shares`); gradients and numbers of all processes are
+averaged by one flat sum, between the backward pass and the clipping. With one share nothing is added to the plain loop.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from playslot_rl.config import StageConfig
 from playslot_rl.errors import ConfigError
 from playslot_rl.modules.quantizer import ActionQuantizer
-from playslot_rl.processes import copied, here, summed
-from playslot_rl.seeding import StepGenerators, global_seed
-from playslot_rl.shares import Share, global_norms, sharing
+from playslot_rl.runtime.processes import copied, here, summed
+from playslot_rl.runtime.shares import Share, global_norms, sharing
+from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.training.stage import Stage
 
 

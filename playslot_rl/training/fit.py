@@ -2,7 +2,7 @@
 
 A stage says what it trains and what its loss is; the loop steps Adam, schedules, clips, checks, logs, validates and
 checkpoints. Killed at any moment and started again, it ends with the same weights and buffers, bit for bit on a CPU.
-Of several processes (`playslot_rl.processes`) each computes its share of every batch, and the first one writes.
+Of several processes (`playslot_rl.runtime.processes`) each computes its share of every batch, and the first one writes.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from torch import Tensor, nn
 from playslot_rl.config import LoggingConfig, OptimConfig, StageConfig, to_dict
 from playslot_rl.config.roles import fixed_keys
 from playslot_rl.errors import CheckpointError
-from playslot_rl.processes import agreed, here, spreading, wait
-from playslot_rl.progress import StageProgress
-from playslot_rl.seeding import global_seed
+from playslot_rl.runtime.processes import agreed, here, spreading, wait
+from playslot_rl.runtime.progress import StageProgress
+from playslot_rl.seeds.draws import global_seed
 from playslot_rl.storage.resume import TrainingCheckpoints, TrainingState
 from playslot_rl.training.averages import WeightAverage
 from playslot_rl.training.batches import GlobalBatches

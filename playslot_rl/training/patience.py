@@ -13,7 +13,7 @@ from pathlib import Path
 
 from torch import nn
 
-from playslot_rl.processes import here, wait
+from playslot_rl.runtime.processes import here, wait
 from playslot_rl.storage.resume import TrainingState
 from playslot_rl.storage.tensors import load_modules, load_tensors, module_tensors, save_tensors
 

@@ -29,7 +29,7 @@ from playslot_rl.data.weighted import weighted
 from playslot_rl.data.windows import Clips
 from playslot_rl.errors import CheckpointError, DataError
 from playslot_rl.modules.action_range import range_of
-from playslot_rl.processes import here, wait
+from playslot_rl.runtime.processes import here, wait
 from playslot_rl.storage.atomic import explain_write_errors
 from playslot_rl.storage.checkpoints import (
     StageCheckpoint,

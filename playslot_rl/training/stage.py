@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor, nn
 
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 
 
 class Stage(Protocol):
@@ -22,13 +22,13 @@ class Stage(Protocol):
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         """Scalars of one step; `loss` is minimised, the others are logged. All randomness comes from `generators`.
 
-        Rows are drawn for the whole batch and passed through `playslot_rl.shares.own_rows`, noise is drawn by
+        Rows are drawn for the whole batch and passed through `playslot_rl.runtime.shares.own_rows`, noise is drawn by
         `own_noise`, and what is no mean over the rows is computed from `all_rows`.
         """
 
     def validate(self, step: int) -> Mapping[str, float]:
         """Numbers on held-out data after `step` steps; called without gradients, modules in eval mode. What takes long
-        is shared out by `playslot_rl.processes.spread`.
+        is shared out by `playslot_rl.runtime.processes.spread`.
         """
 
 

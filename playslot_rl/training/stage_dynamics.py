@@ -16,10 +16,10 @@ from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.errors import DataError
 from playslot_rl.losses.common import total_loss
 from playslot_rl.losses.dynamics import DynamicsLoss
-from playslot_rl.precision import autocast
-from playslot_rl.processes import spread
-from playslot_rl.seeding import StepGenerators, step_generator
-from playslot_rl.shares import own_rows
+from playslot_rl.runtime.precision import autocast
+from playslot_rl.runtime.processes import spread
+from playslot_rl.runtime.shares import own_rows
+from playslot_rl.seeds.draws import StepGenerators, step_generator
 from playslot_rl.world_model import WorldModel, module_device
 
 

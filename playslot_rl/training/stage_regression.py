@@ -22,10 +22,10 @@ from playslot_rl.data.demonstrations import Transitions, real_actions
 from playslot_rl.data.shifts import shift_frames
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
-from playslot_rl.precision import autocast
-from playslot_rl.processes import spread
-from playslot_rl.seeding import StepGenerators
-from playslot_rl.shares import own_noise, own_rows
+from playslot_rl.runtime.precision import autocast
+from playslot_rl.runtime.processes import spread
+from playslot_rl.runtime.shares import own_noise, own_rows
+from playslot_rl.seeds.draws import StepGenerators
 
 Observed = Tensor | tuple[Tensor, ...]
 """What a network is called with: one tensor (b, ...), or several."""

@@ -20,9 +20,9 @@ from playslot_rl.frames import psnr, to_uint8
 from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.modules.savi import Decoded, SAVi
 from playslot_rl.modules.savi.health import SlotHealth
-from playslot_rl.processes import spread
-from playslot_rl.seeding import StepGenerators, step_generator
-from playslot_rl.shares import own_rows
+from playslot_rl.runtime.processes import spread
+from playslot_rl.runtime.shares import own_rows
+from playslot_rl.seeds.draws import StepGenerators, step_generator
 from playslot_rl.training.slot_warnings import slot_warnings
 from playslot_rl.world_model import module_device
 

@@ -71,7 +71,7 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
     from playslot_rl.baselines.lapo.load import MODEL, NAME, sizes_of
     from playslot_rl.baselines.lapo.model import ForwardModel, InverseModel
     from playslot_rl.baselines.lapo.stage import LAPOModelStage
-    from playslot_rl.seeding import global_seed
+    from playslot_rl.seeds.draws import global_seed
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import StageRecord, Training, run_stage
 

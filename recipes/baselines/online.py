@@ -74,7 +74,7 @@ def _dreamer(record: StageRecord, device: torch.device) -> tuple[Learner, dict[s
     """The learner, what a finished run keeps of it, and the agent steps behind what it was given."""
     from playslot_rl.baselines.dreamer.learner import DreamerLearner
     from playslot_rl.baselines.dreamer.networks import DreamerNetworks
-    from playslot_rl.seeding import global_seed
+    from playslot_rl.seeds.draws import global_seed
 
     config, own = record.config, record.config.baselines.dreamer
     with global_seed(config.seed, 0, record.name):
@@ -86,7 +86,7 @@ def _sold(record: StageRecord, parent: str, device: torch.device) -> tuple[Learn
     """As `_dreamer`."""
     from playslot_rl.baselines.sold.actor import build_networks, prior_steps
     from playslot_rl.baselines.sold.learner import SOLDLearner
-    from playslot_rl.seeding import global_seed
+    from playslot_rl.seeds.draws import global_seed
     from playslot_rl.training.runs import load_savi
 
     config, own, slots = record.config, record.config.baselines.sold, record.parents["slots"]

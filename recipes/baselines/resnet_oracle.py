@@ -48,7 +48,7 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.baselines.oracles.resnet import NAME, ResNetPolicy, load_pretrained
     from playslot_rl.data.demonstrations import moving_frames, require_finite
     from playslot_rl.losses.behaviour import BehaviourLoss
-    from playslot_rl.seeding import global_seed
+    from playslot_rl.seeds.draws import global_seed
     from playslot_rl.training.fit import Part
     from playslot_rl.training.patience import Patience
     from playslot_rl.training.record import Training

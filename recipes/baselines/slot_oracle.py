@@ -64,7 +64,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
 
     from playslot_rl.data.demonstrations import moving_slots, real_actions, require_finite, transitions
     from playslot_rl.modules.policy import LatentPolicy
-    from playslot_rl.seeding import global_seed
+    from playslot_rl.seeds.draws import global_seed
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
     from playslot_rl.training.runs import load_savi

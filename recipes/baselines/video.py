@@ -73,7 +73,7 @@ def _on_pixels(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.baselines.caddy.stage import CADDYStage
     from playslot_rl.baselines.svg.stage import SVGStage
     from playslot_rl.baselines.video.load import build_pixel_model
-    from playslot_rl.seeding import global_seed
+    from playslot_rl.seeds.draws import global_seed
 
     own: VideoStageConfig = getattr(config.baselines, config.method)
     device = open_device(config)
@@ -90,7 +90,7 @@ def _on_slots(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.baselines.video.load import uncontrolled
     from playslot_rl.data.cache import Cache
     from playslot_rl.data.slot_cache import slot_cache
-    from playslot_rl.seeding import global_seed
+    from playslot_rl.seeds.draws import global_seed
     from playslot_rl.storage.checkpoints import load_weights
     from playslot_rl.training.patience import patience_of
     from playslot_rl.training.runs import stage_model

@@ -7,7 +7,7 @@ import torch
 from clips import moving_square
 
 from playslot_rl.data.shifts import shift_frames
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.training.stage_regression import FrameInputs
 
 

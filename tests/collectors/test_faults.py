@@ -127,7 +127,7 @@ def test_too_many_dead_workers_end_the_collection(tmp_path: Path, monkeypatch: p
 
 
 def test_missing_ray_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from playslot_rl import ray_cluster
+    from playslot_rl.runtime import ray_cluster
 
     monkeypatch.setattr(ray_cluster.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"playslot_rl\[ray\]"):

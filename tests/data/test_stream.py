@@ -21,7 +21,7 @@ from playslot_rl.data.stride import every
 from playslot_rl.data.windows import Clips
 from playslot_rl.errors import DataError
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.testing import tiny_config, tiny_savi
 
 CAMERA = "observation.images.top"
@@ -165,7 +165,7 @@ def test_a_buffer_that_has_room_for_all_blocks_holds_all_of_them_at_every_step(
 
 
 def test_the_step_of_a_generator_does_not_change_what_it_draws() -> None:
-    from playslot_rl.seeding import derived_seed
+    from playslot_rl.seeds.draws import derived_seed
 
     plain = np.random.default_rng(derived_seed(1, 7, "windows"))
     assert np.array_equal(StepGenerators(1, 7).numpy("windows").random(9), plain.random(9))

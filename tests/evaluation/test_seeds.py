@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from playslot_rl.config import DataConfig, EvaluationConfig, ExperimentConfig
-from playslot_rl.episode_seeds import episode_seed
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, recorded_seeds, training_seeds
+from playslot_rl.seeds.episodes import episode_seed
 
 
 def _data_set(root: Path, content: object) -> Path:

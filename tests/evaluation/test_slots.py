@@ -11,7 +11,6 @@ import torch
 
 from playslot_rl.config.compose import compose
 from playslot_rl.envs import make_env
-from playslot_rl.episode_seeds import episode_seed
 from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.evaluation.slots import (
     RESULT,
@@ -23,6 +22,7 @@ from playslot_rl.evaluation.slots import (
     validation_scores,
 )
 from playslot_rl.modules.savi import SAVi
+from playslot_rl.seeds.episodes import episode_seed
 from playslot_rl.training.runs import load_savi
 
 OBJECTS = {

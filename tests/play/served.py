@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from playslot_rl.processes import free_port
+from playslot_rl.runtime.processes import free_port
 
 OUTPUT = "output.txt"
 """In the folder that the process works in: a pipe that nobody reads would stop it."""

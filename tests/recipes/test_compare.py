@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import signal
@@ -259,7 +258,6 @@ def test_joblib_runs_the_jobs_side_by_side(shared_run: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("playslot_rl.processes") is None, reason="needs training on processes")
 def test_joblib_runs_two_jobs_of_two_processes_each(shared_run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = _arguments(shared_run, out, "methods=slot_oracle", "demos=2,3", "processes=2")

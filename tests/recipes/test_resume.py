@@ -22,7 +22,7 @@ from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.errors import OutputError
 from playslot_rl.recipes.run import open_run
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.locks import locked
 from playslot_rl.training import record
 from playslot_rl.training.stage_slots import SlotsStage

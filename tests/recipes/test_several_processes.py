@@ -19,8 +19,8 @@ from commands import ONE_CORE, smoke
 
 from playslot_rl import cli
 from playslot_rl.errors import TrainingError
-from playslot_rl.processes import free_port
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.runtime.processes import free_port
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.tensors import load_tensors
 from playslot_rl.training.stage_slots import SlotsStage
 

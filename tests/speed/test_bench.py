@@ -24,7 +24,7 @@ from playslot_rl.losses.dynamics import DynamicsLoss
 from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.predictors.cocvp import COCVP
-from playslot_rl.precision import resolve_precision
+from playslot_rl.runtime.precision import resolve_precision
 from playslot_rl.speed import cases
 from playslot_rl.speed.cases import (
     Sizes,

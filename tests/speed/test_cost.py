@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import nn
 
-from playslot_rl import precision as precision_module
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import ConfigError
 from playslot_rl.recipes import cost as recipe
+from playslot_rl.runtime import precision as precision_module
 from playslot_rl.speed import cost, step
 from playslot_rl.speed.cost import Count, Machine, StageCost, estimate, stage_cost
 

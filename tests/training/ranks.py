@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from playslot_rl import processes
+from playslot_rl.runtime import processes
 
 TIMEOUT_S = 300
 

@@ -13,7 +13,7 @@ from playslot_rl.config import ActionDecoderConfig, BehaviourStageConfig, OptimC
 from playslot_rl.data.demonstrations import Demonstrations
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage, Seen, cloning_settings
 from playslot_rl.training.stage_regression import TensorInputs
 

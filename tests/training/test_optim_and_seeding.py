@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from playslot_rl.config import OptimConfig
-from playslot_rl.seeding import StepGenerators, global_seed, step_generator
+from playslot_rl.seeds.draws import StepGenerators, global_seed, step_generator
 from playslot_rl.training.fit import build_adam, clip_gradients, learning_rate, trainable_parameters
 
 

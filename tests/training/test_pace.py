@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.config import OptimConfig, StageConfig
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.resume import TrainingState
 from playslot_rl.training import fit as fit_module
 from playslot_rl.training.fit import Part, fit

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from toy_stage import toy_config
 
 from playslot_rl.errors import CheckpointError
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.resume import TrainingState
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.patience import Patience

@@ -11,9 +11,9 @@ import torch
 from ranks import log_of, run_ranks
 from tiny_stages import DOUBLE, STAGES, in_double
 
-from playslot_rl import processes
 from playslot_rl.errors import CheckpointError, ConfigError, PeerError
-from playslot_rl.processes import agreed, claim, here, wait
+from playslot_rl.runtime import processes
+from playslot_rl.runtime.processes import agreed, claim, here, wait
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
 from playslot_rl.training.fit import fit
 

@@ -16,7 +16,7 @@ from playslot_rl.config import LoggingConfig, OptimConfig, SAViConfig, SlotsStag
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.seeding import step_generator
+from playslot_rl.seeds.draws import step_generator
 from playslot_rl.testing import tiny_savi
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.logging import History

@@ -8,8 +8,8 @@ import pytest
 import torch
 from tiny_stages import STAGES
 
-from playslot_rl.precision import autocast
-from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.runtime.precision import autocast
+from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.training.stage_dynamics import DynamicsStage
 
 KINDS = ["dynamics", "dynamics of many agents", "slotformer", "ocvp_seq"]

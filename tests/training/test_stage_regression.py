@@ -14,7 +14,7 @@ from playslot_rl.data.demonstrations import Demonstrations
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.testing import tiny_config
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, oracle_stage

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from playslot_rl import keys
 from playslot_rl.config import SlotsStageConfig
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.testing import tiny_savi
 from playslot_rl.training.stage_slots import SlotsStage
 

@@ -41,7 +41,7 @@ from playslot_rl.data.windows import Clips
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
-from playslot_rl.seeding import global_seed
+from playslot_rl.seeds.draws import global_seed
 from playslot_rl.testing import tiny_savi
 from playslot_rl.training.fit import Part
 from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from playslot_rl.config import OptimConfig, StageConfig
 from playslot_rl.modules.quantizer import ActionQuantizer
-from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.training.fit import Part, TrainingState, fit
 
 

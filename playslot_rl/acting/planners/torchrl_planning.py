@@ -6,7 +6,7 @@ training distribution is standard.
 Their candidates are called "action" and begin with mean 0 and deviation 1, so the latent actions are renamed and scaled
 at once. They are several times slower than our own on the cached rollout (`playslot bench`, `plan_step`), keep no
 elites, have no floor of the deviation and draw from the global generator: wrap a call in
-`playslot_rl.seeding.global_seed`.
+`playslot_rl.seeds.draws.global_seed`.
 
 Shapes: M candidates, H horizon, N slots, D slot width, Z latent-action width.
 """

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from playslot_rl.baselines.caddy.blocks import Res
-from playslot_rl.shares import all_rows, own_noise
+from playslot_rl.runtime.shares import all_rows, own_noise
 
 VARIANCE = 1e-6
 """Added to the variances."""

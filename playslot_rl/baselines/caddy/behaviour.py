@@ -35,7 +35,7 @@ from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, mov
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
-from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.training.stage_regression import (
     FrameInputs,

@@ -14,7 +14,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.shares import all_rows
+from playslot_rl.runtime.shares import all_rows
 
 TINY = 1e-12
 

@@ -27,10 +27,10 @@ from playslot_rl.config.video import CADDYConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise, psnr
 from playslot_rl.modules.quantizer import usage
-from playslot_rl.precision import autocast
-from playslot_rl.processes import spread
-from playslot_rl.seeding import StepGenerators
-from playslot_rl.shares import own_rows
+from playslot_rl.runtime.precision import autocast
+from playslot_rl.runtime.processes import spread
+from playslot_rl.runtime.shares import own_rows
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.world_model import module_device
 
 

@@ -26,7 +26,7 @@ from playslot_rl.baselines.dreamer.actor import act
 from playslot_rl.baselines.dreamer.networks import BINS, UNIMIX, DreamerNetworks, actor_module
 from playslot_rl.config.baselines import DreamerConfig
 from playslot_rl.losses.common import total_loss
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 
 
 def world_model(networks: DreamerNetworks) -> TensorDictSequential:

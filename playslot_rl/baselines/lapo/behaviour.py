@@ -22,7 +22,7 @@ from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
-from playslot_rl.seeding import global_seed
+from playslot_rl.seeds.draws import global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
 from playslot_rl.training.runs import freeze_on, stage_config, stage_model
 from playslot_rl.training.stage_regression import RegressionStage

@@ -24,10 +24,10 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise
 from playslot_rl.modules.quantizer import usage
-from playslot_rl.precision import autocast
-from playslot_rl.processes import spread
-from playslot_rl.seeding import StepGenerators
-from playslot_rl.shares import own_rows
+from playslot_rl.runtime.precision import autocast
+from playslot_rl.runtime.processes import spread
+from playslot_rl.runtime.shares import own_rows
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.world_model import module_device
 
 BATCH = 64

@@ -19,7 +19,7 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import Actor, RandomActor
 from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.baselines.online.learner import Learner
-from playslot_rl.episode_seeds import redraw_stride
+from playslot_rl.seeds.episodes import redraw_stride
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 
 
 class Learner(Protocol):
@@ -58,7 +58,7 @@ class Learner(Protocol):
     def update(self, batch: TensorDict, generators: StepGenerators) -> Mapping[str, Tensor]:
         """One optimiser step on a batch of sequences, modules in train mode.
 
-        The loop seeds torch's global generators for the call (`playslot_rl.seeding.global_seed`), for what
+        The loop seeds torch's global generators for the call (`playslot_rl.seeds.draws.global_seed`), for what
         takes no generator.
 
         Args:

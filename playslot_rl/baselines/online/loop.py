@@ -28,10 +28,10 @@ from playslot_rl.baselines.online.replay import Replay
 from playslot_rl.config import to_dict
 from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.config.roles import fixed_keys
-from playslot_rl.episode_seeds import episode_seed
 from playslot_rl.evaluation.intervals import wilson
-from playslot_rl.progress import StageProgress
-from playslot_rl.seeding import StepGenerators, global_seed, step_generator
+from playslot_rl.runtime.progress import StageProgress
+from playslot_rl.seeds.draws import StepGenerators, global_seed, step_generator
+from playslot_rl.seeds.episodes import episode_seed
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.training.logging import Watch
 from playslot_rl.training.record import StageRecord

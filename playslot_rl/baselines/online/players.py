@@ -29,11 +29,11 @@ from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.baselines.online.acting import PlayedEpisodes, play
 from playslot_rl.baselines.online.checkpoints import whole_episodes
 from playslot_rl.baselines.online.learner import Learner
-from playslot_rl.children import begin_worker, worker_context
 from playslot_rl.config import CollectorConfig
 from playslot_rl.errors import PlaySlotError
-from playslot_rl.ray_cluster import RayCluster, worker_cannot_start
-from playslot_rl.seeding import global_seed, step_generator
+from playslot_rl.runtime.children import begin_worker, worker_context
+from playslot_rl.runtime.ray_cluster import RayCluster, worker_cannot_start
+from playslot_rl.seeds.draws import global_seed, step_generator
 from playslot_rl.storage.tensors import load_modules, module_tensors, tensor_bytes
 
 START_S = 300.0

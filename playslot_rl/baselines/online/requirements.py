@@ -5,9 +5,9 @@ from __future__ import annotations
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.envs import gym_id
-from playslot_rl.episode_seeds import EPISODES
 from playslot_rl.errors import ConfigError
-from playslot_rl.processes import here
+from playslot_rl.runtime.processes import here
+from playslot_rl.seeds.episodes import EPISODES
 
 
 def require_online(config: ExperimentConfig, online: OnlineConfig, method: str) -> None:

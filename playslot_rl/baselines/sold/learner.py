@@ -24,7 +24,7 @@ from playslot_rl.baselines.sold.networks import SOLDNetworks
 from playslot_rl.config.baselines import SOLDConfig
 from playslot_rl.frames import normalise
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 
 
 class SOLDLearner:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.shares import own_noise
+from playslot_rl.runtime.shares import own_noise
 
 State = tuple[Tensor, Tensor]
 """Hidden and cell state of an LSTM (layers, B, hidden)."""

@@ -16,10 +16,10 @@ from playslot_rl.config.video import SVGConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise, psnr
 from playslot_rl.losses.common import draw_frames
-from playslot_rl.precision import autocast
-from playslot_rl.processes import spread
-from playslot_rl.seeding import StepGenerators, step_generator
-from playslot_rl.shares import own_rows
+from playslot_rl.runtime.precision import autocast
+from playslot_rl.runtime.processes import spread
+from playslot_rl.runtime.shares import own_rows
+from playslot_rl.seeds.draws import StepGenerators, step_generator
 from playslot_rl.world_model import module_device
 
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from playslot_rl.config import PredictorConfig
 from playslot_rl.modules.transformer import KeysValues, sinusoidal_code
-from playslot_rl.precision import full_precision
+from playslot_rl.runtime.precision import full_precision
 
 Condition = tuple[Tensor, ...]
 Layers = list[KeysValues]

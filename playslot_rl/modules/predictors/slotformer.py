@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from playslot_rl.config import PredictorConfig
 from playslot_rl.modules.predictors.predictor import Condition
 from playslot_rl.modules.transformer import TransformerBlock, sinusoidal_code
-from playslot_rl.precision import full_precision
+from playslot_rl.runtime.precision import full_precision
 
 
 class SlotFormer(nn.Module):

@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.shares import own_noise
+from playslot_rl.runtime.shares import own_noise
 
 
 class SlotInitializer(nn.Module):

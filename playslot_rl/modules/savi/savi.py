@@ -18,7 +18,7 @@ from playslot_rl.modules.savi.decoder import BroadcastDecoder, PixelShuffleDecod
 from playslot_rl.modules.savi.encoder import SAViEncoder
 from playslot_rl.modules.savi.initializer import SlotInitializer
 from playslot_rl.modules.savi.transition import SlotTransition
-from playslot_rl.precision import autocast
+from playslot_rl.runtime.precision import autocast
 
 
 class Decoded(NamedTuple):

@@ -22,7 +22,7 @@ from playslot_rl.acting.planners.costs import (
 from playslot_rl.acting.planners.torchrl_planning import ReturnAdvantage, latent_of, planning_env, planning_start
 from playslot_rl.api import PlaySlot
 from playslot_rl.modules.whitening import Whitening
-from playslot_rl.seeding import global_seed
+from playslot_rl.seeds.draws import global_seed
 from playslot_rl.testing import tiny_agent, tiny_config, tiny_savi
 from playslot_rl.world_model import Agent, WorldModel
 

@@ -21,7 +21,7 @@ from playslot_rl.config.compose import compose
 from playslot_rl.data.demonstrations import DemonstrationSplit, transitions
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.modules.action_decoder import ActionDecoder
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.checkpoints import StageCheckpoint, save_stage
 
 SIZE, CPU = 32, torch.device("cpu")

@@ -14,7 +14,7 @@ from playslot_rl.baselines.caddy.perceptual import load_perceptual
 from playslot_rl.baselines.caddy.stage import CADDYStage, clip_length, temperature
 from playslot_rl.config.video import CADDYConfig
 from playslot_rl.data.windows import Clips
-from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.tensors import load_tensors
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.logging import History

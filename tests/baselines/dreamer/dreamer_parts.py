@@ -13,7 +13,7 @@ from playslot_rl.baselines.dreamer.learner import build_loss
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
 from playslot_rl.config import EnvConfig
 from playslot_rl.config.baselines import DreamerConfig
-from playslot_rl.seeding import global_seed
+from playslot_rl.seeds.draws import global_seed
 
 B, T, A = 2, 5, 4
 

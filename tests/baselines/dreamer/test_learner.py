@@ -11,7 +11,7 @@ from playslot_rl.baselines.dreamer.learner import DreamerLearner
 from playslot_rl.baselines.dreamer.networks import DreamerNetworks
 from playslot_rl.config import EnvConfig
 from playslot_rl.errors import ConfigError
-from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.resume import optimizer_tensors, restore_optimizer
 from playslot_rl.storage.tensors import load_modules, module_tensors
 

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from playslot_rl import keys
 from playslot_rl.baselines.dreamer.learner import records, world_model
 from playslot_rl.baselines.sold.losses import imagined_returns
-from playslot_rl.seeding import global_seed
+from playslot_rl.seeds.draws import global_seed
 
 MODEL = {"encoder", "prior", "posterior", "decoder", "reward"}
 

@@ -18,7 +18,7 @@ from playslot_rl.config.baselines import LAPOConfig
 from playslot_rl.data.demonstrations import transitions
 from playslot_rl.data.windows import Clips
 from playslot_rl.modules.action_decoder import ActionDecoder
-from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.seeds.draws import StepGenerators, global_seed
 
 CONFIG = LAPOConfig(channels=(8, 16), hidden=32, groups=2, code_dim=4, codes=4)
 

@@ -19,7 +19,7 @@ from playslot_rl.baselines.online.loop import train_online
 from playslot_rl.config import EnvConfig, ExperimentConfig, LoggingConfig, RenderConfig
 from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.errors import PlaySlotError
-from playslot_rl.seeding import StepGenerators, global_seed
+from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.tensors import module_tensors
 from playslot_rl.training.record import StageRecord
 

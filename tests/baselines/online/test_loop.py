@@ -21,7 +21,7 @@ from playslot_rl.baselines.online import loop
 from playslot_rl.baselines.online.acting import play
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.errors import CheckpointError, TrainingError
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 
 
 @pytest.fixture(autouse=True)

@@ -22,7 +22,7 @@ from playslot_rl.baselines.online.acting import PlayedEpisodes
 from playslot_rl.baselines.online.players import Players, Round, play_round
 from playslot_rl.config import CollectorConfig, EnvConfig, RenderConfig
 from playslot_rl.errors import PlaySlotError
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.tensors import module_tensors
 
 TASK = EnvConfig(max_steps=STEPS), RenderConfig()

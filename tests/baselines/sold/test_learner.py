@@ -16,7 +16,7 @@ from playslot_rl.baselines.sold import losses
 from playslot_rl.baselines.sold.learner import SOLDLearner
 from playslot_rl.baselines.sold.losses import imagine
 from playslot_rl.baselines.sold.networks import sample_action
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 
 Make = Callable[..., SOLDLearner]
 NETWORKS = ("dynamics", "reward", "actor", "critic")

@@ -14,7 +14,7 @@ from playslot_rl.baselines.svg.stage import SVGStage
 from playslot_rl.config.video import SVGConfig
 from playslot_rl.data.windows import Clips
 from playslot_rl.frames import normalise
-from playslot_rl.seeding import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.tensors import load_tensors
 from playslot_rl.training.fit import Part, fit
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from playslot_rl import processes
+from playslot_rl.runtime import processes
 
 if TYPE_CHECKING:
     import numpy as np

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from playslot_rl.config import CompareConfig, EnvConfig, EvaluationConfig, ExperimentConfig, RenderConfig
-from playslot_rl.episode_seeds import EPISODES, LARGEST_SEED, Stream, episode_seed, redraw_stride
+from playslot_rl.seeds.episodes import EPISODES, LARGEST_SEED, Stream, episode_seed, redraw_stride
 
 STREAMS: tuple[Stream, ...] = get_args(Stream)
 EDGES = (0, 1, 999, 1000, 1001, 1899, 1900, 1901, 2000, 4242, 2**31, LARGEST_SEED, LARGEST_SEED + 1)

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from playslot_rl import precision as subject
 from playslot_rl.config import ExperimentConfig, Precision, SAViConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.config.plain import flatten, to_dict
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.precision import autocast, native_bf16, resolve_precision
+from playslot_rl.runtime import precision as subject
+from playslot_rl.runtime.precision import autocast, native_bf16, resolve_precision
 from playslot_rl.storage.resume import first_difference
 
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import functools
 import warnings
-from typing import Final
+from typing import TYPE_CHECKING, Final, Literal
 
-import torch
+if TYPE_CHECKING:
+    import torch
 
-from playslot_rl.config import Precision
+Precision = Literal["fp32", "bf16", "auto"]
 
 _ARITHMETIC: Final = ("avx512_bf16", "amx_bf16", "bf16", "arm_bf16")
 
@@ -21,6 +22,8 @@ _ARITHMETIC: Final = ("avx512_bf16", "amx_bf16", "bf16", "arm_bf16")
 @functools.cache
 def native_bf16(device_type: str) -> bool:
     """Whether devices of a type (`cpu`, `cuda`) multiply bfloat16 in hardware."""
+    import torch
+
     if device_type == "cpu":
         has = torch.cpu.get_capabilities()
         return any(has.get(name, False) for name in _ARITHMETIC)
@@ -40,6 +43,8 @@ def autocast(device_type: str, precision: Precision) -> torch.autocast:
     Warns:
         RuntimeWarning: `bf16` is asked for where it is emulated.
     """
+    import torch
+
     if precision == "bf16" and not native_bf16(device_type):
         _warn_of_emulation(device_type)
     return torch.autocast(device_type, torch.bfloat16, enabled=resolve_precision(precision, device_type) == "bf16")
@@ -47,6 +52,8 @@ def autocast(device_type: str, precision: Precision) -> torch.autocast:
 
 def full_precision(device_type: str) -> torch.autocast:
     """Inside an `autocast`, surrounds what small differences pass through: it is computed in its inputs' precision."""
+    import torch
+
     return torch.autocast(device_type, enabled=False)
 
 

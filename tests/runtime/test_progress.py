@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from playslot_rl import progress
-from playslot_rl.progress import StageProgress, format_seconds
+from playslot_rl.runtime import progress
+from playslot_rl.runtime.progress import StageProgress, format_seconds
 
 
 class Clock:

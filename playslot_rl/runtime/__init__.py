@@ -1,0 +1,1 @@
+"""The machine: processes and threads, memory, devices, precision."""

@@ -1,0 +1,1 @@
+"""Seeds: of every draw of a training, and of every episode."""
