@@ -18,8 +18,8 @@ import numpy as np
 
 from playslot_rl.config import ExperimentConfig, SAViConfig, to_dict
 from playslot_rl.config.weights import data_roots
-from playslot_rl.data.survey import Choice, Survey, choose_size, choose_stride, survey
 from playslot_rl.data.windows import IntArray, split_episodes
+from playslot_rl.datasets.survey import Choice, Survey, choose_size, choose_stride, survey
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.recipes import inspect, train_dynamics, train_slots
 from playslot_rl.recipes.adopt_decisions import Decisions

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from playslot_rl.data.survey import Choice
+from playslot_rl.datasets.survey import Choice
 from playslot_rl.errors import ConfigError
 from playslot_rl.storage.atomic import write_json
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.data.survey import Choice
+from playslot_rl.datasets.survey import Choice
 from playslot_rl.recipes.adopt_decisions import Decisions
 from playslot_rl.recipes.adopt_trials import FEWEST_TIMED, SHORTEST, TIMED_SHARE, TIMED_STEPS, steps_within
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.data.survey import Choice
+from playslot_rl.datasets.survey import Choice
 
 if TYPE_CHECKING:
     from playslot_rl.training.pace import Pace

@@ -12,10 +12,10 @@ def main(config: ExperimentConfig) -> None:
 
     Raises:
         ConfigError: another environment, no `data.root` or `out`, or an unknown camera.
-        DataError, OutputError: see `playslot_rl.data.sketchy.convert_sketchy`.
+        DataError, OutputError: see `playslot_rl.datasets.sketchy.convert_sketchy`.
     """
     from playslot_rl.data.camera_names import camera_list
-    from playslot_rl.data.sketchy import PAPER_CAMERAS, convert_sketchy
+    from playslot_rl.datasets.sketchy import PAPER_CAMERAS, convert_sketchy
 
     if config.env.name != "sketchy":
         raise ConfigError(f"env: got {config.env.name}, expected sketchy, the layout that can be converted")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from playslot_rl.data.sketchy import example_class, masked_crc
+from playslot_rl.datasets.sketchy import example_class, masked_crc
 
 LENGTHS = (4, 6, 3, 5, 4)
 SIZE = (60, 96)

@@ -13,7 +13,7 @@ from playslot_rl.config.compose import compose
 from playslot_rl.data.camera_names import full_name, with_full_cameras
 from playslot_rl.data.source import open_source, open_sources
 from playslot_rl.data.stream import open_stream
-from playslot_rl.data.survey import survey
+from playslot_rl.datasets.survey import survey
 from playslot_rl.errors import DataError
 from playslot_rl.training.runs import store_config
 

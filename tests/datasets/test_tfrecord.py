@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sketchy_layout import example, frame_record
 
-from playslot_rl.data.sketchy import masked_crc, parse_example, read_records
+from playslot_rl.datasets.sketchy import masked_crc, parse_example, read_records
 from playslot_rl.errors import DataError
 
 

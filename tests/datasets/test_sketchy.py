@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from sketchy_layout import CAMERAS, LENGTHS, colour_of, example, frame_record, name_of, timestep, write_sketchy
 
-from playslot_rl.data.sketchy import convert_sketchy, split_episodes
 from playslot_rl.data.source import open_source, open_sources
+from playslot_rl.datasets.sketchy import convert_sketchy, split_episodes
 from playslot_rl.errors import ConfigError, DataError, OutputError
 
 

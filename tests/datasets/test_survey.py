@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from playslot_rl.data.survey import FAR, KEPT, Survey, choose_size, choose_stride, survey, typical_motion
+from playslot_rl.datasets.survey import FAR, KEPT, Survey, choose_size, choose_stride, survey, typical_motion
 from playslot_rl.errors import DataError
 
 Frames = npt.NDArray[np.uint8]
@@ -69,9 +69,9 @@ def test_long_episodes_of_which_only_the_beginning_is_read_move_as_well() -> Non
     assert value == 64, reason
 
 
-def test_a_data_set_is_looked_at_without_reading_all_of_it(foreign_video: Path) -> None:
-    found = survey(foreign_video, "observation.images.side")
+def test_a_data_set_is_looked_at_without_reading_all_of_it(video: Path) -> None:
+    found = survey(video, "observation.images.side")
     assert (found.fps, found.size, found.action_dim, found.lengths.tolist()) == (10.0, (64, 64), 2, [5, 3, 7])
     assert [frames.shape for frames in found.episodes] == [(n, 64, 64, 3) for n in (5, 3, 7)]
     with pytest.raises(DataError, match=r"got 2 cameras .* set data\.camera="):
-        survey(foreign_video)
+        survey(video)
