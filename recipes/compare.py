@@ -19,12 +19,12 @@ def main(config: ExperimentConfig) -> None:
         PlaySlotError: a job failed; the others have finished, and the table says so.
         KeyboardInterrupt: Ctrl-C; the same command carries on.
     """
-    from playslot_rl.comparison.launch import comparison_lock, open_comparison, run_due
-    from playslot_rl.comparison.plan import check_comparison, job_config, job_record, jobs
-    from playslot_rl.comparison.report import Comparison
     from playslot_rl.evaluation.success import DEFAULT_EPISODES
     from playslot_rl.recipes import compare_data
     from playslot_rl.recipes.run import parent_run
+    from playslot_rl.studies.launch import comparison_lock, open_comparison, run_due
+    from playslot_rl.studies.plan import check_comparison, job_config, job_record, jobs
+    from playslot_rl.studies.report import Comparison
 
     began, wanted = time.monotonic(), config.compare
     out = Path(config.out or f"runs/compare_{config.env.name}_{config.preset}")

@@ -14,7 +14,7 @@ from playslot_rl.config.weights import data_roots
 from playslot_rl.errors import ConfigError
 
 if TYPE_CHECKING:
-    from playslot_rl.comparison.plan import Job
+    from playslot_rl.studies.plan import Job
 
 RECORDED = Path("data") / "expert"
 
@@ -48,9 +48,9 @@ def prepare(config: ExperimentConfig, out: Path) -> ExperimentConfig:
     Raises:
         DataError, CheckpointError, OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.comparison.plan import latent_models, model_folder, uses_demos, uses_slots
     from playslot_rl.recipes import train_dynamics, train_slots
     from playslot_rl.recipes.pipeline import collect_videos
+    from playslot_rl.studies.plan import latent_models, model_folder, uses_demos, uses_slots
 
     models = latent_models(config)
     world = uses_slots(config) and not config.run
@@ -84,7 +84,7 @@ def _known(config: ExperimentConfig) -> DataConfig:
 
 
 def _check_demos(config: ExperimentConfig, out: Path) -> None:
-    from playslot_rl.comparison.plan import check_demos, uses_demos
+    from playslot_rl.studies.plan import check_demos, uses_demos
     from playslot_rl.training.record import open_videos
 
     if uses_demos(config) and (config.data.demos or _recorded(out)):
@@ -124,8 +124,8 @@ class Parents:
     """
 
     def __init__(self, config: ExperimentConfig, out: Path) -> None:
-        from playslot_rl.comparison.plan import latent_models, model_folder, uses_demos, uses_slots
         from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+        from playslot_rl.studies.plan import latent_models, model_folder, uses_demos, uses_slots
         from playslot_rl.training.record import open_videos
         from playslot_rl.training.runs import world_model_checkpoints
 

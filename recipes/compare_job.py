@@ -14,9 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from playslot_rl.comparison.launch import Status, job_lock, read_status, write_status
 from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.errors import explain
+from playslot_rl.studies.launch import Status, job_lock, read_status, write_status
 
 
 def main(file: Path) -> Status:
@@ -51,9 +51,9 @@ def _run(job: dict[str, Any]) -> None:
 
         compare_video_job.run(job)
         return
-    from playslot_rl.comparison.several import train_on_several
     from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts, task_facts
     from playslot_rl.recipes import evaluate, train_baseline
+    from playslot_rl.studies.several import train_on_several
 
     config, processes = from_dict(ExperimentConfig, job["config"]), int(job["processes"])
     if processes > 1:

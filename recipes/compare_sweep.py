@@ -11,7 +11,7 @@ from typing import Any
 
 import hydra
 
-from playslot_rl.comparison.launch import run_process
+from playslot_rl.studies.launch import run_process
 
 
 @hydra.main(version_base="1.3", config_path=None)

@@ -41,12 +41,12 @@ def main(config: ExperimentConfig) -> None:
 
 def compare(config: ExperimentConfig) -> None:
     """One comparison, into `config.out`; raises as `main` does."""
-    from playslot_rl.comparison.begun import require_begun_alike
-    from playslot_rl.comparison.launch import comparison_lock, open_comparison, run_due
-    from playslot_rl.comparison.video_plan import check_variants, video_job_config, video_job_record, video_jobs
-    from playslot_rl.comparison.video_report import VideoComparison
     from playslot_rl.envs import RECORDED
     from playslot_rl.evaluation.lpips import open_lpips
+    from playslot_rl.studies.begun import require_begun_alike
+    from playslot_rl.studies.launch import comparison_lock, open_comparison, run_due
+    from playslot_rl.studies.video_plan import check_variants, video_job_config, video_job_record, video_jobs
+    from playslot_rl.studies.video_report import VideoComparison
 
     began, own, out = time.monotonic(), config.compare_video, Path(config.out)
     check_variants(config)
@@ -94,9 +94,9 @@ def _check_models(config: ExperimentConfig, run: str) -> None:
             the weights of a perceptual loss cannot be read.
     """
     from playslot_rl.baselines.video.load import check_pixel_model
-    from playslot_rl.comparison.video_plan import uses_slots
     from playslot_rl.config.compare_video import ON_SLOTS
     from playslot_rl.storage.checkpoints import require_config
+    from playslot_rl.studies.video_plan import uses_slots
     from playslot_rl.training.runs import slots_checkpoint
 
     for method in config.compare_video.methods:
@@ -113,9 +113,9 @@ def _check_clips(config: ExperimentConfig) -> None:
         ConfigError: a test set is one of the sets that are trained on.
         DataError: too few episodes, or none as long as a clip of training or test.
     """
-    from playslot_rl.comparison.video_clips import test_sets, tested_clips
     from playslot_rl.config.weights import data_roots
     from playslot_rl.data.windows import Clips
+    from playslot_rl.studies.video_clips import test_sets, tested_clips
     from playslot_rl.training.record import open_videos
 
     own = config.compare_video
@@ -138,10 +138,10 @@ def _prepare(config: ExperimentConfig, out: Path) -> ExperimentConfig:
         DataError, CheckpointError, OutputError, TrainingError: see `playslot_rl.errors`.
     """
     from playslot_rl.collectors import collect
-    from playslot_rl.comparison.video_plan import uses_slots
     from playslot_rl.envs import PROCEDURAL
     from playslot_rl.recipes import train_slots
     from playslot_rl.recipes.pipeline import collect_demos, collect_videos
+    from playslot_rl.studies.video_plan import uses_slots
     from playslot_rl.training.runs import slots_checkpoint
 
     own = config.compare_video
@@ -168,8 +168,8 @@ def _prepare(config: ExperimentConfig, out: Path) -> ExperimentConfig:
 
 
 def _parents(config: ExperimentConfig) -> dict[str, str]:
-    from playslot_rl.comparison.video_clips import open_clips, test_sets
-    from playslot_rl.comparison.video_plan import uses_slots
+    from playslot_rl.studies.video_clips import open_clips, test_sets
+    from playslot_rl.studies.video_plan import uses_slots
     from playslot_rl.training.record import open_videos
     from playslot_rl.training.runs import slots_checkpoint
 
@@ -187,13 +187,13 @@ def _references(
     """Scores of the rows that need no training, and the true frames of the first clips."""
     from playslot_rl.baselines.video.scores import as_function, score_clips
     from playslot_rl.baselines.video.slots import LastFrame, Reconstruction
-    from playslot_rl.comparison.video_clips import test_sets, tested_clips
-    from playslot_rl.comparison.video_page import LAST_FRAME, RECONSTRUCTION
-    from playslot_rl.comparison.video_report import read_references
     from playslot_rl.config import to_dict
     from playslot_rl.evaluation.lpips import open_lpips
     from playslot_rl.recipes.run import open_device
     from playslot_rl.storage.atomic import write_json
+    from playslot_rl.studies.video_clips import test_sets, tested_clips
+    from playslot_rl.studies.video_page import LAST_FRAME, RECONSTRUCTION
+    from playslot_rl.studies.video_report import read_references
     from playslot_rl.training.runs import load_savi
 
     own, device = config.compare_video, open_device(config)

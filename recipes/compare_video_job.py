@@ -15,7 +15,7 @@ from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.errors import TrainingError
 
 if TYPE_CHECKING:
-    from playslot_rl.comparison.video_plan import VideoJob
+    from playslot_rl.studies.video_plan import VideoJob
 
 
 def run(record: dict[str, Any]) -> None:
@@ -24,7 +24,7 @@ def run(record: dict[str, Any]) -> None:
     Raises:
         PlaySlotError: whatever the training or its data refuse.
     """
-    from playslot_rl.comparison.video_plan import VideoJob
+    from playslot_rl.studies.video_plan import VideoJob
 
     job = VideoJob(record["method"], int(record["seed"]), Path(record["out"]), record["variant"])
     config = _chosen(job, from_dict(ExperimentConfig, record["config"]), record)
@@ -33,8 +33,8 @@ def run(record: dict[str, Any]) -> None:
 
 
 def _train(job: VideoJob, config: ExperimentConfig, processes: int) -> None:
-    from playslot_rl.comparison.several import train_on_several
     from playslot_rl.recipes import train_baseline, train_dynamics
+    from playslot_rl.studies.several import train_on_several
 
     if processes > 1:
         train_on_several("train-dynamics" if job.trained_as == "playslot" else "train-baseline", config, processes)
@@ -49,10 +49,10 @@ def _chosen(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> 
 
     The method's job that comes first makes the trials; those of its other seeds wait for them.
     """
-    from playslot_rl.comparison.begun import require_same_choice
-    from playslot_rl.comparison.video_plan import asked_of, in_steps, training_of, with_training
     from playslot_rl.storage.atomic import write_json
     from playslot_rl.storage.locks import locked
+    from playslot_rl.studies.begun import require_same_choice
+    from playslot_rl.studies.video_plan import asked_of, in_steps, training_of, with_training
 
     path = job.choice
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,7 +70,7 @@ def _chosen(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> 
 
 def _tried(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> dict[str, Any]:
     """The factor of the learning rate, the steps, and the trials that led to them."""
-    from playslot_rl.comparison.video_plan import TRIAL_SEED, asked_of, makes_trials, training_of
+    from playslot_rl.studies.video_plan import TRIAL_SEED, asked_of, makes_trials, training_of
 
     asked, steps = asked_of(record), int(training_of(config, job.method).steps)
     if not makes_trials(asked):
@@ -90,8 +90,8 @@ def _tried(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> d
 def _trial(job: VideoJob, config: ExperimentConfig, rate: float, steps: int, processes: int) -> dict[str, Any]:
     """Validation PSNR after a short training with a factor of the learning rate, and what a step takes; both None with
     a rate that the training does not survive, and its `error`."""
-    from playslot_rl.comparison.video_plan import in_steps, training_of, with_training
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+    from playslot_rl.studies.video_plan import in_steps, training_of, with_training
 
     config = in_steps(config, job.method, steps)
     own = training_of(config, job.method)
@@ -120,12 +120,12 @@ def _score(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> N
     from playslot_rl.baselines.video.load import load_video
     from playslot_rl.baselines.video.rows import method_rows
     from playslot_rl.baselines.video.scores import score_clips
-    from playslot_rl.comparison.video_clips import sheet_name, tested_clips
-    from playslot_rl.comparison.video_plan import asked_of
     from playslot_rl.evaluation.lpips import open_lpips
     from playslot_rl.recipes.run import open_device
     from playslot_rl.storage.atomic import explain_write_errors, write_json
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
+    from playslot_rl.studies.video_clips import sheet_name, tested_clips
+    from playslot_rl.studies.video_plan import asked_of
 
     asked, device, began = asked_of(record), open_device(config), time.monotonic()
     model = load_video(job.trained_as, job.run, device)

@@ -24,8 +24,8 @@ def each_number(config: ExperimentConfig, compare: Callable[[ExperimentConfig], 
         ConfigError: another task, or videos that have their number of objects already.
         PlaySlotError: trainings failed; all others have finished, and the tables say so.
     """
-    from playslot_rl.comparison.video_page import objects_page
     from playslot_rl.storage.atomic import write_json, write_text
+    from playslot_rl.studies.video_page import objects_page
 
     own, out, failed = config.compare_video, Path(config.out), list[str]()
     if config.env.name != "grid_shapes" or config.data.root or own.test or config.run:

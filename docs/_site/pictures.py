@@ -12,8 +12,8 @@ import re
 from pathlib import Path
 from typing import Any, Final
 
-from playslot_rl.comparison.page import comparison_figure
 from playslot_rl.config.methods import canonical_method
+from playslot_rl.studies.page import comparison_figure
 from playslot_rl.visualization.charts import LIGHT, figure_bytes
 
 DOCS: Final = Path(__file__).resolve().parents[1]

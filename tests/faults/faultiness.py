@@ -98,8 +98,8 @@ def _path(event: str, arguments: tuple[Any, ...]) -> str:
 
 def _jobs_here() -> None:
     """A comparison's jobs run in the process of its command, are killed with it, and need no imports of their own."""
-    from playslot_rl.comparison import launch
     from playslot_rl.recipes import compare_job
+    from playslot_rl.studies import launch
 
     launch.run_process = compare_job.main
 

@@ -18,9 +18,9 @@ import pytest
 from filelock import FileLock
 
 from playslot_rl import cli
-from playslot_rl.comparison import launch
-from playslot_rl.comparison.launch import Status
 from playslot_rl.recipes import compare_job
+from playslot_rl.studies import launch
+from playslot_rl.studies.launch import Status
 
 ONE_CORE = ("threads=1", "workers=1", "device=cpu")
 

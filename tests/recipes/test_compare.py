@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from commands import ONE_CORE, Done, assert_one_line, contents, instead, playslot
 
-from playslot_rl.comparison.launch import comparison_lock
 from playslot_rl.config.compare import LAUNCHERS
+from playslot_rl.studies.launch import comparison_lock
 
 Compare = Callable[..., Done]
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from commands import contents, instead, playslot, refused, run_jobs_here, smoke
 
-from playslot_rl.comparison.launch import sweep_command
-from playslot_rl.comparison.video_plan import VideoJob, in_steps, video_job_config
 from playslot_rl.config.compare_video import TITLES, VIDEO_METHODS
 from playslot_rl.config.compose import compose
+from playslot_rl.studies.launch import sweep_command
+from playslot_rl.studies.video_plan import VideoJob, in_steps, video_job_config
 
 METHODS = ",".join(VIDEO_METHODS)
 

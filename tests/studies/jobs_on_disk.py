@@ -7,11 +7,11 @@ from typing import Any
 
 import torch
 
-from playslot_rl.comparison.launch import Status, write_status
-from playslot_rl.comparison.plan import Job
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.tensors import save_tensors
+from playslot_rl.studies.launch import Status, write_status
+from playslot_rl.studies.plan import Job
 
 
 def finish(job: Job, successes: dict[str, int], episodes: int = 10, **meta: Any) -> Job:

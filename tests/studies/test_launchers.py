@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from playslot_rl.comparison import launch
-from playslot_rl.comparison.launch import Status, log_file, write_status
 from playslot_rl.config.compare import LAUNCHERS
+from playslot_rl.studies import launch
+from playslot_rl.studies.launch import Status, log_file, write_status
 
 SBATCH = """#!/bin/bash
 # Runs the array's tasks here, side by side, with the variables that Slurm sets.

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from jobs_on_disk import comparison, finish
 
-from playslot_rl.comparison.page import cell, comparison_figure, comparison_page
-from playslot_rl.comparison.plan import Job
-from playslot_rl.comparison.report import count_parameters, failures, job_rows, summarise
 from playslot_rl.config.methods import METHODS
 from playslot_rl.evaluation.intervals import wilson
+from playslot_rl.studies.page import cell, comparison_figure, comparison_page
+from playslot_rl.studies.plan import Job
+from playslot_rl.studies.report import count_parameters, failures, job_rows, summarise
 from playslot_rl.visualization.charts import LIGHT, METHOD_STYLES, figure_bytes
 
 
@@ -39,7 +39,7 @@ def test_a_failed_job_is_a_row_and_no_number(ended: dict[str, Any]) -> None:
 
 
 def test_what_an_older_run_of_a_failed_job_left_is_not_counted(tmp_path: Path) -> None:
-    from playslot_rl.comparison.launch import Status, write_status
+    from playslot_rl.studies.launch import Status, write_status
 
     job = finish(Job("lapo", 10, 0, tmp_path), {"simulation": 9})
     write_status(job.file, Status("failed", "f", "out of memory", 1.0))

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import pytest
 
-from playslot_rl.comparison import several
-from playslot_rl.comparison.plan import Job, job_config, job_record, jobs
-from playslot_rl.comparison.several import train_on_several, training_command
-from playslot_rl.comparison.video_plan import VideoJob, video_job_config, video_job_record
 from playslot_rl.config import CompareConfig, ExperimentConfig, to_dict
 from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS
 from playslot_rl.config.spelling import spelled
 from playslot_rl.errors import ConfigError, PlaySlotError
+from playslot_rl.studies import several
+from playslot_rl.studies.plan import Job, job_config, job_record, jobs
+from playslot_rl.studies.several import train_on_several, training_command
+from playslot_rl.studies.video_plan import VideoJob, video_job_config, video_job_record
 
 
 def of(folder: Path, *typed: str, command: str = "compare") -> ExperimentConfig:
@@ -111,7 +111,7 @@ def alive(process: int) -> bool:
 def test_a_job_that_is_killed_takes_its_training_with_it(tmp_path: Path) -> None:
     waits = f"import os, time; open({str(tmp_path / 'id')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
     code = (
-        "import sys; from playslot_rl.comparison import several; from playslot_rl.config import ExperimentConfig; "
+        "import sys; from playslot_rl.studies import several; from playslot_rl.config import ExperimentConfig; "
         f"several.training_command = lambda *_: [sys.executable, '-c', {waits!r}]; "
         "several.train_on_several('train-baseline', ExperimentConfig(), 2)"
     )

@@ -8,9 +8,6 @@ from typing import Any
 
 import pytest
 
-from playslot_rl.comparison.begun import require_begun_alike, require_same_choice
-from playslot_rl.comparison.plan import job_config, jobs
-from playslot_rl.comparison.video_plan import VideoJob, in_steps, video_job_config, video_jobs
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compare import CompareConfig
 from playslot_rl.config.compare_video import CompareVideoConfig
@@ -18,6 +15,9 @@ from playslot_rl.config.compose import compose
 from playslot_rl.config.roles import without
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_json
+from playslot_rl.studies.begun import require_begun_alike, require_same_choice
+from playslot_rl.studies.plan import job_config, jobs
+from playslot_rl.studies.video_plan import VideoJob, in_steps, video_job_config, video_jobs
 
 CARRIED_ON: dict[str, Any] = {
     "methods": ("svg", "caddy", "playslot"),

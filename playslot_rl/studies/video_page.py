@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.comparison.video_clips import sheet_name
 from playslot_rl.runtime.progress import format_seconds
+from playslot_rl.studies.video_clips import sheet_name
 from playslot_rl.visualization.charts import VIDEO_STYLES, Theme, legend, new_figure, style_axes
 from playslot_rl.visualization.document import table
 from playslot_rl.visualization.grid import image_grid

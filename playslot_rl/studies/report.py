@@ -12,9 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl.acting.episodes import TaskPool
-from playslot_rl.comparison.launch import Status, read_status
-from playslot_rl.comparison.page import comparison_figure, comparison_page, failures
-from playslot_rl.comparison.plan import Job, latent_models, model_folder, uses_slots
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import shipped
 from playslot_rl.config.methods import METHODS
@@ -23,6 +20,9 @@ from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_se
 from playslot_rl.evaluation.success import hardware, run_references
 from playslot_rl.storage.atomic import write_bytes, write_json, write_text
 from playslot_rl.storage.checkpoints import checkpoint_folder, provenance, read_stage
+from playslot_rl.studies.launch import Status, read_status
+from playslot_rl.studies.page import comparison_figure, comparison_page, failures
+from playslot_rl.studies.plan import Job, latent_models, model_folder, uses_slots
 from playslot_rl.training.runs import world_model_checkpoints, world_model_folder
 from playslot_rl.visualization.charts import LIGHT, figure_bytes
 

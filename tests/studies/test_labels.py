@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 from jobs_on_disk import comparison, finish
 
-from playslot_rl.comparison.page import comparison_figure, comparison_page
-from playslot_rl.comparison.plan import Job, job_config, jobs
-from playslot_rl.comparison.report import job_rows, summarise
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import ConfigError
+from playslot_rl.studies.page import comparison_figure, comparison_page
+from playslot_rl.studies.plan import Job, job_config, jobs
+from playslot_rl.studies.report import job_rows, summarise
 from playslot_rl.visualization.charts import LIGHT
 
 OUT = Path("out")

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from playslot_rl.comparison.plan import absolute, absolute_roots
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.compare_video import ON_SLOTS, TITLES, CompareVideoConfig, VideoMethod
 from playslot_rl.config.methods import MethodName
 from playslot_rl.config.roles import without
 from playslot_rl.errors import ConfigError
+from playslot_rl.studies.plan import absolute, absolute_roots
 
 VARIED = ("model.inverse_dynamics.", "model.predictor.", "dynamics.")
 """Where the settings are that change what PlaySlot predicts, on a SAVi that is there."""

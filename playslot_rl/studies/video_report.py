@@ -15,15 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.baselines.video.scores import bootstrap
-from playslot_rl.comparison.launch import Status, read_status
-from playslot_rl.comparison.report import count_parameters, read_json
-from playslot_rl.comparison.video_clips import sheet_name, test_sets
-from playslot_rl.comparison.video_page import video_figure, video_page, video_sheet
-from playslot_rl.comparison.video_plan import VideoJob
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.storage.atomic import write_bytes, write_json, write_text
 from playslot_rl.storage.checkpoints import provenance
+from playslot_rl.studies.launch import Status, read_status
+from playslot_rl.studies.report import count_parameters, read_json
+from playslot_rl.studies.video_clips import sheet_name, test_sets
+from playslot_rl.studies.video_page import video_figure, video_page, video_sheet
+from playslot_rl.studies.video_plan import VideoJob
 from playslot_rl.visualization.charts import LIGHT, figure_bytes
 from playslot_rl.visualization.grid import png
 

@@ -7,7 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from playslot_rl.comparison.plan import (
+from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
+from playslot_rl.config.compare import LAUNCHERS
+from playslot_rl.config.compose import compose
+from playslot_rl.config.methods import METHODS, MethodName
+from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.studies.plan import (
     Job,
     absolute_roots,
     check_comparison,
@@ -17,11 +22,6 @@ from playslot_rl.comparison.plan import (
     jobs,
     latent_models,
 )
-from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
-from playslot_rl.config.compare import LAUNCHERS
-from playslot_rl.config.compose import compose
-from playslot_rl.config.methods import METHODS, MethodName
-from playslot_rl.errors import CheckpointError, ConfigError
 
 OUT = Path("out")
 

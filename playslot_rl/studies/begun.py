@@ -11,10 +11,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from playslot_rl.comparison.video_plan import VideoJob, makes_trials
 from playslot_rl.config import to_dict
 from playslot_rl.config.compare_video import CompareVideoConfig
 from playslot_rl.errors import CheckpointError
+from playslot_rl.studies.video_plan import VideoJob, makes_trials
 
 TRAINED_WITH: Final = ("trained_seed", "trained_frames", "tested")
 """Settings that a trial and a training are made with."""

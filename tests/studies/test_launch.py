@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from playslot_rl.comparison import launch
-from playslot_rl.comparison.launch import Status, job_lock, log_file, read_status, write_status
 from playslot_rl.errors import PlaySlotError
+from playslot_rl.studies import launch
+from playslot_rl.studies.launch import Status, job_lock, log_file, read_status, write_status
 
 
 @pytest.fixture

@@ -12,10 +12,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from jobs_on_disk import comparison, finish
 
-from playslot_rl.comparison.launch import Status, write_status
-from playslot_rl.comparison.plan import Job
-from playslot_rl.comparison.report import job_rows, summarise
 from playslot_rl.storage.atomic import write_json
+from playslot_rl.studies.launch import Status, write_status
+from playslot_rl.studies.plan import Job
+from playslot_rl.studies.report import job_rows, summarise
 
 
 @pytest.fixture
