@@ -177,8 +177,7 @@ class StageRecord:
             return None
         done = read_stage(path, self.name)
         require_parents(done, self.parents)
-        own = (self.name,) if self.settings is None else self.settings
-        require_config(done, fixed_keys(self._of_stored(*self.counts, *own)))
+        require_config(done, self.finishes())
         facts: list[tuple[str, object, object]] = [("seed", self.config.seed, done.meta.get("seed", self.config.seed))]
         if self.role and self.roots:  # a finished stage can be asked for without
             facts.append(("data", self.data.fingerprint, next(iter(done.meta["data"].values()), "none")))
@@ -190,6 +189,11 @@ class StageRecord:
                 raise CheckpointError(f"{name}: got {got}, expected {old} as {path} was trained with: use another out=")
         print(f"{self.name}: finished before ({done.meta.get('steps')} steps), skipped", flush=True)
         return done
+
+    def finishes(self) -> dict[str, Any]:
+        """Parts of `stored`, nested as there, that a finished stage must share."""
+        own = (self.name,) if self.settings is None else self.settings
+        return fixed_keys(self._of_stored(*self.counts, *own))
 
     def resumes(self) -> dict[str, Any]:
         """Plain values that a half-finished stage must share, beside its settings and the seed."""
