@@ -40,7 +40,7 @@ exit 1
 endef
 export FIND_PYTHON
 
-.PHONY: help setup demo test test-all test-browser docs lint format typing lock clean FORCE
+.PHONY: help setup demo test test-all test-browser docs tables lint format typing lock clean FORCE
 
 help:
 	@echo "make demo      set up, then the main job: success in simulation and in imagination, in minutes"
@@ -48,6 +48,7 @@ help:
 	@echo "make test-all  set up, then all tests"
 	@echo "make test-browser  the page of playslot play in headless Chromium (Debian, Ubuntu: apt-get install chromium)"
 	@echo "make docs      the site of README, docs/ and the API, in build/site"
+	@echo "make tables    the tables and plots of README and docs/, from results/*.json"
 	@echo "make lint      ruff, format check, mypy strict"
 	@echo "make setup     .venv with the pinned packages and $(BIN)/playslot"
 	@echo "make format    format the code"
@@ -106,6 +107,10 @@ docs: export NO_MKDOCS_2_WARNING := 1
 docs: $(STAMP) typing
 	@$(BIN)/mkdocs build --strict $(ARGS)
 	@echo "look at it: $(BIN)/python -m http.server --bind 127.0.0.1 --directory build/site 8000"
+
+tables: $(STAMP)
+	@$(BIN)/python docs/_site/tables.py
+	@$(BIN)/python docs/_site/pictures.py
 
 # mypy, mkdocs and editors do not know the mapped folders: links that look like the installed package.
 typing:

@@ -1,51 +1,57 @@
-"""Draws the pictures of the table "Videos instead of labels" in docs/results.md, from its own numbers:
+"""Draws success over labels from the table `videos_and_labels` in results/:
 
-    .venv/bin/python docs/_site/pictures.py
+    make tables
 
-Each picture holds the fingerprint of the numbers that it was drawn from, and a test compares it with the page.
+Each picture holds the fingerprint of the numbers that it was drawn from, and a test compares it with the table.
 """
 
 from __future__ import annotations
 
 import hashlib
-import re
+import json
 from pathlib import Path
 from typing import Any, Final
 
-from playslot_rl.config.methods import canonical_method
+from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
+
 from playslot_rl.studies.page import comparison_figure
+from playslot_rl.config.methods import canonical_method
 from playslot_rl.visualization.charts import LIGHT, figure_bytes
 
-DOCS: Final = Path(__file__).resolve().parents[1]
+ROOT: Final = Path(__file__).resolve().parents[2]
+IMAGES: Final = ROOT / "docs" / "images"
 PICTURES: Final = {"ButtonPress": "labels_button_press.png", "easy BlockPush": "labels_block_push_easy.png"}
 """Task, as the table calls it, and its picture in docs/images."""
 FACT: Final = "Numbers"
 """Of a PNG's text: the fingerprint."""
-CELL: Final = re.compile(r"(\d+) % \((\d+) to (\d+); seeds (\d+) to (\d+)\)")
 
 
-def numbers(page: str, task: str) -> dict[str, Any]:
-    """What the page says of a task: percentages by method, protocol and labels, and the two references.
+def tables() -> dict[str, Any]:
+    """Those of results/videos_and_labels.json."""
+    read: dict[str, Any] = json.loads((ROOT / "results" / "videos_and_labels.json").read_text())["tables"]
+    return read
+
+
+def numbers(tables: dict[str, Any], task: str) -> dict[str, Any]:
+    """Percentages of a task by method, protocol, videos and labels, and its two references.
 
     Raises:
-        ValueError: the page has no such rows, or a cell of another form.
+        ValueError: the table has no rows of that task.
     """
-    header = next(line for line in page.splitlines() if line.startswith("| task | videos | labelled demonstrations |"))
-    titles = [cell.strip() for cell in header.strip("| ").split("|")][3:-1]
+    table = tables["videos_and_labels"]
     cells = {}
-    for line in page.splitlines():
-        name, *values = (cell.strip(" *") for cell in line.strip("| ").split("|"))
-        if name != task or len(values) != len(titles) + 3:
+    for name, videos, labels, *values in table["rows"]:
+        if name != task:
             continue
-        for title, value in zip(titles, values[2:-1], strict=True):
-            found = CELL.fullmatch(value.replace("*", ""))
-            if found is None:
-                raise ValueError(f"{task}, {title}: got {value!r}, expected MEAN % (LOW to HIGH; seeds A to B)")
-            cells[f"{title}|{values[0].replace(',', '')}|{values[1]}"] = [int(number) for number in found.groups()]
-    expert = re.search(rf"(\d+) % on {task}", page)
-    if not cells or expert is None:
-        raise ValueError(f"{task}: got no rows or no rate of the expert, expected both in docs/results.md")
-    return {"cells": cells, "references": {"expert": int(expert[1]), "random": 0}}
+        for column, cell in zip(table["columns"][3:], values, strict=True):
+            if column.get("unit") == "%":
+                key = f"{column['title']}|{videos}|{labels}"
+                cells[key] = [cell["value"], *cell["interval"], *cell["seeds"]]
+    if not cells:
+        raise ValueError(f"videos_and_labels: got no rows of {task!r}")
+    expert, random = next(row[1:3] for row in tables["videos_and_labels_references"]["rows"] if row[0] == task)
+    return {"cells": cells, "references": {"expert": expert, "random": random}}
 
 
 def fingerprint(found: dict[str, Any]) -> str:
@@ -73,12 +79,22 @@ def draw(found: dict[str, Any]) -> bytes:
     return figure_bytes(comparison_figure(result, LIGHT), LIGHT, facts={FACT: fingerprint(found)})
 
 
+def stale(path: Path, found: dict[str, Any]) -> bool:
+    """Whether the picture is missing or of other numbers."""
+    if not path.is_file():
+        return True
+    with Image.open(path) as stored:
+        return not isinstance(stored, PngImageFile) or stored.text.get(FACT) != fingerprint(found)
+
+
 def main() -> None:
-    """Draw all."""
-    page = (DOCS / "results.md").read_text()
+    """Draw the pictures whose numbers have changed."""
+    read = tables()
     for task, picture in PICTURES.items():
-        (DOCS / "images" / picture).write_bytes(draw(numbers(page, task)))
-        print(f"docs/images/{picture}")
+        found = numbers(read, task)
+        if stale(IMAGES / picture, found):
+            (IMAGES / picture).write_bytes(draw(found))
+            print(f"docs/images/{picture}")
 
 
 if __name__ == "__main__":

@@ -10,8 +10,9 @@ from typing import Any
 
 from children import Children, Ended
 from faultiness import WRITES
-from results import contents
 from table import Row
+
+from results import contents
 
 
 @dataclass
