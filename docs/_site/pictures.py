@@ -15,8 +15,8 @@ from typing import Any, Final
 from PIL import Image
 from PIL.PngImagePlugin import PngImageFile
 
-from playslot_rl.studies.page import comparison_figure
 from playslot_rl.config.methods import canonical_method
+from playslot_rl.studies.page import comparison_figure
 from playslot_rl.visualization.charts import LIGHT, figure_bytes
 
 ROOT: Final = Path(__file__).resolve().parents[2]
