@@ -93,8 +93,8 @@ def _check_models(config: ExperimentConfig, run: str) -> None:
         ConfigError, CheckpointError: SAVi was trained on frames of another size, SVG-LP or CADDY cannot take these, or
             the weights of a perceptual loss cannot be read.
     """
-    from playslot_rl.baselines.video.load import check_pixel_model
     from playslot_rl.config.compare_video import ON_SLOTS
+    from playslot_rl.methods.video.load import check_pixel_model
     from playslot_rl.storage.checkpoints import require_config
     from playslot_rl.studies.video_plan import uses_slots
     from playslot_rl.training.runs import slots_checkpoint
@@ -185,10 +185,10 @@ def _references(
     config: ExperimentConfig, out: Path, parents: dict[str, str]
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, int], npt.NDArray[np.uint8]]]:
     """Scores of the rows that need no training, and the true frames of the first clips."""
-    from playslot_rl.baselines.video.scores import as_function, score_clips
-    from playslot_rl.baselines.video.slots import LastFrame, Reconstruction
     from playslot_rl.config import to_dict
     from playslot_rl.evaluation.lpips import open_lpips
+    from playslot_rl.methods.video.scores import as_function, score_clips
+    from playslot_rl.methods.video.slots import LastFrame, Reconstruction
     from playslot_rl.recipes.run import open_device
     from playslot_rl.storage.atomic import write_json
     from playslot_rl.studies.video_clips import test_sets, tested_clips

@@ -117,10 +117,10 @@ def _score(job: VideoJob, config: ExperimentConfig, record: dict[str, Any]) -> N
     """Write `RUN/video.json` and the predictions of the first clips."""
     import numpy as np
 
-    from playslot_rl.baselines.video.load import load_video
-    from playslot_rl.baselines.video.rows import method_rows
-    from playslot_rl.baselines.video.scores import score_clips
     from playslot_rl.evaluation.lpips import open_lpips
+    from playslot_rl.methods.video.load import load_video
+    from playslot_rl.methods.video.rows import method_rows
+    from playslot_rl.methods.video.scores import score_clips
     from playslot_rl.recipes.run import open_device
     from playslot_rl.storage.atomic import explain_write_errors, write_json
     from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage

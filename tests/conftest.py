@@ -24,7 +24,7 @@ LONGEST = (
     "training/test_several_processes.py",
     "recipes/test_compare_video.py",
     "faults/test_every_command.py",
-    "baselines/online/test_players.py",
+    "methods/online/test_players.py",
     "recipes/test_compare.py",
     "recipes/test_several_processes.py",
     "recipes/test_baselines.py",

@@ -23,7 +23,7 @@ class Method:
         title: as tables and plots name it.
         recipe: module of `playslot_rl.recipes` whose `main(config)` trains it.
         actor: `module:function` of `load_actor(run, device) -> Actor`; empty for one that predicts frames and does not
-            act (`playslot_rl.baselines.video`).
+            act (`playslot_rl.methods.video`).
         online: it learns by acting (environment steps on the axis, needs a reward) instead of from demonstrations.
         slots: it builds on a world model's slots.
         stage: stage of its run whose checkpoint is the method's; empty means its name.
@@ -52,18 +52,18 @@ METHODS: Final[dict[str, Method]] = {
         "PlaySlot", "train_policy", "playslot_rl.acting.agent:load_actor", slots=True, stage="policy", decodes=True
     ),
     "slot_oracle": Method(
-        "Slot Oracle", "baselines.slot_oracle", "playslot_rl.baselines.oracles.slot:load_actor", slots=True
+        "Slot Oracle", "baselines.slot_oracle", "playslot_rl.methods.oracles.slot:load_actor", slots=True
     ),
     "resnet_oracle": Method(
         "ResNet Oracle",
         "baselines.resnet_oracle",
-        "playslot_rl.baselines.oracles.resnet:load_actor",
+        "playslot_rl.methods.oracles.resnet:load_actor",
         aliases=("ResNet",),
     ),
     "slot_bc": Method(
         "Slot BC",
         "baselines.slot_oracle",
-        "playslot_rl.baselines.oracles.slot:load_actor",
+        "playslot_rl.methods.oracles.slot:load_actor",
         slots=True,
         stage="slot_oracle",
         labelled_only=True,
@@ -71,20 +71,20 @@ METHODS: Final[dict[str, Method]] = {
     "resnet_bc": Method(
         "ResNet BC",
         "baselines.resnet_oracle",
-        "playslot_rl.baselines.oracles.resnet:load_actor",
+        "playslot_rl.methods.oracles.resnet:load_actor",
         stage="resnet_oracle",
         labelled_only=True,
     ),
     "lapo": Method(
-        "LAPO", "baselines.lapo", "playslot_rl.baselines.lapo.load:load_actor", decodes=True, model="lapo_model"
+        "LAPO", "baselines.lapo", "playslot_rl.methods.lapo.load:load_actor", decodes=True, model="lapo_model"
     ),
-    "dreamer": Method("DreamerV3", "baselines.online", "playslot_rl.baselines.dreamer.actor:load_actor", online=True),
-    "sold": Method("SOLD", "baselines.online", "playslot_rl.baselines.sold.actor:load_actor", online=True, slots=True),
+    "dreamer": Method("DreamerV3", "baselines.online", "playslot_rl.methods.dreamer.actor:load_actor", online=True),
+    "sold": Method("SOLD", "baselines.online", "playslot_rl.methods.sold.actor:load_actor", online=True, slots=True),
     "caddy_policy": Method(
-        "CADDY", "baselines.caddy", "playslot_rl.baselines.caddy.load:load_policy", decodes=True, model="caddy"
+        "CADDY", "baselines.caddy", "playslot_rl.methods.caddy.load:load_policy", decodes=True, model="caddy"
     ),
     "caddy_oracle": Method(
-        "CADDY Oracle", "baselines.caddy", "playslot_rl.baselines.caddy.load:load_oracle", model="caddy"
+        "CADDY Oracle", "baselines.caddy", "playslot_rl.methods.caddy.load:load_oracle", model="caddy"
     ),
     "svg": Method("SVG-LP", "baselines.video", aliases=("SVG",)),
     "caddy": Method("CADDY", "baselines.video"),

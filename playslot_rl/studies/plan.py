@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from playslot_rl.baselines.online.requirements import require_online
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import shipped
@@ -23,6 +22,7 @@ from playslot_rl.config.roles import without
 from playslot_rl.config.weights import data_roots, is_remote
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.methods.online.requirements import require_online
 
 
 @dataclass(frozen=True)

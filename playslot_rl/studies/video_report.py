@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.baselines.video.scores import bootstrap
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.success import hardware
+from playslot_rl.methods.video.scores import bootstrap
 from playslot_rl.storage.atomic import write_bytes, write_json, write_text
 from playslot_rl.storage.checkpoints import provenance
 from playslot_rl.studies.launch import Status, read_status

@@ -29,7 +29,7 @@ def main(config: ExperimentConfig) -> None:
         DataError: no videos, too few demonstrations, or none with actions.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.baselines.caddy.load import MODEL, POLICY
+    from playslot_rl.methods.caddy.load import MODEL, POLICY
     from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.record import run_stage
 
@@ -49,14 +49,14 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
     Raises:
         CheckpointError, DataError, OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.baselines.caddy.load import MODEL
+    from playslot_rl.methods.caddy.load import MODEL
     from playslot_rl.recipes.baselines import video
 
     return video.train(replace(config, method=MODEL, out=str(run), run=""))
 
 
 def _policy_record(config: ExperimentConfig, run: Path, parents: dict[str, StageCheckpoint]) -> StageRecord:
-    from playslot_rl.baselines.caddy.load import MODEL, POLICY
+    from playslot_rl.methods.caddy.load import MODEL, POLICY
     from playslot_rl.training.record import StageRecord
     from playslot_rl.training.runs import adopt_stage
 
@@ -82,7 +82,7 @@ def _policy_record(config: ExperimentConfig, run: Path, parents: dict[str, Stage
 
 
 def _oracle_record(config: ExperimentConfig, run: Path, parents: dict[str, StageCheckpoint]) -> StageRecord:
-    from playslot_rl.baselines.caddy.load import MODEL, ORACLE
+    from playslot_rl.methods.caddy.load import MODEL, ORACLE
     from playslot_rl.training.record import StageRecord
     from playslot_rl.training.runs import adopt_stage
 
@@ -104,8 +104,8 @@ def _oracle_record(config: ExperimentConfig, run: Path, parents: dict[str, Stage
 
 
 def _policy(config: ExperimentConfig, record: StageRecord) -> Training:
-    from playslot_rl.baselines.caddy.behaviour import CADDYBehaviour
-    from playslot_rl.baselines.caddy.load import MODEL
+    from playslot_rl.methods.caddy.behaviour import CADDYBehaviour
+    from playslot_rl.methods.caddy.load import MODEL
 
     own, device = config.baselines.caddy_policy, open_device(config)
     behaviour = CADDYBehaviour(config, record.parents[MODEL], record.demos, device)
@@ -113,8 +113,8 @@ def _policy(config: ExperimentConfig, record: StageRecord) -> Training:
 
 
 def _oracle(config: ExperimentConfig, record: StageRecord) -> Training:
-    from playslot_rl.baselines.caddy.behaviour import oracle_stage
-    from playslot_rl.baselines.caddy.load import MODEL
+    from playslot_rl.methods.caddy.behaviour import oracle_stage
+    from playslot_rl.methods.caddy.load import MODEL
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
 

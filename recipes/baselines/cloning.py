@@ -12,8 +12,8 @@ from playslot_rl.config.methods import LATENT_MODELS
 from playslot_rl.recipes.run import adopted_policy, cloned, require_parent
 
 if TYPE_CHECKING:
-    from playslot_rl.baselines.cloning import LatentCloning
     from playslot_rl.data.demonstrations import DemonstrationSplit
+    from playslot_rl.methods.cloning import LatentCloning
     from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import StageRecord, Training

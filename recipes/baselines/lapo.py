@@ -27,7 +27,7 @@ def main(config: ExperimentConfig) -> None:
         DataError: no videos, too few demonstrations, or none with actions.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.baselines.lapo.load import MODEL, NAME, sizes_of
+    from playslot_rl.methods.lapo.load import MODEL, NAME, sizes_of
     from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.record import StageRecord, run_stage
     from playslot_rl.training.runs import adopt_stage
@@ -68,9 +68,9 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
     Raises:
         CheckpointError, DataError, OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.baselines.lapo.load import MODEL, NAME, sizes_of
-    from playslot_rl.baselines.lapo.model import ForwardModel, InverseModel
-    from playslot_rl.baselines.lapo.stage import LAPOModelStage
+    from playslot_rl.methods.lapo.load import MODEL, NAME, sizes_of
+    from playslot_rl.methods.lapo.model import ForwardModel, InverseModel
+    from playslot_rl.methods.lapo.stage import LAPOModelStage
     from playslot_rl.seeds.draws import global_seed
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import StageRecord, Training, run_stage
@@ -104,8 +104,8 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
 
 
 def _training(config: ExperimentConfig, record: StageRecord) -> Training:
-    from playslot_rl.baselines.lapo.behaviour import LAPOBehaviour
-    from playslot_rl.baselines.lapo.load import MODEL
+    from playslot_rl.methods.lapo.behaviour import LAPOBehaviour
+    from playslot_rl.methods.lapo.load import MODEL
 
     own, device = config.baselines.lapo, open_device(config)
     behaviour = LAPOBehaviour(config, record.parents[MODEL], record.demos, device)

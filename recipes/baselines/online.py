@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     import torch
     from torch import nn
 
-    from playslot_rl.baselines.online.checkpoints import OnlineState
-    from playslot_rl.baselines.online.learner import Learner
+    from playslot_rl.methods.online.checkpoints import OnlineState
+    from playslot_rl.methods.online.learner import Learner
     from playslot_rl.training.record import StageRecord
 
 
@@ -30,14 +30,14 @@ def main(config: ExperimentConfig) -> None:
         CheckpointError: no finished slots in `run`, or `out` was begun otherwise.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.baselines.online.requirements import require_online
+    from playslot_rl.methods.online.requirements import require_online
 
     name = config.method
     own = config.baselines.dreamer if name == "dreamer" else config.baselines.sold
     require_online(config, own, name)  # before anything is written or computed
     run = open_run(config)
 
-    from playslot_rl.baselines.online.loop import train_online
+    from playslot_rl.methods.online.loop import train_online
     from playslot_rl.storage.atomic import write_bytes
     from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.record import StageRecord
@@ -72,8 +72,8 @@ def main(config: ExperimentConfig) -> None:
 
 def _dreamer(record: StageRecord, device: torch.device) -> tuple[Learner, dict[str, nn.Module], int]:
     """The learner, what a finished run keeps of it, and the agent steps behind what it was given."""
-    from playslot_rl.baselines.dreamer.learner import DreamerLearner
-    from playslot_rl.baselines.dreamer.networks import DreamerNetworks
+    from playslot_rl.methods.dreamer.learner import DreamerLearner
+    from playslot_rl.methods.dreamer.networks import DreamerNetworks
     from playslot_rl.seeds.draws import global_seed
 
     config, own = record.config, record.config.baselines.dreamer
@@ -84,8 +84,8 @@ def _dreamer(record: StageRecord, device: torch.device) -> tuple[Learner, dict[s
 
 def _sold(record: StageRecord, parent: str, device: torch.device) -> tuple[Learner, dict[str, nn.Module], int]:
     """As `_dreamer`."""
-    from playslot_rl.baselines.sold.actor import build_networks, prior_steps
-    from playslot_rl.baselines.sold.learner import SOLDLearner
+    from playslot_rl.methods.sold.actor import build_networks, prior_steps
+    from playslot_rl.methods.sold.learner import SOLDLearner
     from playslot_rl.seeds.draws import global_seed
     from playslot_rl.training.runs import load_savi
 

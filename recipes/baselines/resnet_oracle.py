@@ -24,7 +24,7 @@ def main(config: ExperimentConfig) -> None:
         DataError: fewer than `demos` demonstrations, or none with actions.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.baselines.oracles.resnet import NAME
+    from playslot_rl.methods.oracles.resnet import NAME
     from playslot_rl.training.record import StageRecord, run_stage
 
     record = StageRecord(
@@ -45,9 +45,9 @@ def main(config: ExperimentConfig) -> None:
 
 def _training(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl import keys
-    from playslot_rl.baselines.oracles.resnet import NAME, ResNetPolicy, load_pretrained
     from playslot_rl.data.demonstrations import moving_frames, require_finite
     from playslot_rl.losses.behaviour import BehaviourLoss
+    from playslot_rl.methods.oracles.resnet import NAME, ResNetPolicy, load_pretrained
     from playslot_rl.seeds.draws import global_seed
     from playslot_rl.training.fit import Part
     from playslot_rl.training.patience import Patience

@@ -34,7 +34,7 @@ def main(config: ExperimentConfig) -> None:
         DataError: fewer than `demos` demonstrations, or none with actions.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.baselines.oracles.slot import NAME
+    from playslot_rl.methods.oracles.slot import NAME
     from playslot_rl.training.record import StageRecord, run_stage
     from playslot_rl.training.runs import slots_checkpoint, stage_model, use_world_model
     from playslot_rl.training.stage_behaviour import AFTER_CLONING

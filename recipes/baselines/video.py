@@ -58,7 +58,7 @@ def _record(config: ExperimentConfig, model: dict[str, Any], parents: Mapping[st
 
 
 def _record_on_slots(config: ExperimentConfig) -> StageRecord:
-    from playslot_rl.baselines.video.load import uncontrolled
+    from playslot_rl.methods.video.load import uncontrolled
     from playslot_rl.training.runs import slots_checkpoint, stage_model
 
     run = open_run(config)
@@ -69,10 +69,10 @@ def _record_on_slots(config: ExperimentConfig) -> StageRecord:
 
 
 def _on_pixels(config: ExperimentConfig, record: StageRecord) -> Training:
-    from playslot_rl.baselines.caddy.model import CADDY
-    from playslot_rl.baselines.caddy.stage import CADDYStage
-    from playslot_rl.baselines.svg.stage import SVGStage
-    from playslot_rl.baselines.video.load import build_pixel_model
+    from playslot_rl.methods.caddy.model import CADDY
+    from playslot_rl.methods.caddy.stage import CADDYStage
+    from playslot_rl.methods.svg.stage import SVGStage
+    from playslot_rl.methods.video.load import build_pixel_model
     from playslot_rl.seeds.draws import global_seed
 
     own: VideoStageConfig = getattr(config.baselines, config.method)
@@ -87,9 +87,9 @@ def _on_pixels(config: ExperimentConfig, record: StageRecord) -> Training:
 
 
 def _on_slots(config: ExperimentConfig, record: StageRecord) -> Training:
-    from playslot_rl.baselines.video.load import uncontrolled
     from playslot_rl.data.cache import Cache
     from playslot_rl.data.slot_cache import slot_cache
+    from playslot_rl.methods.video.load import uncontrolled
     from playslot_rl.seeds.draws import global_seed
     from playslot_rl.storage.checkpoints import load_weights
     from playslot_rl.training.patience import patience_of

@@ -30,13 +30,13 @@ def agent(initial: str = "learned") -> Agent:
 
 
 def resnet() -> Actor:
-    from playslot_rl.baselines.oracles.resnet import ResNetPolicy, resnet_actor
+    from playslot_rl.methods.oracles.resnet import ResNetPolicy, resnet_actor
 
     return resnet_actor(ResNetPolicy(compose(["preset=smoke"]).model.policy, 64, 4))
 
 
 def lapo() -> Actor:
-    from playslot_rl.baselines.lapo.load import LAPOPolicy
+    from playslot_rl.methods.lapo.load import LAPOPolicy
     from playslot_rl.modules.action_decoder import ActionDecoder
 
     config = compose(["preset=smoke"])
@@ -45,8 +45,8 @@ def lapo() -> Actor:
 
 
 def caddy(oracle: bool) -> Actor:
-    from playslot_rl.baselines.caddy.heads import MovesHead, OnFrames, StateHead
-    from playslot_rl.baselines.caddy.model import CADDY
+    from playslot_rl.methods.caddy.heads import MovesHead, OnFrames, StateHead
+    from playslot_rl.methods.caddy.model import CADDY
     from playslot_rl.modules.action_decoder import ActionDecoder
 
     config = compose(["preset=smoke"])
@@ -57,16 +57,16 @@ def caddy(oracle: bool) -> Actor:
 
 
 def dreamer() -> Actor:
-    from playslot_rl.baselines.dreamer.actor import DreamerActor
-    from playslot_rl.baselines.dreamer.networks import DreamerNetworks
+    from playslot_rl.methods.dreamer.actor import DreamerActor
+    from playslot_rl.methods.dreamer.networks import DreamerNetworks
 
     config = compose(["preset=smoke"])
     return DreamerActor(DreamerNetworks(config.baselines.dreamer, config.env))
 
 
 def sold() -> Actor:
-    from playslot_rl.baselines.sold.actor import SOLDActor
-    from playslot_rl.baselines.sold.networks import SOLDNetworks
+    from playslot_rl.methods.sold.actor import SOLDActor
+    from playslot_rl.methods.sold.networks import SOLDNetworks
 
     config = compose(["preset=smoke"]).baselines.sold
     savi = agent().world_model.savi

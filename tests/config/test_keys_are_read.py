@@ -27,7 +27,7 @@ LOOPS = (
     "playslot_rl/training/",
     "playslot_rl/losses/dynamics.py",
     "playslot_rl/modules/predictors/",
-    "playslot_rl/baselines/online/",
+    "playslot_rl/methods/online/",
     "recipes/baselines/online.py",
     "recipes/baselines/video.py",
 )

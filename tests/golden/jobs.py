@@ -7,9 +7,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from playslot_rl.comparison.plan import job_config, job_record, jobs
-from playslot_rl.comparison.video_plan import video_job_config, video_job_record, video_jobs
 from playslot_rl.config.compose import compose
+from playslot_rl.studies.plan import job_config, job_record, jobs
+from playslot_rl.studies.video_plan import video_job_config, video_job_record, video_jobs
 
 OUT = Path("/comparison")
 PARENTS = {"slots": "a", "dynamics": "b", "demos": "c", "videos": "d"}

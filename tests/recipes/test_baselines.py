@@ -237,7 +237,7 @@ def test_a_nan_stops_with_the_last_good_checkpoint(
 def test_a_nan_in_lapos_models_stops_before_a_policy_is_cloned(
     shared_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from playslot_rl.baselines.lapo.stage import LAPOModelStage
+    from playslot_rl.methods.lapo.stage import LAPOModelStage
 
     original = LAPOModelStage.loss
 

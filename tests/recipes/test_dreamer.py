@@ -10,9 +10,9 @@ import torch
 from commands import instead, killed_at_first_checkpoint
 
 from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
-from playslot_rl.baselines.dreamer.actor import load_actor
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.methods.dreamer.actor import load_actor
 from playslot_rl.recipes.baselines import online
 
 SMOKE = ("preset=smoke", "method=dreamer", "env=block_reach", "threads=1", "device=cpu", "env.max_steps=6")

@@ -14,11 +14,11 @@ from safetensors.torch import load_file
 
 from playslot_rl import keys
 from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
-from playslot_rl.baselines.sold.actor import load_actor, prior_steps
-from playslot_rl.baselines.sold.learner import SOLDLearner
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError, TrainingError
+from playslot_rl.methods.sold.actor import load_actor, prior_steps
+from playslot_rl.methods.sold.learner import SOLDLearner
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.recipes.baselines import online
 from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage

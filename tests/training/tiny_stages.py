@@ -12,13 +12,6 @@ import torch
 from torch import nn
 
 from playslot_rl import keys
-from playslot_rl.baselines.caddy.model import CADDY
-from playslot_rl.baselines.caddy.stage import CADDYStage
-from playslot_rl.baselines.lapo.model import ForwardModel, InverseModel
-from playslot_rl.baselines.lapo.stage import LAPOModelStage
-from playslot_rl.baselines.oracles.resnet import ResNetPolicy
-from playslot_rl.baselines.svg.model import SVG
-from playslot_rl.baselines.svg.stage import SVGStage
 from playslot_rl.config import (
     ActionDecoderConfig,
     BehaviourStageConfig,
@@ -39,6 +32,13 @@ from playslot_rl.data.demonstrations import Demonstrations
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips
 from playslot_rl.losses.behaviour import BehaviourLoss
+from playslot_rl.methods.caddy.model import CADDY
+from playslot_rl.methods.caddy.stage import CADDYStage
+from playslot_rl.methods.lapo.model import ForwardModel, InverseModel
+from playslot_rl.methods.lapo.stage import LAPOModelStage
+from playslot_rl.methods.oracles.resnet import ResNetPolicy
+from playslot_rl.methods.svg.model import SVG
+from playslot_rl.methods.svg.stage import SVGStage
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import global_seed

@@ -1,0 +1,190 @@
+"""CADDY's action network A: what happened between two frames, as a direction, a discrete action and a variability.
+
+    (mu_t, var_t) = A(s_t m_t)                                  where a frame is, B x Z
+    d_t ~ N(mu_{t+1} - mu_t, var_{t+1} + var_t)                 how it moved
+    p_t = softmax(Linear(d_t)),   a_t = softmax((log p_t + g) / tau)          g Gumbel noise, B x K
+    c_k <- decay c_k + (1 - decay) sum p_tk d_t / sum p_tk      centroids, K x Z, no gradient
+    v_t = sum_k a_tk (d_t - c_k)                                what the action does not say, B x Z
+
+    KL(d_t, N(0, I)) = 1/2 sum_z (var + mean^2 - 1 - log var)
+
+Variances are absolute values of what a linear layer gives, so they may be 0: 1e-6 is added before any root or log.
+At test d_t is the mean and a_t the one-hot argmax of p_t.
+
+Note: the original draws d and g at test too, and its centroids start anywhere; here nothing is drawn at test, and they
+start at 0.
+
+Shapes: B batch, T frames, C channels and h w size of a state, Z latent dim, K actions; `...` is any.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from playslot_rl.methods.caddy.blocks import Res
+from playslot_rl.runtime.shares import all_rows, own_noise
+
+VARIANCE = 1e-6
+"""Added to the variances."""
+
+
+class Gaussian(NamedTuple):
+    """Diagonal normal distributions.
+
+    Attributes:
+        mean: (..., Z).
+        var: variances (..., Z), not negative.
+    """
+
+    mean: Tensor
+    var: Tensor
+
+
+class Moves(NamedTuple):
+    """What happened between consecutive frames.
+
+    Attributes:
+        direction: distribution of d (B, T-1, Z).
+        d: drawn from it, or its mean (B, T-1, Z).
+        logits: of p (B, T-1, K).
+    """
+
+    direction: Gaussian
+    d: Tensor
+    logits: Tensor
+
+    @property
+    def p(self) -> Tensor:
+        """Probabilities of the actions (B, T-1, K)."""
+        return self.logits.softmax(dim=-1)
+
+
+class Latents(NamedTuple):
+    """What steers a prediction, one for each pair of consecutive frames.
+
+    Attributes:
+        a: actions (B, T-1, K), each a distribution over the K: one-hot at test.
+        v: variabilities (B, T-1, Z).
+        p: probabilities that a was taken from (B, T-1, K).
+    """
+
+    a: Tensor
+    v: Tensor
+    p: Tensor
+
+
+class Trunk(nn.Sequential):
+    """Two residual blocks, the first of which halves, and the mean over the map that is left.
+
+    Args:
+        in_channels: C.
+        channels: of the blocks, the width of what is left.
+    """
+
+    def __init__(self, in_channels: int, channels: int) -> None:
+        super().__init__(Res(in_channels, channels, 2), Res(channels, channels))
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """(B, C, h, w), h and w even, to (B, channels)."""
+        for block in self:
+            maps = block(maps)
+        return maps.mean(dim=(-2, -1))
+
+
+class ActionNetwork(nn.Module):
+    """A.
+
+    Args:
+        in_channels: C.
+        channels: of its two residual blocks.
+        latent_dim: Z.
+        actions: K.
+        decay: of the centroids' moving average.
+    """
+
+    centroids: Tensor
+
+    def __init__(self, in_channels: int, channels: int, latent_dim: int, actions: int, decay: float) -> None:
+        super().__init__()
+        self.decay = decay
+        self.trunk = Trunk(in_channels, channels)
+        self.to_mean = nn.Linear(channels, latent_dim)
+        self.to_var = nn.Linear(channels, latent_dim)
+        self.to_logits = nn.Linear(latent_dim, actions)
+        self.register_buffer("centroids", torch.zeros(actions, latent_dim))
+
+    def pose(self, features: Tensor) -> Gaussian:
+        """(mu, var) of frames, from their features s m (..., C, h, w) with h and w even: each (..., Z), float32."""
+        flat = self.trunk(features.flatten(0, -4))
+        mean, var = self.to_mean(flat), self.to_var(flat).abs()
+        leading = features.shape[:-3]
+        return Gaussian(mean.float().unflatten(0, leading), var.float().unflatten(0, leading))
+
+    def moves(self, first: Gaussian, second: Gaussian, noise: torch.Generator | None = None) -> Moves:
+        """From where frames are and where those after them are, each (B, n, Z), to the n moves between them.
+
+        Args:
+            first, second: before and after.
+            noise: d is drawn with it; None takes the mean.
+        """
+        direction = difference(first, second)
+        d = direction.mean
+        if noise is not None:
+            drawn = own_noise(d.shape, lambda shape: torch.randn(shape, generator=noise, device=noise.device))
+            d = d + direction.var.sqrt() * _on(d, drawn)
+        return Moves(direction, d, self.to_logits(d).float())
+
+    def variability(self, a: Tensor, d: Tensor) -> Tensor:
+        """v (..., Z) of actions (..., K) that sum to 1 and directions (..., Z)."""
+        # A copy, because the centroids change in place before the gradient is taken.
+        return d - a @ self.centroids.clone()
+
+    @torch.no_grad()
+    def update_centroids(self, p: Tensor, d: Tensor) -> None:
+        """Move the centroids towards the p-weighted means of directions (..., Z); p is (..., K). Training mode only.
+
+        The means are those of the global batch.
+        """
+        if not self.training:
+            return
+        p, d = all_rows(p.float().flatten(0, -2)), all_rows(d.float().flatten(0, -2))
+        means = (p.T @ d) / p.sum(dim=0).clamp(min=1e-8)[:, None]
+        self.centroids.lerp_(means, 1 - self.decay)
+
+
+def difference(first: Gaussian, second: Gaussian) -> Gaussian:
+    """Distribution of `second` minus `first`, both (..., Z) and independent; 1e-6 is added to its variance."""
+    return Gaussian(second.mean - first.mean, second.var + first.var + VARIANCE)
+
+
+def divergence(direction: Gaussian) -> Tensor:
+    """KL(direction, N(0, I)) (...) in nats, summed over Z, for positive variances."""
+    mean, var = direction
+    return 0.5 * (var + mean.square() - 1 - var.log()).sum(dim=-1)
+
+
+def gumbel_softmax(logits: Tensor, temperature: float, noise: torch.Generator) -> Tensor:
+    """Soft samples (..., K), each summing to 1, of the distributions with these logits (..., K).
+
+    Args:
+        logits: unnormalised log probabilities.
+        temperature: tau, positive; towards 0 the samples are one-hot.
+        noise: source of the Gumbel noise.
+    """
+    drawn = own_noise(logits.shape, lambda shape: torch.rand(shape, generator=noise, device=noise.device))
+    uniform = drawn.clamp(min=1e-20)
+    gumbel = -(-uniform.log()).log()
+    return ((logits + _on(logits, gumbel)) / temperature).softmax(dim=-1)
+
+
+def chosen(p: Tensor) -> Tensor:
+    """The most probable of the K actions as one-hot (..., K), float."""
+    return F.one_hot(p.argmax(dim=-1), p.shape[-1]).to(p.dtype)
+
+
+def _on(like: Tensor, drawn: Tensor) -> Tensor:
+    return drawn.to(like.device)

@@ -1,0 +1,210 @@
+"""How the heads on a frozen CADDY are trained on demonstrations.
+
+    (a_t, v_t) = A(E(x_t), E(x_{t+1}))                   inferred from the videos: one-hot argmax, mean direction
+    L_pi = -sum_k a_tk log softmax(l_t)_k + mean (v^_t - v_t)^2 / sigma^2,   (l_t, v^_t) = f(s_t)
+    L_a = mean (D(z_t) - a_t)^2,   z_t = [a_t, v_t]      D reads the labelled demonstrations
+    L_oracle = mean (f(s_t) - a_t)^2                     of all demonstrations
+
+or means of absolute differences in L_a and L_oracle, `behaviour.loss`.
+
+Note: PlaySlot's paper names neither losses nor heads. The error of the variability is divided by its variance sigma^2
+in the demonstrations, so that it counts beside the action's whatever its scale.
+
+Shapes: M transitions, b rows of a batch, C channels of a state of H/8 x W/8, K actions, Z latent dim, A action dim.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torch.nn import functional as F
+
+from playslot_rl import keys
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, moving_frames
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.losses.behaviour import BehaviourLoss
+from playslot_rl.methods.caddy.encoder import Encoder
+from playslot_rl.methods.caddy.heads import MovesHead, StateHead, as_moves, states_of
+from playslot_rl.methods.caddy.load import ORACLE, POLICY, load_model
+from playslot_rl.methods.caddy.model import CADDY
+from playslot_rl.methods.cloning import LatentCloning
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.seeds.draws import StepGenerators, global_seed
+from playslot_rl.storage.checkpoints import StageCheckpoint
+from playslot_rl.training.stage_regression import (
+    FrameInputs,
+    Inputs,
+    RegressionStage,
+    demonstrated_frames,
+    unexplained,
+)
+from playslot_rl.world_model import module_device
+
+BATCH = 64
+
+
+class StateInputs:
+    """States by row (b, C, H/8, W/8): `Inputs` of a regression, encoded as they are drawn.
+
+    Args:
+        encoder: E, frozen and in evaluation mode.
+        frames: what it reads.
+    """
+
+    def __init__(self, encoder: Encoder, frames: FrameInputs) -> None:
+        self.encoder, self.frames = encoder, frames
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def draw(self, rows: Tensor, generators: StepGenerators) -> Tensor:
+        """States of rows, of their frames shifted as drawn."""
+        return states_of(self.encoder, self.frames.draw(rows, generators))
+
+    def plain(self, rows: Tensor) -> Tensor:
+        """States of rows."""
+        return states_of(self.encoder, self.frames.plain(rows))
+
+
+class MovesLoss(BehaviourLoss):
+    """Cross-entropy of the action and squared error of the variability, over its variance.
+
+    Reads STATE_MAPS (b, C, H/8, W/8) and LATENT_ACTION (b, K + Z), moves; writes `loss_policy`.
+
+    Args:
+        network: states to logits and variability (b, K + Z), standardised.
+    """
+
+    network: MovesHead
+
+    def __init__(self, network: MovesHead) -> None:
+        super().__init__(network)
+        self.set_keys(observation=keys.STATE_MAPS)
+
+    def _error(self, tensordict: TensorDictBase, observed: Sequence[NestedKey]) -> Tensor:
+        out: Tensor = self.network(*(tensordict.get(key) for key in observed))
+        moves, k = tensordict.get(self.tensor_keys.action), self.network.actions
+        error: Tensor = ((out[:, k:] - moves[:, k:]) / self.network.scale).square().mean()
+        return F.cross_entropy(out[:, :k], moves[:, :k]) + error
+
+
+class MovesStage(RegressionStage):
+    """Cloning of moves; validated by both of their parts."""
+
+    criterion: MovesLoss
+
+    def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
+        """`unexplained` fraction of v's variance and `mistaken` actions (0 to 1), of each of the checks."""
+        numbers, k = {}, self.criterion.network.actions
+        for name, examples in self.checks.items():
+            out, moves = self.compared(*examples)
+            numbers[name] = unexplained(out[:, k:], moves[:, k:])
+            wrong = out[:, :k].argmax(dim=-1) != moves[:, :k].argmax(dim=-1)
+            numbers[name.replace("unexplained", "mistaken")] = float(wrong.float().mean())
+        return numbers
+
+
+class CADDYBehaviour(LatentCloning):
+    """Policy and decoder, untrained, with the stages that train them one after the other.
+
+    Args:
+        config: schedules, labels.
+        model: finished CADDY.
+        demos: demonstrations, and those that are held out.
+        device: where to compute.
+
+    Raises:
+        CheckpointError: a damaged model.
+        DataError: demonstrations without actions.
+    """
+
+    policy: MovesHead
+
+    def __init__(
+        self, config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
+    ) -> None:
+        self.own, self.model = config.baselines.caddy_policy, load_model(model, device)
+        super().__init__(config, demos, device, self.own.shift)
+        sizes = self.model.config
+        width = sizes.actions + sizes.latent_dim
+        with global_seed(config.seed, 0, POLICY):
+            self.policy = MovesHead(sizes.encoder[-1], sizes.actions, sizes.latent_dim).to(device)
+            self.decoder = ActionDecoder(config.model.action_decoder, width, config.env.action_dim).to(device)
+        self.policy.standardise(self.trained.latents[:, sizes.actions :])
+
+    def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
+        """Moves (M, K + Z) by the model."""
+        return infer_moves(self.model, source, moves)
+
+    def observe(self, frames: FrameInputs) -> Inputs:
+        """Their states."""
+        return StateInputs(self.model.encoder, frames)
+
+    def chosen(self, outputs: Tensor) -> Tensor:
+        """The most probable action, and v."""
+        return as_moves(outputs, self.policy.actions)
+
+    def policy_stage(self) -> RegressionStage:
+        """See `LatentCloning`."""
+        own = self.own.policy
+        return self.cloning(MovesStage, MovesLoss(self.policy), own.batch_size, own.precision)
+
+    def decoder_stage(self) -> RegressionStage:
+        """See `LatentCloning`."""
+        own = self.own.policy
+        return self.decoding(self.config.behaviour.loss, own.batch_size, own.precision)
+
+
+def oracle_stage(
+    config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
+) -> RegressionStage:
+    """Training of the CADDY Oracle, a new head that clones the real actions of all demonstrations.
+
+    Args:
+        config: schedule, trimming, loss.
+        model: finished CADDY.
+        demos: demonstrations, and those that are held out.
+        device: where to compute.
+
+    Raises:
+        CheckpointError: a damaged model.
+        DataError: demonstrations without actions, or in which nothing moves.
+    """
+    own, behaviour, width = config.baselines.caddy_oracle, config.behaviour, config.env.action_dim
+    caddy = load_model(model, device)
+
+    def examples(source: EpisodeFrames, shift: int = 0) -> tuple[StateInputs, Tensor]:
+        moves = moving_frames(source, behaviour.trim_pixels, behaviour.trim_margin)
+        frames, actions = demonstrated_frames(source, moves, width, device, shift)
+        return StateInputs(caddy.encoder, frames), actions
+
+    with global_seed(config.seed, 0, ORACLE):
+        oracle = StateHead(caddy.config.encoder[-1], width, acts=True).to(device)
+    criterion = BehaviourLoss(oracle, behaviour.loss)
+    criterion.set_keys(observation=keys.STATE_MAPS, action=keys.ACTION)
+    return RegressionStage(
+        "oracle",
+        criterion,
+        *examples(demos.trained, own.shift),
+        own.policy.batch_size,
+        held_out=None if demos.held_out is None else examples(demos.held_out),
+        validated=1024,
+        precision=own.policy.precision,
+    )
+
+
+@torch.no_grad()
+def infer_moves(model: CADDY, source: EpisodeFrames, moves: Transitions) -> Tensor:
+    """Moves (M, K + Z) of transitions, a one-hot action and a variability each; the model in evaluation mode."""
+    parts = []
+    for rows in np.array_split(moves.rows, -(-len(moves.rows) // BATCH)):
+        pairs = source.pixels(np.stack((rows, rows + 1), axis=1)).to(module_device(model))
+        latents = model.infer(pairs)
+        parts.append(torch.cat((latents.a, latents.v), dim=-1)[:, 0])
+    return torch.cat(parts)

@@ -1,0 +1,112 @@
+"""What acts on a frozen CADDY's states: a policy of moves, and an oracle's real actions.
+
+    s_t = E(x_t)
+    CADDY          (l_t, u_t) = f(s_t),   v_t = m + sigma u_t,   z_t = [onehot argmax l_t, v_t]       K + Z numbers
+    CADDY Oracle   a_t = f(s_t)                                                                       A numbers
+
+f is a trunk like A's and a linear layer, with weights of its own; z_t is what A says of two frames. The variability's
+scale is free (a weight of 1e-4 holds it), so that f gives it in units of its deviation sigma in the demonstrations.
+
+Note: PlaySlot's authors do not say what their heads look like, or what of E they read. Ours read the state s_t alone:
+the map m_t, which A multiplies it by, hides what the agent does not move, such as the button that it is to press.
+
+Shapes: B batch, M transitions, C channels of a state of H/8 x W/8, H W image height and width, K actions, Z latent
+dim, A action dim.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from playslot_rl.methods.caddy.action import Trunk, chosen
+from playslot_rl.methods.caddy.encoder import Encoder, inside
+from playslot_rl.modules.action_range import ActionRange
+
+
+class StateHead(nn.Module):
+    """A trunk of A's form and a linear layer.
+
+    Args:
+        in_channels: C; the trunk has twice as many, as A's.
+        out_dim: K + Z, or A.
+        acts: it gives real actions, and has their `action_range`.
+    """
+
+    def __init__(self, in_channels: int, out_dim: int, acts: bool = False) -> None:
+        super().__init__()
+        self.trunk = Trunk(in_channels, 2 * in_channels)
+        self.to_out = nn.Linear(2 * in_channels, out_dim)
+        if acts:
+            self.action_range = ActionRange(out_dim)
+
+    def forward(self, states: Tensor) -> Tensor:
+        """States (B, C, H/8, W/8) to (B, out_dim)."""
+        out: Tensor = self.to_out(self.trunk(states))
+        return out
+
+
+class MovesHead(StateHead):
+    """A head whose outputs are moves: logits of the action, and the variability.
+
+    Args:
+        in_channels: C.
+        actions: K.
+        latent_dim: Z.
+    """
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, in_channels: int, actions: int, latent_dim: int) -> None:
+        super().__init__(in_channels, actions + latent_dim)
+        self.actions = actions
+        self.register_buffer("mean", torch.zeros(latent_dim))
+        self.register_buffer("scale", torch.ones(()))
+
+    @torch.no_grad()
+    def standardise(self, v: Tensor) -> None:
+        """Take m and sigma, one for all dimensions, from variabilities (M, Z)."""
+        self.mean.copy_(v.mean(dim=0))
+        self.scale.copy_((v - self.mean).square().mean().sqrt().clamp(min=1e-6))
+
+    def forward(self, states: Tensor) -> Tensor:
+        """States (B, C, H/8, W/8) to logits and variabilities (B, K + Z), float32."""
+        out = super().forward(states).float()
+        return torch.cat((out[:, : self.actions], self.mean + self.scale * out[:, self.actions :]), dim=-1)
+
+
+class OnFrames(nn.Module):
+    """A head on the states of a frozen encoder.
+
+    Args:
+        encoder: E, in evaluation mode.
+        head: reads its states.
+    """
+
+    def __init__(self, encoder: Encoder, head: StateHead) -> None:
+        super().__init__()
+        self.encoder, self.head = encoder, head
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Frames (B, 3, H, W), uint8 or float [0, 1], to moves (B, K + Z), or to actions (B, A) of an oracle."""
+        out: Tensor = self.head(states_of(self.encoder, pixels))
+        return as_moves(out, self.head.actions) if isinstance(self.head, MovesHead) else out
+
+
+@torch.no_grad()
+def states_of(encoder: Encoder, pixels: Tensor) -> Tensor:
+    """States (B, C, H/8, W/8) of frames (B, 3, H, W), uint8 or float [0, 1]; no gradient goes to E."""
+    s, _ = encoder(inside(pixels))
+    states: Tensor = s.float()
+    return states
+
+
+def as_moves(outputs: Tensor, actions: int) -> Tensor:
+    """Logits and variability (..., K + Z) to moves (..., K + Z): the most probable action as one-hot, and v.
+
+    Example:
+        >>> as_moves(torch.tensor([0.1, 0.9, 0.5, -3.0]), actions=3).tolist()
+        [0.0, 1.0, 0.0, -3.0]
+    """
+    return torch.cat((chosen(outputs[..., :actions]), outputs[..., actions:]), dim=-1)

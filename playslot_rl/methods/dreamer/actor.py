@@ -1,0 +1,81 @@
+"""DreamerV3 as an actor: one step of acting, and a trained one from disk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from playslot_rl import keys
+from playslot_rl.acting.actor import Actor
+from playslot_rl.config import EnvConfig
+from playslot_rl.config.baselines import DreamerConfig
+from playslot_rl.methods.dreamer.networks import DreamerNetworks
+from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
+from playslot_rl.training.runs import freeze_on, stage_config
+
+NAME: Final = "dreamer"
+
+
+def act(networks: DreamerNetworks, memory: TensorDictBase, generator: torch.Generator | None) -> TensorDict:
+    """See a frame and choose an action.
+
+    Args:
+        networks: in eval mode.
+        memory: `state` (n, S), `belief` (n, H), `keys.ACTION` (n, A) and `keys.PIXELS` uint8 (n, 3, H, W).
+        generator: of state and action; None takes the most likely state and the mean action.
+
+    Returns:
+        The same keys anew; the frames reduced.
+    """
+    frames = networks.reduce(memory.get(keys.PIXELS))
+    state, belief = networks.filter(
+        memory.get("state"), memory.get("belief"), memory.get(keys.ACTION), frames, generator
+    )
+    mean, std = networks.actor(state, belief)
+    action = mean
+    if generator is not None:
+        action = mean + std * torch.randn(mean.shape, generator=generator, device=mean.device)
+    values = {"state": state, "belief": belief, keys.ACTION: action, keys.PIXELS: frames}
+    return TensorDict(values, memory.batch_size)
+
+
+class DreamerActor(Actor):
+    """DreamerV3 without exploring. The memory: `state`, `belief` and the last ACTION.
+
+    Args:
+        networks: trained, in eval mode.
+    """
+
+    def __init__(self, networks: DreamerNetworks) -> None:
+        super().__init__(("state", "belief", keys.ACTION))
+        self.networks = networks
+
+    def reset(self, seeds: Sequence[int]) -> TensorDict:
+        """Zero states; nothing is drawn."""
+        return self.networks.blank(len(seeds)).to(self.device)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """PIXELS uint8 (n, 3, H, W) and the memory -> ACTION (n, A) and the memory."""
+        # The prior draws a sample that is not used here.
+        with torch.random.fork_rng(devices=[]):
+            out = act(self.networks, tensordict, None)
+        return tensordict.update(out.select(*self.out_keys))
+
+
+def load_actor(run: Path, device: torch.device | str = "cpu") -> DreamerActor:
+    """The trained actor of `RUN/dreamer/checkpoint`, in eval mode.
+
+    Raises:
+        CheckpointError: no finished training there, or a damaged one.
+    """
+    checkpoint = read_stage(checkpoint_folder(run, NAME), NAME)
+    config, env = stage_config(checkpoint, DreamerConfig, NAME), stage_config(checkpoint, EnvConfig, "env")
+    with torch.random.fork_rng(devices=[]):
+        networks = DreamerNetworks(config, env)
+    load_weights(checkpoint, {"networks": networks})
+    freeze_on(networks, device)
+    return DreamerActor(networks)

@@ -1,0 +1,83 @@
+"""LAPO's second and third stage: the latent policy clones the inverse model's latents, the decoder regresses actions.
+
+    L_pi = mean (pi(o_t) - z_t)^2,   L_a = mean (D(z_t) - a_t)^2
+
+Note: LAPO fine-tunes its policy online or fits a decoder on labelled transitions; this is the second.
+
+Shapes: M transitions, Z latent-action width.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from playslot_rl import keys
+from playslot_rl.config import ExperimentConfig, LAPOConfig
+from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.losses.behaviour import BehaviourLoss
+from playslot_rl.methods.cloning import LatentCloning
+from playslot_rl.methods.lapo.load import NAME, LAPOPolicy
+from playslot_rl.methods.lapo.model import InverseModel
+from playslot_rl.methods.lapo.stage import infer_latents
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.seeds.draws import global_seed
+from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
+from playslot_rl.training.runs import freeze_on, stage_config, stage_model
+from playslot_rl.training.stage_regression import RegressionStage
+
+
+class LAPOBehaviour(LatentCloning):
+    """Policy and decoder, untrained, with the stages that train them one after the other.
+
+    Args:
+        config: sizes, schedules, labels.
+        model: finished inverse and forward model.
+        demos: demonstrations, and those that are held out.
+        device: where to compute.
+
+    Raises:
+        CheckpointError: a damaged model.
+        DataError: demonstrations without actions.
+    """
+
+    def __init__(
+        self, config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
+    ) -> None:
+        self.own, self.inverse = config.baselines.lapo, load_inverse(model, device)
+        super().__init__(config, demos, device, self.own.shift)
+        with global_seed(config.seed, 0, NAME):
+            self.policy = LAPOPolicy(self.own, config.env.image_size).to(device)
+            width = self.own.latent_dim
+            self.decoder = ActionDecoder(config.model.action_decoder, width, config.env.action_dim).to(device)
+
+    def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
+        """Latent actions (M, Z) by the inverse model."""
+        return infer_latents(self.inverse, source, moves, self.device, self.own.targets == "quantised")
+
+    def policy_stage(self) -> RegressionStage:
+        """See `LatentCloning`."""
+        own, criterion = self.own.policy, BehaviourLoss(self.policy, self.own.loss)
+        criterion.set_keys(observation=keys.PIXELS)
+        return self.cloning(RegressionStage, criterion, own.batch_size, own.precision)
+
+    def decoder_stage(self) -> RegressionStage:
+        """See `LatentCloning`."""
+        return self.decoding(self.own.loss, self.own.policy.batch_size, self.own.policy.precision)
+
+
+def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseModel:
+    """The inverse model of a finished stage, frozen.
+
+    Raises:
+        CheckpointError: it is damaged.
+    """
+    from playslot_rl.methods.lapo.model import ForwardModel
+
+    config, (_, env) = stage_config(model, LAPOConfig, NAME), stage_model(model)
+    with torch.random.fork_rng(devices=[]):
+        inverse, forward = InverseModel(config, env.image_size), ForwardModel(config)
+    load_weights(model, {"inverse": inverse, "forward": forward})
+    freeze_on(inverse, device)
+    return inverse

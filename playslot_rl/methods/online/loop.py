@@ -1,0 +1,283 @@
+"""The one loop of the methods that learn by acting: rounds of episodes, and updates from their replay.
+
+Everything that is drawn derives from (seed, round) or (seed, update). Checkpoints lie between rounds, so that no
+environment has to be stored; killed at any moment and started again, the same command ends with the same weights, bit
+for bit on a CPU (with a budget of minutes: as far as the time reaches).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from playslot_rl.acting.episodes import LOCKSTEP, TaskPool
+from playslot_rl.config import to_dict
+from playslot_rl.config.baselines import OnlineConfig
+from playslot_rl.config.roles import fixed_keys
+from playslot_rl.evaluation.intervals import wilson
+from playslot_rl.methods.online.acting import PlayedEpisodes, play
+from playslot_rl.methods.online.checkpoints import OnlineCheckpoints, OnlineState
+from playslot_rl.methods.online.learner import Learner
+from playslot_rl.methods.online.players import Players, Round, play_round
+from playslot_rl.methods.online.replay import Replay
+from playslot_rl.runtime.progress import StageProgress
+from playslot_rl.seeds.draws import StepGenerators, global_seed, step_generator
+from playslot_rl.seeds.episodes import episode_seed
+from playslot_rl.storage.atomic import write_json
+from playslot_rl.training.logging import Watch
+from playslot_rl.training.record import StageRecord
+
+if TYPE_CHECKING:
+    from torchrl.trainers.algorithms import DreamerV3UpdateRatio
+
+
+def train_online(
+    learner: Learner,
+    online: OnlineConfig,
+    record: StageRecord,
+    *,
+    title: str,
+    device: torch.device,
+    prior_steps: int = 0,
+) -> tuple[OnlineState, int]:
+    """Train until `online.steps` agent steps (or `online.minutes`), carrying on from the newest checkpoint.
+
+    Writes `checkpoints`, `replay`, `logs`, `metrics.jsonl` and `curve.json` in `RUN/METHOD`, nothing else.
+
+    Args:
+        learner: its modules already on `device`.
+        online: the method's config.
+        record: the method, which is the prefix of its config keys, its run, task, renderer, seed, logging.
+        title: as the curve names it.
+        device: the learner's.
+        prior_steps: agent steps behind what the learner was given (a world model's data), added to the curve's.
+
+    Returns:
+        Where it ended, and the agent steps that this process started at.
+
+    Raises:
+        TrainingError: a loss or weight is not finite; the last good checkpoint stays.
+        CheckpointError: the folder was begun with another config, or its checkpoint is damaged.
+        OutputError: another command trains it, or a full disk; the last good checkpoint stays.
+        KeyboardInterrupt: Ctrl-C; its message says where the same command carries on.
+    """
+    with record.training() as begin:
+        run = _Run(learner, online, record, title, device, prior_steps)
+        begin()
+        return _train(run, record)
+
+
+def _train(run: _Run, record: StageRecord) -> tuple[OnlineState, int]:
+    online, start, logging = run.online, run.state.step, record.config.logging
+    run.watch.history.rewind(start)
+    if not run.finished:
+        progress = StageProgress(record.name, start, online.steps, logging.progress, online.evaluate_every)
+        with run.watch.running(logging, start), progress, run.pool, run.playing():
+            while not run.finished:
+                run.advance(progress)
+    run.write_curve()
+    return run.state, start
+
+
+class _Run:
+    """One process's part of a run: the pieces `train_online` moves from round to round."""
+
+    def __init__(
+        self,
+        learner: Learner,
+        online: OnlineConfig,
+        record: StageRecord,
+        title: str,
+        device: torch.device,
+        prior_steps: int,
+    ) -> None:
+        from torchrl.trainers.algorithms import DreamerV3UpdateRatio
+
+        config, folder, name = record.config, record.folder, record.name
+        self.learner, self.online, self.config, self.folder = learner, online, config, folder
+        self.title, self.device, self.prior_steps = title, device, prior_steps
+        self.replay = Replay(online, config.env.max_steps + 1)
+        own = {name: fixed_keys(to_dict(online)), "seed": config.seed}
+        self.checkpoints = OnlineCheckpoints(folder, {**own, **record.resumes()})
+        cure = f"lower its learning rate (baselines.{name}.*)"
+        self.watch = Watch(name, folder, self.checkpoints, cure)
+        self.state = self.checkpoints.resume_online(learner.modules, learner.optimizers, self.replay)
+        self.ratio: DreamerV3UpdateRatio = DreamerV3UpdateRatio(online.update_ratio)
+        self.ratio.load_state_dict({"ratio": online.update_ratio, "previous": self.state.ratio_from})
+        self.pool = TaskPool(config.env, config.render)
+        self.players: Players | None = None
+        self.ahead: PlayedEpisodes | None = None
+        if self.state.ahead:
+            self.ahead = PlayedEpisodes(self.checkpoints.ahead(), **self.state.ahead)
+        self.new: list[TensorDictBase] = []
+        self._began = time.monotonic() - self.state.seconds
+
+    @contextlib.contextmanager
+    def playing(self) -> Iterator[None]:
+        """Inside the block workers play the episodes, if there are to be any."""
+        count, config = self.online.workers, self.config
+        if count:
+            make_pool = partial(TaskPool, config.env, config.render)
+            self.players = Players(self.learner, make_pool, count, config.collector)
+        try:
+            yield
+        finally:
+            if self.players is not None:
+                self.players.close()
+
+    @property
+    def finished(self) -> bool:
+        """Whether the steps, or the minutes, are used up."""
+        late = 0 < self.online.minutes * 60 <= self.state.seconds
+        return self.state.step >= self.online.steps or late
+
+    def advance(self, progress: StageProgress) -> None:
+        """One round of episodes, its updates, and whatever is due after it."""
+        before = self.state
+        if not before.random:
+            self.state = replace(before, random=self._measure(random=True))
+        self._play()
+        if self.state.step > self.online.prefill and self.replay.ready:
+            self._learn()
+        self.state = replace(self.state, ratio_from=self.ratio.state_dict()["previous"], seconds=self._seconds())
+        progress.update(min(self.state.step, self.online.steps), {})
+        over = self.finished
+        if self._due(before.step, self.online.evaluate_every) or over:
+            self._evaluate()
+        if self._due(before.step, self.online.checkpoint_every) or over:
+            self._save()
+
+    def _seconds(self) -> float:
+        return time.monotonic() - self._began
+
+    def _due(self, before: int, every: int) -> bool:
+        return self.state.step // every > before // every
+
+    def _mode(self, training: bool) -> None:
+        for module in self.learner.modules.values():
+            module.train(training)
+
+    def _play(self) -> None:
+        state, n = self.state, self.online.envs
+        played = self._next()
+        self.replay.add(played.frames)
+        self.new.append(played.frames)
+        step = state.step + n * self.config.env.max_steps
+        self.state = replace(state, step=step, rounds=state.rounds + 1, episodes=state.episodes + n)
+        values = {"return": sum(played.returns) / n, "success": sum(played.successes) / n}
+        self._log("acting", values)
+        if self.players is not None and step < self.online.steps:
+            self.players.begin(self._round())  # with the weights from before the updates that come now
+
+    def _round(self) -> Round:
+        """The episodes that are to be played next."""
+        state, seed = self.state, self.config.seed
+        seeds = tuple(episode_seed("training", seed, state.episodes + i) for i in range(self.online.envs))
+        return Round(seed, state.rounds, seeds, random=state.step < self.online.prefill)
+
+    def _next(self) -> PlayedEpisodes:
+        """Those of `_round`, played."""
+        if self.players is None:
+            return play_round(self.pool, self.learner, self.device, self._round())
+        if self.ahead is None and not self.players.playing:
+            self.players.begin(self._round())
+        played, self.ahead = self.ahead or self.players.finish(), None
+        return played
+
+    def _learn(self) -> None:
+        self._mode(True)
+        for _ in range(self.ratio(self.state.step)):
+            update, seed = self.state.updates, self.config.seed
+            batch = self.replay.sample(step_generator(seed, update, "replay")).to(self.device)
+            with global_seed(seed, update, "update"):
+                values = self.learner.update(batch, StepGenerators(seed, update, self.device))
+            # One transfer for all, so that a GPU is waited for once an update.
+            numbers = dict(zip(values, torch.stack([v.float() for v in values.values()]).tolist(), strict=True))
+            for key, value in numbers.items():
+                if not math.isfinite(value):
+                    raise self.watch.not_finite(key, str(value), self._when())
+            self.state = replace(self.state, updates=update + 1)
+            if update == 0 or (update + 1) % self.online.log_every == 0:
+                self._log("train", numbers, at=update + 1)
+
+    def _development_seeds(self) -> list[int]:
+        """The fixed episodes behind a learning curve, the same ones for every method and training seed."""
+        return [episode_seed("development", 0, i) for i in range(self.online.evaluation_episodes)]
+
+    def _measure(self, random: bool = False) -> dict[str, Any]:
+        """Play the development episodes without exploring.
+
+        Gives `return_mean` and its standard error, `success_rate` (0 to 1) and its Wilson interval `ci95`.
+        """
+        seeds, played = self._development_seeds(), []
+        self._mode(False)
+        with global_seed(self.config.seed, self.state.rounds, "development"):
+            for first in range(0, len(seeds), LOCKSTEP):
+                generator = step_generator(self.config.seed, first, "development", self.device)
+                learner = None if random else self.learner
+                chunk = seeds[first : first + LOCKSTEP]
+                played.append(play(self.pool, chunk, learner, self.device, generator, random=random))
+        returns = np.array([value for part in played for value in part.returns])
+        solved = sum(sum(part.successes) for part in played)
+        return {
+            "return_mean": float(returns.mean()),
+            "return_error": float(returns.std(ddof=1) / np.sqrt(len(returns))) if len(returns) > 1 else 0.0,
+            "success_rate": solved / len(returns),
+            "ci95": list(wilson(solved, len(returns))),
+        }
+
+    def _evaluate(self) -> None:
+        state = self.state
+        point = self._measure()
+        row = {
+            "env_steps": state.step + self.prior_steps,
+            "updates": state.updates,
+            "seconds": round(state.seconds, 1),
+            **point,
+        }
+        metrics = {key: value for key, value in point.items() if isinstance(value, float)}
+        self.state = replace(state, metrics=metrics, curve=[*state.curve, row], seconds=self._seconds())
+        self._log("validation", metrics, at=state.step)
+        self.write_curve()
+
+    def write_curve(self) -> None:
+        """Renew `curve.json`."""
+        seeds = self._development_seeds()
+        values = {
+            "method": self.title,
+            "env": self.config.env.name,
+            "episodes": len(seeds),
+            "first_seed": seeds[0],
+            "random": self.state.random,
+            "rows": self.state.curve,
+        }
+        write_json(self.folder / "curve.json", values)
+
+    def _save(self) -> None:
+        self.watch.require_finite(self.learner.modules, self._when())
+        new = torch.cat(self.new) if self.new else None
+        if self.players is not None and self.players.playing:
+            self.ahead = self.players.finish()  # played with weights that no checkpoint holds
+        ahead = self.ahead
+        told = {} if ahead is None else {"returns": ahead.returns, "successes": ahead.successes}
+        self.state = replace(self.state, ahead=told)
+        modules, optimizers = self.learner.modules, self.learner.optimizers
+        frames = None if ahead is None else ahead.frames
+        self.checkpoints.save_online(self.state, modules, optimizers, new, self.replay.capacity, frames)
+        self.new = []
+
+    def _when(self) -> str:
+        return f"update {self.state.updates + 1}"
+
+    def _log(self, split: str, values: Mapping[str, float], at: int | None = None) -> None:
+        numbers = {"updates": self.state.updates, **values, "seconds": round(self._seconds(), 3)}
+        self.watch.log(split, self.state.step, numbers, at=at)

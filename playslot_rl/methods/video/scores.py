@@ -1,0 +1,110 @@
+"""Scores of a video predictor on held-out clips, clip by clip and step by step.
+
+Shapes: C clips, T frames of a clip, S seed frames, P predicted frames, H W image height and width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.windows import IntArray
+from playslot_rl.evaluation.video import frame_scores
+from playslot_rl.frames import normalise, to_uint8
+from playslot_rl.methods.video.predictor import VideoPredictor
+from playslot_rl.methods.video.slots import SlotVideo
+
+BATCH = 8
+Predict = Callable[[Tensor, Tensor | None, Tensor | None], Tensor]
+"""Frames (C, T, 3, H, W), donors of the same shape or None, and real actions (C, T - 1, A) or None, to (C, P, ...)."""
+
+
+def as_function(model: VideoPredictor, seed: int) -> Predict:
+    """A predictor as a function of clips."""
+
+    def predict(frames: Tensor, donors: Tensor | None, actions: Tensor | None) -> Tensor:
+        if isinstance(model, SlotVideo) and model.needs_actions:
+            return model.predict(frames, seed, donors, actions)
+        return model.predict(frames, seed, donors)
+
+    return predict
+
+
+@torch.no_grad()
+def score_clips(
+    predict: Predict,
+    source: EpisodeFrames,
+    rows: IntArray,
+    seed: int,
+    device: torch.device | str,
+    *,
+    lpips: nn.Module | None = None,
+    shuffled: bool = False,
+    shown: int = 0,
+) -> tuple[dict[str, Any], npt.NDArray[np.uint8]]:
+    """Predict the frames past the seed of each clip, and compare.
+
+    Args:
+        predict: the model.
+        source: the videos.
+        rows: row numbers of the clips' frames, int64 (C, T).
+        seed: S.
+        device: where the model computes.
+        lpips: network, or None.
+        shuffled: latents, or real actions, past the seed come from the next clip, so that none keeps its own.
+        shown: of so many first clips the predictions are kept.
+
+    Returns:
+        `psnr`, `ssim` and `lpips` (None without a network): lists (C, P); and frames (shown, P, H, W, 3).
+
+    Raises:
+        ValueError: latents of one clip alone cannot be shuffled.
+    """
+    if shuffled and len(rows) < 2:
+        raise ValueError(f"clips: got {len(rows)}, expected at least 2 to shuffle latents between them")
+    found: dict[str, list[Tensor]] = {"psnr": [], "ssim": [], "lpips": []}
+    pictures: list[npt.NDArray[np.uint8]] = []
+    order = np.roll(np.arange(len(rows)), -1)
+    for part in np.array_split(np.arange(len(rows)), -(-len(rows) // BATCH)):
+        frames = normalise(source.pixels(rows[part]).to(device))
+        donors = normalise(source.pixels(rows[order[part]]).to(device)) if shuffled else None
+        actions = None
+        if source.actions is not None:
+            moves = source.actions[rows[part][:, :-1]]
+            if shuffled:
+                moves = np.concatenate(
+                    (moves[:, : seed - 1], source.actions[rows[order[part]][:, seed - 1 : -1]]), axis=1
+                )
+            actions = torch.from_numpy(moves).to(device)
+        predicted = predict(frames, donors, actions)
+        scores = frame_scores(predicted, frames[:, seed:], lpips)
+        for name, values in scores._asdict().items():
+            if values is not None:
+                found[name].append(values.cpu())
+        pictures.append(to_uint8(predicted[: max(0, shown - sum(map(len, pictures)))]))
+    result = {name: torch.cat(values).double().tolist() if values else None for name, values in found.items()}
+    return result, np.concatenate(pictures)
+
+
+def bootstrap(values: npt.ArrayLike, seed: int = 0, draws: int = 2000) -> tuple[float, float]:
+    """95 % percentile interval of the mean over clips, which are drawn with replacement.
+
+    Args:
+        values: one number a clip (C,).
+        seed: of the draws.
+        draws: how many.
+
+    Example:
+        >>> bootstrap([1.0, 1.0, 1.0])
+        (1.0, 1.0)
+    """
+    numbers = np.asarray(values, np.float64)
+    drawn = np.random.default_rng(seed).integers(0, len(numbers), (draws, len(numbers)))
+    low, high = np.quantile(numbers[drawn].mean(axis=1), [0.025, 0.975])
+    return float(low), float(high)

@@ -1,0 +1,82 @@
+"""The ResNet oracle: tokens of the last feature map, all of it trained, weights from where they were said to come."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torchvision.models import resnet18
+
+from playslot_rl import keys
+from playslot_rl.config import PolicyConfig
+from playslot_rl.errors import CheckpointError
+from playslot_rl.methods.oracles.resnet import ResNetPolicy, cached_weights, load_pretrained, resnet_actor
+from playslot_rl.storage.tensors import save_tensors
+
+HEAD = PolicyConfig(dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16)
+
+
+@pytest.fixture
+def policy() -> ResNetPolicy:
+    torch.manual_seed(0)
+    return ResNetPolicy(HEAD, 64, 4)
+
+
+def test_features_are_those_of_torchvisions_network(policy: ResNetPolicy) -> None:
+    pixels = torch.randint(256, (2, 3, 64, 64), dtype=torch.uint8)
+    whole = resnet18(weights=None)
+    whole.load_state_dict({**policy.trunk.state_dict(), **{k: v for k, v in whole.state_dict().items() if "fc" in k}})
+    whole.eval()
+    policy.eval()
+    got = policy.features(pixels)
+    assert got.shape == (2, 4, 512)
+    torch.testing.assert_close(
+        whole.fc(got.mean(1)), whole((pixels / 255.0 - policy.mean) / policy.std), atol=1e-4, rtol=1e-4
+    )
+
+
+def test_gradients_reach_trunk_position_and_head(policy: ResNetPolicy) -> None:
+    policy(torch.rand(2, 3, 64, 64)).square().sum().backward()
+    missing = [name for name, p in policy.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    assert missing == []
+
+
+def test_actions_are_clamped_and_the_actor_remembers_nothing(policy: ResNetPolicy) -> None:
+    with torch.no_grad():
+        policy.head.head.bias.fill_(9.0)
+    actor = resnet_actor(policy.eval())
+    memory = actor.reset([1, 2])
+    assert memory.is_empty()
+    actions = actor(memory.set(keys.PIXELS, torch.zeros(2, 3, 64, 64, dtype=torch.uint8)))[keys.ACTION]
+    assert (actions == 1).all()
+
+
+def test_auto_takes_the_cached_weights_and_says_scratch_without(
+    policy: ResNetPolicy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.hub, "_hub_dir", str(tmp_path))
+    before = policy.trunk.conv1.weight.clone()
+    assert load_pretrained(policy, "auto") == "scratch"
+    assert torch.equal(policy.trunk.conv1.weight, before)
+    other = resnet18(weights=None)
+    cached_weights().parent.mkdir()
+    torch.save(other.state_dict(), cached_weights())
+    assert load_pretrained(policy, "auto") == "imagenet"
+    assert torch.equal(policy.trunk.conv1.weight, other.conv1.weight)
+    assert load_pretrained(policy, "scratch") == "scratch"
+
+
+def test_a_given_file_is_read_and_a_wrong_one_refused(policy: ResNetPolicy, tmp_path: Path) -> None:
+    tensors = dict(policy.trunk.state_dict())
+    save_tensors(tmp_path / "good.safetensors", tensors)
+    assert load_pretrained(policy, str(tmp_path / "good.safetensors")) == "imagenet"
+    tensors.pop("layer1.0.conv1.weight")
+    save_tensors(tmp_path / "short.safetensors", tensors)
+    with pytest.raises(CheckpointError, match=r"got no tensor layer1\.0\.conv1\.weight"):
+        load_pretrained(policy, str(tmp_path / "short.safetensors"))
+    with pytest.raises(CheckpointError, match="expected a file of ResNet-18's"):
+        load_pretrained(policy, str(tmp_path / "none.pth"))
+    (tmp_path / "bad.pth").write_bytes(b"no weights")
+    with pytest.raises(CheckpointError, match="expected a file of ResNet-18's"):
+        load_pretrained(policy, str(tmp_path / "bad.pth"))
