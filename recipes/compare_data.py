@@ -139,7 +139,7 @@ class Parents:
 
     def of(self, job: Job) -> dict[str, str]:
         """Of one job."""
-        from playslot_rl.data.demonstrations import first_demonstrations
+        from playslot_rl.data.views import first_demonstrations
 
         prints = dict(self._world) if METHODS[job.method].slots else {}
         if model := METHODS[job.method].model:

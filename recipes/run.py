@@ -137,8 +137,8 @@ def demonstration_views(
         slots_print: fingerprint of SAVi's checkpoint.
     """
     from playslot_rl.data.cache import Cache
-    from playslot_rl.data.shifts import shifted_copies
     from playslot_rl.data.slot_cache import slot_cache
+    from playslot_rl.data.views import shifted_copies
     from playslot_rl.world_model import module_device
 
     def parse(frames: EpisodeFrames) -> npt.NDArray[np.float32]:

@@ -21,6 +21,7 @@ from playslot_rl.data.places import CLUTTER, OUTSIDE, filled, is_clutter, parque
 from playslot_rl.data.problems import SHOWN, Problems
 from playslot_rl.data.tables import TASKS_NAME, UNREADABLE, WRONG_COLUMN, Episode
 from playslot_rl.errors import DataError
+from playslot_rl.runtime.processes import here
 
 TIME_TOLERANCE_S: Final = 1e-4
 """As LeRobot's default; float32 holds it up to about half an hour."""
@@ -283,4 +284,6 @@ def _require_order(contents: Contents, problems: Problems) -> None:
 
 @functools.cache
 def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+    """Once, by one of several processes."""
+    if here().first:
+        print(line, file=sys.stderr, flush=True)

@@ -6,7 +6,6 @@ F frames, H W image height and width.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -17,8 +16,8 @@ from torch import Tensor
 
 from playslot_rl.data.cache import note_read
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.stride import ChosenFrames
 from playslot_rl.data.trimming import moving_rows, slot_motion
+from playslot_rl.data.views import drawn_demonstrations, episode_range, first_demonstrations
 from playslot_rl.errors import DataError
 from playslot_rl.frames import normalise
 from playslot_rl.modules.action_range import ActionRange
@@ -26,10 +25,6 @@ from playslot_rl.modules.action_range import ActionRange
 FRAMES_AT_ONCE = 1024
 MotionOf = Callable[[npt.NDArray[np.int64]], Tensor]
 """The motion (M,) of the transitions from some rows (M,)."""
-DRAW_STREAM = 14
-"""Keeps the draws of demonstrations apart from what else a seed draws."""
-TEST_STREAM = 0x7E57
-"""Seed of the split in training and test episodes."""
 
 
 @dataclass(frozen=True)
@@ -114,93 +109,6 @@ def require_labelled(labelled: int, demos: int) -> None:
             f"behaviour.labelled_demos: got {labelled}, expected at most the {demos} demonstrations "
             "there are: lower it or collect more"
         )
-
-
-def first_demonstrations(source: EpisodeFrames, demos: int | None) -> EpisodeFrames:
-    """The first `demos` episodes of a data set; None, or as many as there are, gives the data set itself.
-
-    Row numbers stay those of the whole data set, so its slot cache serves every number of demonstrations.
-
-    Raises:
-        DataError: there are fewer episodes.
-    """
-    if demos is None or demos == source.episodes:
-        return source
-    if demos > source.episodes:
-        raise DataError(
-            f"demos: got {demos}, expected at most the {source.episodes} demonstrations there are: "
-            "lower it or collect more"
-        )
-    return replace(
-        source,
-        starts=source.starts[:demos],
-        lengths=source.lengths[:demos],
-        seeds=None if source.seeds is None else source.seeds[:demos],
-        fingerprint=hashlib.sha256(f"{source.fingerprint}/first {demos}".encode()).hexdigest()[:16],
-    )
-
-
-def drawn_demonstrations(source: EpisodeFrames, seed: int, among: int | None = None) -> EpisodeFrames:
-    """The same episodes, the first `among` of them (None: all) in an order drawn by a seed; row numbers stay."""
-    first = first_demonstrations(source, among)
-    order = np.random.default_rng([seed, DRAW_STREAM]).permutation(first.episodes)
-    order = np.concatenate((order, np.arange(first.episodes, source.episodes)))
-    return replace(
-        source,
-        starts=source.starts[order],
-        lengths=source.lengths[order],
-        seeds=None if source.seeds is None else source.seeds[order],
-        fingerprint=hashlib.sha256(f"{first.fingerprint}/drawn {seed}".encode()).hexdigest()[:16],
-    )
-
-
-def split_tested(source: EpisodeFrames, fraction: float) -> tuple[EpisodeFrames, EpisodeFrames]:
-    """The episodes that are trained on, and those that are kept for a test, the same ones for every seed; rows stay.
-
-    Args:
-        source: the data set.
-        fraction: of its episodes that are kept, at least two.
-
-    Raises:
-        DataError: fewer than two would be left for either.
-    """
-    kept = max(2, round(fraction * source.episodes))
-    if source.episodes - kept < 2:
-        raise DataError(
-            f"data.tested={fraction}: got {source.episodes} episodes, expected at least 4, two of them to train on: "
-            "collect more"
-        )
-    order = np.random.default_rng(TEST_STREAM).permutation(source.episodes)
-    parts = {"trained": np.sort(order[kept:]), "tested": np.sort(order[:kept])}
-    trained, tested = (
-        replace(
-            source,
-            starts=source.starts[episodes],
-            lengths=source.lengths[episodes],
-            seeds=None if source.seeds is None else source.seeds[episodes],
-            fingerprint=hashlib.sha256(f"{source.fingerprint}/{name} {kept}".encode()).hexdigest()[:16],
-        )
-        for name, episodes in parts.items()
-    )
-    return trained, tested
-
-
-def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames:
-    """Episodes `first` to `last` (exclusive) as a data set of their own, rows counted anew."""
-    begin, end = int(source.starts[first]), int(source.starts[last - 1] + source.lengths[last - 1])
-    frames = source.frames
-    return replace(
-        source,
-        # A slice of a memory map is a view, but several in a row would be copied to memory, all of them.
-        frames=frames[begin:end] if isinstance(frames, np.ndarray) else ChosenFrames(frames, np.arange(begin, end)),
-        shares=None if source.shares is None else source.shares.between(begin, end),
-        starts=source.starts[first:last] - begin,
-        lengths=source.lengths[first:last],
-        actions=None if source.actions is None else source.actions[begin:end],
-        success=None if source.success is None else source.success[begin:end],
-        seeds=None if source.seeds is None else source.seeds[first:last],
-        fingerprint=hashlib.sha256(f"{source.fingerprint}/episodes {first} {last}".encode()).hexdigest()[:16],
-    )
 
 
 @dataclass(frozen=True)

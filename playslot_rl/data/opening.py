@@ -9,7 +9,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import DataRoot, data_roots
 from playslot_rl.data.cache import Cache
 from playslot_rl.data.source import EpisodeFrames, open_sources
-from playslot_rl.data.stride import every
+from playslot_rl.data.views import every
 from playslot_rl.data.weighted import weighted
 
 

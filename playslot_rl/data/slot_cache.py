@@ -18,7 +18,8 @@ import torch
 
 from playslot_rl.data.cache import ArrayWriter, CachePlace, build_on, cache_folder, load_cached
 from playslot_rl.data.cache_entries import ENTRY_NAME, room
-from playslot_rl.data.source import ConcatFrames, EpisodeFrames
+from playslot_rl.data.rows import RowView
+from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.stream import streams_of
 from playslot_rl.frames import normalise
 from playslot_rl.seeds.draws import step_generator
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from playslot_rl.modules.savi import SAVi
 
 SlotRows = npt.NDArray[np.float32]
-"""Slots (F, N, D) by row: an array, or (`ConcatFrames`) several that are indexed by rows as one."""
+"""Slots (F, N, D) by row: an array, or (`RowView`) several that are indexed by rows as one."""
 
 _FORMAT = "1"
 _BY_ROW = "2"
@@ -72,7 +73,7 @@ def slot_cache(
     if shares is not None and shares.sources and source.fingerprint == shares.fingerprint:
         # Each set's own, whatever the weights.
         parts = [slot_cache(s, savi, savi_fingerprint, cache, device, progress) for s in shares.sources]
-        return cast("SlotRows", ConcatFrames(parts))
+        return cast("SlotRows", RowView(parts))
     whole = _in_order(source)
     identity = [_FORMAT if whole else _BY_ROW, source.fingerprint, source.camera, source.image_size, savi_fingerprint]
     key = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:24]

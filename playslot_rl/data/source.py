@@ -10,22 +10,27 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.data.action_limits import ActionLimits, joined_limits, limits_of
+from playslot_rl.config.weights import is_remote
+from playslot_rl.data.action_limits import ActionLimits, limits_of
 from playslot_rl.data.agreement import open_files
 from playslot_rl.data.cache import CachePlace, build_on, cache_folder, load_cached, note_read, settings
 from playslot_rl.data.cache_entries import ENTRY_NAME, room
 from playslot_rl.data.contents import Contents
 from playslot_rl.data.frame_build import FrameArray, build_frames
 from playslot_rl.data.metadata import stated_size
+from playslot_rl.data.remote import open_remote
+from playslot_rl.data.rows import FrameRows, Frames
+from playslot_rl.data.stream import FrameStream
+from playslot_rl.data.views import concatenate
 from playslot_rl.errors import DataError
 from playslot_rl.storage.atomic import write_json
 
@@ -34,73 +39,8 @@ if TYPE_CHECKING:
 
     from playslot_rl.data.weighted import Shares
 
-Frames = npt.NDArray[np.uint8]
 _FORMAT = "1"
 """Of the frame cache."""
-
-
-class FrameRows(Protocol):
-    """Frames uint8 (F, H, W, 3) by row number: an array, several in a row, or one that computes what it reads."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(F, H, W, 3)."""
-
-    @property
-    def dtype(self) -> Any:
-        """uint8."""
-
-    def __len__(self) -> int:
-        """F."""
-
-    def __getitem__(self, rows: Any, /) -> Any:
-        """Frames of an integer, a slice or an integer array of any shape."""
-
-
-def row_numbers(rows: Any, count: int) -> tuple[npt.NDArray[np.int64], tuple[int, ...]]:
-    """The rows that an index means.
-
-    Args:
-        rows: an integer, a slice or an integer array of any shape; negative numbers count from the end.
-        count: of all rows.
-
-    Returns:
-        Numbers from 0 on, int64 (n,), and the shape of the index.
-
-    Raises:
-        IndexError: there is no such row.
-    """
-    if isinstance(rows, slice):
-        rows = np.arange(*rows.indices(count))
-    index = np.asarray(rows, np.int64)
-    flat = np.where(index < 0, index + count, index).reshape(-1)
-    if flat.size and (flat.min() < 0 or flat.max() >= count):
-        raise IndexError(f"row {int(flat.max())}: expected 0 to {count - 1}")
-    return flat, index.shape
-
-
-class ConcatFrames:
-    """Several memory-mapped arrays as one along the first axis, gathered by row numbers; nothing is copied before."""
-
-    def __init__(self, parts: Sequence[FrameRows]) -> None:
-        self.parts = list(parts)
-        self._ends = np.cumsum([len(part) for part in self.parts])
-        self.shape = (int(self._ends[-1]), *self.parts[0].shape[1:])
-        self.dtype = self.parts[0].dtype
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __getitem__(self, rows: Any) -> Frames:
-        """Rows by an integer, a slice or an integer array of any shape."""
-        flat, shape = row_numbers(rows, len(self))
-        part = np.searchsorted(self._ends, flat, side="right")
-        out = np.empty((len(flat), *self.shape[1:]), self.dtype)
-        for number in np.unique(part):
-            here = part == number
-            offset = self._ends[number] - len(self.parts[number])
-            out[here] = self.parts[number][flat[here] - offset]
-        return out.reshape(*shape, *self.shape[1:])
 
 
 @dataclass(frozen=True)
@@ -184,56 +124,6 @@ class EpisodeFrames:
         return self.actions
 
 
-def open_source(
-    root: str | Path, camera: str = "", cache: CachePlace = "", *, image_size: int | None = None, resize: bool = False
-) -> EpisodeFrames:
-    """Open a LeRobot v3.0 data set through the frame cache; the first time decodes all its frames.
-
-    Args:
-        root: its folder.
-        camera: image or video feature; empty means the only one.
-        cache: the cache; empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
-        image_size: side the model expects; None takes what there is.
-        resize: resize frames of another size instead of refusing them.
-
-    Raises:
-        DataError: the data set is missing, foreign, truncated or unfinalised; no such camera; wrong frame size.
-        OutputError: full disk.
-    """
-    files = open_files(root)
-    camera = files.camera(camera)
-    stated = stated_size(files.features[camera])
-    # Refused before everything is decoded, where the metadata say it.
-    if image_size is not None and not resize and stated != (image_size, image_size):
-        raise wrong_size(files, camera, stated, image_size)
-    make = partial(_frame_cache, files, camera, cache, image_size if resize else None)
-    folder, fingerprint = make()
-    frames: Frames = load_cached(folder, "frames.npy", make)
-    if image_size is not None and frames.shape[1:3] != (image_size, image_size):
-        raise wrong_size(files, camera, (frames.shape[1], frames.shape[2]), image_size)
-    meta = json.loads((folder / ENTRY_NAME).read_text())
-    if len(frames) != files.rows or meta.get("fingerprint", fingerprint) != fingerprint:
-        raise DataError(
-            f"{folder}: got {len(frames)} frames of {meta.get('fingerprint')}, expected {files.rows} of {fingerprint}: "
-            "delete it, it is made again"
-        )
-    with np.load(folder / "columns.npz") as columns:
-        labels: dict[str, Any] = {
-            name: columns.get(name) for name in ("starts", "lengths", "actions", "success", "seeds")
-        }
-    return EpisodeFrames(
-        frames=frames,
-        fingerprint=fingerprint,
-        fps=meta["fps"],
-        task=meta["task"],
-        camera=camera,
-        robot=str(files.info.get("robot_type") or ""),
-        name=str(root),
-        limits=limits_of(files, labels["actions"]),
-        **labels,
-    )
-
-
 def open_sources(
     roots: str | Sequence[str | Path],
     camera: str = "",
@@ -243,63 +133,100 @@ def open_sources(
     resize: bool = False,
     buffer: int | None = None,
 ) -> EpisodeFrames:
-    """Open one or several data sets as one; `roots` is a list, or a string with commas.
+    """Open LeRobot v3.0 data sets as one; with several cameras each episode comes once for each of them.
 
-    With several cameras (commas in `camera`) each episode comes once for each of them. Labels that not every data set
-    has are dropped. The frames must have one size. With a `buffer`, frames of a shuffle buffer, they are not cached but
-    decoded while they are read (`playslot_rl.data.stream`).
+    Frames are decoded once, into the frame cache; with a `buffer` they are decoded while they are read
+    (`playslot_rl.data.stream`). Labels that not every data set has are dropped.
+
+    Args:
+        roots: folders, or a text with commas; with a `buffer` also addresses of data sets on the Hub.
+        camera: image or video feature, or several with commas; empty means the only one.
+        cache: empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
+        image_size: side the model expects; None takes what there is.
+        resize: resize frames of another size instead of refusing them.
+        buffer: frames of a shuffle buffer.
 
     Raises:
-        DataError: as `open_source`, or the frame sizes differ.
+        DataError: a data set is missing, foreign, truncated or unfinalised; no such camera; wrong or differing frame
+            sizes. With a `buffer`, a frame that cannot be decoded is found when it is read.
+        OutputError: full disk.
     """
     names = [name.strip() for name in roots.split(",")] if isinstance(roots, str) else list(roots)
-    cameras = [name.strip() for name in camera.split(",")]
-    pairs = [(name, one) for name in ([name for name in names if str(name)] or [""]) for one in cameras]
-    names = [name for name, _ in pairs]
-    if buffer is None:
-        opening = partial(open_source, image_size=image_size, resize=resize)
-    else:
-        from playslot_rl.data.stream import open_stream
-
-        opening = partial(open_stream, image_size=image_size, resize=resize, buffer=buffer)
-    sources = [opening(root, one, cache) for root, one in pairs]
-    if len(sources) == 1:
-        return sources[0]
-    for name, source in zip(names, sources, strict=True):
-        if source.image_size != sources[0].image_size:
-            got, want = source.image_size, sources[0].image_size
-            raise DataError(f"{name}: got frames of {got[0]}x{got[1]}, expected {want[0]}x{want[1]} as in {names[0]}")
-    return concatenate(sources)
-
-
-def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
-    """Several data sets with frames of one size as one; labels that not all have, or of another width, are dropped."""
-    offsets = np.cumsum([0, *(len(source.frames) for source in sources)])[:-1]
-    parts = [p for s in sources for p in (s.frames.parts if isinstance(s.frames, ConcatFrames) else [s.frames])]
-
-    def joined(name: str) -> Any:
-        labels = [getattr(source, name) for source in sources]
-        if any(label is None or label.shape[1:] != labels[0].shape[1:] for label in labels):
-            return None
-        return np.concatenate(labels)
-
-    actions = joined("actions")
-    return replace(
-        sources[0],
-        frames=ConcatFrames(parts),
-        starts=np.concatenate([s.starts + offset for s, offset in zip(sources, offsets, strict=True)]),
-        lengths=np.concatenate([s.lengths for s in sources]),
-        actions=actions,
-        success=joined("success"),
-        seeds=joined("seeds"),
-        fingerprint=hashlib.sha256("+".join(s.fingerprint for s in sources).encode()).hexdigest()[:16],
-        name=",".join(dict.fromkeys(s.name for s in sources)),
-        shares=None,
-        limits=None if actions is None else joined_limits([s.limits for s in sources], actions.shape[1]),
-    )
+    sources: list[EpisodeFrames] = []
+    for root in [name for name in names if str(name)] or [""]:
+        remote = buffer is not None and is_remote(root)
+        files = open_remote(str(root), cache_folder(cache)) if remote else open_files(root)
+        labels = labels_of(files)
+        limits = limits_of(files, labels["actions"])
+        for one in camera.split(","):
+            frames, fingerprint, feature = _frames_of(files, one.strip(), cache, image_size, resize, buffer)
+            sources.append(
+                EpisodeFrames(
+                    frames=frames,
+                    fingerprint=fingerprint,
+                    fps=files.fps,
+                    task=_task(files),
+                    camera=feature,
+                    robot=str(files.info.get("robot_type") or ""),
+                    name=str(root),
+                    limits=limits,
+                    **labels,
+                )
+            )
+    first = sources[0]
+    for source in sources[1:]:
+        if source.image_size != first.image_size:
+            got, want = source.image_size, first.image_size
+            raise DataError(
+                f"{source.name}: got frames of {got[0]}x{got[1]}, expected {want[0]}x{want[1]} as in {first.name}"
+            )
+    return concatenate(sources) if len(sources) > 1 else first
 
 
-def wrong_size(files: Contents, camera: str, got: tuple[int, int], expected: int) -> DataError:
+def open_source(
+    root: str | Path,
+    camera: str = "",
+    cache: CachePlace = "",
+    *,
+    image_size: int | None = None,
+    resize: bool = False,
+    buffer: int | None = None,
+) -> EpisodeFrames:
+    """`open_sources` of a single data set."""
+    return open_sources([root], camera, cache, image_size=image_size, resize=resize, buffer=buffer)
+
+
+def _frames_of(
+    files: Contents, camera: str, cache: CachePlace, image_size: int | None, resize: bool, buffer: int | None
+) -> tuple[FrameRows, str, str]:
+    """A camera's frames, cached or (with a `buffer`) streamed, the data set's fingerprint, and the camera's full name.
+
+    Raises:
+        DataError, OutputError: see `open_sources`.
+    """
+    camera, size = files.camera(camera), image_size if resize else None
+    stated = stated_size(files.features[camera])
+    # Refused before everything is decoded, where the metadata say it.
+    if image_size is not None and not resize and stated != (image_size, image_size):
+        raise _wrong_size(files, camera, stated, image_size)
+    fingerprint = files_fingerprint(files, camera, cache_folder(cache))
+    if buffer is not None:
+        return FrameStream(files, camera, size, buffer), fingerprint, camera
+    make = partial(_frame_cache, files, camera, cache, size, fingerprint)
+    folder = make()
+    frames: Frames = load_cached(folder, "frames.npy", make)
+    if image_size is not None and frames.shape[1:3] != (image_size, image_size):
+        raise _wrong_size(files, camera, (frames.shape[1], frames.shape[2]), image_size)
+    made_of = json.loads((folder / ENTRY_NAME).read_text()).get("fingerprint", fingerprint)
+    if len(frames) != files.rows or made_of != fingerprint:
+        raise DataError(
+            f"{folder}: got {len(frames)} frames of {made_of}, expected {files.rows} of {fingerprint}: delete it, it "
+            "is made again"
+        )
+    return frames, fingerprint, camera
+
+
+def _wrong_size(files: Contents, camera: str, got: tuple[int, int], expected: int) -> DataError:
     """Frames of another size than the model's."""
     return DataError(
         f"{files.name}: got frames of {got[0]}x{got[1]} from {camera}, expected {expected}x{expected}: "
@@ -307,8 +234,8 @@ def wrong_size(files: Contents, camera: str, got: tuple[int, int], expected: int
     )
 
 
-def _frame_cache(files: Contents, camera: str, cache: CachePlace, size: int | None) -> tuple[Path, str]:
-    """The cache folder of a data set's camera, made if needed, and the data set's fingerprint.
+def _frame_cache(files: Contents, camera: str, cache: CachePlace, size: int | None, fingerprint: str) -> Path:
+    """The cache folder of a data set's camera, made if needed.
 
     It holds `frames.npy` uint8 (F, H, W, 3), `columns.npz` and `meta.json`, and is keyed by the data set's content, the
     camera and the frame size (None keeps it), never by the path.
@@ -318,7 +245,6 @@ def _frame_cache(files: Contents, camera: str, cache: CachePlace, size: int | No
         raise DataError(
             f"data.cache={folder}: got a folder inside the data set {files.root}, expected one outside: move it"
         )
-    fingerprint = files_fingerprint(files, camera, folder)
     key = hashlib.sha256(json.dumps([_FORMAT, fingerprint, camera, size]).encode()).hexdigest()[:24]
 
     def build(part: Path) -> None:
@@ -326,12 +252,17 @@ def _frame_cache(files: Contents, camera: str, cache: CachePlace, size: int | No
         with room(cache, array.bytes, key):
             array.begin()
         build_frames(files, camera, size, part, settings(cache).workers)
-        np.savez(part / "columns.npz", **labels_of(files))  # type: ignore[arg-type]
-        tasks = files.episodes[0].tasks
+        labels = {name: values for name, values in labels_of(files).items() if values is not None}
+        np.savez(part / "columns.npz", **labels)
         facts = {"name": str(files.root), "camera": camera, "fingerprint": fingerprint}
-        write_json(part / ENTRY_NAME, {**facts, "fps": files.fps, "task": tasks[0] if tasks else ""})
+        write_json(part / ENTRY_NAME, {**facts, "fps": files.fps, "task": _task(files)})
 
-    return build_on(folder / "frames" / key, build), fingerprint
+    return build_on(folder / "frames" / key, build)
+
+
+def _task(files: Contents) -> str:
+    tasks = files.episodes[0].tasks
+    return tasks[0] if tasks else ""
 
 
 def files_fingerprint(files: Contents, camera: str, cache: Path) -> str:
@@ -353,16 +284,15 @@ def files_fingerprint(files: Contents, camera: str, cache: Path) -> str:
     return fingerprint
 
 
-def labels_of(files: Contents) -> dict[str, npt.NDArray[Any]]:
-    """`starts`, `lengths`, and where there are some, `actions`, `success` and `seeds`, as of `EpisodeFrames`."""
+def labels_of(files: Contents) -> dict[str, Any]:
+    """`starts`, `lengths`, `actions`, `success` and `seeds`, as of `EpisodeFrames`."""
     lengths = np.array([episode.length for episode in files.episodes], np.int64)
     starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
-    found: dict[str, npt.NDArray[Any]] = {"starts": starts, "lengths": lengths}
     actions, success, seeds = map(files.numbers, (keys.FEATURE_ACTION, keys.FEATURE_SUCCESS, keys.FEATURE_SEED))
-    if actions is not None:
-        found["actions"] = actions.astype(np.float32).reshape(files.rows, -1)
-    if success is not None:
-        found["success"] = success.astype(bool)
-    if seeds is not None:
-        found["seeds"] = seeds[starts].astype(np.int64)
-    return found
+    return {
+        "starts": starts,
+        "lengths": lengths,
+        "actions": None if actions is None else actions.astype(np.float32).reshape(files.rows, -1),
+        "success": None if success is None else success.astype(bool),
+        "seeds": None if seeds is None else seeds[starts].astype(np.int64),
+    }

@@ -19,34 +19,16 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.config.weights import is_remote
-from playslot_rl.data.action_limits import limits_of
-from playslot_rl.data.agreement import open_files
-from playslot_rl.data.cache import CachePlace, cache_folder
 from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.frames import rgb_frames, sized
 from playslot_rl.data.metadata import stated_size
-from playslot_rl.data.remote import open_remote
-from playslot_rl.data.shifts import ShiftedFrames
-from playslot_rl.data.source import (
-    ConcatFrames,
-    EpisodeFrames,
-    FrameRows,
-    Frames,
-    files_fingerprint,
-    labels_of,
-    row_numbers,
-    wrong_size,
-)
-from playslot_rl.data.stride import ChosenFrames
+from playslot_rl.data.rows import FrameRows, Frames, IntArray, RowView, row_numbers
 
-IntArray = npt.NDArray[np.int64]
 BLOCKS: Final = 16
 """Blocks of a full buffer."""
 FEW: Final = 4
@@ -69,8 +51,9 @@ class FrameStream:
     """
 
     def __init__(self, contents: Contents, camera: str, size: int | None, buffer: int) -> None:
-        self._spans = contents.spans
-        self._contents, self.camera, self.size, self.buffer = contents, camera, size, buffer
+        self._spans = contents.spans  # found from the columns
+        self._contents = replace(contents, columns={"episode_index": contents.columns["episode_index"]})
+        self.camera, self.size, self.buffer = camera, size, buffer
         height, width = stated_size(contents.features[camera])
         self.shape = (contents.rows, size or height, size or width, 3)
         self.dtype = np.dtype(np.uint8)
@@ -170,81 +153,24 @@ def _blocks(spans: Sequence[Span], frames: int) -> list[list[Span]]:
     return found
 
 
-def open_stream(
-    root: str | Path,
-    camera: str = "",
-    cache: CachePlace = "",
-    *,
-    buffer: int,
-    image_size: int | None = None,
-    resize: bool = False,
-) -> EpisodeFrames:
-    """Open a LeRobot v3.0 data set without a frame cache.
-
-    Args:
-        root, camera, cache, image_size, resize: as of `playslot_rl.data.source.open_source`, or the address of a data
-            set on the Hub; the cache only remembers its fingerprint, or its metadata.
-        buffer: frames of the shuffle buffer.
-
-    Raises:
-        DataError: as `open_source`; a frame that cannot be decoded is found when it is read.
-    """
-    files = open_remote(str(root), cache_folder(cache)) if is_remote(root) else open_files(root)
-    camera = files.camera(camera)
-    stated = stated_size(files.features[camera])
-    if image_size is not None and not resize and stated != (image_size, image_size):
-        raise wrong_size(files, camera, stated, image_size)
-    labels = labels_of(files)
-    fingerprint = files_fingerprint(files, camera, cache_folder(cache))
-    limits = limits_of(files, labels.get("actions"))
-    tasks, _ = files.episodes[0].tasks, files.spans  # found from the columns, which are not kept
-    files = replace(files, columns={"episode_index": files.columns["episode_index"]})
-    return EpisodeFrames(
-        frames=FrameStream(files, camera, image_size if resize else None, buffer),
-        starts=labels["starts"],
-        lengths=labels["lengths"],
-        actions=labels.get("actions"),
-        success=labels.get("success"),
-        seeds=labels.get("seeds"),
-        fingerprint=fingerprint,
-        fps=files.fps,
-        task=tasks[0] if tasks else "",
-        camera=camera,
-        robot=str(files.info.get("robot_type") or ""),
-        name=str(root),
-        limits=limits,
-    )
-
-
 def streams_of(frames: FrameRows) -> list[FrameStream]:
     """The streams that frames are read from, whatever is done to them; none for a frame cache."""
-    match frames:
-        case FrameStream():
-            return [frames]
-        case ChosenFrames() | ShiftedFrames():
-            return streams_of(frames.frames)
-        case ConcatFrames():
-            return [stream for part in frames.parts for stream in streams_of(part)]
-    return []
+    if isinstance(frames, RowView):
+        return [stream for part in frames.parts for stream in streams_of(part)]
+    return [frames] if isinstance(frames, FrameStream) else []
 
 
 def blocks_of(frames: FrameRows, rows: IntArray) -> IntArray:
     """Number of the block of each row, counted through all of `streams_of`."""
-    match frames:
-        case FrameStream():
-            return frames.block_of(rows)
-        case ChosenFrames():
-            return blocks_of(frames.frames, frames.rows[rows])
-        case ShiftedFrames():
-            return blocks_of(frames.frames, rows)
-        case ConcatFrames():
-            found, begin, counted = np.empty(len(rows), np.int64), 0, 0
-            for part in frames.parts:
-                here = (rows >= begin) & (rows < begin + len(part))
-                found[here] = blocks_of(part, rows[here] - begin) + counted
-                begin, counted = begin + len(part), counted + sum(len(s.blocks) for s in streams_of(part))
-            return found
-    raise TypeError(f"got {type(frames).__name__}, expected frames that are streamed")
+    if isinstance(frames, FrameStream):
+        return frames.block_of(rows)
+    if not isinstance(frames, RowView):
+        raise TypeError(f"got {type(frames).__name__}, expected frames that are streamed")
+    found, before = np.empty(len(rows), np.int64), 0
+    for part, here, own in frames.located(rows):
+        found[here] = blocks_of(part, own) + before
+        before += sum(len(stream.blocks) for stream in streams_of(part))
+    return found
 
 
 class ShuffleBuffer:

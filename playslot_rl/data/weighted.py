@@ -9,17 +9,16 @@ Shapes: P sets, E episodes, F frames, B batch.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.data.source import EpisodeFrames, concatenate
+from playslot_rl.data.rows import IntArray
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.views import concatenate, text_hash
 from playslot_rl.errors import DataError
-
-IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -69,8 +68,7 @@ def weighted(sources: Sequence[EpisodeFrames], weights: Sequence[float | None], 
             if got != want:
                 raise DataError(f"{name}: got {what} {got}, expected {want} as in {names[0]}: read sets of one kind")
     joined = concatenate(sources)
-    total = f"{joined.fingerprint}/weights {','.join(f'{weight:g}' for weight in given)}"
-    fingerprint = hashlib.sha256(total.encode()).hexdigest()[:16]
+    fingerprint = text_hash(f"{joined.fingerprint}/weights {','.join(f'{weight:g}' for weight in given)}")
     ends = np.cumsum([len(source.frames) for source in sources]).astype(np.int64)
     shares = Shares(ends, np.asarray(given, np.float64), tuple(sources), fingerprint)
     return replace(joined, fingerprint=fingerprint, shares=shares)

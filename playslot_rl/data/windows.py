@@ -11,12 +11,11 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from playslot_rl.data.rows import IntArray as IntArray
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.stream import ShuffleBuffer, streams_of
 from playslot_rl.data.weighted import draw_episodes
 from playslot_rl.errors import DataError
-
-IntArray = npt.NDArray[np.int64]
 
 
 def sample_windows(

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from playslot_rl.acting.episodes import Task
 from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.data.source import EpisodeFrames, FrameRows
+from playslot_rl.data.rows import FrameRows
+from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import spread_evenly
 from playslot_rl.errors import RenderError
 from playslot_rl.frames import to_float

@@ -24,7 +24,6 @@ from torch import Tensor
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.data.source import open_source
-from playslot_rl.data.stream import open_stream
 from playslot_rl.data.windows import Clips, sample_windows
 from playslot_rl.frames import normalise
 from playslot_rl.runtime.progress import quiet_datasets
@@ -53,7 +52,7 @@ def sampling_rates(sizes: Sizes) -> dict[str, float]:
             rows = sample_windows(source.starts, source.lengths, sizes.window, sizes.window_batch, generator)
             return normalise(source.pixels(rows))
 
-        streamed = open_stream(root, cache=Path(folder) / "cache", buffer=len(source.frames) // 4)
+        streamed = open_source(root, cache=Path(folder) / "cache", buffer=len(source.frames) // 4)
         clips, steps = Clips(streamed, sizes.window, 0.0, 0), itertools.count()
 
         def decoded() -> Tensor:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.data.demonstrations import split_tested
 from playslot_rl.data.opening import open_configured
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.views import split_tested
 from playslot_rl.data.windows import IntArray, spread_windows
 from playslot_rl.errors import ConfigError, DataError
 

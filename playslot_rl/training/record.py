@@ -16,15 +16,10 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.roles import fixed_keys
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.action_limits import ActionLimits, said, scaled
-from playslot_rl.data.demonstrations import (
-    DemonstrationSplit,
-    episode_range,
-    split_demonstrations,
-    split_tested,
-    transitions,
-)
+from playslot_rl.data.demonstrations import DemonstrationSplit, split_demonstrations, transitions
 from playslot_rl.data.opening import open_configured
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.views import episode_range, split_tested
 from playslot_rl.data.weighted import weighted
 from playslot_rl.data.windows import Clips
 from playslot_rl.errors import CheckpointError, DataError

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from playslot_rl.data.demonstrations import (
-    drawn_demonstrations,
-    first_demonstrations,
     real_actions,
     require_labelled,
     split_demonstrations,
     transitions,
 )
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.views import drawn_demonstrations, first_demonstrations
 from playslot_rl.errors import DataError
 
 

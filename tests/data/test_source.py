@@ -15,7 +15,8 @@ import torch
 from foreign import LENGTHS, foreign_frames, write_foreign
 
 from playslot_rl.data.cache import build_once, cache_folder
-from playslot_rl.data.source import ConcatFrames, open_source, open_sources
+from playslot_rl.data.rows import RowView
+from playslot_rl.data.source import open_source, open_sources
 from playslot_rl.errors import DataError, OutputError
 
 
@@ -90,7 +91,7 @@ def test_the_data_set_is_left_untouched(foreign_images: Path, tmp_path: Path) ->
 def test_several_data_sets_are_read_as_one(foreign_images: Path, damaged: Path, tmp_path: Path) -> None:
     both = open_sources(f"{foreign_images}, {damaged}", cache=tmp_path / "cache")
     frames = np.concatenate(foreign_frames())
-    assert isinstance(both.frames, ConcatFrames)
+    assert isinstance(both.frames, RowView)
     assert both.frames.shape == (30, 32, 32, 3)
     assert both.starts.tolist() == [0, 5, 8, 15, 20, 23]
     rows = np.array([[14, 15], [29, 0]])

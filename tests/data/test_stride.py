@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from playslot_rl.data.source import open_source
-from playslot_rl.data.stride import every
+from playslot_rl.data.views import every
 
 
 def test_rows_of_each_episode_from_its_first_frame_on(foreign_images: Path, tmp_path: Path) -> None:

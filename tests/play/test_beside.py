@@ -21,7 +21,7 @@ from scene import EPISODES, FRAMES
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.stride import every
+from playslot_rl.data.views import every
 from playslot_rl.play import pictures
 from playslot_rl.play.page import PlayPage
 from playslot_rl.play.recording import record

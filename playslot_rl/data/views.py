@@ -1,0 +1,190 @@
+"""Data sets as views of others: several as one, some of their episodes, every k-th frame, all frames moved.
+
+Nothing is copied, and the fingerprint of each follows from what it is a view of.
+
+Shapes: F frames, E episodes, A action width.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.data.action_limits import joined_limits
+from playslot_rl.data.rows import IntArray, RowView
+from playslot_rl.errors import DataError
+
+if TYPE_CHECKING:
+    from playslot_rl.data.source import EpisodeFrames
+
+DIRECTIONS = ((1, 1), (-1, -1), (1, -1), (-1, 1), (1, 0), (-1, 0), (0, 1), (0, -1))
+"""Of shifted copies, (down, right): corners first, so that the first four surround the original."""
+DRAW_STREAM = 14
+"""Keeps the draws of demonstrations apart from what else a seed draws."""
+TEST_STREAM = 0x7E57
+"""Seed of the split in training and test episodes."""
+
+
+def text_hash(text: str) -> str:
+    """16 hex digits."""
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _viewed(source: EpisodeFrames, how: str, **changes: Any) -> EpisodeFrames:
+    return replace(source, fingerprint=text_hash(f"{source.fingerprint}/{how}"), **changes)
+
+
+def _chosen(source: EpisodeFrames, episodes: slice | IntArray, how: str) -> EpisodeFrames:
+    """Some episodes, in an order. Row numbers stay, so that the slot cache of the whole serves any choice."""
+    seeds = None if source.seeds is None else source.seeds[episodes]
+    return _viewed(source, how, starts=source.starts[episodes], lengths=source.lengths[episodes], seeds=seeds)
+
+
+def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
+    """Several data sets with frames of one size as one; labels that not all have, or of another width, are dropped."""
+    offsets = np.cumsum([0, *(len(source.frames) for source in sources)])[:-1]
+
+    def joined(name: str) -> Any:
+        labels = [getattr(source, name) for source in sources]
+        if any(label is None or label.shape[1:] != labels[0].shape[1:] for label in labels):
+            return None
+        return np.concatenate(labels)
+
+    actions = joined("actions")
+    return replace(
+        sources[0],
+        frames=RowView([source.frames for source in sources]),
+        starts=np.concatenate([s.starts + offset for s, offset in zip(sources, offsets, strict=True)]),
+        lengths=joined("lengths"),
+        actions=actions,
+        success=joined("success"),
+        seeds=joined("seeds"),
+        fingerprint=text_hash("+".join(source.fingerprint for source in sources)),
+        name=",".join(dict.fromkeys(source.name for source in sources)),
+        shares=None,
+        limits=None if actions is None else joined_limits([s.limits for s in sources], actions.shape[1]),
+    )
+
+
+def shifted(source: EpisodeFrames, offset: tuple[int, int]) -> EpisodeFrames:
+    """Every frame moved by `offset` pixels (down, right), edges repeated; labels and row numbers stay.
+
+    SAVi reads videos, so a copy keeps one offset from its first frame to its last.
+    """
+    return _viewed(source, f"shifted {offset[0]} {offset[1]}", frames=RowView([source.frames], offset=offset))
+
+
+def shifted_copies(source: EpisodeFrames, shift: int, copies: int) -> Sequence[EpisodeFrames]:
+    """The first `copies` of the eight neighbours at `shift` pixels; none where `shift` is 0."""
+    return [shifted(source, (shift * y, shift * x)) for y, x in DIRECTIONS[: copies if shift else 0]]
+
+
+def every(source: EpisodeFrames, stride: int) -> EpisodeFrames:
+    """The same episodes with every `stride`-th of their frames; `stride` 1 gives the data set itself.
+
+        row r of episode e  <-  row starts_e + k r,    r = 0 .. ceil(lengths_e / k) - 1
+
+    The action of a kept row is the mean of the k actions that lead to the next kept one (those of a velocity or of a
+    displacement a step stay in their range).
+
+    Raises:
+        ValueError: `stride` below 1.
+    """
+    if stride < 1:
+        raise ValueError(f"stride: got {stride}, expected 1 (every frame) or more")
+    if stride == 1:
+        return source
+    lengths = -(-source.lengths // stride)
+    pairs = zip(source.starts, source.lengths, strict=True)
+    rows = np.concatenate([np.arange(s, s + n, stride, dtype=np.int64) for s, n in pairs])
+    return _viewed(
+        source,
+        f"every {stride}",
+        frames=RowView([source.frames], rows),
+        starts=(np.cumsum(lengths) - lengths).astype(np.int64),
+        lengths=lengths.astype(np.int64),
+        actions=None if source.actions is None else _mean_actions(source, stride),
+        success=None if source.success is None else source.success[rows],
+        fps=source.fps / stride,
+    )
+
+
+def _mean_actions(source: EpisodeFrames, stride: int) -> npt.NDArray[np.float32]:
+    """(F, A) for the kept rows. An episode's last action is padding and counts only where nothing else is left."""
+    actions, means = source.require_actions(), []
+    for start, length in zip(source.starts, source.lengths, strict=True):
+        for first in range(0, int(length), stride):
+            last = max(first + 1, min(first + stride, int(length) - 1))
+            means.append(actions[start + first : start + last].mean(axis=0))
+    return np.stack(means).astype(np.float32)
+
+
+def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames:
+    """Episodes `first` to `last` (exclusive) as a data set of their own, rows counted anew."""
+    begin, end = int(source.starts[first]), int(source.starts[last - 1] + source.lengths[last - 1])
+    frames = source.frames
+    return _viewed(
+        source,
+        f"episodes {first} {last}",
+        # A slice of a memory map is a view, but of others it would be copied to memory, all of it.
+        frames=frames[begin:end] if isinstance(frames, np.ndarray) else RowView([frames], np.arange(begin, end)),
+        shares=None if source.shares is None else source.shares.between(begin, end),
+        starts=source.starts[first:last] - begin,
+        lengths=source.lengths[first:last],
+        actions=None if source.actions is None else source.actions[begin:end],
+        success=None if source.success is None else source.success[begin:end],
+        seeds=None if source.seeds is None else source.seeds[first:last],
+    )
+
+
+def first_demonstrations(source: EpisodeFrames, demos: int | None) -> EpisodeFrames:
+    """The first `demos` episodes; None, or as many as there are, gives the data set itself.
+
+    Raises:
+        DataError: there are fewer episodes.
+    """
+    if demos is None or demos == source.episodes:
+        return source
+    if demos > source.episodes:
+        raise DataError(
+            f"demos: got {demos}, expected at most the {source.episodes} demonstrations there are: "
+            "lower it or collect more"
+        )
+    return _chosen(source, slice(demos), f"first {demos}")
+
+
+def drawn_demonstrations(source: EpisodeFrames, seed: int, among: int | None = None) -> EpisodeFrames:
+    """The same episodes, the first `among` of them (None: all) in an order drawn by a seed."""
+    first = first_demonstrations(source, among)
+    order = np.random.default_rng([seed, DRAW_STREAM]).permutation(first.episodes)
+    how = f"drawn {seed}"
+    drawn = _chosen(source, np.concatenate((order, np.arange(first.episodes, source.episodes))), how)
+    return replace(drawn, fingerprint=text_hash(f"{first.fingerprint}/{how}"))
+
+
+def split_tested(source: EpisodeFrames, fraction: float) -> tuple[EpisodeFrames, EpisodeFrames]:
+    """The episodes that are trained on, and those that are kept for a test, the same ones for every seed.
+
+    Args:
+        source: the data set.
+        fraction: of its episodes that are kept, at least two.
+
+    Raises:
+        DataError: fewer than two would be left for either.
+    """
+    kept = max(2, round(fraction * source.episodes))
+    if source.episodes - kept < 2:
+        raise DataError(
+            f"data.tested={fraction}: got {source.episodes} episodes, expected at least 4, two of them to train on: "
+            "collect more"
+        )
+    order = np.random.default_rng(TEST_STREAM).permutation(source.episodes)
+    return (
+        _chosen(source, np.sort(order[kept:]), f"trained {kept}"),
+        _chosen(source, np.sort(order[:kept]), f"tested {kept}"),
+    )
