@@ -12,7 +12,7 @@ import hashlib
 import io
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -22,12 +22,13 @@ import numpy as np
 from playslot_rl import keys
 from playslot_rl.data.cache import build_once
 from playslot_rl.data.contents import Contents, read_metadata
+from playslot_rl.data.hub_faults import Asked, one_line
 from playslot_rl.data.metadata import DATA_PATH, FORMAT_TAG, INFO_NAME
 from playslot_rl.data.places import filled, is_plain_path
 from playslot_rl.data.problems import Problems
 from playslot_rl.data.tables import MOST_ROWS, Array, Episode, read_columns
 from playslot_rl.errors import DataError
-from playslot_rl.storage.secrets import checked_token, masked_logs
+from playslot_rl.storage.secrets import checked_token, mask
 
 BUFFER: Final = 1 << 20
 """Bytes that are asked of the client at once; it reads ahead by more."""
@@ -62,9 +63,16 @@ class Remote:
         from huggingface_hub import HfFileSystem
 
         name = f"{self.place}/{path.relative_to(self.root).as_posix()}"
-        with asking(self.address, self.token):
-            system = HfFileSystem(token=self.token or False)
-            return io.BufferedReader(_Ranges(self.address, self.token, system.open(name, "rb")), BUFFER)
+        with self.asking():
+            try:
+                file = HfFileSystem(token=self.token or False).open(name, "rb")
+            except FileNotFoundError as error:
+                raise DataError(f"{self.address}: got no file {path.name}, expected it there: {_LOOK}") from error
+        return io.BufferedReader(_Ranges(self, file), BUFFER)
+
+    def asking(self) -> contextlib.AbstractContextManager[None]:
+        """As `_asking`."""
+        return _asking(self.address, self.token, self.root)
 
     def holds(self, path: Path) -> bool:
         """Whether the commit has the file."""
@@ -81,8 +89,8 @@ class Remote:
 class _Ranges(io.RawIOBase):
     """A file of the Hub whose errors are one line."""
 
-    def __init__(self, address: str, token: str | None, file: Any) -> None:
-        self._address, self._token, self._file = address, token, file
+    def __init__(self, remote: Remote, file: Any) -> None:
+        self._remote, self._file = remote, file
 
     def readable(self) -> bool:
         return True
@@ -97,7 +105,7 @@ class _Ranges(io.RawIOBase):
         return int(self._file.tell())
 
     def readinto(self, buffer: Any) -> int:
-        with asking(self._address, self._token):
+        with self._remote.asking():
             piece = self._file.read(len(buffer))
         buffer[: len(piece)] = piece
         return len(piece)
@@ -107,49 +115,13 @@ class _Ranges(io.RawIOBase):
         super().close()
 
 
-@contextlib.contextmanager
-def asking(address: str, token: str | None) -> Iterator[None]:
-    """Say what goes wrong at the Hub inside in one line, without the token. The client has tried again by then.
+def _asking(address: str, token: str | None, root: Path, revision: str = "") -> contextlib.AbstractContextManager[None]:
+    """A block that talks to the Hub: its errors are one line. The client has tried again by then."""
+    from huggingface_hub import constants
 
-    Raises:
-        DataError: no such data set or revision, no access, offline, or no answer.
-    """
-    failure = None
-    try:
-        with masked_logs(token):
-            yield
-        return
-    except Exception as error:
-        said = _said(error)
-        if said is None:
-            raise
-        failure = DataError(f"{address}: {said}")
-    # The client's error holds the server's answer, which may repeat the token it was sent: it does not go along.
-    try:
-        raise failure
-    finally:
-        failure.__context__ = None
-
-
-def _said(error: Exception) -> str | None:
-    """What an error of the client means; None if it is no error of the client."""
-    import httpx
-    from huggingface_hub import errors
-
-    again = "check the network and run the same command again, it carries on"
-    if isinstance(error, errors.OfflineModeIsEnabled):
-        return "got offline mode (HF_HUB_OFFLINE is set), expected access to the Hub: unset it"
-    if isinstance(error, errors.RevisionNotFoundError):
-        return "got no such revision, expected a branch, a tag or a commit: see its page on the Hub"
-    if isinstance(error, errors.HfHubHTTPError):
-        status = int(error.response.status_code)
-        if status not in (401, 403, 404):
-            return f"got status {status} from the Hub, expected its files: {again}"
-        cure = "check the name; if it is private, run `hf auth login` once, or set HF_TOKEN"
-        return f"got status {status}, expected a data set that can be read: {cure}"
-    if isinstance(error, httpx.TransportError | ConnectionError | TimeoutError):
-        return f"got no connection ({type(error).__name__}), expected the Hub: {again}"
-    return f"got no file {error}, expected it there: {_LOOK}" if isinstance(error, FileNotFoundError) else None
+    endpoint = mask(constants.ENDPOINT, token)
+    asked = Asked(address, "data set", endpoint, root, revision, writing=False, has_token=token is not None)
+    return one_line(asked, token, DataError)
 
 
 def open_remote(address: str, cache: Path) -> Contents:
@@ -194,7 +166,7 @@ def _commit_of(address: str, cache: Path) -> Remote:
     name, revision = matched[1], matched[2]
     token = checked_token(get_token())
     api = HfApi(token=token or False, library_name="playslot_rl")
-    with asking(address, token):
+    with _asking(address, token, cache, revision or ""):
         try:
             info = api.dataset_info(name, revision=revision or FORMAT_TAG)
         except errors.RevisionNotFoundError:
@@ -210,7 +182,7 @@ def _commit_of(address: str, cache: Path) -> Remote:
 
     def fetch(folder: Path) -> None:
         wanted = [glob.escape(path) for path in files if path.startswith("meta/") and is_plain_path(path)]
-        with asking(address, token):
+        with _asking(address, token, cache):
             api.snapshot_download(name, repo_type="dataset", revision=commit, local_dir=folder, allow_patterns=wanted)
 
     root = build_once(cache / "remote" / f"{name.replace('/', '--')}-{commit[:16]}", fetch)

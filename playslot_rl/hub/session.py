@@ -13,17 +13,16 @@ import glob
 import re
 import tempfile
 import time
-import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from playslot_rl.data.hub_faults import Asked, one_line
 from playslot_rl.data.places import inside
 from playslot_rl.errors import HubError
-from playslot_rl.hub.errors import translate
 from playslot_rl.hub.layout import CARD_NAME, same_content, size_of
-from playslot_rl.storage.secrets import checked_token, mask, masked_logs
+from playslot_rl.storage.secrets import checked_token, mask
 
 if TYPE_CHECKING:
     from huggingface_hub import RepoFile
@@ -38,33 +37,11 @@ Kind = Literal["dataset", "model"]
 
 
 @dataclass(frozen=True)
-class Repository:
-    """A data set or model on the Hub, and how to talk about it.
+class Repository(Asked):
+    """A data set or model on the Hub, and how to talk about it; `api` is a `huggingface_hub.HfApi` with the token."""
 
-    Attributes:
-        name: `user/name`.
-        endpoint: address of the Hub.
-        root: local folder.
-        writing: a push (a pull otherwise).
-        has_token: whether a token was sent.
-        revision: the revision asked for; empty if none was.
-        kind: what it is.
-        api: `huggingface_hub.HfApi` with the token.
-    """
-
-    name: str
-    endpoint: str
-    root: Path
-    writing: bool
-    has_token: bool
-    revision: str
     kind: Kind
     api: Any
-
-    @property
-    def what(self) -> str:
-        """What it is, in words."""
-        return "data set" if self.kind == "dataset" else "model"
 
     @property
     def here(self) -> dict[str, str]:
@@ -227,27 +204,16 @@ def open_repository(
     token = checked_token(token) or checked_token(get_token())
     name, endpoint = mask(repo_id, token), mask(constants.ENDPOINT, token)
     api = HfApi(token=token or False, library_name="playslot_rl")
-    hub = Repository(name, endpoint, root, writing, token is not None, revision, kind, api)
-    try:
+    what = "data set" if kind == "dataset" else "model"
+    hub = Repository(name, what, endpoint, root, revision, writing, token is not None, kind, api)
+    with one_line(hub, token):
         if not _NAME.fullmatch(repo_id):
             raise errors.HFValidationError(repo_id)
         if is_offline_mode():
             raise errors.OfflineModeIsEnabled
         if writing and token is None:
             raise errors.LocalTokenNotFoundError
-        with masked_logs(token):
-            yield hub
-        return
-    except Exception as error:  # noqa: BLE001 - nothing that may hold a token goes on as it is
-        known = translate(error, hub)
-        failure = type(known)(mask(str(known), token))
-        failure.add_note(mask("".join(traceback.format_exception(error)), token))
-    # A server may repeat the token it was sent, and the client's errors hold its answer: their masked text goes along
-    # as a note, they themselves do not.
-    try:
-        raise failure
-    finally:
-        failure.__context__ = None
+        yield hub
 
 
 MAIN: Final = "main"

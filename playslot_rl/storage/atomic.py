@@ -45,12 +45,18 @@ def explain_write_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if isinstance(error, OutputError) or error.errno not in _REASONS:
+        known = None if isinstance(error, OutputError) else write_error(path, error)
+        if known is None:
             raise
-        reason, cure = _REASONS[error.errno]
-        raise OutputError(
-            f"cannot write {path}: {reason}, expected a writable folder with free space; {cure}"
-        ) from error
+        raise known from error
+
+
+def write_error(path: Path, error: BaseException) -> OutputError | None:
+    """What kept from writing below `path`, in one line; None where it is another error."""
+    if not isinstance(error, OSError) or error.errno not in _REASONS:
+        return None
+    reason, cure = _REASONS[error.errno]
+    return OutputError(f"cannot write {path}: {reason}, expected a writable folder with free space; {cure}")
 
 
 def temporary_name(path: Path) -> Path:
