@@ -46,7 +46,7 @@ class DataConfig(Checked):
         draw: seed of the draw that decides which demonstrations are the first ones, of those that are not held out;
             None takes them in the order in which they were recorded.
         camera: image feature(s) to read, separated by commas; empty means the only one.
-        stride: of each episode every `stride`-th frame is read (`playslot_rl.data.stride`).
+        stride: of each episode every `stride`-th frame is read (`playslot_rl.data.views.every`).
         resize: resize frames of another size than `env.image_size` (area averaging) instead of refusing them.
         cache: folder of the frame and slot caches; empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
         cache_limit: of all caches there together, such as `20GB`; the least recently used make room, never what a

@@ -127,7 +127,7 @@ class BehaviourStageConfig(StageConfig):
             paper); slots have a standard deviation of about 0.7, and a prediction is about 0.03 off.
         shift: policy, oracle and decoder also learn from copies of the demonstrations moved by so many pixels, with the
             same actions (0 in the paper, none): from ten demonstrations a policy learns where it has been.
-        shifted_copies: how many, of the eight directions (`playslot_rl.data.shifts.DIRECTIONS`).
+        shifted_copies: how many, of the eight directions (`playslot_rl.data.views.DIRECTIONS`).
         trim: slot motion, the RMS change of the slots to the next frame, up to which a transition counts as still and
             is left out by all that clone from slots; read off the videos alone. 0 keeps every row (paper).
         trim_pixels: the same for those that clone from frames: the RMS change of the pixels, in [0, 1].
