@@ -14,11 +14,13 @@ STAMP := $(VENV)/.setup-done
 LOCK := requirements.lock
 PLUGIN := lerobot_policy_playslot
 ARGS ?=
-# One worker more than cores: a seventh of the tests' time is waiting for processes, locks and pipes.
-WORKERS := $(shell echo $$(( $$(getconf _NPROCESSORS_ONLN) + 1 )))
-PARALLEL := --numprocesses $(WORKERS) --maxprocesses 5 --dist loadfile --no-loadscope-reorder
+# The quick tests compute; whole commands wait for processes, locks and pipes, too: one worker more than cores.
+CORES := $(shell getconf _NPROCESSORS_ONLN)
+PARALLEL := --maxprocesses 5 --dist loadfile --no-loadscope-reorder
 PYTHON ?=
 
+# Where it is set, every test process would compile the tests and the library anew.
+unexport PYTHONDONTWRITEBYTECODE
 export UV_PYTHON := $(BIN)/python
 export UV_PYTHON_DOWNLOADS := never
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -40,12 +42,13 @@ exit 1
 endef
 export FIND_PYTHON
 
-.PHONY: help setup demo test test-all test-browser docs tables lint format typing lock clean FORCE
+.PHONY: help setup demo test test-integration test-all test-browser docs tables lint format typing lock clean FORCE
 
 help:
 	@echo "make demo      set up, then the main job: success in simulation and in imagination, in minutes"
 	@echo "make test      set up, then the quick tests"
-	@echo "make test-all  set up, then all tests"
+	@echo "make test-integration  whole commands, trainings, simulators, pages, processes, builds: minutes"
+	@echo "make test-all  all tests but those in a browser"
 	@echo "make test-browser  the page of playslot play in headless Chromium (Debian, Ubuntu: apt-get install chromium)"
 	@echo "make docs      the site of README, docs/ and the API, in build/site"
 	@echo "make tables    the tables and plots of README and docs/, from results/*.json"
@@ -77,10 +80,13 @@ demo: $(STAMP)
 	@$(BIN)/playslot demo $(ARGS)
 
 test: $(STAMP)
-	@$(BIN)/python -m pytest -m "not slow and not browser" $(PARALLEL) $(ARGS)
+	@$(BIN)/python -m pytest -m "not integration and not slow and not browser" -n $(CORES) $(PARALLEL) $(ARGS)
+
+test-integration: $(STAMP)
+	@$(BIN)/python -m pytest -m "integration and not slow and not browser" -n $$(($(CORES) + 1)) $(PARALLEL) $(ARGS)
 
 # The slow ones kill processes and count on time: one after the other.
-test-all: test
+test-all: test test-integration
 	@$(BIN)/python -m pytest -m "slow and not browser" $(ARGS)
 
 # Playwright (161 MB) is installed here only. The browser is the system's: Playwright's own need not be downloaded.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,27 +22,32 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 LONGEST = (
-    "training/test_several_processes.py",
+    "recipes/test_robot_actions.py",
     "recipes/test_compare_video.py",
     "faults/test_every_command.py",
-    "methods/online/test_players.py",
-    "recipes/test_compare.py",
     "recipes/test_several_processes.py",
-    "recipes/test_baselines.py",
-    "speed/test_bench.py",
-    "recipes/test_bad_input.py",
     "test_docs_site.py",
+    "recipes/test_baselines.py",
+    "recipes/test_compare.py",
     "hub/test_circle.py",
-    "recipes/test_commands.py",
-    "collectors/test_collect.py",
-    "test_docs_python.py",
-    "recipes/test_sold.py",
 )
-"""Files that take longest, the longest first. They begin: no worker is left alone with one of them at the end."""
+"""Files that take longest. They begin: no worker is left alone with one of them at the end."""
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files of which the marker expression takes no test: to import them takes longer than many a test."""
+    if not collection_path.name.startswith("test_") or collection_path.suffix != ".py":
+        return None
+    text, wanted = collection_path.read_text(), config.option.markexpr
+    for tier in ("integration", "slow"):
+        whole, part = re.search(rf"^pytestmark = (\[\s*)?pytest\.mark\.{tier}\b", text, re.M), f"mark.{tier}" in text
+        if (f"not {tier}" in wanted and whole) or (wanted.startswith(tier) and not part):
+            return True
+    return None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the longest files first (`make test` hands files to its workers in this order)."""
+    """Put the longest files first (files go to pytest's workers in this order)."""
     first = {REPOSITORY / "tests" / name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: first.get(item.path, len(LONGEST)))
 

@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = ROOT / "playslot_rl" / "pretrained" / "button_press"
 

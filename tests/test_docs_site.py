@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.integration
+
 pytest.importorskip("mkdocs", reason="needs the extra `docs`")
 pytest.importorskip("mkdocstrings", reason="needs the extra `docs`")
 

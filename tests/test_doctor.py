@@ -15,6 +15,8 @@ from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.runtime.allocator import tune_allocator
 from playslot_rl.runtime.threads import available_cores, set_threads
 
+pytestmark = pytest.mark.integration
+
 
 def test_all_is_well_here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert doctor.main(ExperimentConfig(data=DataConfig(cache=str(tmp_path / "cache")), device="cpu")) == 0

@@ -97,6 +97,7 @@ def test_the_version_is_stated_once(repository: Path) -> None:
     assert playslot_rl.__version__ not in (repository / "pyproject.toml").read_text().partition("[tool.setuptools]")[0]
 
 
+@pytest.mark.integration
 def test_the_wheel_is_complete(repository: Path, tmp_path: Path) -> None:
     # From a copy: setuptools leaves build/ in the source folder, and stale files there would hide a missing one.
     source = tmp_path / "source"
@@ -118,6 +119,7 @@ def test_the_wheel_is_complete(repository: Path, tmp_path: Path) -> None:
     assert any(name.endswith("dist-info/licenses/LICENSE") for name in names)
 
 
+@pytest.mark.integration
 def test_the_plugins_wheel_is_complete(repository: Path, tmp_path: Path) -> None:
     source = tmp_path / "source"
     shutil.copytree(repository / PLUGIN, source, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info", "build"))

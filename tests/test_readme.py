@@ -15,6 +15,8 @@ from playslot_rl.config.compose import compose
 from playslot_rl.recipes.cache import parser as cache_parser
 from playslot_rl.recipes.dataset import parser as dataset_parser
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 

@@ -107,6 +107,7 @@ def play(actor: Actor, seeds: Sequence[int], rows: Sequence[int]) -> list[Tensor
     ]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ACTORS)
 def test_an_actor_is_a_function_of_its_inputs_and_its_episodes_are_apart(name: str) -> None:
     torch.manual_seed(0)

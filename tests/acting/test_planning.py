@@ -59,6 +59,7 @@ def acted(of: PlanningActor, seeds: Sequence[int], steps: int) -> list[TensorDic
     return seen
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", PLANNERS)
 @pytest.mark.parametrize("policy", [False, True])
 def test_every_planner_acts_and_its_first_plan_is_no_worse_than_the_proposal(
@@ -75,6 +76,7 @@ def test_every_planner_acts_and_its_first_plan_is_no_worse_than_the_proposal(
             assert bool(moment[keys.PROPOSAL_COST].isnan().all())
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", PLANNERS)
 def test_the_more_a_plan_has_to_stay_near_the_policys_the_nearer_it_is(agent: Agent, name: str) -> None:
     def strayed(prior: float) -> float:
@@ -122,6 +124,7 @@ def test_a_plan_begins_where_the_last_one_ends(agent: Agent) -> None:
     torch.testing.assert_close(starts[1][:1], proposal)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["cem", "prototypes"])
 def test_episodes_side_by_side_do_not_touch_each_other_and_repeat(agent: Agent, name: str) -> None:
     both, again = acted(actor(agent, name), [7, 8], 3), acted(actor(agent, name), [7, 8], 3)

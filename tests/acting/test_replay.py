@@ -35,6 +35,7 @@ def config() -> ExperimentConfig:
     return replace(config, model=replace(config.model, inverse_dynamics=dynamics))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("scale", "success"), [(1.0, 1.0), (0.0, 0.0)])
 def test_latents_that_are_the_actions_succeed_as_the_expert_does_unless_the_decoder_loses_them(
     config: ExperimentConfig, scale: float, success: float
@@ -50,6 +51,7 @@ def test_latents_that_are_the_actions_succeed_as_the_expert_does_unless_the_deco
     assert [one["steps"] for one in result["per_episode"]] == (expert if success else [None, None])
 
 
+@pytest.mark.integration
 def test_the_film_is_whole_and_of_the_episodes_that_were_asked_for(config: ExperimentConfig) -> None:
     with TaskPool(config.env, config.render) as pool:
         frames, actions = perform(pool, SEEDS)
@@ -62,6 +64,7 @@ def test_the_film_is_whole_and_of_the_episodes_that_were_asked_for(config: Exper
     assert actions.abs().max() <= 1
 
 
+@pytest.mark.integration
 def test_the_policy_is_not_asked(config: ExperimentConfig) -> None:
     agent = Agent.untrained(WorldModel(tiny_config().model, config.env)).eval()
     agent.policy = nn.Module()  # type: ignore[assignment]

@@ -65,6 +65,7 @@ def square_env(agent: Agent, max_steps: int = STEPS, length: int = 100, start: i
     return latent_env(SquareEnv(length, start=start), agent.world_model, agent.action_decoder, max_steps)
 
 
+@pytest.mark.integration
 def test_specs_hold_unbatched_and_batched_from_inside_and_outside(agent: Agent) -> None:
     check_env_specs(square_env(agent))
     check_env_specs(SerialEnv(2, lambda: square_env(agent)))
@@ -131,6 +132,7 @@ def test_a_task_of_another_shape_is_refused(agent: Agent) -> None:
         latent_env(SquareEnv(width=2), agent.world_model, agent.action_decoder, STEPS)
 
 
+@pytest.mark.integration
 @torch.no_grad()
 def test_one_policy_module_acts_on_the_real_task_and_in_imagination(agent: Agent) -> None:
     config, policy = tiny_config(max_steps=STEPS), latent_policy_module(agent.policy)

@@ -23,6 +23,8 @@ from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.errors import ConfigError, DataError, OutputError
 
+pytestmark = pytest.mark.integration
+
 STEPS = 3
 SMALL = {
     "env": {"image_size": 32, "warmup_steps": 1},

@@ -22,6 +22,8 @@ from playslot_rl.collectors.recording import Report, record_into
 from playslot_rl.config import CollectorConfig
 from playslot_rl.errors import ConfigError, OutputError, PlaySlotError
 
+pytestmark = pytest.mark.integration
+
 # --- handing out, with workers that are not processes ----------------------------------------------------------------
 
 

@@ -72,6 +72,7 @@ def test_episode_metadata_and_statistics_are_lerobots(pair: tuple[Path, Path]) -
         assert json.loads((pair[0] / "meta" / file).read_text()) == json.loads((pair[1] / "meta" / file).read_text())
 
 
+@pytest.mark.integration
 def test_large_sets_are_split_into_files_that_lerobot_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from lerobot.datasets import dataset_metadata
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

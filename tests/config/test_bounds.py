@@ -282,6 +282,7 @@ def test_the_values_of_a_stored_run_are_text(tmp_path: Any, monkeypatch: pytest.
     assert SECRET not in json.dumps(to_dict(compose([f"run={tmp_path}"], "evaluate")))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("command", "argument"),
     [

@@ -55,6 +55,7 @@ def test_entries_come_in_the_order_of_their_last_use(three: list[Path], tmp_path
     assert names(tmp_path) == ["b", "a", "c"]
 
 
+@pytest.mark.integration
 def test_an_array_holds_its_entry_until_it_and_its_views_are_gone(three: list[Path], tmp_path: Path) -> None:
     view = load_cached(three[0], "frames.npy")[10:20]
     kept = view.copy()
@@ -68,6 +69,7 @@ def test_an_array_holds_its_entry_until_it_and_its_views_are_gone(three: list[Pa
     assert names(tmp_path) == []
 
 
+@pytest.mark.integration
 def test_another_process_holds_its_entry_until_it_ends(three: list[Path], tmp_path: Path) -> None:
     script = (
         "import sys; from pathlib import Path; from playslot_rl.data.cache import load_cached\n"
@@ -180,6 +182,7 @@ def test_limits_are_amounts() -> None:
             DataConfig(cache_limit=wrong)
 
 
+@pytest.mark.integration
 @pytest.mark.skipif(not Path("/proc/self/smaps").is_file(), reason="the kernel does not say")
 def test_pages_that_were_read_are_given_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from playslot_rl.data import cache

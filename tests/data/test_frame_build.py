@@ -50,6 +50,7 @@ def test_units_hold_every_episode_once_and_cross_no_file(foreign_images: Path, f
         assert all(len({span.file for span in unit}) == 1 for unit in found)
 
 
+@pytest.mark.integration
 def test_several_processes_make_the_same_array(foreign_images: Path, foreign_video: Path, tmp_path: Path) -> None:
     one = open_source(foreign_images, cache=Cache(tmp_path / "one"))
     two = open_source(foreign_images, cache=Cache(tmp_path / "two", workers=2))
@@ -101,6 +102,7 @@ def test_a_unit_that_is_not_what_its_digest_says_is_decoded_again(
     assert np.array_equal(np.load(tmp_path / "frames.npy"), np.concatenate(foreign_frames()))
 
 
+@pytest.mark.integration
 def test_a_killed_build_is_finished_by_the_next_and_its_workers_die_with_it(
     foreign_images: Path, tmp_path: Path
 ) -> None:

@@ -238,6 +238,7 @@ def test_a_damaged_cache_says_what_to_delete(foreign_images: Path, tmp_path: Pat
         open_source(foreign_images, cache=tmp_path)
 
 
+@pytest.mark.integration
 def test_a_cache_is_built_once_by_several_processes(tmp_path: Path) -> None:
     context = multiprocessing.get_context("fork")
     workers = [context.Process(target=build_slowly, args=(tmp_path,)) for _ in range(4)]

@@ -40,6 +40,7 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
     return found
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", ["foreign_images", "foreign_video"])
 @pytest.mark.parametrize("buffer", [1, 6, 1000])
 def test_streamed_frames_are_those_of_the_cache(

@@ -41,12 +41,14 @@ def same_as_lerobot(mine: dict[str, Any], theirs: dict[str, Any], spread: float)
         np.testing.assert_allclose(mine[key], value, atol=spread if key in QUANTILES else 1e-5, err_msg=key)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("lengths", [(8,), (8, 5), (1, 1), (2, 3)])
 def test_what_lerobot_wrote_is_sound(lengths: tuple[int, ...], tmp_path: Path) -> None:
     result = verify(write_features(tmp_path / "set", lengths))
     assert (result.errors, result.warnings) == ((), ())
 
 
+@pytest.mark.integration
 def test_repair_writes_the_statistics_of_lerobot(written: Path, tmp_path: Path) -> None:
     broken = Path(shutil.copytree(written, tmp_path / "broken"))
     (broken / "meta/stats.json").unlink()
@@ -93,6 +95,7 @@ def test_statistics_of_every_component_are_read_as_those_of_the_last_axis(writte
     assert np.shape(statistics(tmp_path / "merged")["pose"]["mean"]) == (4,)
 
 
+@pytest.mark.integration
 def test_split_and_merge_give_it_back(written: Path, tmp_path: Path) -> None:
     split(written, tmp_path / "parts", {"a": 0.5, "b": 0.5}, seed=0)
     merge([tmp_path / "parts/a", tmp_path / "parts/b"], tmp_path / "all")

@@ -73,6 +73,7 @@ def test_every_command_ends_in_a_line(name: str, hostile: Path, capsys: pytest.C
             assert verify(out / words[-1].removeprefix("OUT/")).ok, label
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ROWS)
 def test_training_reads_it_or_says_in_a_line_why_not(
     name: str, hostile: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

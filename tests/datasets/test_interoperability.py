@@ -12,6 +12,8 @@ from damage import load
 from playslot_rl import keys
 from playslot_rl.data.source import open_source
 
+pytestmark = pytest.mark.integration
+
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 
 

@@ -63,6 +63,7 @@ def test_merged_images_are_the_sources_in_order(images: Path, other: Path, tmp_p
     assert content_fingerprint(tmp_path / "all").episodes == parts
 
 
+@pytest.mark.integration
 def test_merged_videos_are_not_encoded_again(video: Path, tmp_path: Path) -> None:
     again = Path(shutil.copytree(video, tmp_path / "again"))
     merge([video, again], tmp_path / "all")
@@ -73,6 +74,7 @@ def test_merged_videos_are_not_encoded_again(video: Path, tmp_path: Path) -> Non
     assert len(list((tmp_path / "all").rglob("*.mp4"))) == 2
 
 
+@pytest.mark.integration
 def test_a_merged_set_can_be_resumed_and_merged_again(images: Path, other: Path, tmp_path: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -86,6 +88,7 @@ def test_a_merged_set_can_be_resumed_and_merged_again(images: Path, other: Path,
     assert merge([tmp_path / "all", images], tmp_path / "more").verification.episodes == 9
 
 
+@pytest.mark.integration
 def test_small_limits_make_several_files(video: Path, images: Path, tmp_path: Path) -> None:
     for source in (video, images):
         small = Path(shutil.copytree(source, tmp_path / f"{source.name}-small"))
@@ -159,6 +162,7 @@ def test_a_full_disk_while_merging_leaves_nothing(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["broken"]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", ["images", "video"])
 def test_a_split_is_disjoint_and_complete(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     source: Path = request.getfixturevalue(kind)
@@ -172,6 +176,7 @@ def test_a_split_is_disjoint_and_complete(kind: str, request: pytest.FixtureRequ
         assert np.array_equal(frames_of(part), expected)
 
 
+@pytest.mark.integration
 def test_a_video_without_key_frames_is_copied_whole(video: Path, tmp_path: Path) -> None:
     from lerobot.datasets.dataset_tools import split_dataset
 
@@ -223,6 +228,7 @@ merging.merge([Path(a) for a in sys.argv[2:]], Path(sys.argv[1]))
 """
 
 
+@pytest.mark.integration
 def test_a_merge_killed_before_it_gets_its_name_leaves_the_sources_and_the_same_command_does_it(
     images: Path, tmp_path: Path
 ) -> None:

@@ -59,6 +59,7 @@ def with_picture(root: Path, content: bytes) -> Path:
     return root
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", PICTURES)
 def test_pictures_of_every_kind_are_read_as_what_they_show(name: str, broken: Path, tmp_path: Path) -> None:
     content, expected = PICTURES[name]
@@ -92,6 +93,7 @@ REFUSED: dict[str, tuple[bytes, str]] = {
 }
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", REFUSED)
 def test_bombs_and_what_is_no_picture_are_refused_before_memory_is_spent(
     name: str, broken: Path, tmp_path: Path
@@ -146,6 +148,7 @@ def same_rows(root: Path, as_in: Path) -> None:
     assert (verify(root).ok, verify(root).fingerprint) == (True, verify(as_in).fingerprint)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("place", CLUTTER)
 def test_files_of_other_systems_are_named_and_passed_over(
     place: str, images: Path, video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -48,6 +48,7 @@ def test_the_split_is_the_papers_and_keeps_its_proportion() -> None:
     assert split_episodes(1) == (1, 0)
 
 
+@pytest.mark.integration
 def test_demonstrations_become_episodes_in_the_order_of_their_files(converted: Path, tmp_path: Path) -> None:
     train = open_source(converted / "train", "observation.images.front_left", tmp_path)
     held_out = open_source(converted / "eval", "observation.images.front_left", tmp_path)

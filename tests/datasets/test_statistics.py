@@ -62,6 +62,7 @@ def write(root: Path, storage: str, draw: Draw, lengths: tuple[int, ...], size: 
     return root
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", WRITTEN)
 def test_what_lerobot_wrote_is_sound(kind: str, tmp_path: Path) -> None:
     result = verify(write(tmp_path / "set", *WRITTEN[kind]))

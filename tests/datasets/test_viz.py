@@ -15,6 +15,8 @@ from playslot_rl.data.problems import Problems
 from playslot_rl.datasets import viz
 from playslot_rl.visualization.charts import LIGHT, curve_chart, curve_figure
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.mark.parametrize(
     ("number", "words"),

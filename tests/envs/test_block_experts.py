@@ -44,6 +44,7 @@ def run(variant: str, episodes: int, distractors: int, noise: float = 0.0, exper
     return Tally(success / episodes, fallen / episodes, last / episodes)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("variant", "distractors"), [("push", 0), ("push", 4), ("reach", 3), ("pick", 3)])
 def test_experts_solve_a_few_episodes_and_leave_them_solved(variant: str, distractors: int) -> None:
     tally = run(variant, 5, distractors)

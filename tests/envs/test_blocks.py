@@ -211,6 +211,7 @@ def test_fast_rendering_looks_like_full_quality(push: BlockPushEnv) -> None:
     assert 0.0 < np.abs(a - b).mean() < 3.0
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", NAMES)
 def test_passes_gymnasiums_checker(name: str) -> None:
     from gymnasium.utils.env_checker import check_env

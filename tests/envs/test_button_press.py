@@ -46,6 +46,7 @@ def test_seeds_move_the_button_and_the_arm(env: ButtonPressEnv) -> None:
     assert np.ptp(np.stack(hands), axis=0).max() > 0.005
 
 
+@pytest.mark.integration
 def test_warm_up_is_independent_of_the_buttons_place(env: ButtonPressEnv) -> None:
     # The two streams of an episode must not share their numbers.
     places, hands = [], []
@@ -69,6 +70,7 @@ def test_expert_presses_the_button_and_the_clip_goes_on(env: ButtonPressEnv) -> 
     assert ended == [False] * (env.config.max_steps - 1) + [True]
 
 
+@pytest.mark.integration
 def test_passes_gymnasiums_checker() -> None:
     import warnings
 
@@ -133,6 +135,7 @@ def run_python(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", code], env=variables, capture_output=True, text=True, timeout=120)
 
 
+@pytest.mark.integration
 def test_unclosed_environments_leave_no_traceback_at_exit() -> None:
     done = run_python(
         "from playslot_rl.envs import make_env; a, b = make_env(), make_env(); a.reset(seed=0); print('made')"
@@ -143,6 +146,7 @@ def test_unclosed_environments_leave_no_traceback_at_exit() -> None:
     assert "ignored" not in done.stderr
 
 
+@pytest.mark.integration
 def test_renders_although_mujoco_was_imported_without_a_backend() -> None:
     done = run_python(
         "import os; os.environ.pop('MUJOCO_GL', None); os.environ.pop('DISPLAY', None)\n"

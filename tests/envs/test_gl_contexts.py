@@ -14,7 +14,10 @@ import pytest
 from playslot_rl.config.compose import compose
 from playslot_rl.envs import gl_contexts, make_env
 
-pytestmark = pytest.mark.skipif(os.environ.get("MUJOCO_GL") != "egl", reason="contexts are kept where EGL draws")
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(os.environ.get("MUJOCO_GL") != "egl", reason="contexts are kept where EGL draws"),
+]
 
 
 @pytest.fixture(autouse=True)

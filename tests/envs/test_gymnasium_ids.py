@@ -18,6 +18,8 @@ from playslot_rl.config.compose import compose
 from playslot_rl.envs import ENVIRONMENTS, block_ids, make_env, make_torchrl_env, task_config, task_env
 from playslot_rl.errors import ConfigError
 
+pytestmark = pytest.mark.integration
+
 IDS = sorted({name for name, _ in ENVIRONMENTS.values()} | set(block_ids()))
 NAMES = [f"playslot_rl.envs:{name}" for name in IDS]
 SOME = NAMES[:1]

@@ -75,6 +75,7 @@ def card_of(damage: Callable[[WorldModel], None], name: str) -> Card:
     return make_card(model, videos(), {}, DataConfig())
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["pretrained/button_press", "pretrained/block_push_easy"])
 @pytest.mark.parametrize("damage", KINDS)
 def test_a_dead_model_is_not_praised(damage: Callable[[WorldModel], None], name: str) -> None:

@@ -28,6 +28,7 @@ def pool() -> Iterator[GoalPool]:
         yield made
 
 
+@pytest.mark.integration
 def test_the_expert_reaches_the_goals_that_are_its_own(pool: GoalPool) -> None:
     goals = make_goals(pool, SEEDS, "solved", PlanConfig(), 0)
     assert [goal.seed for goal in goals] == list(SEEDS)
@@ -41,6 +42,7 @@ def test_the_expert_reaches_the_goals_that_are_its_own(pool: GoalPool) -> None:
         assert np.array_equal(goal.places, np.stack(trace.places))
 
 
+@pytest.mark.integration
 def test_a_goal_ahead_begins_where_the_expert_was(pool: GoalPool) -> None:
     goals = make_goals(pool, SEEDS, "ahead", PlanConfig(), 0)
     again = make_goals(pool, SEEDS, "ahead", PlanConfig(), 0)
@@ -70,6 +72,7 @@ def test_curves_are_told_by_their_end_their_slope_and_their_top() -> None:
     assert shape(ways) == {"goal_is_minimum": 0.5, "downhill": 0.75, "hill": 2.0, "curves": ways}
 
 
+@pytest.mark.integration
 def test_the_cost_along_the_way_and_the_table(pool: GoalPool) -> None:
     goals = make_goals(pool, SEEDS, "ahead", PlanConfig(), 0)
     found = cost_along_solution(tiny_agent(), goals, looks=2)

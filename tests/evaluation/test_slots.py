@@ -34,6 +34,7 @@ OBJECTS = {
 }
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", sorted(OBJECTS))
 def test_pixels_are_told_apart_in_every_task(name: str) -> None:
     config = compose([f"env={name}", "preset=compact"])
@@ -68,6 +69,7 @@ def test_slots_per_object_counts_those_with_a_share() -> None:
     assert slots_per_object(truth, found, 4) == 1.5
 
 
+@pytest.mark.integration
 def test_a_shipped_models_slots_are_scored_and_written(tmp_path: Path) -> None:
     config = compose(["env=block_push_easy", "preset=compact", "episodes=1"])
     assert load_savi("pretrained/block_push_easy").config.n_slots == 5
@@ -77,6 +79,7 @@ def test_a_shipped_models_slots_are_scored_and_written(tmp_path: Path) -> None:
     assert result["psnr"] > 22
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", [*sorted(OBJECTS), "grid_shapes"])
 def test_stage_one_is_told_of_every_tasks_segmentation_and_never_of_an_evaluations(name: str) -> None:
     config = compose([f"env={name}", "preset=smoke", "slots.segmented_episodes=2", "env.max_steps=2"])

@@ -86,6 +86,7 @@ def test_imagining_equals_the_modules_called_by_hand_past_the_context_too(contex
         torch.testing.assert_close(imagined.actions, agent.action_decoder(imagined.latents))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_result_has_the_agreed_keys(protocol: str, config: ExperimentConfig, agent: Agent, pool: TaskPool) -> None:
     result = evaluate(agent, config, protocol, 2, 1, facts=FACTS, pool=pool)

@@ -20,6 +20,8 @@ from tiny_disk import tiny_disk
 from playslot_rl import cli
 from playslot_rl.recipes import cache, dataset
 
+pytestmark = pytest.mark.integration
+
 Open = Callable[..., Lab]
 QUICK = [name for name, row in TABLE.items() if row.quick]
 ROWS = [pytest.param(name, marks=pytest.mark.slow) for name in TABLE]

@@ -17,6 +17,8 @@ from playslot_rl.datasets.split import split
 from playslot_rl.datasets.verify import verify
 from playslot_rl.envs import ENVIRONMENTS, PROCEDURAL
 
+pytestmark = pytest.mark.integration
+
 Client = Callable[..., dict[str, Any]]
 EPISODES = 3
 

@@ -13,6 +13,8 @@ import yaml
 from fake_hub import FakeHub, Fault, Repository
 from small_data import contents, write_small
 
+pytestmark = pytest.mark.integration
+
 Client = Callable[..., dict[str, Any]]
 
 

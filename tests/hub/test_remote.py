@@ -14,6 +14,8 @@ from hub_contents import Fault
 from playslot_rl.cli import main
 from playslot_rl.data.source import open_source
 
+pytestmark = pytest.mark.integration
+
 Client = Callable[..., dict[str, Any]]
 SMALL = ["env=grid_shapes", "preset=smoke", "threads=1", "device=cpu", "logging.progress=false"]
 ADDRESS = "hf://datasets/owner/shapes"

@@ -99,6 +99,7 @@ def test_a_target_of_another_width_is_refused_rather_than_broadcast() -> None:
         BehaviourLoss(tiny_agent().policy)(data)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("steps", [150])
 def test_a_policy_learns_latent_actions_that_depend_on_the_slots(steps: int) -> None:
     policy = tiny_agent().policy.train()

@@ -32,6 +32,8 @@ from playslot_rl.recipes import play
 from playslot_rl.training.runs import pretrained_folder
 from playslot_rl.world_model import Agent
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.fixture
 def robots(agent: Agent, source: EpisodeFrames) -> RecordedStarts:

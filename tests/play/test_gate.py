@@ -23,6 +23,8 @@ from served import served
 from playslot_rl.play.gate import MOST_BODY, Gate
 from playslot_rl.play.pages import MOST_PAGES
 
+pytestmark = pytest.mark.integration
+
 SOCKET = "/_nicegui_ws/socket.io"
 STATIC = f"/_nicegui/{nicegui_version}/static"
 TRAVERSALS = [

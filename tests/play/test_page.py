@@ -29,6 +29,8 @@ from playslot_rl.play.studio import Studio
 from playslot_rl.recipes import play
 from playslot_rl.world_model import Agent
 
+pytestmark = pytest.mark.integration
+
 
 def test_keys_step_undo_and_reset_and_the_buttons_touch_and_record(studio: Studio) -> None:
     async def script(user: User, pages: list[PlayPage]) -> None:

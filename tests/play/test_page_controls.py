@@ -17,6 +17,8 @@ from PIL import Image
 from playslot_rl.play.page import GAP, PlayPage
 from playslot_rl.play.studio import Studio
 
+pytestmark = pytest.mark.integration
+
 
 def test_a_key_that_is_let_go_while_the_page_is_busy_still_steps_once(studio: Studio) -> None:
     async def script(user: User, pages: list[PlayPage]) -> None:

@@ -22,6 +22,8 @@ from playslot_rl.play.page import PlayPage
 from playslot_rl.play.session import PlaySession
 from playslot_rl.play.studio import Studio
 
+pytestmark = pytest.mark.integration
+
 
 def test_a_page_that_goes_takes_its_session_with_it(studio: Studio) -> None:
     """The moments and the simulator at once, the rest with the next collection: nothing else holds it."""

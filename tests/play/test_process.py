@@ -11,6 +11,8 @@ pytest.importorskip("nicegui", reason="the extra `play` is not installed")
 
 from served import OUTPUT, served
 
+pytestmark = pytest.mark.integration
+
 
 def test_without_a_browser_the_address_is_said_and_ctrl_c_ends_it(tmp_path: Path) -> None:
     no_browser = str(tmp_path / "none")

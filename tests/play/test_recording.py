@@ -29,6 +29,7 @@ def play(session: PlaySession) -> None:
     session.drive("policy")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("shown", ["imagined", "true"])
 def test_a_recording_is_a_sound_data_set(session: PlaySession, tmp_path: Path, shown: recording.Shown) -> None:
     play(session)

@@ -200,6 +200,7 @@ def test_previews_are_what_the_presses_would_do(session: PlaySession) -> None:
     assert np.array_equal(session.preview([2, 4])[:, 0], np.stack([session.now.frame] * 2))
 
 
+@pytest.mark.integration
 def test_the_planner_steers_to_the_moment_that_is_marked(session: PlaySession) -> None:
     assert session.planner is not None
     with pytest.raises(ValueError, match="planner: got no goal, expected a marked moment"):

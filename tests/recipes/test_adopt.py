@@ -22,6 +22,8 @@ from playslot_rl.recipes.play import open_studio
 from playslot_rl.training.runs import load_savi
 from playslot_rl.training.stage_slots import warm_start
 
+pytestmark = pytest.mark.integration
+
 QUICK = ("minutes=0.02", "adopt.slots=[2,3]", "adopt.prototypes=4")
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from commands import smoke
 
+pytestmark = pytest.mark.integration
+
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "adopt.md"
 SCRIPTS = re.findall(r"^```py\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
 

@@ -18,6 +18,8 @@ from playslot_rl.training import fit
 from playslot_rl.training.stage_dynamics import DynamicsStage
 from playslot_rl.training.stage_slots import SlotsStage
 
+pytestmark = pytest.mark.integration
+
 
 class Clock:
     """Seconds that pass where they are told to."""

@@ -16,6 +16,8 @@ from commands import assert_one_line, contents, playslot, refused, smoke, weight
 from playslot_rl.storage.tensors import load_tensors, save_tensors
 from playslot_rl.training.stage_slots import SlotsStage
 
+pytestmark = pytest.mark.integration
+
 # --- arguments ----------------------------------------------------------------------------------------------------
 
 

@@ -13,6 +13,8 @@ from commands import ONE_CORE, contents, instead, killed_at_first_checkpoint, re
 from playslot_rl.config import to_dict
 from playslot_rl.config.compose import compose
 
+pytestmark = pytest.mark.integration
+
 METHODS = ("slot_oracle", "resnet_oracle", "lapo", "caddy_policy", "caddy_oracle")
 SECOND_HALF = {
     "slot_oracle": ("behaviour.steps=60", "behaviour.checkpoint_every=5"),

@@ -12,6 +12,8 @@ from commands import Done, contents, playslot, refused, smoke, weights
 
 from playslot_rl.evaluation.intervals import wilson
 
+pytestmark = pytest.mark.integration
+
 KEYS = {
     "protocol", "episodes", "seeds", "success_rate", "ci95", "mean_steps_to_success", "labelled_demos", "demos",
     "references",

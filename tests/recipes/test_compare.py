@@ -18,6 +18,8 @@ from commands import ONE_CORE, Done, assert_one_line, contents, instead, playslo
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.studies.launch import comparison_lock
 
+pytestmark = pytest.mark.integration
+
 Compare = Callable[..., Done]
 
 

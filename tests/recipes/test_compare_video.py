@@ -16,6 +16,8 @@ from playslot_rl.config.compose import compose
 from playslot_rl.studies.launch import sweep_command
 from playslot_rl.studies.video_plan import VideoJob, in_steps, video_job_config
 
+pytestmark = pytest.mark.integration
+
 METHODS = ",".join(VIDEO_METHODS)
 
 

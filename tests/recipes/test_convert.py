@@ -8,6 +8,8 @@ import pytest
 from commands import ONE_CORE, playslot, refused
 from sketchy_layout import name_of, write_sketchy
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.mark.usefixtures("started")
 def test_a_converted_data_set_trains_and_compares_on_both_cameras(tmp_path: Path) -> None:

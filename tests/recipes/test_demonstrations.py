@@ -13,6 +13,8 @@ from playslot_rl import collectors
 from playslot_rl.config.compose import compose
 from playslot_rl.recipes.pipeline import collect_demos
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.mark.parametrize(
     ("begun", "record", "expected"),

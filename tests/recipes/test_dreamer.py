@@ -15,6 +15,8 @@ from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.methods.dreamer.actor import load_actor
 from playslot_rl.recipes.baselines import online
 
+pytestmark = pytest.mark.integration
+
 SMOKE = ("preset=smoke", "method=dreamer", "env=block_reach", "threads=1", "device=cpu", "env.max_steps=6")
 
 

@@ -15,6 +15,8 @@ from playslot_rl.config.compose import compose
 from playslot_rl.data.source import open_source
 from playslot_rl.envs.grid_shapes import generate, moves_of
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.fixture(scope="module")
 def shapes(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -14,6 +14,8 @@ from foreign import foreign_frames
 
 from playslot_rl.evaluation.card_lines import MEASURES
 
+pytestmark = pytest.mark.integration
+
 
 def written(run: Path) -> dict[str, object]:
     stored: dict[str, object] = json.loads((run / "inspect" / "inspect.json").read_text())

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from commands import ONE_CORE, killed_at_first_checkpoint, playslot, refused, smoke, weights
 
+pytestmark = pytest.mark.integration
+
 STEPS = ("slots.steps=12", "slots.checkpoint_every=4", "slots.validate_every=6")
 
 

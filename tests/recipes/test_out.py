@@ -13,6 +13,8 @@ from commands import assert_one_line, contents, playslot
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import OutputError
 
+pytestmark = pytest.mark.integration
+
 COMMANDS = [
     "collect", "convert", "train-slots", "train-dynamics", "train-policy", "train-baseline", "evaluate", "inspect",
     "plan", "export", "play", "pipeline", "adopt", "compare", "compare-video", "demo",

@@ -13,6 +13,8 @@ from playslot_rl.config.compose import compose
 from playslot_rl.config.planning import PLANNERS, PROPOSALS
 from playslot_rl.errors import ConfigError
 
+pytestmark = pytest.mark.integration
+
 SMALL = (
     "env.max_steps=20",  # smoke's are too few for the expert
     "plan.horizon=3",

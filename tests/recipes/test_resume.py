@@ -27,6 +27,8 @@ from playslot_rl.storage.locks import locked
 from playslot_rl.training import record
 from playslot_rl.training.stage_slots import SlotsStage
 
+pytestmark = pytest.mark.integration
+
 LONG = {
     "slots": ("slots.steps=32", "slots.checkpoint_every=4", "slots.validate_every=16"),
     "dynamics": ("dynamics.steps=32", "dynamics.checkpoint_every=4", "dynamics.validate_every=16"),

@@ -23,6 +23,8 @@ from playslot_rl.envs.pixel_task import PixelTask
 from playslot_rl.sharing.folder import RANGE
 from playslot_rl.storage.tensors import load_tensors
 
+pytestmark = pytest.mark.integration
+
 TASK = ("env=video", "env.action_dim=6")
 LABELS = [name for name, method in METHODS.items() if method.actor and not method.online]
 """Methods that learn real actions from demonstrations."""

@@ -24,6 +24,8 @@ from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.tensors import load_tensors
 from playslot_rl.training.stage_slots import SlotsStage
 
+pytestmark = pytest.mark.integration
+
 SOON_S = 120
 RANKS = 2
 

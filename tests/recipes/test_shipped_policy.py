@@ -16,6 +16,8 @@ from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes import evaluate
 from playslot_rl.training import runs
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.fixture
 def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:

@@ -13,6 +13,8 @@ from playslot_rl.recipes import evaluate, slots
 from playslot_rl.recipes.run import open_device
 from playslot_rl.training.runs import use_world_model
 
+pytestmark = pytest.mark.integration
+
 
 def test_slots_are_scored_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     use_world_model(tmp_path, "pretrained/button_press")

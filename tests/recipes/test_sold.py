@@ -24,6 +24,8 @@ from playslot_rl.recipes.baselines import online
 from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
 from playslot_rl.training.runs import slots_checkpoint
 
+pytestmark = pytest.mark.integration
+
 FIXED = ("preset=smoke", "method=sold", "device=cpu", "threads=1", "logging.backend=none")
 
 

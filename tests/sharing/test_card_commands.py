@@ -93,6 +93,7 @@ def strided(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return trained(tmp_path_factory.mktemp("run") / "run", recordings, "data.stride=3", "data.validation=0.2")
 
 
+@pytest.mark.integration
 def test_the_card_of_a_run_on_recordings_can_be_followed(
     strided: Path, recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

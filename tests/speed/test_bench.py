@@ -84,6 +84,7 @@ def test_every_variant_of_a_case_computes_the_same_thing(case: str, sizes: Sizes
     assert math.isfinite(first)
 
 
+@pytest.mark.integration
 def test_a_game_is_the_same_whatever_it_is_computed_with(sizes: Sizes) -> None:
     rows = play_variants()
     shipped = [float(build_step(rows["shipped"], sizes)()) for _ in range(2)]
@@ -124,6 +125,7 @@ def test_the_dynamics_loss_is_the_stages(decoded_frames: int, sizes: Sizes) -> N
     torch.testing.assert_close(got, expected)
 
 
+@pytest.mark.integration
 def test_two_processes_share_the_batch_of_one(sizes: Sizes) -> None:
     variants = [variant for team in teams().values() for variant, _ in team]
     with ExitStack() as stack:
@@ -150,6 +152,7 @@ def test_a_child_that_fails_ends_the_benchmark_with_one_line(sizes: Sizes) -> No
     assert not child.process.is_alive()
 
 
+@pytest.mark.integration
 def test_a_child_that_is_killed_ends_the_benchmark_with_one_line(sizes: Sizes) -> None:
     with start("killed", Variant("rollout_cache"), sizes, 1) as child:
         child.answer()
@@ -158,6 +161,7 @@ def test_a_child_that_is_killed_ends_the_benchmark_with_one_line(sizes: Sizes) -
             child.ask()
 
 
+@pytest.mark.integration
 def test_each_child_has_its_own_allocator_setting_and_ends_with_its_block(sizes: Sizes) -> None:
     for allocator in (True, False, True):
         with start("x", Variant("rollout_cache", allocator=allocator), sizes, 1) as child:
@@ -169,6 +173,7 @@ def test_each_child_has_its_own_allocator_setting_and_ends_with_its_block(sizes:
         assert not child.process.is_alive()
 
 
+@pytest.mark.integration
 def test_the_command_writes_every_key_with_its_ratio_and_medians(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -59,6 +59,7 @@ def _hold(file: Path, started: str, seconds: float) -> None:
         time.sleep(seconds)
 
 
+@pytest.mark.integration
 def test_a_second_process_waits_for_the_lock(job: Path, tmp_path: Path) -> None:
     import time
 

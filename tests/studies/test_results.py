@@ -133,6 +133,7 @@ def test_the_plot_shows_every_series_in_its_methods_colour(ended: dict[str, Any]
     assert curve.get_color() == LIGHT.series[METHOD_STYLES["dreamer"].colour]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", ["png", "svg"])
 def test_the_same_comparison_is_the_same_picture(ended: dict[str, Any], kind: str) -> None:
     pictures = [figure_bytes(comparison_figure(ended, LIGHT), LIGHT, kind) for _ in range(2)]

@@ -83,6 +83,7 @@ def stub(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
     monkeypatch.setattr(several, "training_command", lambda *_: [sys.executable, "-c", code])
 
 
+@pytest.mark.integration
 def test_the_first_line_of_error_is_the_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said = "playslot train-baseline (rank 1): error: loss is nan at step 3, expected a finite number"
     peer = "playslot train-baseline: error: rank 0 of 2: another process ended"

@@ -80,6 +80,7 @@ def test_imagined_rows_end_at_the_horizon() -> None:
     assert torch.equal(demos.latents[alone.rows], demos.latents[far])
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("source", "pays"), [("slots", True), ("spurious", False)])
 def test_slots_are_trusted_where_they_pay(source: str, pays: bool) -> None:
     policy, decoder = networks()
@@ -108,6 +109,7 @@ def test_a_decoder_that_does_not_trust_slots_acts_without_them() -> None:
     assert not bool(again.trusts_slots), "it is stored"
 
 
+@pytest.mark.integration
 def test_fine_tuning_learns_actions_and_goes_on_cloning() -> None:
     policy, decoder = networks()
     demos, config = demonstrations("slots"), replace(CONFIG, imagined=False)

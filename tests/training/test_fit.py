@@ -77,6 +77,7 @@ def test_training_changes_weights_and_codebook_but_not_the_frozen_part(tmp_path:
     assert any("quantizer" in key for key in changed)
 
 
+@pytest.mark.integration
 def test_a_run_killed_by_the_system_ends_with_the_same_weights(tmp_path: Path) -> None:
     script = Path(__file__).with_name("toy_stage.py")
     command = [sys.executable, str(script), str(tmp_path / "killed"), "12", "0.1"]

@@ -78,6 +78,7 @@ def rates(folder: Path) -> list[float]:
     return [row["lr"] for row in rows if row["split"] == "train"]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("seconds", "validation", "fewest", "most"),
     [

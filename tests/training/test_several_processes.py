@@ -17,6 +17,8 @@ from playslot_rl.runtime.processes import agreed, claim, here, wait
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
 from playslot_rl.training.fit import fit
 
+pytestmark = pytest.mark.integration
+
 SEED = 3
 CURVE = 1e-5
 """Largest relative difference of a number that is logged while training."""

@@ -94,6 +94,7 @@ def _agent(config: ExperimentConfig) -> Agent:
     return agent.eval()
 
 
+@pytest.mark.integration
 def test_report_of_a_whole_run_is_self_contained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = tiny_config(max_steps=2)
     rng = np.random.default_rng(0)

@@ -82,6 +82,7 @@ def train(folder: Path) -> int:
     return fit(Part("baselines.caddy", stage, stage.config), folder, seed=3)[1]
 
 
+@pytest.mark.integration
 def test_a_resumed_run_repeats_bit_for_bit_across_the_end_of_the_warm_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,6 +109,7 @@ def test_a_resumed_run_repeats_bit_for_bit_across_the_end_of_the_warm_up(
     assert rows[0] == rows[1]
 
 
+@pytest.mark.integration
 def test_training_lowers_the_loss_and_the_held_out_error() -> None:
     stage = stage_of(seed_frames=1, predicted_frames=2, warmup_steps=10, growth_steps=0, batch_size=6)
     optimizer = torch.optim.Adam(stage.model.parameters(), lr=1e-2)

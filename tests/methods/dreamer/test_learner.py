@@ -31,6 +31,7 @@ def state(agent: DreamerLearner) -> dict[str, torch.Tensor]:
     return {key: value.clone() for key, value in module_tensors(agent.modules).items()}
 
 
+@pytest.mark.integration
 def test_reconstruction_and_reward_prediction_learn() -> None:
     agent = learner()
     first = step(agent, 0)

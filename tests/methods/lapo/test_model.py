@@ -72,6 +72,7 @@ def test_the_image_error_trains_the_inverse_model_through_the_latent(
     assert any(bool(grad.abs().sum() > 0) for grad in grads if grad is not None)
 
 
+@pytest.mark.integration
 def test_training_predicts_the_change_and_the_codes_tell_directions_apart(
     models: tuple[InverseModel, ForwardModel],
 ) -> None:

@@ -80,6 +80,7 @@ def test_the_curve_has_a_row_for_each_interval_and_the_random_policy(tmp_path: P
         assert {"updates", "seconds", "return_mean", "return_error", "success_rate", "ci95"} <= row.keys()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("at, resumed", [(0, 0), (9, 32), (22, 48)])
 def test_a_run_that_was_interrupted_ends_with_the_weights_of_one_that_was_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, resumed: int
@@ -108,6 +109,7 @@ def test_a_run_that_was_interrupted_ends_with_the_weights_of_one_that_was_not(
     assert kept[0] == kept[1]
 
 
+@pytest.mark.integration
 def test_a_resumed_run_whose_ring_had_turned_draws_the_same_sequences(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,6 +25,8 @@ from playslot_rl.methods.online.players import Players, Round, play_round
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.tensors import module_tensors
 
+pytestmark = pytest.mark.integration
+
 TASK = EnvConfig(max_steps=STEPS), RenderConfig()
 CPU = torch.device("cpu")
 

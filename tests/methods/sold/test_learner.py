@@ -237,6 +237,7 @@ def test_rewards_are_of_the_frames_reached_and_values_of_the_frames_left(
     assert len(lengths) > 1
 
 
+@pytest.mark.integration
 def test_the_reward_of_an_episodes_first_frame_is_nobodys(make_learner: Make, batch: TensorDict) -> None:
     absurd = batch.clone()
     absurd[keys.REWARD][batch[keys.IS_FIRST]] = 1e4
@@ -270,6 +271,7 @@ def test_the_critic_finds_the_value_of_a_constant_reward(make_learner: Make) -> 
     assert value.item() == pytest.approx(2.0, abs=0.15)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("gradient", ["dynamics", pytest.param("reinforce", marks=pytest.mark.slow)])
 def test_an_action_that_moves_slots_towards_reward_is_found(make_learner: Make, gradient: str) -> None:
     """A world of one number: the action adds to it and the reward is that number. The policy learns to push it up."""

@@ -34,6 +34,7 @@ def train(folder: Path, config: SVGConfig) -> SVGStage:
     return stage
 
 
+@pytest.mark.integration
 def test_a_resumed_training_ends_with_the_same_weights_statistics_and_optimiser(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: SVGConfig
 ) -> None:
@@ -92,6 +93,7 @@ def test_only_the_asked_frames_are_decoded(config: SVGConfig) -> None:
     assert decoded == [3 * 5, 3 * 2]
 
 
+@pytest.mark.integration
 def test_training_predicts_better_with_running_statistics_too(config: SVGConfig) -> None:
     stage = make_stage(replace(config, batch_size=4, decoded_frames=3, channels=(8, 8)), episodes=12)
     optimizer = torch.optim.Adam(stage.model.parameters(), lr=5e-3)
