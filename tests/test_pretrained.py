@@ -16,6 +16,7 @@ import pytest
 
 import playslot_rl
 from playslot_rl.config.compose import compose
+from playslot_rl.pretrained import episode
 from playslot_rl.storage.checkpoints import read_stage
 from playslot_rl.training.runs import load_agent, load_world_model, pretrained_folder
 
@@ -97,3 +98,20 @@ def test_its_policy_solves_the_task_in_simulation(env: str) -> None:
     config = compose(["preset=compact", f"env={env}", "evaluation.references=false", "device=cpu"])
     result = evaluate(load_agent(f"pretrained/{env}"), config, "simulation", 20, 11)
     assert result["success_rate"] >= LEAST[env], f"{result['success_rate']:.0%} of 20 episodes"
+
+
+@pytest.mark.parametrize("env", ENVS)
+def test_an_episode_ships_with_each_model_that_it_imagines_from_the_first_frame(env: str) -> None:
+    video = episode(env)
+    assert video.shape == (21 if env == "button_press" else 26, 64, 64, 3)
+    assert video.dtype == np.uint8
+    model = playslot_rl.load(f"pretrained/{env}", device="cpu")
+    future = model.decode(model.imagine(video[0], model.infer_actions(model.parse(video)).z)).frames.movedim(1, -1)
+    error = np.square(video[1:] / 255 - future.numpy()).mean()
+    still = np.square(video[1:] / 255 - video[:1] / 255).mean()
+    assert error < 0.7 * still
+
+
+def test_an_episode_of_another_task_is_refused_with_those_that_ship() -> None:
+    with pytest.raises(ValueError, match="got 'maze', expected one of block_push, block_push_easy, button_press"):
+        episode("maze")
