@@ -34,6 +34,7 @@ from playslot_rl.errors import CheckpointError, require_type
 from playslot_rl.frames import as_numbers, normalise
 from playslot_rl.modules.inverse_dynamics import LatentActions
 from playslot_rl.modules.savi import Decoded
+from playslot_rl.runs import Run
 from playslot_rl.runtime.devices import named_device, probed
 from playslot_rl.world_model import Agent, WorldModel, module_device
 
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[Any] | Tensor
 
 
-def load(run: str | Path = "pretrained", device: str = "", seed: int = 0) -> PlaySlot:
+def load(run: str | Path | Run = "pretrained", device: str = "", seed: int = 0) -> PlaySlot:
     """Load a run folder, or the world model that ships with the package.
 
     Args:
@@ -64,19 +65,19 @@ def load(run: str | Path = "pretrained", device: str = "", seed: int = 0) -> Pla
         4
     """
     from playslot_rl.sharing.folder import is_model_folder
-    from playslot_rl.storage.checkpoints import checkpoint_folder
-    from playslot_rl.training.runs import load_agent, load_world_model, run_folder, stored_view
 
-    require_type(run, "run", str, PathLike, expected="a run folder or `pretrained`")
+    require_type(run, "run", str, PathLike, Run, expected="a run folder or `pretrained`")
     require_type(seed, "seed", SupportsIndex, expected="a number")
-    if is_model_folder(Path(run)):
-        return PlaySlot.from_pretrained(run, device, seed=seed)
+    folder = run.folder if isinstance(run, Run) else Path(run)
+    if is_model_folder(folder):
+        return PlaySlot.from_pretrained(folder, device, seed=seed)
     target = probed(named_device(device))
-    if not (checkpoint_folder(run_folder(run), "policy") / "meta.json").is_file():
-        return PlaySlot(load_world_model(run, target), None, seed, stored_view(run).resize)
+    opened = run if isinstance(run, Run) else Run.open(run)
+    if not opened.has("policy"):
+        return PlaySlot(opened.load_world_model(target), None, seed, opened.view.resize)
     from playslot_rl.sharing.run import described
 
-    agent, policy = load_agent(run, target), described(run)
+    agent, policy = opened.load_agent(target), described(opened)
     model = PlaySlot(agent.world_model, agent, seed, policy.resize)
     model._policy = policy
     return model

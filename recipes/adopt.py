@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from playslot_rl.config import ExperimentConfig, SAViConfig, to_dict
+from playslot_rl.config import EnvConfig, ExperimentConfig, SAViConfig, to_dict
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.windows import IntArray, split_episodes
 from playslot_rl.datasets.survey import Choice, Survey, choose_size, choose_stride, survey
@@ -34,9 +34,8 @@ from playslot_rl.recipes.adopt_trials import (
     with_prototypes,
     with_slots,
 )
-from playslot_rl.recipes.run import open_run
-from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
-from playslot_rl.training.runs import slots_checkpoint, stage_model
+from playslot_rl.runs import Run
+from playslot_rl.runs.opening import run_to_write
 
 if TYPE_CHECKING:
     from playslot_rl.training.pace import Pace
@@ -57,7 +56,7 @@ def main(config: ExperimentConfig) -> None:
             f"data.root: got {config.data.root or 'nothing'}, expected one data set, such as data.root=SET"
         )
     began = time.monotonic()
-    run = open_run(config)
+    run = run_to_write(config).folder
     seen = survey(config.data.root, config.data.camera)
     least = shortest(config)
     if np.median(seen.lengths) < least:
@@ -92,7 +91,7 @@ def _train(
     own: Any = getattr(config, stage)
     before = plan.decide.spent
     train(config, paced(own.steps, milliseconds, getattr(own, "teacher_steps", 0)))
-    meta = read_stage(checkpoint_folder(Path(config.out), stage), stage).meta
+    meta = Run(Path(config.out)).own(stage).meta
     if plan.decide.spent > before + 1:  # not one that was finished before
         plan.decide.note(before + float(meta["seconds"]))
 
@@ -147,7 +146,7 @@ def clip_room(lengths: IntArray, least: int, validation: float, seed: int) -> tu
 
 def start_for(where: str, size: int) -> str:
     """What SAVi starts from: a model of frames of another size has other weights."""
-    if where and stage_model(slots_checkpoint(where))[1].image_size != size:
+    if where and Run.open(where).stage("slots").group(EnvConfig, "env").image_size != size:
         print(f"note: frames of {size} pixels, other than those of slots.start_from={where}: SAVi starts from scratch")
         return ""
     return where

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.datasets.survey import Choice
+from playslot_rl.runs import Run
 
 if TYPE_CHECKING:
     from playslot_rl.training.pace import Pace
@@ -67,7 +68,6 @@ def scheduled(config: ExperimentConfig, stage: str, steps: int, patience: int = 
 def seconds_a_step(config: ExperimentConfig, stage: str, out: Path) -> float:
     """Seconds that a step takes, measured in a small part of the minutes; nothing else of that training is kept."""
     from playslot_rl.recipes import train_dynamics, train_slots
-    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
     from playslot_rl.training.pace import Pace
 
     pace = Pace(60 * config.minutes * TIMED_SHARE, FEWEST_TIMED)
@@ -78,7 +78,7 @@ def seconds_a_step(config: ExperimentConfig, stage: str, out: Path) -> float:
     timed = replace(timed, **{stage: replace(getattr(timed, stage), **once)})
     with _quietly():
         (train_slots if stage == "slots" else train_dynamics).main(replace(timed, out=str(out)), pace)
-    meta = read_stage(checkpoint_folder(out, stage), stage).meta
+    meta = Run(out).own(stage).meta
     return float(meta["seconds"]) / float(meta["steps"])
 
 
@@ -110,7 +110,6 @@ def choose_slots(config: ExperimentConfig, out: Path, steps: int, milliseconds: 
         milliseconds: of a step.
     """
     from playslot_rl.recipes import train_slots
-    from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
 
     errors = {}
     for slots in sorted(config.adopt.slots):
@@ -118,7 +117,7 @@ def choose_slots(config: ExperimentConfig, out: Path, steps: int, milliseconds: 
         with _quietly():
             trial = scheduled(replace(with_slots(config, slots), out=str(folder)), "slots", steps)
             train_slots.main(trial, paced(steps, milliseconds))
-        meta = read_stage(checkpoint_folder(folder, "slots"), "slots").meta
+        meta = Run(folder).own("slots").meta
         if meta["steps"] < CUT_SHORT * steps:
             preset = config.model.savi.n_slots
             return Choice(preset, f"the preset's: the time was enough for {meta['steps']} of {steps} steps of a trial")
@@ -146,17 +145,17 @@ def choose_prototypes(config: ExperimentConfig, run: Path, out: Path, steps: int
     from playslot_rl.evaluation.probes import infer_latents
     from playslot_rl.recipes import train_dynamics
     from playslot_rl.training.record import open_videos
-    from playslot_rl.training.runs import load_world_model, slots_checkpoint
     from playslot_rl.world_model import module_device
 
     many = config.adopt.prototypes
     trial = scheduled(with_prototypes(config, many), "dynamics", steps)
     with _quietly():
         train_dynamics.main(replace(trial, run=str(run), out=str(out)), paced(steps, milliseconds))
-    model = load_world_model(out, config.device or "cpu")
+    trained = Run.open(out)
+    model = trained.load_world_model(config.device or "cpu")
     source = open_videos(config, config.data.root, "adopt")
     slots = slot_cache(
-        source, model.savi, slots_checkpoint(out).fingerprint, Cache.of(config.data), module_device(model), False
+        source, model.savi, trained.stage("slots").fingerprint, Cache.of(config.data), module_device(model), False
     )
     _, codes, _ = infer_latents(model.inverse_dynamics, slots, source.starts, source.lengths)
     shares = np.sort(np.bincount(codes.reshape(-1), minlength=many) / codes.size)[::-1]

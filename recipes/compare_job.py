@@ -53,6 +53,7 @@ def _run(job: dict[str, Any]) -> None:
         return
     from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts, task_facts
     from playslot_rl.recipes import evaluate, train_baseline
+    from playslot_rl.runs import Run
     from playslot_rl.studies.several import train_on_several
 
     config, processes = from_dict(ExperimentConfig, job["config"]), int(job["processes"])
@@ -68,7 +69,7 @@ def _run(job: dict[str, Any]) -> None:
         **task_facts(config, seed),
     }
     for protocol in job["protocols"]:
-        if not evaluate.measured(run, protocol, facts):
+        if not evaluate.measured(Run(run), protocol, facts):
             again = replace(config, run=config.out, out="", seed=seed, protocol=protocol)
             evaluate.main(again, report=False)
 

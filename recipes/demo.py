@@ -1,4 +1,4 @@
-"""`playslot demo`: the main job in minutes, on the shipped world model. Writes everything under `runs/demo/`."""
+"""`playslot demo`: the main job in minutes, on a pretrained world model. Writes everything under `runs/demo/`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.errors import ConfigError
 from playslot_rl.recipes import evaluate, inspect, train_policy
 from playslot_rl.recipes.pipeline import collect_demos
-from playslot_rl.recipes.run import open_run, parent_run
+from playslot_rl.runs import Run
+from playslot_rl.runs.opening import run_to_write
 from playslot_rl.seeds.episodes import LARGEST_SEED
 
 FIRST_SEED = 7
-"""Added to `seed`: the shipped model was trained on videos of the base seeds 0 and 1, and the demo sees new ones."""
+"""Added to `seed`: the pretrained model was trained on videos of the base seeds 0 and 1, and the demo sees new ones."""
 
 
 def main(config: ExperimentConfig) -> None:
@@ -21,7 +22,6 @@ def main(config: ExperimentConfig) -> None:
     write the report.
     """
     from playslot_rl.envs import gym_id
-    from playslot_rl.training.runs import store_config, world_model_checkpoints
 
     began = time.monotonic()
     gym_id(config.env.name)  # one without a simulator is refused before anything is written
@@ -31,10 +31,10 @@ def main(config: ExperimentConfig) -> None:
             f"seed: got {config.seed}, expected at most {LARGEST_SEED - FIRST_SEED}; choose a smaller one"
         )
     config = replace(config, out=name, run="pretrained", seed=FIRST_SEED + config.seed)
-    folder = open_run(config)
-    world_model_checkpoints(parent_run(config, folder))  # a missing one is refused before anything is recorded
+    run = run_to_write(config)
+    folder, _ = run.folder, Run.of(config).world_stages  # a missing one is refused before anything is recorded
     if not (folder / "config.json").is_file():
-        store_config(config, folder)
+        run.store(config)
     config = replace(config, data=collect_demos(config, folder))
     train_policy.main(config)
     shown = replace(config.data, root=config.data.demos)

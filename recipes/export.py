@@ -22,7 +22,7 @@ def main(config: ExperimentConfig) -> None:
         OutputError: `out` holds something else, or cannot be written.
         HubError: the push failed; the folder stays.
     """
-    run, folder = evaluate.check_run(replace(config, out="")), check_out(config)
+    run, folder = evaluate.run_with_policy(replace(config, out="")), check_out(config)
     from playslot_rl.sharing.folder import is_model_folder
     from playslot_rl.sharing.run import export_run, read_source, require_exported
 

@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.recipes.run import open_device, stored_result
+from playslot_rl.runs import Run
+from playslot_rl.runs.opening import require_task
+from playslot_rl.runtime.devices import open_device
 
 
-def main(config: ExperimentConfig, run: Path) -> None:
+def main(config: ExperimentConfig, run: Run) -> None:
     """Score the world model of `run` and print the result.
 
     Raises:
@@ -20,20 +22,18 @@ def main(config: ExperimentConfig, run: Path) -> None:
         ConfigError: fewer than two clips, other frames than the run's, or seeds that it was trained on.
     """
     from playslot_rl.evaluation.objects import evaluate_run_objects
-    from playslot_rl.recipes.evaluate import check_environment
-    from playslot_rl.training.runs import load_world_model
     from playslot_rl.visualization.report import write_report
 
-    model = load_world_model(run, open_device(config))
-    check_environment(config, model.env)
+    model = run.load_world_model(open_device(config.device, config.threads))
+    require_task(config, model.env)
     print(
         f"{config.env.name}: nothing to act on, so slots and latent actions are scored instead of a policy", flush=True
     )
-    print(describe(evaluate_run_objects(run, model, config), run), flush=True)
-    print(f"report: {write_report(run, world_model=model)}", flush=True)
+    print(describe(evaluate_run_objects(run, model, config), run.folder), flush=True)
+    print(f"report: {write_report(run.folder, world_model=model)}", flush=True)
 
 
-def main_if_needed(config: ExperimentConfig, run: Path) -> None:
+def main_if_needed(config: ExperimentConfig, run: Run) -> None:
     """As `main`, unless this world model was scored on these clips before."""
     from playslot_rl.evaluation.objects import DEFAULT_CLIPS, RESULT, run_fingerprints
 
@@ -42,8 +42,8 @@ def main_if_needed(config: ExperimentConfig, run: Path) -> None:
         "seed": config.seed,
         "fingerprints": run_fingerprints(run),
     }
-    stored = stored_result(run / RESULT, facts)
-    if stored is not None and (run / "report.html").is_file():
+    stored = run.result(RESULT, facts)
+    if stored is not None and (run.folder / "report.html").is_file():
         print(f"objects: scored before, ARI {stored['ari']:.2f}, skipped", flush=True)
         return
     main(config, run)

@@ -9,7 +9,7 @@ from pathlib import Path
 from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.envs import PROCEDURAL, gym_id
 from playslot_rl.recipes import evaluate, inspect, slots, train_dynamics, train_policy, train_slots
-from playslot_rl.recipes.run import open_run
+from playslot_rl.runs.opening import run_to_write
 
 
 def main(config: ExperimentConfig) -> None:
@@ -18,17 +18,16 @@ def main(config: ExperimentConfig) -> None:
     With `data.root` set nothing is collected but missing demonstrations (`data.demos`). Where nothing can be acted on
     (GridShapes) there are neither demonstrations nor a policy, and slots and latent actions are scored instead.
     """
-    from playslot_rl.training.runs import store_config
-
     began = time.monotonic()
     behaves = config.env.name not in PROCEDURAL
     if behaves:
         gym_id(config.env.name)  # refused now, not after hours of training
     name = config.out or config.run or f"runs/{config.env.name}_{config.preset}"
     config = replace(config, out=name, run="")
-    folder = open_run(config)
+    run = run_to_write(config)
+    folder = run.folder
     if not (folder / "config.json").is_file():  # a stage stores it anew once it finds that it fits
-        store_config(config, folder)
+        run.store(config)
     config = replace(config, data=_collect(config, folder))
     for stage in (train_slots, train_dynamics, *([train_policy] if behaves else [])):
         since = time.monotonic()
@@ -36,7 +35,7 @@ def main(config: ExperimentConfig) -> None:
         print(f"{stage.__name__.rsplit('.', 1)[-1]}: {time.monotonic() - since:.0f} s", flush=True)
     inspect.main_if_needed(replace(config, run=name, out="", episodes=None))
     if behaves:
-        slots.main_if_needed(config, folder)
+        slots.main_if_needed(config, run_to_write(config))
     evaluate.main_if_needed(replace(config, run=name, out=""))
     print(f"pipeline: {time.monotonic() - began:.0f} s, report {folder / 'report.html'}", flush=True)
 

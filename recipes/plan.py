@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.config.compose import shipped
 from playslot_rl.config.planning import GoalName
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.recipes.evaluate import check_environment, check_run, take_shipped, trained_environment
+from playslot_rl.recipes.evaluate import run_with_policy
+from playslot_rl.runs.opening import require_task, run_of_pretrained
+from playslot_rl.runtime.devices import open_device
 
 if TYPE_CHECKING:
     from playslot_rl.evaluation.goals import GoalEpisode, GoalPool
@@ -35,7 +36,7 @@ def main(config: ExperimentConfig) -> None:
     """
     from playslot_rl.acting.planners.size import search_size
 
-    run = check_run(config, "plan")
+    run = run_with_policy(config, "plan")
     gym_id(config.env.name)  # refuses what has no simulator
     frame_skip = config.env.frame_skip
     try:
@@ -44,32 +45,30 @@ def main(config: ExperimentConfig) -> None:
         raise ConfigError(str(error)) from error
     if config.method != "playslot":
         raise CheckpointError(f"run={config.run}: got a run of method={config.method}, expected one of playslot's own")
-    if shipped(config.run):
-        run = take_shipped(config)
+    if run.pretrained:
+        run = run_of_pretrained(config, run)
     from playslot_rl.evaluation.goals import GoalPool
     from playslot_rl.evaluation.planning_table import table
     from playslot_rl.evaluation.success import run_facts
-    from playslot_rl.recipes.run import open_device
     from playslot_rl.storage.atomic import write_json, write_text
-    from playslot_rl.training.runs import load_agent
 
-    facts = run_facts(run)
-    agent = load_agent(run, open_device(config))
-    check_environment(config, trained_environment(run, "policy"))
+    facts = run_facts(run.folder)
+    agent = run.load_agent(open_device(config.device, config.threads))
+    require_task(config, agent.world_model.env)
     mode = agent.world_model.config.inverse_dynamics.mode
     if mode in ("ground_truth", "none"):
         raise CheckpointError(
             f"run={config.run}: got a world model of mode {mode}, expected one that infers latents, which costs "
             "compare: train one with model.inverse_dynamics.mode=hybrid"
         )
-    folder, parts = run / "planning", {}
+    folder, parts = run.folder / "planning", {}
     for goals, size in sizes.items():
         with GoalPool(config.env, config.render) as pool:
-            common = {"demos": facts.demos, "labelled_demos": facts.labelled_demos, **_facts(config, run)}
+            common = {"demos": facts.demos, "labelled_demos": facts.labelled_demos, **_facts(config, run.folder)}
             common |= {"fingerprints": facts.fingerprints, "commit": facts.commit, "size": asdict(size)}
             parts[goals] = _measure(config, agent, pool, goals, folder / goals, common)
     report = {"run": config.run, "command": "playslot " + " ".join(sys.argv[1:]), "settings": to_dict(config.plan)}
-    report |= {"goals": parts, **_facts(config, run)}
+    report |= {"goals": parts, **_facts(config, run.folder)}
     write_json(folder / "planning.json", report)
     write_text(folder / "planning.md", table(report))
     print(table(report) + f"\nwritten to {folder / 'planning.md'}", flush=True)

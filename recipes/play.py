@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.compose import shipped
 from playslot_rl.errors import ConfigError, DataError
-from playslot_rl.recipes.run import open_device, parent_run
+from playslot_rl.runs import Run
+from playslot_rl.runs.opening import SAME_TASK, require_task
+from playslot_rl.runtime.devices import open_device
 
 if TYPE_CHECKING:
     from playslot_rl.play.starts import RecordedStarts, SimulatedStarts
@@ -51,10 +52,10 @@ def open_studio(config: ExperimentConfig) -> Studio:
 
     if not config.run:
         raise ConfigError("run: got nothing, expected a run or a shipped model, such as run=pretrained")
-    run = parent_run(config, Path())
-    model = load(run, str(open_device(config)), config.seed)
+    run = Run.of(config)
+    model = load(run, str(open_device(config.device, config.threads)), config.seed)
     world, agent = model.world_model, model.agent
-    recorded, simulated = recorded_starts(config, world, agent), simulated_starts(config, world)
+    recorded, simulated = recorded_starts(config, run, world, agent), simulated_starts(config, world)
     if recorded is None and simulated is None:
         print("no data set and no simulator to start from: upload a picture, or give data.root=", flush=True)
     out = Path(config.out or "runs") / "play"
@@ -64,16 +65,14 @@ def open_studio(config: ExperimentConfig) -> Studio:
     )  # fmt: skip
 
 
-def predicted_frames(run: str) -> int:
+def predicted_frames(run: Run) -> int:
     """Steps that the run's predictor was trained to predict; 0 for an exported policy, which does not say it."""
     from playslot_rl.config import DynamicsStageConfig
     from playslot_rl.sharing.folder import is_model_folder
-    from playslot_rl.training.runs import stage_config, world_model_checkpoints
 
-    if is_model_folder(Path(run)):
+    if is_model_folder(run.folder):
         return 0
-    dynamics = world_model_checkpoints(run)["dynamics"]
-    return stage_config(dynamics, DynamicsStageConfig, "dynamics").predicted_frames
+    return run.stage("dynamics").group(DynamicsStageConfig, "dynamics").predicted_frames
 
 
 def run_camera(config: ExperimentConfig, recorded: RecordedStarts | None) -> str:
@@ -93,11 +92,10 @@ def simulated_starts(config: ExperimentConfig, world: WorldModel) -> SimulatedSt
     from playslot_rl.envs import ENVIRONMENTS, task_metadata
     from playslot_rl.evaluation.seeds import first_seed
     from playslot_rl.play.starts import SimulatedStarts, task_maker
-    from playslot_rl.recipes.evaluate import SAME_TASK, check_environment
 
     if config.env.name not in ENVIRONMENTS:
         return None
-    check_environment(config, world.env, SAME_TASK[1:])
+    require_task(config, world.env, SAME_TASK[1:])
     metadata = task_metadata(config.env)
     fps = metadata["control_hz"] / config.env.frame_skip
     maker = task_maker(config.env, config.render)
@@ -110,19 +108,21 @@ def _stored_root(run: Path) -> str:
     return str(json.loads(stored.read_text())["data"]["root"]) if stored.is_file() else ""
 
 
-def recorded_starts(config: ExperimentConfig, world: WorldModel, agent: Agent | None) -> RecordedStarts | None:
+def recorded_starts(
+    config: ExperimentConfig, run: Run, world: WorldModel, agent: Agent | None
+) -> RecordedStarts | None:
     """Frames of `data.root`, or of the data sets that the run names and that are on this machine."""
     from playslot_rl.data.opening import open_configured
     from playslot_rl.envs import ENVIRONMENTS
     from playslot_rl.evaluation.seeds import data_folders
     from playslot_rl.play.starts import RecordedStarts, task_maker
 
-    known = shipped(config.run)
-    named = data_folders(config, None if known else Path(config.run))
+    known = bool(run.pretrained)
+    named = data_folders(config, None if known else run.folder)
     found = [root for root in named if (root / "meta" / "info.json").is_file()]
     missing = [root for root in named if root not in found]
-    # A shipped model names no data set, so the user did; a run names those of its training.
-    typed = known or config.data.root != _stored_root(Path(config.run))
+    # A pretrained model names no data set, so the user did; a run names those of its training.
+    typed = known or config.data.root != _stored_root(run.folder)
     if missing and (typed or (not found and config.env.name not in ENVIRONMENTS)):
         raise DataError(f"data.root={missing[0]}: got no data set, expected a LeRobot v3.0 one: check data.root=")
     if named and not found:

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.recipes.run import open_device, stored_result
+from playslot_rl.runs import Run
+from playslot_rl.runtime.devices import open_device
 
 
-def main(config: ExperimentConfig, run: Path) -> None:
+def main(config: ExperimentConfig, run: Run) -> None:
     """Score the slots of `run` on the scripted expert's episodes and print the result.
 
     Raises:
@@ -23,16 +24,16 @@ def main(config: ExperimentConfig, run: Path) -> None:
     """
     from playslot_rl.evaluation.slots import RESULT, evaluate_slots
 
-    print(describe(evaluate_slots(run, run, config, open_device(config)), run / RESULT), flush=True)
+    device = open_device(config.device, config.threads)
+    print(describe(evaluate_slots(run, run.folder, config, device), run.folder / RESULT), flush=True)
 
 
-def main_if_needed(config: ExperimentConfig, run: Path) -> None:
+def main_if_needed(config: ExperimentConfig, run: Run) -> None:
     """As `main` with the default number of episodes, unless these slots were scored with this seed before."""
     from playslot_rl.evaluation.slots import RESULT
-    from playslot_rl.training.runs import slots_checkpoint
 
-    facts = {"seed": config.seed, "fingerprints": {"slots": slots_checkpoint(run).fingerprint}}
-    stored = stored_result(run / RESULT, facts)
+    facts = {"seed": config.seed, "fingerprints": {"slots": run.stage("slots").fingerprint}}
+    stored = run.result(RESULT, facts)
     if stored is not None:
         print(f"slots: scored before, FG-ARI {stored['foreground_ari']:.2f}, skipped", flush=True)
         return

@@ -8,7 +8,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import open_device, open_run, parent_run, require_parent
+from playslot_rl.runs import Run
+from playslot_rl.runs.opening import require_parent, run_to_write
+from playslot_rl.runtime.devices import open_device
 
 if TYPE_CHECKING:
     from playslot_rl.training.pace import Pace
@@ -29,30 +31,29 @@ def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
     from playslot_rl.data.cache import Cache
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.seeds.draws import global_seed
-    from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
+    from playslot_rl.storage.checkpoints import load_weights
     from playslot_rl.training.fit import Part
     from playslot_rl.training.patience import patience_of
     from playslot_rl.training.record import StageRecord, Training, run_stage
-    from playslot_rl.training.runs import adopt_stage, run_folder, stage_model
     from playslot_rl.training.stage_dynamics import DynamicsStage
     from playslot_rl.world_model import WorldModel
 
-    run = open_run(config)
-    slots = read_stage(checkpoint_folder(run_folder(parent_run(config, run)), "slots"), "slots")
+    run = run_to_write(config)
+    slots = Run.of(config, run.folder).own("slots")
     require_parent(config, run, slots, "image_size")
-    model = replace(config.model, savi=stage_model(slots)[0].savi)
+    model = replace(config.model, savi=slots.sizes[0].savi)
     record = StageRecord(
         "dynamics",
-        run,
+        run.folder,
         config,
         stored={"env": to_dict(config.env), "model": to_dict(model), "dynamics": to_dict(config.dynamics)},
         counts=("model.inverse_dynamics", "model.predictor"),
         parents={"slots": slots},
-        ready=partial(adopt_stage, slots, run),
+        ready=partial(run.take, slots),
     )
 
     def prepare() -> Training:
-        device, source, own = open_device(config), record.data, config.dynamics
+        device, source, own = open_device(config.device, config.threads), record.data, config.dynamics
         with global_seed(config.seed, 0, "dynamics"):
             world = WorldModel(model, config.env)
         load_weights(slots, {"savi": world.savi})

@@ -10,16 +10,10 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from playslot_rl.config import BehaviourStageConfig, ExperimentConfig, to_dict
-from playslot_rl.recipes.run import (
-    adopted_policy,
-    cloned,
-    demonstration_views,
-    open_device,
-    open_run,
-    parent_run,
-    require_parent,
-)
+from playslot_rl.config import BehaviourStageConfig, DynamicsStageConfig, ExperimentConfig, to_dict
+from playslot_rl.runs import Run
+from playslot_rl.runs.opening import require_parent, run_to_write
+from playslot_rl.runtime.devices import open_device
 
 if TYPE_CHECKING:
     from playslot_rl.data.demonstrations import Demonstrations
@@ -39,25 +33,24 @@ def main(config: ExperimentConfig) -> None:
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
     from playslot_rl.training.record import StageRecord, run_stage
-    from playslot_rl.training.runs import use_world_model, world_model_checkpoints, world_model_config
 
-    run = open_run(config)
-    parent = parent_run(config, run)
-    parents = world_model_checkpoints(parent)
+    run = run_to_write(config)
+    parent = Run.of(config, run.folder)
+    parents = parent.world_stages
     for checkpoint in parents.values():
         require_parent(config, run, checkpoint, "image_size", "action_dim")
-    model, env = world_model_config(parents)
+    model, env = parent.world_config
     sizes = to_dict(replace(model, **behaviour_networks(config)))
     record = StageRecord(
         "policy",
-        run,
+        run.folder,
         config,
         stored={"env": to_dict(env), "model": sizes, "policy": to_dict(replace(config.behaviour, policy_from=""))},
         counts=("model.policy", "model.action_decoder"),
         identity={"model": sizes},
         parents=parents,
         role="demos",
-        ready=partial(use_world_model, run, parent),
+        ready=partial(run.build_on, parent),
     )
 
     run_stage(record, lambda: _training(config, record, parent))
@@ -72,21 +65,22 @@ def behaviour_networks(config: ExperimentConfig) -> dict[str, Any]:
     }
 
 
-def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Training:
+def _training(config: ExperimentConfig, record: StageRecord, parent: Run) -> Training:
     """The frozen world model's view of the demonstrations; fresh policy, oracle and decoder on top of it."""
     from playslot_rl.data.demonstrations import require_finite, require_labelled
     from playslot_rl.data.labels import label_demonstrations, with_copies
     from playslot_rl.seeds.draws import global_seed
+    from playslot_rl.training.demonstrated import cloned, demonstration_views, policy_taken_over
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
-    from playslot_rl.training.runs import load_world_model, trained_horizon
     from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage, cloning_settings
     from playslot_rl.world_model import Agent
 
-    device, split, behaviour = open_device(config), record.demos, config.behaviour
+    split, behaviour = record.demos, config.behaviour
+    device = open_device(config.device, config.threads)
     require_labelled(behaviour.labelled_demos, split.trained.episodes)  # before anything is computed
     require_finite(split, None if behaviour.oracle else behaviour.labelled_demos)
-    world = load_world_model(parent, device)
+    world = parent.load_world_model(device)
     world.config = replace(world.config, **behaviour_networks(config))
     with global_seed(config.seed, 0, "policy"):
         agent = Agent.untrained(world, oracle=behaviour.oracle).to(device)
@@ -97,7 +91,8 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
 
     demos = with_copies([label(*view) for view in views])
     held_out = next((label(*view) for view in others), None)
-    horizon = trained_horizon(record.parents["dynamics"])
+    dynamics = parent.stage("dynamics").group(DynamicsStageConfig, "dynamics")
+    horizon = dynamics.seed_frames - 1 + dynamics.predicted_frames
     demos.labelled(behaviour.labelled_demos)  # none that say anything are refused before anything is trained
 
     def parts() -> Iterator[Part]:
@@ -127,7 +122,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
             "held_out_demos": 0 if held_out is None else len(held_out.lengths),
             "data_root": record.roots,
         },
-        adopt=adopted_policy(config, record, behaviour.steps),
+        adopt=policy_taken_over(config, record, behaviour.steps),
     )
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import open_device, open_run
+from playslot_rl.runs import Run
+from playslot_rl.runs.opening import run_to_write
+from playslot_rl.runtime.devices import open_device
 
 if TYPE_CHECKING:
     from playslot_rl.training.pace import Pace
@@ -28,27 +30,27 @@ def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
     from playslot_rl.training.fit import Part
     from playslot_rl.training.patience import patience_of
     from playslot_rl.training.record import StageRecord, Training, run_stage
-    from playslot_rl.training.runs import load_savi, slots_checkpoint
     from playslot_rl.training.stage_slots import SlotsStage, warm_start
 
     own = config.slots
     record = StageRecord(
         "slots",
-        open_run(config),
+        run_to_write(config).folder,
         config,
         stored={"env": to_dict(config.env), "model": to_dict(config.model), "slots": to_dict(own)},
         counts=("env.image_size", "model.savi"),
     )
 
     def prepare() -> Training:
-        device, source = open_device(config), record.data
+        device, source = open_device(config.device, config.threads), record.data
         with global_seed(config.seed, 0, "slots"):
             savi = SAVi(config.model.savi, config.env.image_size).to(device)
         known = validation_scores(config) if here().first else None
         started: dict[str, str] = {}
         if own.start_from:
-            warm_start(savi, load_savi(own.start_from, device), own.start_from)
-            started = {"started_from": slots_checkpoint(own.start_from).fingerprint}
+            other = Run.open(own.start_from)
+            warm_start(savi, other.load_savi(device), own.start_from)
+            started = {"started_from": other.stage("slots").fingerprint}
         stage = SlotsStage(savi, record.clips(own.clip_frames), own, known)
         return Training(
             [Part("slots", stage, own, patience=patience_of(own.patience, "mse"), pace=pace)],

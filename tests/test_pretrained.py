@@ -17,8 +17,8 @@ import pytest
 import playslot_rl
 from playslot_rl.config.compose import compose
 from playslot_rl.pretrained import episode
+from playslot_rl.runs import Run, pretrained_folder
 from playslot_rl.storage.checkpoints import read_stage
-from playslot_rl.training.runs import load_agent, load_world_model, pretrained_folder
 
 ENVS = ("button_press", "block_push_easy", "block_push")
 STAGES = ("slots", "dynamics", "policy")
@@ -65,7 +65,7 @@ def test_no_other_model_ships() -> None:
 
 @pytest.mark.parametrize("env", ENVS)
 def test_it_loads_and_has_the_sizes_of_the_compact_preset(env: str) -> None:
-    world = load_world_model(f"pretrained/{env}")
+    world = Run.open(f"pretrained/{env}").load_world_model()
     config = compose(["preset=compact", f"env={env}"])
     assert world.config.savi == config.model.savi
     assert world.config.inverse_dynamics == config.model.inverse_dynamics
@@ -75,7 +75,7 @@ def test_it_loads_and_has_the_sizes_of_the_compact_preset(env: str) -> None:
 
 @pytest.mark.parametrize("env", ENVS)
 def test_its_policy_was_trained_on_it(env: str) -> None:
-    agent = load_agent(f"pretrained/{env}")
+    agent = Run.open(f"pretrained/{env}").load_agent()
     assert agent.action_decoder.reads_slots
 
 
@@ -96,7 +96,7 @@ def test_its_policy_solves_the_task_in_simulation(env: str) -> None:
     from playslot_rl.evaluation.success import evaluate
 
     config = compose(["preset=compact", f"env={env}", "evaluation.references=false", "device=cpu"])
-    result = evaluate(load_agent(f"pretrained/{env}"), config, "simulation", 20, 11)
+    result = evaluate(Run.open(f"pretrained/{env}").load_agent(), config, "simulation", 20, 11)
     assert result["success_rate"] >= LEAST[env], f"{result['success_rate']:.0%} of 20 episodes"
 
 

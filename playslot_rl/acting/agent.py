@@ -17,6 +17,7 @@ from torch import Tensor
 from playslot_rl import keys
 from playslot_rl.acting.actor import PlannedActor, SlotActor
 from playslot_rl.acting.imagination import ImaginationEnv
+from playslot_rl.runs import Run
 from playslot_rl.world_model import Agent, action_decoder_module, latent_policy_module, oracle_module
 
 
@@ -33,9 +34,7 @@ def load_actor(run: Path, device: torch.device | str = "cpu") -> SlotActor:
     Raises:
         CheckpointError: a stage is missing or damaged.
     """
-    from playslot_rl.training.runs import load_agent
-
-    return playslot_actor(load_agent(run, device))
+    return playslot_actor(Run.open(run).load_agent(device))
 
 
 def oracle_actor(agent: Agent) -> SlotActor:

@@ -36,18 +36,18 @@ COMPARISONS: Final = {
 """Commands with a group of their own in the config, and its keys that go without its name."""
 NAMES: Final = {"plan": {"planner": PLANNERS, "proposal": PROPOSALS, "goals": GOALS}}
 """Commands with keys of their group that go without its name, and take one name, several with commas, or `all`."""
-SHIPPED: Final = "pretrained"
-"""`run=pretrained` names the task's shipped world model, `run=pretrained/ENV` one of them: no run folders."""
+PRETRAINED: Final = "pretrained"
+"""`run=pretrained` names the task's pretrained world model, `run=pretrained/ENV` one of them: no run folders."""
 
 
-def shipped(run: str) -> bool:
-    """Whether `run` names a shipped world model instead of a folder."""
-    return run.partition("/")[0] == SHIPPED
+def is_pretrained(run: str) -> bool:
+    """Whether `run` names a pretrained model instead of a folder."""
+    return run.partition("/")[0] == PRETRAINED
 
 
 def near_run(run: str) -> str:
-    """The shipped model or the run beside it that a name may be meant for, as the end of a message."""
-    models = [SHIPPED, *(f"{SHIPPED}/{env}" for env in choices("env"))]
+    """The pretrained model or the run beside it that a name may be meant for, as the end of a message."""
+    models = [PRETRAINED, *(f"{PRETRAINED}/{env}" for env in choices("env"))]
     place = Path(run)
     with contextlib.suppress(OSError):
         models += [str(found.parent) for found in place.parent.glob("*/config.json")]
@@ -89,8 +89,8 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         run = _expand_home(_unquote(pairs.get("run", "")))
         if command == "adopt":
             pairs.setdefault("env", "video")
-        continues = command in CONTINUES and run != "" and not shipped(run)
-        if shipped(run) and run != SHIPPED:
+        continues = command in CONTINUES and run != "" and not is_pretrained(run)
+        if is_pretrained(run) and run != PRETRAINED:
             pairs.setdefault("env", run.partition("/")[2])  # the task that the model is named after
             _check_choice("env", pairs["env"])
         if continues:

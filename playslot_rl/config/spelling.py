@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.baselines import BaselinesConfig
-from playslot_rl.config.compose import CONTINUES, compose, quoted, shipped
+from playslot_rl.config.compose import CONTINUES, compose, is_pretrained, quoted
 from playslot_rl.config.plain import flatten
 from playslot_rl.errors import ConfigError
 
@@ -25,7 +25,7 @@ def spelled(config: ExperimentConfig, command: str) -> list[str]:
     Raises:
         ConfigError: no arguments make it: `run` is of another preset or task, and the command takes its config.
     """
-    continues = command in CONTINUES and config.run != "" and not shipped(config.run)
+    continues = command in CONTINUES and config.run != "" and not is_pretrained(config.run)
     base = [] if continues else [f"env={config.env.name}", f"preset={config.preset}"]
     base += [f"{key}={value}" for key, value in (("run", config.run), ("out", config.out)) if value]
     known, wanted = flatten(to_dict(compose(base, command))), flatten(to_dict(config))

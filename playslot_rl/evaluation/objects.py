@@ -25,8 +25,8 @@ from playslot_rl.evaluation.success import hardware
 from playslot_rl.evaluation.video import video_metrics
 from playslot_rl.frames import to_float
 from playslot_rl.modules.savi.health import owners
+from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import write_json
-from playslot_rl.training.runs import world_model_checkpoints
 from playslot_rl.world_model import WorldModel, module_device
 
 DEFAULT_CLIPS: Final = 100
@@ -164,7 +164,7 @@ def evaluate_objects(model: WorldModel, config: ExperimentConfig, clips: int, se
     }
 
 
-def evaluate_run_objects(run: Path, model: WorldModel, config: ExperimentConfig) -> dict[str, Any]:
+def evaluate_run_objects(run: Run, model: WorldModel, config: ExperimentConfig) -> dict[str, Any]:
     """Score a run's world model on `config.episodes` clips (100) and write `RUN/evaluation/objects/eval_info.json`.
 
     Raises:
@@ -177,7 +177,7 @@ def evaluate_run_objects(run: Path, model: WorldModel, config: ExperimentConfig)
         raise ConfigError(f"episodes: got {clips}, expected at least 2, since a probe is tested on clips held out")
     start = first_seed(config, config.seed)
     seeds = list(range(start, start + clips))
-    check_disjoint(seeds, training_seeds(config, run))
+    check_disjoint(seeds, training_seeds(config, run.folder))
     model.eval()
     result = {
         "protocol": "objects",
@@ -189,18 +189,19 @@ def evaluate_run_objects(run: Path, model: WorldModel, config: ExperimentConfig)
         "wall_seconds": round(time.perf_counter() - began, 2),
         "hardware": hardware(),
     }
-    (run / RESULT).parent.mkdir(parents=True, exist_ok=True)
-    write_json(run / RESULT, result)
+    path = run.folder / RESULT
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, result)
     return result
 
 
-def run_fingerprints(run: Path) -> dict[str, str]:
+def run_fingerprints(run: Run) -> dict[str, str]:
     """Weights of the world model's stages.
 
     Raises:
         CheckpointError: one is missing or damaged.
     """
-    return {name: stage.fingerprint for name, stage in world_model_checkpoints(run).items()}
+    return {name: stage.fingerprint for name, stage in run.world_stages.items()}
 
 
 Labels = npt.NDArray[Any]

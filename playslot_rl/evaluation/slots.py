@@ -25,9 +25,9 @@ from playslot_rl.evaluation.success import hardware
 from playslot_rl.frames import psnr, to_float
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.modules.savi.health import owners
+from playslot_rl.runs import Run
 from playslot_rl.seeds.episodes import episode_seed
 from playslot_rl.storage.atomic import write_json
-from playslot_rl.training.runs import load_savi, slots_checkpoint
 from playslot_rl.world_model import module_device
 
 DEFAULT_EPISODES: Final = 20
@@ -135,7 +135,7 @@ def slots_per_object(truth: npt.NDArray[np.int64], found: npt.NDArray[np.int64],
     return float(np.mean(counts)) if counts else 0.0
 
 
-def evaluate_slots(run: str | Path, out: Path, config: ExperimentConfig, device: torch.device | str) -> dict[str, Any]:
+def evaluate_slots(run: Run, out: Path, config: ExperimentConfig, device: torch.device | str) -> dict[str, Any]:
     """Score a run's slots on `config.episodes` episodes (20) and write `OUT/evaluation/slots/eval_info.json`.
 
     Raises:
@@ -145,14 +145,14 @@ def evaluate_slots(run: str | Path, out: Path, config: ExperimentConfig, device:
     """
     began, start = time.perf_counter(), first_seed(config, config.seed)
     seeds = list(range(start, start + (config.episodes or DEFAULT_EPISODES)))
-    check_disjoint(seeds, training_seeds(config, Path(run)))
+    check_disjoint(seeds, training_seeds(config, run.folder))
     result = {
         "protocol": "slots",
         "episodes": len(seeds),
         "seed": config.seed,
         "seeds": seeds,
-        **score_slots(load_savi(run, device), segmented_episodes(config, seeds), seeds),
-        "fingerprints": {"slots": slots_checkpoint(run).fingerprint},
+        **score_slots(run.load_savi(device), segmented_episodes(config, seeds), seeds),
+        "fingerprints": {"slots": run.stage("slots").fingerprint},
         "wall_seconds": round(time.perf_counter() - began, 2),
         "hardware": hardware(),
     }

@@ -41,6 +41,22 @@ def named_device(name: str | torch.device = "") -> torch.device:
     return device
 
 
+def open_device(name: str, threads: int) -> torch.device:
+    """The device of a name (`named_device`) that computes, after setting threads and the allocator; of several
+    processes on GPUs each has its own.
+
+    Raises:
+        ConfigError: no such device.
+    """
+    from playslot_rl.runtime.allocator import tune_allocator
+    from playslot_rl.runtime.processes import own_device
+    from playslot_rl.runtime.threads import set_threads
+
+    tune_allocator()
+    set_threads(threads)
+    return probed(own_device(named_device(name)))
+
+
 def probed(device: torch.device) -> torch.device:
     """The device, after a look whether it is there.
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.config.compose import compose, shipped
+from playslot_rl.config.compose import compose, is_pretrained
 from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import keys_of
 from playslot_rl.config.weights import data_roots
@@ -170,7 +170,7 @@ def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
         looks = name == "validate_every" and bool(getattr(stage, "patience", 0))
         if (key in free and not looks) or (key in preset and preset[key] == value):
             continue
-        if key in folders and value and not shipped(str(value)):
+        if key in folders and value and not is_pretrained(str(value)):
             value = START  # no folder of this machine
         found.append(f"{key}={_value(value)}")
     return found

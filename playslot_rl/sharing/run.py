@@ -7,24 +7,23 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl import keys
-from playslot_rl.config import DataConfig, ExperimentConfig
+from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.camera_names import camera_list, cameras_of, full_name
 from playslot_rl.data.metadata import INFO_NAME, RECORD_NAME, read_info
 from playslot_rl.envs import ENVIRONMENTS, RECORDED
 from playslot_rl.errors import CheckpointError, ConfigError, DataError, OutputError
 from playslot_rl.evaluation.success import POLICY_PROTOCOLS, run_facts
+from playslot_rl.runs import Run
 from playslot_rl.sharing.card import make_card
 from playslot_rl.sharing.commands import Result
 from playslot_rl.sharing.folder import SharedPolicyConfig, require_whole, save_pretrained
-from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage
-from playslot_rl.training.runs import load_agent, pretrained_folder, run_folder, stored_view, world_model_checkpoints
 
 if TYPE_CHECKING:
     from playslot_rl.world_model import Agent
@@ -33,15 +32,14 @@ LIBRARIES: Final = ("torch", "torchrl", "tensordict", "lerobot", "gymnasium", "m
 """Named on the card with their versions."""
 
 
-def read_source(run: Path) -> dict[str, Any]:
+def read_source(run: Run) -> dict[str, Any]:
     """Plain values: fingerprints of weights and data, demonstrations, labels, commit, seed, versions.
 
     Raises:
         CheckpointError: the run has no policy, or its checkpoints are damaged or do not belong together.
     """
-    run_facts(run)  # a run without a policy is refused with what to do
-    policy = read_stage(checkpoint_folder(run, "policy"), "policy")
-    parents = world_model_checkpoints(run)
+    run_facts(run.folder)  # a run without a policy is refused with what to do
+    policy, parents = run.own("policy"), run.world_stages
     meta = policy.meta
     prints = {name: checkpoint.fingerprint for name, checkpoint in parents.items()}
     return {
@@ -56,7 +54,7 @@ def read_source(run: Path) -> dict[str, Any]:
         "world_model_seed": parents["slots"].meta.get("seed"),
         "commit": meta.get("commit", ""),
         "clocked": any(parent.meta.get("clocked", False) for parent in parents.values()),
-        "shipped_world_model": _is_shipped(str(policy.config.get("env", {}).get("name", "")), prints),
+        "shipped_world_model": _is_pretrained(str(policy.config.get("env", {}).get("name", "")), prints),
         "trained_with": {"playslot_rl": meta.get("version", ""), "torch": meta.get("torch", "")},
         "recorded": _recorded(Path(str(meta.get("data_root", "")))),
         "versions": versions(),
@@ -70,13 +68,13 @@ def versions() -> dict[str, str]:
     return {"playslot_rl": __version__, **{name: importlib.metadata.version(name) for name in LIBRARIES}}
 
 
-def _is_shipped(env: str, prints: dict[str, str]) -> bool:
+def _is_pretrained(env: str, prints: dict[str, str]) -> bool:
     """Whether the world model is the one that ships with the package."""
     try:
-        shipped = world_model_checkpoints(pretrained_folder(env))
+        pretrained = Run.open(f"pretrained/{env}").world_stages
     except CheckpointError:
         return False
-    return prints == {name: checkpoint.fingerprint for name, checkpoint in shipped.items()}
+    return prints == {name: checkpoint.fingerprint for name, checkpoint in pretrained.items()}
 
 
 def _recorded(root: Path) -> dict[str, Any]:
@@ -93,7 +91,7 @@ def _elsewhere(root: Path) -> bool:
     return (root / INFO_NAME).is_file() and not (root / RECORD_NAME).is_file()
 
 
-def read_results(run: Path, source: dict[str, Any]) -> list[Result]:
+def read_results(run: Run, source: dict[str, Any]) -> list[Result]:
     """Evaluations of exactly this policy, from `RUN/evaluation/*/eval_info.json`; those of an older one are left out.
 
     Raises:
@@ -101,7 +99,7 @@ def read_results(run: Path, source: dict[str, Any]) -> list[Result]:
     """
     results = []
     for protocol in POLICY_PROTOCOLS:
-        path = run / "evaluation" / protocol / "eval_info.json"
+        path = run.folder / "evaluation" / protocol / "eval_info.json"
         if not path.is_file():
             continue
         try:
@@ -136,7 +134,7 @@ def _result(info: dict[str, Any]) -> Result:
 
 
 def export_run(
-    run: Path, folder: Path, config: ExperimentConfig, source: dict[str, Any] | None = None
+    run: Run, folder: Path, config: ExperimentConfig, source: dict[str, Any] | None = None
 ) -> SharedPolicyConfig:
     """Write the policy of a run to a new folder.
 
@@ -155,13 +153,13 @@ def export_run(
     roots = data_roots(",".join(text for text in (config.data.root, config.data.demos) if text))
     source = {**source, "recorded_elsewhere": any(_elsewhere(Path(root.path)) for root in roots)}
     results = read_results(run, source)
-    agent = load_agent(run)
+    agent = run.load_agent()
     policy = _policy(run, agent, config, source)
-    made = replace(config, data=replace(config.data, camera=stored_view(run).camera))  # one of several may be exported
+    made = replace(config, data=replace(config.data, camera=run.view.camera))  # one of several may be exported
     return save_pretrained(agent, folder, policy, lambda written: make_card(folder.name, written, agent, made, results))
 
 
-def require_exported(run: Path, folder: Path, config: ExperimentConfig, source: dict[str, Any]) -> None:
+def require_exported(run: Run, folder: Path, config: ExperimentConfig, source: dict[str, Any]) -> None:
     """Check that a model folder is whole and holds what `export_run` would write into it.
 
     Versions of libraries and results on its card may be those of the day on which it was made.
@@ -172,23 +170,23 @@ def require_exported(run: Path, folder: Path, config: ExperimentConfig, source: 
         OutputError: it holds another policy.
     """
     made = require_whole(folder)
-    wanted = replace(_policy(run, load_agent(run), config, source), fingerprint=made.fingerprint)
+    wanted = replace(_policy(run, run.load_agent(), config, source), fingerprint=made.fingerprint)
     if made.source.get("fingerprints") != source["fingerprints"] or replace(made, source=source) != wanted:
         raise OutputError(
-            f"out={folder}: got another policy, expected a new folder or that of run={run}: choose another"
+            f"out={folder}: got another policy, expected a new folder or that of run={run.name}: choose another"
         )
 
 
-def _policy(run: Path, agent: Agent, config: ExperimentConfig, source: dict[str, Any]) -> SharedPolicyConfig:
-    meta, env = _meta(run), agent.world_model.env
-    if env.name in RECORDED and "actions" not in meta:
+def _policy(run: Run, agent: Agent, config: ExperimentConfig, source: dict[str, Any]) -> SharedPolicyConfig:
+    policy, env = run.own("policy"), agent.world_model.env
+    if env.name in RECORDED and "actions" not in policy.meta:
         raise CheckpointError(
-            f"{checkpoint_folder(run, 'policy')}: got a policy of an earlier version, which clipped the robot's "
+            f"{policy.path}: got a policy of an earlier version, which clipped the robot's "
             "actions to [-1, 1], expected one that knows their range: train it again by `playslot train-policy` with "
             "another out="
         )
-    view, demos = stored_view(run), _demonstrations(config)
-    own = _described(view, meta)
+    view, demos = run.view, _demonstrations(config)
+    own = described(run)
     return SharedPolicyConfig(
         env=env,
         model=agent.world_model.config,
@@ -201,12 +199,9 @@ def _policy(run: Path, agent: Agent, config: ExperimentConfig, source: dict[str,
     )
 
 
-def described(run: Path | str) -> SharedPolicyConfig:
+def described(run: Run) -> SharedPolicyConfig:
     """What a run says of the frames that its policy looks at, and of its actions; its networks are not made."""
-    return _described(stored_view(run), _meta(run))
-
-
-def _described(view: DataConfig, meta: Mapping[str, Any]) -> SharedPolicyConfig:
+    view, meta = run.view, run.own("policy").meta
     one = "" if "," in view.camera else view.camera
     return SharedPolicyConfig(
         camera=str(meta.get("camera") or one or keys.FEATURE_IMAGE),
@@ -215,10 +210,6 @@ def _described(view: DataConfig, meta: Mapping[str, Any]) -> SharedPolicyConfig:
         fps=float(meta.get("fps", 0.0)),
         actions={key: value for key, value in (meta.get("actions") or {}).items() if key in ("names", "low", "high")},
     )
-
-
-def _meta(run: Path | str) -> Mapping[str, Any]:
-    return read_stage(checkpoint_folder(run_folder(run), "policy"), "policy").meta
 
 
 def _demonstrations(config: ExperimentConfig) -> tuple[str, dict[str, Any]] | None:
@@ -241,7 +232,7 @@ def _frame_rate(config: ExperimentConfig, demos: tuple[str, dict[str, Any]] | No
     return 0.0
 
 
-def _camera(run: Path, config: ExperimentConfig, known: Sequence[str], demos: tuple[str, dict[str, Any]] | None) -> str:
+def _camera(run: Run, config: ExperimentConfig, known: Sequence[str], demos: tuple[str, dict[str, Any]] | None) -> str:
     """LeRobot's name of the camera a run looks at: `data.camera`, else the only one of its demonstrations.
 
     Where the demonstrations are no longer there it is that of the run, or of our own data sets: the last one `known`.
@@ -250,7 +241,7 @@ def _camera(run: Path, config: ExperimentConfig, known: Sequence[str], demos: tu
         ConfigError: there are several.
         DataError: there is no such camera.
     """
-    names, where, otherwise = camera_list(config.data.camera), str(run), known[-1]
+    names, where, otherwise = camera_list(config.data.camera), run.name, known[-1]
     if demos is not None:
         known, where = cameras_of(demos[1]["features"]), demos[0]
         names = names or [*known]

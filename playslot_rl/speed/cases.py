@@ -279,9 +279,9 @@ def _play(variant: Variant, sizes: Sizes) -> Step:
     from playslot_rl.play.pictures import encode, strip, with_masks
     from playslot_rl.play.session import PlaySession
     from playslot_rl.play.starts import Start
-    from playslot_rl.training.runs import load_world_model
+    from playslot_rl.runs import Run
 
-    model = load_world_model("pretrained") if variant.shipped else _play_model(variant, sizes)
+    model = Run.open("pretrained").load_world_model() if variant.shipped else _play_model(variant, sizes)
     session, side = PlaySession(model), model.env.image_size
     first = Start("", np.zeros((side, side, 3), np.uint8), torch.randn(1, *model.slot_shape))
 

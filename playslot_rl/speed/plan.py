@@ -31,9 +31,9 @@ def plan_step(variant: Variant, sizes: Sizes) -> Step:
     """
     from playslot_rl.acting.planners import latent_statistics
     from playslot_rl.acting.planners.costs import SlotDistance
-    from playslot_rl.training.runs import load_agent
+    from playslot_rl.runs import Run
 
-    agent = load_agent("pretrained")
+    agent = Run.open("pretrained").load_agent()
     agent.world_model.eval().requires_grad_(False)
     start, goal = torch.randn(2, *agent.world_model.slot_shape)
     make = _own if variant.cached else _torchrl

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from playslot_rl.errors import OutputError
+from playslot_rl.errors import CheckpointError, OutputError
 
 _REASONS = {
     errno.ENOSPC: ("the disk is full", "free some space or choose another folder; the same command carries on"),
@@ -149,6 +149,21 @@ def write_json(path: Path, obj: Any) -> None:
         ValueError: a number is not finite, which JSON cannot hold.
     """
     write_text(path, json.dumps(obj, indent=2, allow_nan=False) + "\n")
+
+
+def read_json(path: Path, cure: str = "train that stage again") -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        CheckpointError: it is missing or damaged; ends with the `cure`.
+    """
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path} is damaged ({error}), expected a JSON object: {cure}") from error
+    if not isinstance(values, dict):
+        raise CheckpointError(f"{path} is damaged ({type(values).__name__}), expected a JSON object: {cure}")
+    return values
 
 
 def replace_dir(tmp: Path, final: Path) -> None:

@@ -1,7 +1,7 @@
 """Finished stages: `weights.safetensors`, `config.json` and `meta.json` in a folder. Never a pickle.
 
 A child names its parents by the fingerprints of their weights and refuses any other. Where the folders lie in a run:
-`playslot_rl.training.runs`.
+`playslot_rl.runs`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,13 @@ from typing import Any
 import torch
 from torch import nn
 
+from playslot_rl.config import EnvConfig, ModelConfig, from_dict
 from playslot_rl.config.plain import flatten
 from playslot_rl.errors import CheckpointError
 from playslot_rl.runtime.precision import native_bf16
-from playslot_rl.storage.atomic import write_json
+from playslot_rl.storage.atomic import read_json, write_json
 from playslot_rl.storage.folders import new_folder
-from playslot_rl.storage.resume import first_difference, read_json
+from playslot_rl.storage.resume import first_difference
 from playslot_rl.storage.tensors import (
     load_modules,
     load_tensors,
@@ -64,6 +65,48 @@ class StageCheckpoint:
     config: dict[str, Any]
     meta: dict[str, Any]
     fingerprint: str
+
+    def group[Group](self, cls: type[Group], name: str) -> Group:
+        """A group of the config it was trained with; all stages store `env`.
+
+        Raises:
+            CheckpointError: its config.json is not one of this version.
+        """
+        try:
+            return from_dict(cls, self.config[name], f"{name}.")
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(
+                f"{self.path}/config.json: {error}; expected the {name} of this version of playslot_rl: train that "
+                "stage again"
+            ) from error
+
+    @property
+    def sizes(self) -> tuple[ModelConfig, EnvConfig]:
+        """The groups `model` and `env`.
+
+        Raises:
+            CheckpointError: its config.json is not one of this version.
+        """
+        return self.group(ModelConfig, "model"), self.group(EnvConfig, "env")
+
+    def restore[Network: nn.Module](
+        self, build: Callable[[], Network], parts: str | Sequence[str], device: torch.device | str = "cpu"
+    ) -> Network:
+        """A network with the stored weights, in evaluation mode, without gradients; the global generator is as before.
+
+        Args:
+            build: makes it anew.
+            parts: the name that the whole network is stored under, or those of its attributes that are stored.
+            device: of the network.
+
+        Raises:
+            CheckpointError: missing, unexpected or misshapen tensors, or a file that is not the one that was saved.
+        """
+        with torch.random.fork_rng(devices=[]):
+            network = build()
+        whole: dict[str, nn.Module] = {parts: network} if isinstance(parts, str) else {}
+        load_weights(self, whole or {name: getattr(network, name) for name in parts})
+        return network.to(device).eval().requires_grad_(False)
 
 
 def checkpoint_folder(run: Path, stage: str) -> Path:

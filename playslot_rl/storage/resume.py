@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from playslot_rl.config.plain import flatten
 from playslot_rl.config.spelling import typed_key
 from playslot_rl.errors import CheckpointError, OutputError
-from playslot_rl.storage.atomic import write_json
+from playslot_rl.storage.atomic import read_json, write_json
 from playslot_rl.storage.folders import new_folder, remove_leftovers
 from playslot_rl.storage.tensors import load_into, load_modules, load_tensors, module_tensors, save_tensors
 
@@ -208,21 +208,6 @@ class TrainingCheckpoints:
                 f"set {key} back, use another out=, or delete that folder"
             )
         return last, stored
-
-
-def read_json(path: Path, cure: str = "train that stage again") -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        CheckpointError: it is missing or damaged; ends with the `cure`.
-    """
-    try:
-        values = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path} is damaged ({error}), expected a JSON object: {cure}") from error
-    if not isinstance(values, dict):
-        raise CheckpointError(f"{path} is damaged ({type(values).__name__}), expected a JSON object: {cure}")
-    return values
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer, names: Sequence[str] = ()) -> dict[str, Tensor]:

@@ -16,7 +16,7 @@ from typing import Any
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compare import LAUNCHERS
-from playslot_rl.config.compose import shipped
+from playslot_rl.config.compose import is_pretrained
 from playslot_rl.config.methods import METHODS, MethodName, method_stage
 from playslot_rl.config.roles import without
 from playslot_rl.config.weights import data_roots, is_remote
@@ -226,7 +226,7 @@ def job_config(config: ExperimentConfig, job: Job, world: str) -> ExperimentConf
 
 def absolute(path: str) -> str:
     """A path from the root; nothing, shipped models (`pretrained/ENV`) and addresses on the Hub as they are."""
-    return path if not path or shipped(path) or is_remote(path) else str(Path(path).expanduser().resolve())
+    return path if not path or is_pretrained(path) or is_remote(path) else str(Path(path).expanduser().resolve())
 
 
 def absolute_roots(text: str) -> str:

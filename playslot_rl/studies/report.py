@@ -13,7 +13,7 @@ from typing import Any
 
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.compose import shipped
+from playslot_rl.config.compose import is_pretrained
 from playslot_rl.config.methods import METHODS
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
@@ -267,7 +267,7 @@ class Comparison:
             return None
         stages = world_model_checkpoints(self.config.run)
         return {
-            "source": self.config.run if shipped(self.config.run) else Path(self.config.run).name,
+            "source": self.config.run if is_pretrained(self.config.run) else Path(self.config.run).name,
             "fingerprints": {name: stage.fingerprint for name, stage in stages.items()},
             "seconds": sum(float(stage.meta.get("seconds", 0.0)) for stage in stages.values()),
             "episodes": stages["slots"].meta.get("episodes"),

@@ -24,6 +24,8 @@ from playslot_rl.data.weighted import weighted
 from playslot_rl.data.windows import Clips
 from playslot_rl.errors import CheckpointError, DataError
 from playslot_rl.modules.action_range import range_of
+from playslot_rl.runs import Run
+from playslot_rl.runs.opening import STAGE_LOCK
 from playslot_rl.runtime.processes import here, wait
 from playslot_rl.storage.atomic import explain_write_errors
 from playslot_rl.storage.checkpoints import (
@@ -37,9 +39,7 @@ from playslot_rl.storage.checkpoints import (
 )
 from playslot_rl.storage.locks import locked
 from playslot_rl.training.fit import Part, fit
-from playslot_rl.training.runs import store_config
 
-LOCK: Final = "training.lock"
 PATIENCE: Final = 10.0
 """Seconds in which the children of a killed training end."""
 
@@ -222,7 +222,7 @@ class StageRecord:
             def hold() -> None:
                 with explain_write_errors(self.folder):
                     self.folder.mkdir(parents=True, exist_ok=True)
-                held.enter_context(locked(self.folder / LOCK, busy, PATIENCE))
+                held.enter_context(locked(self.folder / STAGE_LOCK, busy, PATIENCE))
 
             begun = self.folder.is_dir()
             if begun and here().first:
@@ -234,7 +234,7 @@ class StageRecord:
                     if not begun:
                         hold()
                     begun = True
-                    store_config(self.config, self.run)
+                    Run(self.run).store(self.config)
                     self.ready()
 
             yield begin

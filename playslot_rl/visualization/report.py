@@ -21,8 +21,8 @@ from playslot_rl.evaluation.objects import RESULT, parse_clips, seed_frames
 from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.frames import to_uint8
+from playslot_rl.runs import Run
 from playslot_rl.storage.checkpoints import checkpoint_folder
-from playslot_rl.training.runs import world_model_folder
 from playslot_rl.visualization.card import card_section
 from playslot_rl.visualization.document import (
     Block,
@@ -104,7 +104,7 @@ def stored_config(run: Path) -> ExperimentConfig:
 def read_metas(run: Path) -> dict[str, dict[str, Any]]:
     """Stage -> meta of its finished checkpoint; for the world model's stages, of the model that the run uses."""
     try:
-        model = world_model_folder(run)
+        model = Run.open(run).world_run.folder
     except CheckpointError:
         model = run  # the report is written from what there is
     homes = {"slots": model, "dynamics": model, "policy": run}

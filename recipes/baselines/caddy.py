@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.recipes.baselines.cloning import BEHAVIOUR, cloning, model_of
-from playslot_rl.recipes.run import cloned, open_device, open_run
+from playslot_rl.recipes.run import open_device, open_run
 
 if TYPE_CHECKING:
     from playslot_rl.storage.checkpoints import StageCheckpoint
@@ -115,6 +115,7 @@ def _policy(config: ExperimentConfig, record: StageRecord) -> Training:
 def _oracle(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.methods.caddy.behaviour import oracle_stage
     from playslot_rl.methods.caddy.load import MODEL
+    from playslot_rl.training.demonstrated import cloned
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl.config import ExperimentConfig, StageConfig
 from playslot_rl.config.methods import LATENT_MODELS
-from playslot_rl.recipes.run import adopted_policy, cloned, require_parent
+from playslot_rl.recipes.run import require_parent
 
 if TYPE_CHECKING:
     from playslot_rl.data.demonstrations import DemonstrationSplit
@@ -101,6 +101,7 @@ def cloning(
         policy: its schedule, `baselines.METHOD.policy`.
         decoder_steps, decoder_lr: the decoder's; the rest is as for the policy.
     """
+    from playslot_rl.training.demonstrated import cloned, policy_taken_over
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
 
@@ -125,5 +126,5 @@ def cloning(
         behaviour.device,
         lambda _: f"{said}, {record.folder}",
         extra={**extra, **labelled},
-        adopt=adopted_policy(config, record, policy.steps),
+        adopt=policy_taken_over(config, record, policy.steps),
     )

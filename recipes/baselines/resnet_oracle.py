@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import cloned, open_device, open_run
+from playslot_rl.recipes.run import open_device, open_run
 
 if TYPE_CHECKING:
     from playslot_rl.data.demonstrations import Transitions
@@ -49,6 +49,7 @@ def _training(config: ExperimentConfig, record: StageRecord) -> Training:
     from playslot_rl.losses.behaviour import BehaviourLoss
     from playslot_rl.methods.oracles.resnet import NAME, ResNetPolicy, load_pretrained
     from playslot_rl.seeds.draws import global_seed
+    from playslot_rl.training.demonstrated import cloned
     from playslot_rl.training.fit import Part
     from playslot_rl.training.patience import Patience
     from playslot_rl.training.record import Training

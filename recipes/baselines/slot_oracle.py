@@ -10,19 +10,12 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.run import (
-    cloned,
-    demonstration_views,
-    open_device,
-    open_run,
-    parent_run,
-    require_parent,
-)
+from playslot_rl.recipes.run import open_device, open_run, parent_run, require_parent
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from playslot_rl.recipes.run import ParsedVideos
+    from playslot_rl.training.demonstrated import ParsedVideos
     from playslot_rl.training.record import StageRecord, Training
 
 
@@ -65,6 +58,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
     from playslot_rl.data.demonstrations import moving_slots, real_actions, require_finite, transitions
     from playslot_rl.modules.policy import LatentPolicy
     from playslot_rl.seeds.draws import global_seed
+    from playslot_rl.training.demonstrated import cloned, demonstration_views
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import Training
     from playslot_rl.training.runs import load_savi

@@ -14,7 +14,7 @@ from playslot_rl.data.camera_names import full_name, with_full_cameras
 from playslot_rl.data.source import open_source, open_sources
 from playslot_rl.datasets.survey import survey
 from playslot_rl.errors import DataError
-from playslot_rl.training.runs import store_config
+from playslot_rl.runs import Run
 
 TOP, SIDE = "observation.images.top", "observation.images.side"
 CAMERAS = [TOP, SIDE, "observation.depth.side", "observation.images.left.wrist", "observation.images.wrist"]
@@ -74,7 +74,7 @@ def test_all_readers_take_the_short_name_for_the_same_frames(two: Path, tmp_path
 @pytest.mark.parametrize("typed", ["side", "top,side", SIDE, "", "nowhere"])
 def test_a_run_stores_full_names(two: Path, tmp_path: Path, typed: str) -> None:
     config = compose(["preset=smoke", "env=video", f"data.root={two}", f"data.camera={typed}"])
-    store_config(config, tmp_path)
+    Run(tmp_path).store(config)
     stored = json.loads((tmp_path / "config.json").read_text())["data"]["camera"]
     assert stored == {"side": SIDE, "top,side": f"{TOP},{SIDE}"}.get(typed, typed)
     assert compose([f"run={tmp_path}"], "play").data.camera == stored

@@ -19,7 +19,7 @@ from playslot_rl.evaluation.card import Card, card_json, make_card
 from playslot_rl.evaluation.card_lines import MEASURES, NO_NUMBERS, Line, line
 from playslot_rl.evaluation.card_verdict import NEEDS, conclude, settle, worthless
 from playslot_rl.evaluation.latent_lines import _probe_lines
-from playslot_rl.training.runs import load_world_model
+from playslot_rl.runs import Run
 from playslot_rl.world_model import WorldModel
 
 PAGE = Path(__file__).parents[2] / "docs" / "inspect.md"
@@ -68,7 +68,7 @@ KINDS = (
 
 
 def card_of(damage: Callable[[WorldModel], None], name: str) -> Card:
-    model = copy.deepcopy(load_world_model(name, "cpu"))
+    model = copy.deepcopy(Run.open(name).load_world_model("cpu"))
     with torch.random.fork_rng(devices=[]), torch.no_grad():
         torch.manual_seed(0)
         damage(model)

@@ -22,8 +22,8 @@ from playslot_rl.evaluation.slots import (
     validation_scores,
 )
 from playslot_rl.modules.savi import SAVi
+from playslot_rl.runs import Run
 from playslot_rl.seeds.episodes import episode_seed
-from playslot_rl.training.runs import load_savi
 
 OBJECTS = {
     "button_press": {1: "arm", 2: "box"},
@@ -72,8 +72,8 @@ def test_slots_per_object_counts_those_with_a_share() -> None:
 @pytest.mark.integration
 def test_a_shipped_models_slots_are_scored_and_written(tmp_path: Path) -> None:
     config = compose(["env=block_push_easy", "preset=compact", "episodes=1"])
-    assert load_savi("pretrained/block_push_easy").config.n_slots == 5
-    result = evaluate_slots("pretrained/block_push_easy", tmp_path, config, torch.device("cpu"))
+    assert Run.open("pretrained/block_push_easy").load_savi().config.n_slots == 5
+    result = evaluate_slots(Run.open("pretrained/block_push_easy"), tmp_path, config, torch.device("cpu"))
     assert json.loads((tmp_path / RESULT).read_text()) == result
     assert result["foreground_ari"] > 0.4
     assert result["psnr"] > 22

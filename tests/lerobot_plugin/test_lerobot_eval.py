@@ -14,9 +14,9 @@ import pytest
 
 from playslot_rl.config.compose import compose
 from playslot_rl.evaluation.success import evaluate
+from playslot_rl.runs import Run
 from playslot_rl.sharing.run import export_run
 from playslot_rl.storage.atomic import write_json
-from playslot_rl.training.runs import load_agent
 
 pytestmark = pytest.mark.slow  # a process that imports all of LeRobot
 
@@ -48,8 +48,8 @@ def lerobot_eval(policy: Path, out: Path, *arguments: str) -> dict[str, Any]:
 @pytest.mark.parametrize("side_by_side", [1, 2])
 def test_lerobot_eval_measures_what_our_evaluation_measures(run: Path, tmp_path: Path, side_by_side: int) -> None:
     config = compose(["preset=compact", "evaluation.references=false", "device=cpu"])
-    ours = evaluate(load_agent(run), config, "simulation", 2, 0)
-    export_run(run, tmp_path / "policy", config)
+    ours = evaluate(Run.open(run).load_agent(), config, "simulation", 2, 0)
+    export_run(Run.open(run), tmp_path / "policy", config)
     info = lerobot_eval(
         tmp_path / "policy", tmp_path / "eval", "--eval.n_episodes=2", f"--eval.batch_size={side_by_side}",
         "--eval.use_async_envs=false", f"--seed={ours['seeds'][0]}",

@@ -29,7 +29,7 @@ from playslot_rl.play.session import PlaySession
 from playslot_rl.play.starts import RecordedStarts
 from playslot_rl.play.studio import Studio
 from playslot_rl.recipes import play
-from playslot_rl.training.runs import pretrained_folder
+from playslot_rl.runs import pretrained_folder
 from playslot_rl.world_model import Agent
 
 pytestmark = pytest.mark.integration

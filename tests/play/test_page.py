@@ -27,6 +27,7 @@ from playslot_rl.play.server import choose_port
 from playslot_rl.play.starts import RecordedStarts
 from playslot_rl.play.studio import Studio
 from playslot_rl.recipes import play
+from playslot_rl.runs import Run
 from playslot_rl.world_model import Agent
 
 pytestmark = pytest.mark.integration
@@ -187,11 +188,11 @@ def test_data_sets_of_a_run_may_be_gone_and_typed_ones_may_not(
 ) -> None:
     config = replace(ExperimentConfig(run=str(tmp_path)), data=DataConfig(root=f"{tmp_path}/elsewhere"))
     (tmp_path / "config.json").write_text(json.dumps(to_dict(config)))
-    assert play.recorded_starts(config, agent.world_model, None) is None
+    assert play.recorded_starts(config, Run(tmp_path), agent.world_model, None) is None
     assert "are not on this machine" in capsys.readouterr().out
     typed = replace(config, data=DataConfig(root=f"{tmp_path}/typo"))
     with pytest.raises(DataError, match="typo: got no data set, expected a LeRobot"):
-        play.recorded_starts(typed, agent.world_model, None)
+        play.recorded_starts(typed, Run(tmp_path), agent.world_model, None)
 
 
 def test_play_wants_a_run_and_a_data_set_that_is_there(tmp_path: Path) -> None:

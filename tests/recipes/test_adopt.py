@@ -19,7 +19,7 @@ from playslot_rl.recipes import adopt_trials
 from playslot_rl.recipes.adopt import clip_room, savi_for, start_for
 from playslot_rl.recipes.adopt_trials import SHORTEST, scheduled, steps_within, too_short
 from playslot_rl.recipes.play import open_studio
-from playslot_rl.training.runs import load_savi
+from playslot_rl.runs import Run
 from playslot_rl.training.stage_slots import warm_start
 
 pytestmark = pytest.mark.integration
@@ -179,7 +179,7 @@ def test_slots_start_from_a_model_that_takes_scenes_apart(capsys: pytest.Capture
     config = compose(["env=video", "preset=compact"])
     start = config.slots.start_from
     savi = SAVi(replace(config.model.savi, n_slots=4), config.env.image_size)
-    warm_start(savi, load_savi(start), start)  # refuses other sizes
+    warm_start(savi, Run.open(start).load_savi(), start)  # refuses other sizes
     assert (start_for(start, 64), start_for("", 128)) == (start, "")
     assert capsys.readouterr().out == ""
     assert start_for(start, 128) == ""

@@ -171,12 +171,12 @@ def test_a_parent_that_is_read_only_is_one_line(
     ("left", "ours"), [(".config.json.tmp-0", True), (".adopt.json.tmp-1", True), (".x.tmp-0", False)]
 )
 def test_what_a_kill_in_a_runs_first_file_left_is_nobody_elses(tmp_path: Path, left: str, ours: bool) -> None:
-    from playslot_rl.recipes.run import open_run
+    from playslot_rl.runs.opening import run_to_write
 
     (tmp_path / left).write_text("{")
     config = compose(["preset=smoke", f"out={tmp_path}"])
     if ours:
-        assert open_run(config) == tmp_path
+        assert run_to_write(config).folder == tmp_path
     else:
         with pytest.raises(OutputError, match="holds something else"):
-            open_run(config)
+            run_to_write(config)

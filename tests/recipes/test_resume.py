@@ -21,7 +21,7 @@ from playslot_rl import cli
 from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.errors import OutputError
-from playslot_rl.recipes.run import open_run
+from playslot_rl.runs.opening import run_to_write
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.locks import locked
 from playslot_rl.training import record
@@ -178,11 +178,11 @@ def test_a_kill_before_the_first_file_of_a_run_leaves_no_foreign_folder(tmp_path
         (out / method_stage(method)).mkdir(parents=True)
         for name in names:
             (out / method_stage(method) / name).touch()
-        assert open_run(compose([f"out={out}"])) == out
+        assert run_to_write(compose([f"out={out}"])).folder == out
         (out / method_stage(method) / "photo.png").touch()
         if method_stage(method) not in ("slots", "dynamics", "policy"):
             with pytest.raises(OutputError, match="got a folder that holds something else"):
-                open_run(compose([f"out={out}"]))
+                run_to_write(compose([f"out={out}"]))
 
 
 @pytest.mark.slow

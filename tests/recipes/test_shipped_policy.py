@@ -14,7 +14,7 @@ import playslot_rl
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes import evaluate
-from playslot_rl.training import runs
+from playslot_rl.runs import run as runs
 
 pytestmark = pytest.mark.integration
 

@@ -10,19 +10,19 @@ import pytest
 
 from playslot_rl.config.compose import compose
 from playslot_rl.recipes import evaluate, slots
-from playslot_rl.recipes.run import open_device
-from playslot_rl.training.runs import use_world_model
+from playslot_rl.runs import Run
+from playslot_rl.runtime.devices import open_device
 
 pytestmark = pytest.mark.integration
 
 
 def test_slots_are_scored_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    use_world_model(tmp_path, "pretrained/button_press")
+    Run(tmp_path).build_on(Run.open("pretrained/button_press"))
     config = compose(["preset=smoke", "protocol=slots", "episodes=2"], "evaluate")
-    assert open_device(config).type == "cpu"
+    assert open_device(config.device, config.threads).type == "cpu"
     evaluate.main(replace(config, run=str(tmp_path)))
     assert "FG-ARI 0." in capsys.readouterr().out
     stored = json.loads((tmp_path / "evaluation" / "slots" / "eval_info.json").read_text())
     assert (stored["protocol"], stored["episodes"], len(stored["seeds"])) == ("slots", 2, 2)
-    slots.main_if_needed(config, tmp_path)
+    slots.main_if_needed(config, Run(tmp_path))
     assert f"scored before, FG-ARI {stored['foreground_ari']:.2f}, skipped" in capsys.readouterr().out

@@ -21,8 +21,8 @@ from playslot_rl.methods.sold.actor import load_actor, prior_steps
 from playslot_rl.methods.sold.learner import SOLDLearner
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.recipes.baselines import online
+from playslot_rl.runs import Run
 from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
-from playslot_rl.training.runs import slots_checkpoint
 
 pytestmark = pytest.mark.integration
 
@@ -67,7 +67,7 @@ def trained(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_leaves_weights_parents_and_a_learning_curve(trained: Path, world: Path) -> None:
     meta = json.loads((trained / "sold" / "checkpoint" / "meta.json").read_text())
     assert meta["modules"] == ["actor", "critic", "dynamics", "reward"]
-    assert meta["parents"] == {"slots": slots_checkpoint(world).fingerprint}
+    assert meta["parents"] == {"slots": Run.open(world).stage("slots").fingerprint}
     assert json.loads((trained / "config.json").read_text())["method"] == "sold"
     curve = json.loads((trained / "sold" / "curve.json").read_text())
     # 48 agent steps of its own in two points, behind 30 of SAVi's data.
@@ -180,7 +180,7 @@ def test_another_frame_size_than_savis_is_refused(world: Path, tmp_path: Path) -
 
 
 def test_savis_data_are_counted_from_the_config_the_checkpoint_or_its_episodes(world: Path) -> None:
-    own, slots = compose(["preset=smoke"]).baselines.sold, slots_checkpoint(world)
+    own, slots = compose(["preset=smoke"]).baselines.sold, Run.open(world).stage("slots")
     assert prior_steps(own, slots) == 30
     assert prior_steps(compose(["preset=smoke", "baselines.sold.savi_steps=5"]).baselines.sold, slots) == 5
     del slots.meta["agent_steps"]

@@ -15,6 +15,7 @@ from commands import ONE_CORE, contents, playslot, refused
 
 from playslot_rl.config import to_dict
 from playslot_rl.config.compose import compose
+from playslot_rl.runs import Run
 from playslot_rl.sharing.commands import reproduce
 from playslot_rl.sharing.folder import read_config
 from playslot_rl.sharing.run import read_results, read_source
@@ -25,7 +26,7 @@ def evaluated(run: Path, protocol: str, **changes: Any) -> dict[str, Any]:
     """Store a result of this run's policy."""
     info = {
         "protocol": protocol, "episodes": 50, "seed": 0, "success_rate": 0.98, "ci95": [0.895, 0.996],
-        "mean_steps_to_success": 14.5, "fingerprints": read_source(run)["fingerprints"],
+        "mean_steps_to_success": 14.5, "fingerprints": read_source(Run.open(run))["fingerprints"],
         "references": {"random": {"success_rate": 0.0, "ci95": [0.0, 0.07]},
                        "slot_oracle": {"success_rate": None, "ci95": None}},
     } | changes  # fmt: skip
@@ -91,7 +92,7 @@ def test_the_card_names_no_folder_of_this_machine(run: Path, tmp_path: Path) -> 
 def test_results_of_an_older_policy_are_left_out(run: Path, tmp_path: Path) -> None:
     evaluated(run, "simulation", fingerprints={"policy": "0" * 16})
     evaluated(run, "imagination", success_rate=0.46, ci95=[0.33, 0.6])
-    assert [result.protocol for result in read_results(run, read_source(run))] == ["imagination"]
+    assert [result.protocol for result in read_results(Run.open(run), read_source(Run.open(run)))] == ["imagination"]
     card = exported(run, tmp_path / "press")
     assert "in imagination (open loop) | 46 % | 33 to 60 %" in card
     assert "98 %" not in card

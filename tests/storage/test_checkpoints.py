@@ -13,18 +13,11 @@ import torch
 
 from playslot_rl.config import to_dict
 from playslot_rl.errors import CheckpointError
+from playslot_rl.runs import Run
 from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
 from playslot_rl.storage.resume import first_difference
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors, weights_fingerprint
 from playslot_rl.testing import tiny_config
-from playslot_rl.training.runs import (
-    load_agent,
-    load_savi,
-    load_world_model,
-    run_folder,
-    use_world_model,
-    world_model_folder,
-)
 from playslot_rl.world_model import Agent, WorldModel
 
 
@@ -110,7 +103,7 @@ def test_weights_that_are_no_numbers_are_refused(value: float, tmp_path: Path) -
     save_tensors(folder / "weights.safetensors", tensors)
     edit(folder / "meta.json", fingerprint=weights_fingerprint(folder / "weights.safetensors"))
     with pytest.raises(CheckpointError, match=f"tensor {name} holds values that are NaN or infinite"):
-        load_savi(tmp_path / "run")
+        Run.open(tmp_path / "run").load_savi()
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +126,7 @@ def test_an_agent_comes_back_equal_and_frozen(tmp_path: Path, oracle: bool) -> N
     agent = write_run(tmp_path, oracle=oracle)
     torch.manual_seed(9)
     state = torch.get_rng_state()
-    loaded = load_agent(tmp_path)
+    loaded = Run.open(tmp_path).load_agent()
     assert torch.equal(torch.get_rng_state(), state)
     before, after = module_tensors({"agent": agent}), module_tensors({"agent": loaded})
     assert before.keys() == after.keys()
@@ -158,7 +151,7 @@ def test_saving_again_replaces_the_folder(run: Path) -> None:
     first = read_stage(checkpoint_folder(run, "slots"), "slots").fingerprint
     write_run(run, seed=1)
     assert read_stage(checkpoint_folder(run, "slots"), "slots").fingerprint != first
-    load_agent(run)
+    Run.open(run).load_agent()
     assert [path.name for path in (run / "slots").iterdir()] == ["checkpoint"]
 
 
@@ -168,7 +161,7 @@ def test_a_child_refuses_a_parent_it_was_not_trained_on(run: Path, tmp_path: Pat
         shutil.rmtree(checkpoint_folder(run, stage))
         shutil.copytree(checkpoint_folder(tmp_path / "other", stage), checkpoint_folder(run, stage))
         with pytest.raises(CheckpointError, match=r"was trained on \w+ [0-9a-f]{16}, got") as caught:
-            load_agent(run)
+            Run.open(run).load_agent()
         assert one_line(caught)
 
 
@@ -181,7 +174,7 @@ def test_a_damaged_file_is_refused(run: Path, name: str, fault: str) -> None:
     else:
         path.write_bytes(path.read_bytes()[:50] if fault == "truncated" else b"")
     with pytest.raises(CheckpointError) as caught:
-        load_savi(run)
+        Run.open(run).load_savi()
     assert one_line(caught)
     assert str(checkpoint_folder(run, "slots")) in str(caught.value)
 
@@ -207,7 +200,7 @@ def test_wrong_tensors_are_refused(run: Path, fault: str) -> None:
         "value": "was changed or damaged",
     }
     with pytest.raises(CheckpointError, match=expected[fault]) as caught:
-        load_world_model(run)
+        Run.open(run).load_world_model()
     assert one_line(caught)
 
 
@@ -216,17 +209,17 @@ def test_another_stage_or_format_is_refused(run: Path) -> None:
         read_stage(checkpoint_folder(run, "slots"), "dynamics")
     edit(checkpoint_folder(run, "slots") / "meta.json", format="other/9")
     with pytest.raises(CheckpointError, match="'other/9'"):
-        load_savi(run)
+        Run.open(run).load_savi()
 
 
 def test_a_missing_stage_names_the_command(run: Path, tmp_path: Path) -> None:
     shutil.rmtree(run / "policy")
     with pytest.raises(CheckpointError, match="playslot train-policy"):
-        load_agent(run)
+        Run.open(run).load_agent()
     with pytest.raises(CheckpointError, match="no such folder"):
-        load_agent(tmp_path / "nowhere")
+        Run.open(tmp_path / "nowhere").load_agent()
     with pytest.raises(CheckpointError, match="no such folder"):
-        run_folder("")
+        Run.open("")
 
 
 def test_a_changed_config_names_the_key(run: Path) -> None:
@@ -258,7 +251,7 @@ def test_a_policy_from_before_whitening_and_decoders_that_read_slots_loads(
             for name in (*names, *(key for key in list(model[part]) if key.startswith("state_"))):
                 del model[part][name]
         edit(path, model=model)
-    old, trained = load_agent(run), source_run[1].eval()
+    old, trained = Run.open(run).load_agent(), source_run[1].eval()
     slots = torch.randn(2, *trained.world_model.slot_shape)
     z = old.policy(slots)
     torch.testing.assert_close(z, trained.policy(slots))
@@ -268,18 +261,18 @@ def test_a_policy_from_before_whitening_and_decoders_that_read_slots_loads(
 def test_a_config_of_another_version_is_refused(run: Path) -> None:
     edit(checkpoint_folder(run, "slots") / "config.json", model={"savi": {"slot_dimension": 3}})
     with pytest.raises(CheckpointError, match="unknown key"):
-        load_savi(run)
+        Run.open(run).load_savi()
 
 
 def test_a_run_may_use_the_world_model_of_another(run: Path, tmp_path: Path) -> None:
     child = tmp_path / "child"
     shutil.copytree(run / "policy", child / "policy")
     with pytest.raises(CheckpointError, match="no slots checkpoint"):
-        load_agent(child)
-    use_world_model(child, run)
+        Run.open(child).load_agent()
+    Run(child).build_on(Run.open(run))
     assert json.loads((child / "world_model.json").read_text()) == {"source": "../run"}
-    assert world_model_folder(child).resolve() == run.resolve()
-    load_agent(child)
+    assert Run.open(child).world_run.folder.resolve() == run.resolve()
+    Run.open(child).load_agent()
     (child / "world_model.json").write_text("{}")
     with pytest.raises(CheckpointError, match='no "source"'):
-        load_agent(child)
+        Run.open(child).load_agent()

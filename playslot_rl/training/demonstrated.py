@@ -1,0 +1,78 @@
+"""What the stages that clone demonstrations share: their slots, and what is said of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.data.cache import Cache
+from playslot_rl.data.demonstrations import DemonstrationSplit
+from playslot_rl.data.views import shifted_copies
+from playslot_rl.data.slot_cache import slot_cache
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.modules.savi import SAVi
+from playslot_rl.runs import Run
+from playslot_rl.training.record import StageRecord
+from playslot_rl.world_model import module_device
+
+ParsedVideos = tuple[EpisodeFrames, npt.NDArray[np.float32]]
+
+
+def demonstration_views(
+    config: ExperimentConfig, demos: DemonstrationSplit, savi: SAVi, slots_print: str
+) -> tuple[list[ParsedVideos], list[ParsedVideos]]:
+    """Demonstrations and their shifted copies (`behaviour.shift`), each with the slots (F, N, D) of its frames, and the
+    held-out ones, none or one, likewise; cached on disk.
+
+    Args:
+        config: of the command.
+        demos: what is trained on, and what is held out.
+        savi: parses the frames, on its device.
+        slots_print: fingerprint of SAVi's checkpoint.
+    """
+
+    def parse(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
+        return slot_cache(
+            frames, savi, slots_print, Cache.of(config.data), module_device(savi), config.logging.progress
+        )
+
+    def copies(of: EpisodeFrames) -> Sequence[EpisodeFrames]:
+        return shifted_copies(of, config.behaviour.shift, config.behaviour.shifted_copies)
+
+    shifted_views = [(copy, parse(of)) for copy, of in zip(copies(demos.trained), copies(demos.parsed), strict=True)]
+    held_out = [] if demos.held_out is None else [(demos.held_out, parse(demos.held_out))]
+    return [(demos.trained, parse(demos.parsed)), *shifted_views], held_out
+
+
+def policy_taken_over(config: ExperimentConfig, record: StageRecord, steps: int) -> Callable[[], None] | None:
+    """Takes over the finished policy training of the run `behaviour.policy_from` names, if it is the same one."""
+    source = config.behaviour.policy_from
+    return partial(Run(record.run).take_training, source, record.name, steps) if source else None
+
+
+def cloned(
+    name: str, split: DemonstrationSplit, rows: int, labelled: int | None = None, views: int = 1
+) -> tuple[str, dict[str, Any]]:
+    """What a stage that clones demonstrations says of them: its closing line, less its folder, and for `meta.json`.
+
+    Args:
+        name: of the stage.
+        split: the demonstrations; those of one frame show nothing and are not counted.
+        rows: how many of their rows trimming left.
+        labelled: how many of them showed their actions; None: all.
+        views: shifted copies that were cloned with them, and they themselves.
+    """
+    demos, kept = int((split.trained.lengths >= 2).sum()), rows / (views * int((split.trained.lengths - 1).sum()))
+    shown = "all" if labelled is None else str(labelled)
+    held_out = "none" if split.held_out is None else str(split.held_out.episodes)
+    line = f"{name}: {demos} demos, {100 * kept:.0f} % of their rows kept, {shown} labelled, {held_out} held out"
+    return line, {
+        "demos": demos,
+        "labelled_demos": demos if labelled is None else labelled,
+        "kept_rows": round(kept, 4),
+    }
