@@ -12,9 +12,9 @@ import numpy.typing as npt
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.cache import Cache
 from playslot_rl.data.demonstrations import DemonstrationSplit
-from playslot_rl.data.views import shifted_copies
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.views import shifted_copies
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runs import Run
 from playslot_rl.training.record import StageRecord
