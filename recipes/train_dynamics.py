@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import ExperimentConfig
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import require_parent, run_to_write
 from playslot_rl.runtime.devices import open_device
@@ -30,6 +30,7 @@ def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
     """
     from playslot_rl.data.cache import Cache
     from playslot_rl.data.slot_cache import slot_cache
+    from playslot_rl.methods.playslot.method import DYNAMICS
     from playslot_rl.seeds.draws import global_seed
     from playslot_rl.storage.checkpoints import load_weights
     from playslot_rl.training.fit import Part
@@ -43,12 +44,11 @@ def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
     require_parent(config, run, slots, "image_size")
     model = replace(config.model, savi=slots.sizes[0].savi)
     record = StageRecord(
-        "dynamics",
+        DYNAMICS,
         run.folder,
         config,
-        stored={"env": to_dict(config.env), "model": to_dict(model), "dynamics": to_dict(config.dynamics)},
-        counts=("model.inverse_dynamics", "model.predictor"),
         parents={"slots": slots},
+        groups={"model": model},
         ready=partial(run.take, slots),
     )
 

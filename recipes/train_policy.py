@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from playslot_rl.config import BehaviourStageConfig, DynamicsStageConfig, ExperimentConfig, to_dict
+from playslot_rl.config import BehaviourStageConfig, DynamicsStageConfig, ExperimentConfig
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import require_parent, run_to_write
 from playslot_rl.runtime.devices import open_device
@@ -32,6 +32,7 @@ def main(config: ExperimentConfig) -> None:
         DataError: no demonstrations, none with actions, or fewer than `demos` or `behaviour.labelled_demos`.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
+    from playslot_rl.methods.playslot.method import POLICY
     from playslot_rl.training.record import StageRecord, run_stage
 
     run = run_to_write(config)
@@ -40,16 +41,12 @@ def main(config: ExperimentConfig) -> None:
     for checkpoint in parents.values():
         require_parent(config, run, checkpoint, "image_size", "action_dim")
     model, env = parent.world_config
-    sizes = to_dict(replace(model, **behaviour_networks(config)))
     record = StageRecord(
-        "policy",
+        POLICY,
         run.folder,
         config,
-        stored={"env": to_dict(env), "model": sizes, "policy": to_dict(replace(config.behaviour, policy_from=""))},
-        counts=("model.policy", "model.action_decoder"),
-        identity={"model": sizes},
         parents=parents,
-        role="demos",
+        groups={"env": env, "model": replace(model, **behaviour_networks(config))},
         ready=partial(run.build_on, parent),
     )
 
@@ -98,7 +95,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: Run) -> Tra
     def parts() -> Iterator[Part]:
         cloning = cloning_settings(behaviour)
         clone = CloneStage(agent.policy, agent.oracle, demos, cloning, held_out, horizon)
-        yield Part("policy", clone, cloning, lr_key="behaviour.optim.lr")
+        yield Part("policy", clone, cloning, group="behaviour")
         agent.eval()
         if agent.action_decoder.reads_slots:
             agent.action_decoder.trusts_slots.fill_(False)  # one demonstration cannot tell
@@ -129,5 +126,6 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: Run) -> Tra
 def _part(name: str, stage: Stage, behaviour: BehaviourStageConfig, steps: int, lr: float) -> Part:
     from playslot_rl.training.fit import Part
 
-    own = replace(behaviour, steps=steps, optim=replace(behaviour.optim, lr=lr))
-    return Part(name, stage, own, folder=name, lr_key=f"behaviour.{name.partition('_')[0]}_lr")
+    own, group = replace(behaviour, steps=steps, optim=replace(behaviour.optim, lr=lr)), name.partition("_")[0]
+    renamed = {"steps": f"behaviour.{group}_steps", "optim.lr": f"behaviour.{group}_lr"}
+    return Part(name, stage, own, folder=name, group="behaviour", renamed=renamed)

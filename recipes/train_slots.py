@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import ExperimentConfig
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import run_to_write
 from playslot_rl.runtime.devices import open_device
@@ -24,6 +24,7 @@ def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
         DataError, OutputError, CheckpointError, TrainingError: see `playslot_rl.errors`.
     """
     from playslot_rl.evaluation.slots import validation_scores
+    from playslot_rl.methods.playslot.method import SLOTS
     from playslot_rl.modules.savi import SAVi
     from playslot_rl.runtime.processes import here
     from playslot_rl.seeds.draws import global_seed
@@ -33,13 +34,7 @@ def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
     from playslot_rl.training.stage_slots import SlotsStage, warm_start
 
     own = config.slots
-    record = StageRecord(
-        "slots",
-        run_to_write(config).folder,
-        config,
-        stored={"env": to_dict(config.env), "model": to_dict(config.model), "slots": to_dict(own)},
-        counts=("env.image_size", "model.savi"),
-    )
+    record = StageRecord(SLOTS, run_to_write(config).folder, config)
 
     def prepare() -> Training:
         device, source = open_device(config.device, config.threads), record.data

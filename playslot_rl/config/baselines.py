@@ -21,6 +21,7 @@ from playslot_rl.config.roles import (
     at_least,
     between,
     role,
+    was,
     within,
 )
 from playslot_rl.config.stages import OptimConfig, StageConfig
@@ -51,7 +52,7 @@ class ResNetOracleConfig(StageConfig):
     )
     weights: str = "auto"
     shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
-    patience: int = field(default=0, metadata=at_least(0))
+    patience: int = field(default=0, metadata=was(0) | at_least(0))
 
 
 def _stage(steps: int, lr: float, schedule: Literal["cosine", "constant"]) -> StageConfig:
@@ -94,7 +95,7 @@ class LAPOConfig(Checked):
     dead_threshold: float = field(default=1.0, metadata=NOT_NEGATIVE)
     commitment: float = field(default=0.05, metadata=NOT_NEGATIVE)
     loss: Literal["l2", "l1"] = "l2"
-    targets: Literal["quantised", "continuous"] = "quantised"
+    targets: Literal["quantised", "continuous"] = field(default="quantised", metadata=was("quantised"))
     shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
     model: StageConfig = field(default_factory=lambda: _stage(200_000, 3e-4, "cosine"))
     policy: StageConfig = field(default_factory=lambda: _stage(20_000, 2e-4, "constant"))
@@ -181,11 +182,11 @@ class OnlineConfig(Checked):
     minutes: float = field(default=0.0, metadata=role("free") | at_least(0, largest=YEAR_MINUTES))
     prefill: int = field(default=1000, metadata=at_least(1))
     envs: int = field(default=1, metadata=at_least(1, largest=1024))
-    workers: int = field(default=0, metadata=at_least(0, largest=1024))
+    workers: int = field(default=0, metadata=was(0) | at_least(0, largest=1024))
     update_ratio: float = field(default=0.5, metadata=above_zero())
     batch_size: int = field(default=16, metadata=at_least(1))
     sequence: int = field(default=64, metadata=SEQUENCE)
-    reward_scale: float = field(default=1.0, metadata=above_zero())
+    reward_scale: float = field(default=1.0, metadata=was(1.0) | above_zero())
     capacity: int = field(default=1_000_000, metadata=at_least(1))
     replay_on_disk: bool = field(default=False, metadata=role("free"))
     evaluate_every: int = field(default=10_000, metadata=role("free") | at_least(1))
@@ -311,7 +312,7 @@ class SOLDConfig(OnlineConfig):
     actor_gradient: Literal["dynamics", "reinforce"] = "dynamics"
     return_rate: float = field(default=0.01, metadata=SHARE)
     critic_decay: float = field(default=0.98, metadata=SHARE)
-    actor_average: float = field(default=0.0, metadata=SHARE)
+    actor_average: float = field(default=0.0, metadata=was(0.0) | SHARE)
     slot_weight: float = field(default=1.0, metadata=NOT_NEGATIVE)
     image_weight: float = field(default=1.0, metadata=NOT_NEGATIVE)
     decoded_frames: int = field(default=0, metadata=NOT_NEGATIVE)

@@ -6,7 +6,17 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import COUNT, LAYERS, NOT_NEGATIVE, OPEN_FRACTION, Checked, at_least, below_one, between
+from playslot_rl.config.roles import (
+    COUNT,
+    LAYERS,
+    NOT_NEGATIVE,
+    OPEN_FRACTION,
+    Checked,
+    at_least,
+    below_one,
+    between,
+    was,
+)
 
 LatentMode = Literal["hybrid", "discrete", "continuous", "ground_truth", "none"]
 
@@ -132,7 +142,7 @@ class PredictorConfig(Checked):
     """
 
     group = "model.predictor."
-    kind: Literal["cocvp", "ocvp_seq", "slotformer"] = "cocvp"
+    kind: Literal["cocvp", "ocvp_seq", "slotformer"] = field(default="cocvp", metadata=was("cocvp"))
     dim: int = field(default=256, metadata=COUNT)
     layers: int = field(default=4, metadata=LAYERS)
     heads: int = field(default=8, metadata=COUNT)
@@ -140,7 +150,7 @@ class PredictorConfig(Checked):
     mlp_dim: int = field(default=1024, metadata=COUNT)
     residual: bool = False
     context: int = field(default=24, metadata=at_least(2, "at least 2 frames"))
-    project_out: bool = True
+    project_out: bool = field(default=True, metadata=was(True))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -168,7 +178,7 @@ class PolicyConfig(Checked):
     heads: int = field(default=4, metadata=COUNT)
     head_dim: int = field(default=64, metadata=COUNT)
     mlp_dim: int = field(default=1024, metadata=COUNT)
-    whiten: bool = False
+    whiten: bool = field(default=False, metadata=was(False))
 
 
 @dataclass(frozen=True)
@@ -186,12 +196,12 @@ class ActionDecoderConfig(Checked):
 
     group = "model.action_decoder."
     hidden_dim: int = field(default=128, metadata=at_least(1))
-    state_dim: int = field(default=64, metadata=at_least(1))
-    state_layers: int = field(default=2, metadata=LAYERS)
-    state_heads: int = field(default=4, metadata=at_least(1))
-    state_dropout: float = field(default=0.5, metadata=below_one("0 to below 1"))
-    whiten: bool = False
-    reads_slots: bool = False
+    state_dim: int = field(default=64, metadata=was(64) | at_least(1))
+    state_layers: int = field(default=2, metadata=was(2) | LAYERS)
+    state_heads: int = field(default=4, metadata=was(4) | at_least(1))
+    state_dropout: float = field(default=0.5, metadata=was(0.5) | below_one("0 to below 1"))
+    whiten: bool = field(default=False, metadata=was(False))
+    reads_slots: bool = field(default=False, metadata=was(False))
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, ClassVar, Final, Literal
 
 from playslot_rl.config.plain import check, to_dict, type_hints
@@ -152,13 +152,24 @@ def without(config: Any, unwanted: Role) -> dict[str, Any]:
     return values
 
 
-def fixed_keys(values: Mapping[str, Any]) -> dict[str, Any]:
-    """What a resumed or finished training must share with these nested plain values: all keys that are not `free`."""
-    from playslot_rl.config.experiment import ExperimentConfig
+def was(value: Any) -> dict[str, Any]:
+    """Metadata of a field that came after the first checkpoints, and what those were trained with."""
+    return {"was": value}
 
-    free = {key.rpartition(".")[2] for key in keys_of(ExperimentConfig, "free")}
-    return {
-        key: fixed_keys(value) if isinstance(value, Mapping) else value
-        for key, value in values.items()
-        if key not in free
-    }
+
+@functools.cache
+def earlier(cls: type) -> dict[str, Any]:
+    """What checkpoints that do not name a key were trained with, by the dotted names of a config class's keys."""
+    hints, found = type_hints(cls), dict[str, Any]()
+    for field in dataclasses.fields(cls):
+        if "was" in field.metadata:
+            found[field.name] = field.metadata["was"]
+        elif dataclasses.is_dataclass(hints[field.name]):
+            found.update({f"{field.name}.{key}": value for key, value in earlier(hints[field.name]).items()})
+    return found
+
+
+def by_default[Config](config: Config, unwanted: Role) -> Config:
+    """A config whose keys of a role have their defaults again; those of groups inside it stay."""
+    names = [field for field in dataclasses.fields(config) if unwanted in field.metadata.get("roles", ())]  # type: ignore[arg-type]
+    return dataclasses.replace(config, **{field.name: field.default for field in names})  # type: ignore[type-var]

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import fields
-from typing import Any, Final
+from typing import Any
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.config.baselines import BaselinesConfig
 from playslot_rl.config.compose import CONTINUES, compose, is_pretrained, quoted
 from playslot_rl.config.plain import flatten
 from playslot_rl.errors import ConfigError
-
-_DECODER: Final[Mapping[str, str]] = {"steps": "decoder_steps", "optim.lr": "decoder_lr"}
 
 
 def spelled(config: ExperimentConfig, command: str) -> list[str]:
@@ -48,26 +43,3 @@ def _text(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ",".join(quoted(part) if isinstance(part, str) else _text(part) for part in value) + "]"
     return str(value)
-
-
-def typed_key(key: str) -> str:
-    """A dotted key of a stage's settings, as checkpoints store them, by the name under which it is typed.
-
-    Examples:
-        >>> [typed_key(key) for key in ("svg.steps", "policy.loss", "decoder.optim.lr", "lapo.action_decoder.steps")]
-        ['baselines.svg.steps', 'behaviour.loss', 'behaviour.decoder_lr', 'baselines.lapo.decoder_steps']
-        >>> typed_key("model.savi.dim")
-        'model.savi.dim'
-    """
-    method, decodes, setting = key.partition(".action_decoder.")
-    if decodes:  # of a baseline's policy, but for what it has of its own
-        key = f"{method}.{_DECODER.get(setting, f'policy.{setting}')}"
-    stage, dot, rest = key.partition(".")
-    if stage in ("decoder", "finetune"):
-        own = _DECODER.get(rest, "").removeprefix("decoder")
-        return f"behaviour.{stage}{own}" if own else f"behaviour.{rest}"
-    if dot and stage in ("policy", "slot_oracle"):
-        return f"behaviour.{rest}"
-    if dot and stage in {field.name for field in fields(BaselinesConfig)}:
-        return f"baselines.{key}"
-    return key

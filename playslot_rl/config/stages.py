@@ -3,11 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import COUNT, NOT_NEGATIVE, RATE, Checked, above_zero, at_least, below_one, between, role
+from playslot_rl.config.roles import (
+    COUNT,
+    NOT_NEGATIVE,
+    RATE,
+    Checked,
+    above_zero,
+    at_least,
+    below_one,
+    between,
+    role,
+    was,
+)
 from playslot_rl.runtime.precision import Precision as Precision
+
+AFTER_CLONING: Final = (
+    "labelled_demos", "decoder_inputs", "decoder_state", "decoder_steps", "decoder_lr", "finetune_steps",
+    "finetune_labels", "finetune_lr", "policy_from",
+)  # fmt: skip
+"""Settings of the behaviour stage for what comes after the policy."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +49,7 @@ class OptimConfig(Checked):
     schedule: Literal["cosine", "constant"] = "cosine"
     grad_clip: float = field(default=0.05, metadata=NOT_NEGATIVE)
     accumulate: int = field(default=1, metadata=role("free") | at_least(1))
-    ema: float = field(default=0.0, metadata=below_one("0 (none) to below 1"))
+    ema: float = field(default=0.0, metadata=was(0.0) | below_one("0 (none) to below 1"))
 
 
 @dataclass(frozen=True)
@@ -80,10 +97,10 @@ class SlotsStageConfig(StageConfig):
     group = "slots."
     clip_frames: int = field(default=8, metadata=COUNT)
     start_from: str = field(default="", metadata=role("folder"))
-    motion_weight: float = field(default=0.0, metadata=at_least(0, "0 (all pixels alike) or more"))
-    zoom_steps: int = field(default=0, metadata=at_least(0, "0 (none) or more"))
-    zoom: float = field(default=2.0, metadata=between(1, 8, "1 (as they are) to 8 times"))
-    patience: int = field(default=0, metadata=at_least(0, "0 (train all steps) or more"))
+    motion_weight: float = field(default=0.0, metadata=was(0.0) | at_least(0, "0 (all pixels alike) or more"))
+    zoom_steps: int = field(default=0, metadata=was(0) | at_least(0, "0 (none) or more"))
+    zoom: float = field(default=2.0, metadata=was(2.0) | between(1, 8, "1 (as they are) to 8 times"))
+    patience: int = field(default=0, metadata=was(0) | at_least(0, "0 (train all steps) or more"))
     segmented_episodes: int = field(default=4, metadata=role("free") | at_least(0, "0 (no FG-ARI) or more", 1000))
 
 
@@ -110,7 +127,7 @@ class DynamicsStageConfig(StageConfig):
     image_weight: float = field(default=1.0, metadata=NOT_NEGATIVE)
     slot_weight: float = field(default=1.0, metadata=NOT_NEGATIVE)
     vq_weight: float = field(default=0.25, metadata=NOT_NEGATIVE)
-    patience: int = field(default=0, metadata=at_least(0, "0 (train all steps) or more"))
+    patience: int = field(default=0, metadata=was(0) | at_least(0, "0 (train all steps) or more"))
 
 
 @dataclass(frozen=True)
@@ -152,23 +169,23 @@ class BehaviourStageConfig(StageConfig):
 
     group = "behaviour."
     labelled_demos: int = field(default=50, metadata=at_least(1))
-    parsed: bool = True
+    parsed: bool = field(default=True, metadata=was(True))
     imagined: bool = True
     loss: Literal["l2", "l1"] = "l2"
     slot_noise: float = field(default=0.0, metadata=at_least(0, "0 (none) or more"))
     shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
     shifted_copies: int = field(default=8, metadata=between(1, 8, "1 to 8"))
-    trim: float = field(default=0.0, metadata=at_least(0, "0 (keep all) or more"))
-    trim_pixels: float = field(default=0.0, metadata=between(0, 1, "0 (keep all) to 1"))
-    trim_margin: int = field(default=2, metadata=at_least(0, "0 or more"))
-    whiten: bool = False
+    trim: float = field(default=0.0, metadata=was(0.0) | at_least(0, "0 (keep all) or more"))
+    trim_pixels: float = field(default=0.0, metadata=was(0.0) | between(0, 1, "0 (keep all) to 1"))
+    trim_margin: int = field(default=2, metadata=was(2) | at_least(0, "0 or more"))
+    whiten: bool = field(default=False, metadata=was(False))
     decoder_inputs: Literal["inverse_dynamics", "policy", "both"] = "inverse_dynamics"
-    decoder_state: bool = False
+    decoder_state: bool = field(default=False, metadata=was(False))
     decoder_steps: int = field(default=2000, metadata=at_least(1))
     decoder_lr: float = field(default=2e-4, metadata=above_zero(largest=1e40))
-    finetune_steps: int = field(default=0, metadata=at_least(0, "0 (none) or more"))
-    finetune_labels: int = field(default=10, metadata=at_least(1))
-    finetune_lr: float = field(default=2e-4, metadata=above_zero(largest=1e40))
+    finetune_steps: int = field(default=0, metadata=was(0) | at_least(0, "0 (none) or more"))
+    finetune_labels: int = field(default=10, metadata=was(10) | at_least(1))
+    finetune_lr: float = field(default=2e-4, metadata=was(2e-4) | above_zero(largest=1e40))
     policy_from: str = field(default="", metadata=role("machine", "folder"))
     oracle: bool = True
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 from playslot_rl.config.model import PredictorConfig
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import COUNT, LAYERS, NOT_NEGATIVE, OPEN_FRACTION, above_zero, at_least, role
+from playslot_rl.config.roles import COUNT, LAYERS, NOT_NEGATIVE, OPEN_FRACTION, above_zero, at_least, role, was
 from playslot_rl.config.stages import DynamicsStageConfig, OptimConfig, StageConfig
 
 
@@ -127,7 +127,7 @@ class SlotFormerSizes(PredictorConfig):
     head_dim: int = field(default=32, metadata=COUNT)
     residual: bool = True
     context: int = field(default=6, metadata=at_least(2, "at least 2 frames"))
-    project_out: bool = False
+    project_out: bool = field(default=False, metadata=was(True))
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class OCVPSeqSizes(PredictorConfig):
     head_dim: int = field(default=32, metadata=COUNT)
     mlp_dim: int = field(default=512, metadata=COUNT)
     residual: bool = True
-    project_out: bool = False
+    project_out: bool = field(default=False, metadata=was(True))
 
 
 @dataclass(frozen=True)

@@ -232,14 +232,19 @@ def require_parents(child: StageCheckpoint, parents: Mapping[str, StageCheckpoin
             )
 
 
-def require_config(checkpoint: StageCheckpoint, wanted: Mapping[str, Any]) -> None:
+def require_config(checkpoint: StageCheckpoint, wanted: Mapping[str, Any], typed: Callable[[str], str] = str) -> None:
     """Check that the parts of a config in `wanted`, such as `{"model": {"savi": ...}}`, are those of a checkpoint.
+
+    Args:
+        checkpoint: a finished stage.
+        wanted: nested as in its config.
+        typed: see `first_difference`.
 
     Raises:
         CheckpointError: names the first key that differs.
     """
     stored, keys = flatten(checkpoint.config), flatten(wanted).keys()
-    difference = first_difference({key: stored[key] for key in stored.keys() & keys}, wanted)
+    difference = first_difference({key: stored[key] for key in stored.keys() & keys}, wanted, typed)
     if difference is not None:
         key, old, new = difference
         raise CheckpointError(

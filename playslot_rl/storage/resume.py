@@ -11,16 +11,17 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.plain import flatten
-from playslot_rl.config.spelling import typed_key
+from playslot_rl.config.roles import earlier
 from playslot_rl.errors import CheckpointError, OutputError
 from playslot_rl.storage.atomic import read_json, write_json
 from playslot_rl.storage.folders import new_folder, remove_leftovers
@@ -53,49 +54,25 @@ class TrainingState:
     planned: int = 0
 
 
-ADDED: Final[Mapping[str, Any]] = {
-    "reward_scale": 1.0,
-    "actor_average": 0.0,
-    "workers": 0,
-    "kind": "cocvp",
-    "targets": "quantised",
-    "trim": 0.0,
-    "trim_pixels": 0.0,
-    "trim_margin": 2,
-    "whiten": False,
-    "decoder_state": False,
-    "finetune_steps": 0,
-    "finetune_labels": 10,
-    "finetune_lr": 2e-4,
-    "state_dim": 64,
-    "state_layers": 2,
-    "state_heads": 4,
-    "state_dropout": 0.5,
-    "reads_slots": False,
-    "patience": 0,
-    "project_out": True,
-    "ema": 0.0,
-    "motion_weight": 0.0,
-    "zoom_steps": 0,
-    "zoom": 2.0,
-    "parsed": True,
-}
-"""Settings that came after the first checkpoints, and what those were trained with."""
+def first_difference(
+    stored: Mapping[str, Any], wanted: Mapping[str, Any], typed: Callable[[str], str] = str
+) -> tuple[str, Any, Any] | None:
+    """The first dotted key at which two nested configs differ: (key as it is typed, stored value, wanted value).
 
+    A wanted precision of `auto` is equal to any that was stored. A key that came after what is stored counts as what
+    was computed without it (`playslot_rl.config.roles.was`).
 
-def first_difference(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> tuple[str, Any, Any] | None:
-    """The first dotted key at which two nested configs differ: (key, stored value, wanted value).
-
-    A wanted precision of `auto` is equal to any that was stored.
+    Args:
+        stored, wanted: what is compared.
+        typed: from a key as it is stored to the full name under which it is typed.
     """
-    right = flatten(wanted)
-    added = {key: ADDED[name] for key in right if (name := key.rpartition(".")[-1]) in ADDED}
-    left = {**added, **flatten(stored)}
+    right, known = flatten(wanted), earlier(ExperimentConfig)
+    left = {**{key: known[typed(key)] for key in right if typed(key) in known}, **flatten(stored)}
     for key in sorted(left.keys() | right.keys()):
         if key.rpartition(".")[-1] == "precision" and right.get(key) == "auto":
             continue  # whatever this processor is good at: a run goes on on another one
         if left.get(key, _ABSENT) != right.get(key, _ABSENT):
-            return typed_key(key), left.get(key, _ABSENT), right.get(key, _ABSENT)
+            return typed(key), left.get(key, _ABSENT), right.get(key, _ABSENT)
     return None
 
 
@@ -105,10 +82,11 @@ class TrainingCheckpoints:
     Args:
         folder: where the `step_XXXXXXXX` folders live.
         identity: nested plain values that must be equal for a resumed run to be the same run.
+        typed: from a key of the identity to the full name under which it is typed, for messages.
     """
 
-    def __init__(self, folder: Path, identity: Mapping[str, Any]) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, identity: Mapping[str, Any], typed: Callable[[str], str] = str) -> None:
+        self.folder, self.typed = folder, typed
         self.identity: dict[str, Any] = json.loads(json.dumps(identity))
 
     def saved(self) -> list[Path]:
@@ -200,7 +178,7 @@ class TrainingCheckpoints:
         missing = {"format", "step", "seconds", "metrics", "identity"} - stored.keys()
         if missing:
             raise CheckpointError(f"{path} is damaged (no {', '.join(sorted(missing))}): {cure}")
-        difference = first_difference(stored["identity"], self.identity)
+        difference = first_difference(stored["identity"], self.identity, self.typed)
         if difference is not None:
             key, old, new = difference
             raise CheckpointError(

@@ -18,8 +18,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.config import LoggingConfig, OptimConfig, StageConfig, to_dict
-from playslot_rl.config.roles import fixed_keys
+from playslot_rl.config import LoggingConfig, OptimConfig, StageConfig
+from playslot_rl.config.roles import without
 from playslot_rl.errors import CheckpointError
 from playslot_rl.runtime.processes import agreed, here, spreading, wait
 from playslot_rl.runtime.progress import StageProgress
@@ -43,7 +43,8 @@ class Part:
         stage: modules, already on their device, with their loss.
         config: steps, optimiser, intervals.
         folder: below the stage's own; empty is that one.
-        lr_key: config key of the learning rate, for messages; empty means `NAME.optim.lr`.
+        group: dotted name of its config, for messages; `NAME` if empty.
+        renamed: of that config the keys that are typed by another full name.
         identity: further plain values that a resumed one must share.
         patience: ends the training before `config.steps`, with the weights of the best validation; None does not.
         pace: changes `config.steps` as the clock says; None does not.
@@ -53,15 +54,15 @@ class Part:
     stage: Stage
     config: StageConfig
     folder: str = ""
-    lr_key: str = ""
+    group: str = ""
+    renamed: Mapping[str, str] = field(default_factory=dict)
     identity: Mapping[str, Any] = field(default_factory=dict)
     patience: Patience | None = None
     pace: Pace | None = None
 
-    @property
-    def key(self) -> str:
-        """Dotted config group, for messages."""
-        return self.lr_key.rpartition(".optim.")[0] or self.lr_key.partition(".")[0] or self.name
+    def typed(self, key: str) -> str:
+        """The full name under which a key of `config` is typed."""
+        return self.renamed.get(key, f"{self.group or self.name}.{key}")
 
 
 def fit(
@@ -72,6 +73,7 @@ def fit(
     device: torch.device | str = "cpu",
     logging: LoggingConfig | None = None,
     identity: Mapping[str, Any] | None = None,
+    typed: Callable[[str], str] = str,
     ready: Callable[[], None] | None = None,
 ) -> tuple[TrainingState, int]:
     """Train to `part.config.steps` or the end of patience, carrying on from the newest checkpoint if there is one.
@@ -86,6 +88,7 @@ def fit(
         device: device of the generators.
         logging: backend and progress bar; None logs to `metrics.jsonl` only, silently.
         identity: further plain values a resumed run must share (model config, data and parent fingerprints).
+        typed: from a key of these to the full name under which it is typed.
         ready: called once, before the first step, when a stage begun before was found to be the same.
 
     Returns:
@@ -100,7 +103,7 @@ def fit(
     """
     silent = LoggingConfig(backend="none", progress=False)
     logging, config = (logging or silent) if here().first else silent, part.config
-    run = _Run(part, folder / part.folder, seed, device, identity or {})
+    run = _Run(part, folder / part.folder, seed, device, identity or {}, typed)
     start = run.state.step
     if here().first:
         if ready is not None:
@@ -122,20 +125,31 @@ class _Run:
     """One process's part of a stage: the pieces `fit` moves from step to step."""
 
     def __init__(
-        self, part: Part, folder: Path, seed: int, device: torch.device | str, identity: Mapping[str, Any]
+        self,
+        part: Part,
+        folder: Path,
+        seed: int,
+        device: torch.device | str,
+        identity: Mapping[str, Any],
+        typed: Callable[[str], str],
     ) -> None:
         self.part, self.stage, self.config, self.seed, self.device = part, part.stage, part.config, seed, device
         self.folder, self.patience = folder, part.patience
         self.parameters = trainable_parameters(part.stage.modules)
-        self.batches = GlobalBatches(part.stage, part.config, self.parameters, part.key)
+        self.batches = GlobalBatches(part.stage, part.config, self.parameters, part.group or part.name)
         self.optimizer = build_adam(self.parameters, part.config.optim)
         ema = part.config.optim.ema
         self.average = WeightAverage(self.parameters, ema) if ema else None
-        own = {part.name: fixed_keys(to_dict(part.config)), "seed": seed}
+        own = {part.name: without(part.config, "free"), "seed": seed}
         if part.patience is not None:  # when it looks decides where it ends
             own["validate_every"] = part.config.validate_every
-        self.checkpoints = TrainingCheckpoints(folder / "checkpoints", {**own, **identity, **part.identity})
-        cure = f"lower {part.lr_key or f'{part.name}.optim.lr'} or check the data"
+        begins = f"{part.name}."
+        self.checkpoints = TrainingCheckpoints(
+            folder / "checkpoints",
+            {**own, **identity, **part.identity},
+            lambda key: part.typed(key.removeprefix(begins)) if key.startswith(begins) else typed(key),
+        )
+        cure = f"lower {part.typed('optim.lr')} or check the data"
         self.watch = Watch(part.name, folder, self.checkpoints, cure)
         self.state = self.checkpoints.resume(part.stage.modules, self.optimizer, self.parameters, self._averaged)
         self._began = time.monotonic() - self.state.seconds
@@ -178,7 +192,7 @@ class _Run:
         if not self.config.compile:
             yield
             return
-        compile_parts(self.stage.modules, f"{self.part.key}.compile")
+        compile_parts(self.stage.modules, self.part.typed("compile"))
         try:
             yield
         finally:

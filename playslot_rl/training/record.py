@@ -6,14 +6,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import torch
 from torch import nn
 
-from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.roles import fixed_keys
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config.roles import by_default, without
+from playslot_rl.config.stage_spec import StageSpec, group_of
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.action_limits import ActionLimits, said, scaled
 from playslot_rl.data.demonstrations import DemonstrationSplit, split_demonstrations, transitions
@@ -40,6 +42,9 @@ from playslot_rl.storage.checkpoints import (
 from playslot_rl.storage.locks import locked
 from playslot_rl.training.fit import Part, fit
 
+_ROLES: Final[Mapping[str, Literal["train", "demos", ""]]] = {
+    "videos": "train", "demos": "demos", "labelled": "demos", "": "",
+}  # fmt: skip
 PATIENCE: Final = 10.0
 """Seconds in which the children of a killed training end."""
 
@@ -69,33 +74,38 @@ def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrame
 
 @dataclass(frozen=True)
 class StageRecord:
-    """What makes a stage this one and no other.
+    """A stage that a command trains: what it is, and of which config, data and parents.
 
     Attributes:
-        name: the stage; its folder in the run is called so.
+        spec: what identifies it.
         run: the run folder.
         config: of the command.
-        stored: the checkpoint's config, nested plain values: `env` and whatever else the stage depends on.
-        counts: dotted keys of `stored` that a finished and a half-finished stage must share.
-        settings: further ones that a finished stage must share (a half-finished one compares its `Part`s' configs);
-            those of `NAME` if None.
-        identity: further plain values that a half-finished stage must share.
         parents: checkpoints it is trained on, by stage.
-        role: of the data set, in the checkpoint, too: videos (`train`) or demonstrations (`demos`); empty for what
-            learns by acting.
+        groups: groups of the config that are the parents' instead of the command's.
         ready: called before the first step; puts what the stage builds on into the run.
     """
 
-    name: str
+    spec: StageSpec
     run: Path
     config: ExperimentConfig
-    stored: Mapping[str, Any]
-    counts: tuple[str, ...] = ()
-    settings: tuple[str, ...] | None = None
-    identity: Mapping[str, Any] = field(default_factory=dict)
     parents: Mapping[str, StageCheckpoint] = field(default_factory=dict)
-    role: Literal["train", "demos", ""] = "train"
+    groups: Mapping[str, Any] = field(default_factory=dict)
     ready: Callable[[], None] = lambda: None
+
+    @property
+    def name(self) -> str:
+        """The stage; its folder in the run is called so."""
+        return self.spec.name
+
+    @property
+    def role(self) -> Literal["train", "demos", ""]:
+        """Of the data set, in the checkpoint, too: videos (`train`) or demonstrations (`demos`)."""
+        return _ROLES[self.spec.data]
+
+    @cached_property
+    def stored(self) -> dict[str, Any]:
+        """The checkpoint's config, nested plain values."""
+        return {self.spec.stored_name(group): to_dict(self._group(group)) for group in self.spec.groups}
 
     @property
     def folder(self) -> Path:
@@ -172,7 +182,7 @@ class StageRecord:
             return None
         done = read_stage(path, self.name)
         require_parents(done, self.parents)
-        require_config(done, self.finishes())
+        require_config(done, self.finishes(), self.spec.typed)
         facts: list[tuple[str, object, object]] = [("seed", self.config.seed, done.meta.get("seed", self.config.seed))]
         if self.role and self.roots:  # a finished stage can be asked for without
             facts.append(("data", self.data.fingerprint, next(iter(done.meta["data"].values()), "none")))
@@ -187,11 +197,16 @@ class StageRecord:
 
     def finishes(self) -> dict[str, Any]:
         """Parts of `stored`, nested as there, that a finished stage must share."""
-        own = (self.name,) if self.settings is None else self.settings
-        return fixed_keys(self._of_stored(*self.counts, *own))
+        picked: dict[str, Any] = {}
+        for key in (*self.spec.keys, *self.spec.settings):
+            put(picked, self.spec.stored_name(key), self._value(key, free=False))
+        return picked
 
     def resumes(self) -> dict[str, Any]:
         """Plain values that a half-finished stage must share, beside its settings and the seed."""
+        picked: dict[str, Any] = {}
+        for key in (*self.spec.keys, *self.spec.begun):
+            put(picked, self.spec.stored_name(key, begun=True), self._value(key))
         data: dict[str, Any] = {"data": self.data.fingerprint} if self.role else {}
         if self.role == "demos" and scaled(self.actions):
             data["actions"] = said(self.actions)
@@ -199,7 +214,21 @@ class StageRecord:
             data["data.validation"] = self.config.data.validation
             if self.config.data.stream:  # other windows than from the cache
                 data["data.shuffle_buffer"] = self.config.data.shuffle_buffer
-        return {**self._of_stored(*self.counts), **data, **self.prints, **self.identity}
+        return {**picked, **data, **self.prints}
+
+    def _group(self, name: str) -> Any:
+        """A group of the config as the stage is trained with it, less what only says where a job is made."""
+        group = self.groups[name] if name in self.groups else attrgetter(name)(self.config)
+        return by_default(group, "machine")
+
+    def _value(self, key: str, free: bool = True) -> Any:
+        """A key or group of the config, plain; without those keys that may differ unless `free`."""
+        owner = group_of(key)
+        config = self._group(owner)
+        value: Any = to_dict(config) if free else without(config, "free")
+        for name in key.removeprefix(owner).split(".")[1:]:
+            value = value[name]
+        return value
 
     @contextmanager
     def training(self) -> Iterator[Callable[[], None]]:
@@ -277,17 +306,13 @@ class StageRecord:
         several = "," in self.config.data.camera
         return {"fps": self.data.fps} | ({} if several else {"camera": self.data.camera})
 
-    def _of_stored(self, *keys: str) -> dict[str, Any]:
-        """The parts of `stored` that dotted keys name, nested as there."""
-        picked: dict[str, Any] = {}
-        for key in keys:
-            *parents, last = key.split(".")
-            source: Any = self.stored
-            target = picked
-            for parent in parents:
-                source, target = source[parent], target.setdefault(parent, {})
-            target[last] = source[last]
-        return picked
+
+def put(values: dict[str, Any], key: str, value: Any) -> None:
+    """Set a dotted key of nested dicts."""
+    *groups, last = key.split(".")
+    for group in groups:
+        values = values.setdefault(group, {})
+    values[last] = value
 
 
 @dataclass(frozen=True)
@@ -356,6 +381,7 @@ def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -
             device=training.device,
             logging=record.config.logging,
             identity={**record.resumes(), **training.identity},
+            typed=record.spec.typed,
             ready=begin,
         )
         prefix = f"{part.folder}_" if part.folder else ""

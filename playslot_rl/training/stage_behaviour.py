@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.config import BehaviourStageConfig
+from playslot_rl.config.stages import AFTER_CLONING
 from playslot_rl.data.demonstrations import Demonstrations
 from playslot_rl.errors import DataError
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
@@ -41,12 +42,6 @@ PAYS: Final = 0.85
 Acting leaves the demonstrations' states, where what few labels have taught about slots does harm: on easy BlockPush
 0.93 (25 labels) costs eight points of success, 0.78 (100 labels) brings four (docs/trials.md).
 """
-
-AFTER_CLONING: Final = (
-    "labelled_demos", "decoder_inputs", "decoder_state", "decoder_steps", "decoder_lr", "finetune_steps",
-    "finetune_labels", "finetune_lr", "policy_from",
-)  # fmt: skip
-"""Settings of what comes after the policy."""
 
 
 def cloning_settings(config: BehaviourStageConfig) -> BehaviourStageConfig:

@@ -12,8 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.baselines.cloning import BEHAVIOUR, cloning, model_of
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.recipes.baselines.cloning import cloning, model_of
 from playslot_rl.recipes.run import open_device, open_run
 
 if TYPE_CHECKING:
@@ -29,13 +29,16 @@ def main(config: ExperimentConfig) -> None:
         DataError: no videos, too few demonstrations, or none with actions.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
+    from playslot_rl.methods.caddy import method
     from playslot_rl.methods.caddy.load import MODEL, POLICY
     from playslot_rl.storage.checkpoints import StageCheckpoint
-    from playslot_rl.training.record import run_stage
+    from playslot_rl.training.record import StageRecord, run_stage
+    from playslot_rl.training.runs import adopt_stage
 
     run, parents = open_run(config), dict[str, StageCheckpoint]()
     acts = config.method == POLICY
-    record = _policy_record(config, run, parents) if acts else _oracle_record(config, run, parents)
+    spec = method.POLICY if acts else method.ORACLE
+    record = StageRecord(spec, run, config, parents, ready=lambda: adopt_stage(parents[MODEL], run))
     record.data.require_actions(config.env.action_dim)
     labelled = config.behaviour.labelled_demos if acts else None
     world = config.baselines.caddy_policy.world if acts else config.baselines.caddy_oracle.world
@@ -53,54 +56,6 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
     from playslot_rl.recipes.baselines import video
 
     return video.train(replace(config, method=MODEL, out=str(run), run=""))
-
-
-def _policy_record(config: ExperimentConfig, run: Path, parents: dict[str, StageCheckpoint]) -> StageRecord:
-    from playslot_rl.methods.caddy.load import MODEL, POLICY
-    from playslot_rl.training.record import StageRecord
-    from playslot_rl.training.runs import adopt_stage
-
-    own = config.baselines.caddy_policy
-    trim = {key: getattr(config.behaviour, key) for key in ("trim_pixels", "trim_margin")}
-    return StageRecord(
-        POLICY,
-        run,
-        config,
-        stored={
-            "env": to_dict(config.env),
-            "model": to_dict(config.model),
-            "behaviour": to_dict(replace(config.behaviour, policy_from="")),
-            POLICY: to_dict(replace(own, world="")),
-        },
-        counts=("model.action_decoder", "behaviour.loss"),
-        settings=(*(f"behaviour.{key}" for key in BEHAVIOUR), POLICY),
-        identity={"shift": own.shift, **trim},
-        parents=parents,
-        role="demos",
-        ready=lambda: adopt_stage(parents[MODEL], run),
-    )
-
-
-def _oracle_record(config: ExperimentConfig, run: Path, parents: dict[str, StageCheckpoint]) -> StageRecord:
-    from playslot_rl.methods.caddy.load import MODEL, ORACLE
-    from playslot_rl.training.record import StageRecord
-    from playslot_rl.training.runs import adopt_stage
-
-    own = config.baselines.caddy_oracle
-    return StageRecord(
-        ORACLE,
-        run,
-        config,
-        stored={
-            "env": to_dict(config.env),
-            "behaviour": to_dict(config.behaviour),
-            ORACLE: to_dict(replace(own, world="")),
-        },
-        counts=("behaviour.loss", "behaviour.trim_pixels", "behaviour.trim_margin", f"{ORACLE}.shift"),
-        parents=parents,
-        role="demos",
-        ready=lambda: adopt_stage(parents[MODEL], run),
-    )
 
 
 def _policy(config: ExperimentConfig, record: StageRecord) -> Training:
@@ -123,7 +78,7 @@ def _oracle(config: ExperimentConfig, record: StageRecord) -> Training:
     stage = oracle_stage(config, record.parents[MODEL], split, device)
     said, extra = cloned(record.name, split, len(stage.targets))
     return Training(
-        [Part(f"{record.name}.policy", stage, own.policy, lr_key=f"baselines.{record.name}.policy.optim.lr")],
+        [Part(f"{record.name}.policy", stage, own.policy, group=f"baselines.{record.name}.policy")],
         device,
         lambda _: f"{said}, {record.folder}",
         extra=extra,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig, StageConfig
 from playslot_rl.config.methods import LATENT_MODELS
@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.fit import Part
     from playslot_rl.training.record import StageRecord, Training
-
-BEHAVIOUR: Final = ("labelled_demos", "decoder_inputs", "trim_pixels", "trim_margin")
-"""Settings of the behaviour stage that count for them, too."""
 
 
 def model_of(
@@ -110,13 +107,15 @@ def cloning(
     labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
 
     def parts() -> Iterator[Part]:
-        yield Part(f"{name}.policy", behaviour.policy_stage(), policy, lr_key=f"baselines.{name}.policy.optim.lr")
+        group = f"baselines.{name}"
+        yield Part(f"{name}.policy", behaviour.policy_stage(), policy, group=f"{group}.policy")
         yield Part(
             f"{name}.action_decoder",
             behaviour.decoder_stage(),
             decoding,
             folder="decoder",
-            lr_key=f"baselines.{name}.decoder_lr",
+            group=f"{group}.policy",
+            renamed={"steps": f"{group}.decoder_steps", "optim.lr": f"{group}.decoder_lr"},
             identity=labelled,
         )
 

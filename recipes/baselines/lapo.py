@@ -6,12 +6,11 @@ actions of `behaviour.labelled_demos` of them. `baselines.lapo.world=RUN` takes 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.recipes.baselines.cloning import BEHAVIOUR, cloning, model_of
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.recipes.baselines.cloning import cloning, model_of
 from playslot_rl.recipes.run import open_device, open_run
 
 if TYPE_CHECKING:
@@ -28,34 +27,13 @@ def main(config: ExperimentConfig) -> None:
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
     from playslot_rl.methods.lapo.load import MODEL, NAME, sizes_of
+    from playslot_rl.methods.lapo.method import POLICY
     from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.record import StageRecord, run_stage
     from playslot_rl.training.runs import adopt_stage
 
     run, own, parents = open_run(config), config.baselines.lapo, dict[str, StageCheckpoint]()
-    stored = {
-        "env": to_dict(config.env),
-        "model": to_dict(config.model),
-        "behaviour": to_dict(replace(config.behaviour, policy_from="")),
-        NAME: to_dict(own),
-    }
-    its_own = (f"{NAME}.{key}" for key in stored[NAME] if key not in ("model", "world"))
-    record = StageRecord(
-        NAME,
-        run,
-        config,
-        stored=stored,
-        settings=("model.action_decoder", *(f"behaviour.{key}" for key in BEHAVIOUR), *its_own),
-        identity={
-            "action_decoder": to_dict(config.model.action_decoder),
-            NAME: sizes_of(own),
-            **{key: getattr(own, key) for key in ("loss", "targets", "shift")},
-            **{key: getattr(config.behaviour, key) for key in ("trim_pixels", "trim_margin")},
-        },
-        parents=parents,
-        role="demos",
-        ready=lambda: adopt_stage(parents[MODEL], run),
-    )
+    record = StageRecord(POLICY, run, config, parents, ready=lambda: adopt_stage(parents[MODEL], run))
     record.data.require_actions(config.env.action_dim)
     labelled, sizes = config.behaviour.labelled_demos, {NAME: sizes_of(own)}
     parents[MODEL] = model_of(config, run, MODEL, own.world, train_model, record.demos, labelled, sizes)
@@ -68,7 +46,8 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
     Raises:
         CheckpointError, DataError, OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.methods.lapo.load import MODEL, NAME, sizes_of
+    from playslot_rl.methods.lapo.load import MODEL
+    from playslot_rl.methods.lapo.method import MODEL as STAGE
     from playslot_rl.methods.lapo.model import ForwardModel, InverseModel
     from playslot_rl.methods.lapo.stage import LAPOModelStage
     from playslot_rl.seeds.draws import global_seed
@@ -76,14 +55,7 @@ def train_model(config: ExperimentConfig, run: Path) -> StageCheckpoint:
     from playslot_rl.training.record import StageRecord, Training, run_stage
 
     own = config.baselines.lapo
-    record = StageRecord(
-        MODEL,
-        run,
-        config,
-        stored={"env": to_dict(config.env), "model": to_dict(config.model), NAME: to_dict(own)},
-        counts=tuple(f"{NAME}.{key}" for key in sizes_of(own)),
-        settings=(f"{NAME}.model",),
-    )
+    record = StageRecord(STAGE, run, config)
 
     def prepare() -> Training:
         device = open_device(config)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.methods import METHODS
 from playslot_rl.recipes.run import open_device, open_run, parent_run, require_parent
 
@@ -37,7 +37,9 @@ def main(config: ExperimentConfig) -> None:
     require_online(config, own, name)  # before anything is written or computed
     run = open_run(config)
 
+    from playslot_rl.methods.dreamer import method as dreamer
     from playslot_rl.methods.online.loop import train_online
+    from playslot_rl.methods.sold import method as sold
     from playslot_rl.storage.atomic import write_bytes
     from playslot_rl.storage.checkpoints import StageCheckpoint
     from playslot_rl.training.record import StageRecord
@@ -49,14 +51,10 @@ def main(config: ExperimentConfig) -> None:
         parents["slots"] = slots_checkpoint(parent)
         require_parent(config, run, parents["slots"], "image_size")
     record = StageRecord(
-        name,
+        dreamer.STAGE if name == "dreamer" else sold.STAGE,
         run,
         config,
-        stored={"env": to_dict(config.env), name: to_dict(own)},
-        counts=("env",),
-        identity={"render": to_dict(config.render)},
         parents=parents,
-        role="",
         ready=partial(use_world_model, run, parent) if parents else lambda: None,
     )
     if record.finished():

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import ExperimentConfig
 from playslot_rl.recipes.run import open_device, open_run
 
 if TYPE_CHECKING:
@@ -24,22 +24,10 @@ def main(config: ExperimentConfig) -> None:
         DataError: fewer than `demos` demonstrations, or none with actions.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.methods.oracles.resnet import NAME
+    from playslot_rl.methods.resnet_oracle.method import STAGE
     from playslot_rl.training.record import StageRecord, run_stage
 
-    record = StageRecord(
-        NAME,
-        open_run(config),
-        config,
-        stored={
-            "env": to_dict(config.env),
-            "model": to_dict(config.model),
-            "behaviour": to_dict(config.behaviour),
-            NAME: to_dict(config.baselines.resnet_oracle),
-        },
-        counts=("model.policy", "behaviour.loss", "behaviour.trim_pixels", "behaviour.trim_margin"),
-        role="demos",
-    )
+    record = StageRecord(STAGE, open_run(config), config)
     run_stage(record, lambda: _training(config, record))
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import ExperimentConfig
 from playslot_rl.recipes.run import open_device, open_run, parent_run, require_parent
 
 if TYPE_CHECKING:
@@ -27,26 +27,21 @@ def main(config: ExperimentConfig) -> None:
         DataError: fewer than `demos` demonstrations, or none with actions.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
-    from playslot_rl.methods.oracles.slot import NAME
+    from playslot_rl.methods.slot_oracle.method import STAGE
     from playslot_rl.training.record import StageRecord, run_stage
     from playslot_rl.training.runs import slots_checkpoint, stage_model, use_world_model
-    from playslot_rl.training.stage_behaviour import AFTER_CLONING
 
     run = open_run(config)
     parent = parent_run(config, run)
     slots = slots_checkpoint(parent)
     require_parent(config, run, slots, "image_size")
     model = replace(config.model, savi=stage_model(slots)[0].savi)
-    stored = to_dict(config.behaviour)
     record = StageRecord(
-        NAME,
+        STAGE,
         run,
         config,
-        stored={"env": to_dict(config.env), "model": to_dict(model), NAME: stored},
-        counts=("model.policy",),
-        settings=tuple(f"{NAME}.{key}" for key in stored if key not in AFTER_CLONING),
         parents={"slots": slots},
-        role="demos",
+        groups={"model": model},
         ready=partial(use_world_model, run, parent),
     )
     run_stage(record, lambda: _training(config, record, parent))
@@ -85,7 +80,7 @@ def _training(config: ExperimentConfig, record: StageRecord, parent: str) -> Tra
     stage = oracle_stage(oracle, slots, actions, behaviour, examples(others) if others else None)
     said, extra = cloned(record.name, split, len(slots), views=len(views))
     return Training(
-        [Part(record.name, stage, config.behaviour, lr_key="behaviour.optim.lr")],
+        [Part(record.name, stage, config.behaviour, group="behaviour")],
         device,
         lambda _: f"{said}, {record.folder}",
         extra=extra,

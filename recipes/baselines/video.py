@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from playslot_rl.config import DynamicsStageConfig, ExperimentConfig, VideoStageConfig, to_dict
+from playslot_rl.config import DynamicsStageConfig, ExperimentConfig, ModelConfig, VideoStageConfig
 from playslot_rl.config.methods import METHODS
 from playslot_rl.recipes.run import open_device, open_run, parent_run, require_parent
 
@@ -36,23 +36,27 @@ def train(config: ExperimentConfig) -> StageCheckpoint:
     """
     from playslot_rl.training.record import run_stage
 
-    record = _record_on_slots(config) if METHODS[config.method].slots else _record(config, to_dict(config.model), {})
+    record = _record_on_slots(config) if METHODS[config.method].slots else _record(config, config.model, {})
     prepare = _on_slots if METHODS[config.method].slots else _on_pixels
     return run_stage(record, lambda: prepare(config, record))
 
 
-def _record(config: ExperimentConfig, model: dict[str, Any], parents: Mapping[str, StageCheckpoint]) -> StageRecord:
+def _record(config: ExperimentConfig, model: ModelConfig, parents: Mapping[str, StageCheckpoint]) -> StageRecord:
+    from playslot_rl.methods.caddy import method as caddy
+    from playslot_rl.methods.ocvp_seq import method as ocvp_seq
+    from playslot_rl.methods.slotformer import method as slotformer
+    from playslot_rl.methods.svg import method as svg
     from playslot_rl.training.record import StageRecord
     from playslot_rl.training.runs import use_world_model
 
     run, name = open_run(config), config.method
+    specs = {"caddy": caddy.MODEL, "svg": svg.STAGE, "slotformer": slotformer.STAGE, "ocvp_seq": ocvp_seq.STAGE}
     return StageRecord(
-        name,
+        specs[name],
         run,
         config,
-        stored={"env": to_dict(config.env), "model": model, name: to_dict(getattr(config.baselines, name))},
-        counts=("env.image_size", f"model.{'savi' if parents else 'policy'}"),
         parents=parents,
+        groups={"model": model},
         ready=partial(use_world_model, run, parent_run(config, run)) if parents else lambda: None,
     )
 
@@ -65,7 +69,7 @@ def _record_on_slots(config: ExperimentConfig) -> StageRecord:
     slots = slots_checkpoint(parent_run(config, run))
     require_parent(config, run, slots, "image_size")
     sizes = uncontrolled(config.model, config.baselines, config.method)
-    return _record(config, to_dict(replace(sizes, savi=stage_model(slots)[0].savi)), {"slots": slots})
+    return _record(config, replace(sizes, savi=stage_model(slots)[0].savi), {"slots": slots})
 
 
 def _on_pixels(config: ExperimentConfig, record: StageRecord) -> Training:

@@ -20,8 +20,7 @@ from playslot_rl.config import (
     to_dict,
 )
 from playslot_rl.config.compose import choices, compose
-from playslot_rl.config.plain import flatten
-from playslot_rl.config.roles import Checked, fixed_keys, keys_of, without
+from playslot_rl.config.roles import Checked, keys_of, without
 from playslot_rl.errors import ConfigError
 
 PRESETS = ["compact", "paper", "smoke"]
@@ -271,19 +270,12 @@ def test_a_config_without_a_role_keeps_all_other_keys() -> None:
     }
     assert {**whole["data"], **left["data"]} == whole["data"]
     assert to_dict(config) == whole
-    fixed = fixed_keys(whole)
+    fixed = without(config, "free")
     free = ("compile", "segmented_episodes")
     kept = {k: v for k, v in whole["slots"].items() if not k.endswith("_every") and k not in free}
     kept["optim"] = {k: v for k, v in kept["optim"].items() if k != "accumulate"}
     assert fixed["slots"] == kept
     assert "minutes" not in fixed["baselines"]["dreamer"]
-
-
-def test_a_name_is_free_in_every_group_or_in_none() -> None:
-    """So that stored values, which have no class, can be told apart by name."""
-    free = keys_of(ExperimentConfig, "free")
-    names = {key.rpartition(".")[2] for key in free}
-    assert {key for key in flatten(to_dict(ExperimentConfig())) if key.rpartition(".")[2] in names} == free
 
 
 def test_a_config_checks_its_values() -> None:

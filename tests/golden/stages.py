@@ -108,8 +108,8 @@ def begun(options: tuple[str, ...], folder: Path) -> Seen:
     seen = Seen()
     plain_init, plain_finished = TrainingCheckpoints.__init__, StageRecord.finished
 
-    def init(self: TrainingCheckpoints, where: Path, identity: Mapping[str, Any]) -> None:
-        plain_init(self, where, identity)
+    def init(self: TrainingCheckpoints, where: Path, identity: Mapping[str, Any], *more: Any) -> None:
+        plain_init(self, where, identity, *more)
         seen.identities[where.parent.relative_to(folder).as_posix()] = self.identity
         if type(self) is not TrainingCheckpoints:
             raise _BuiltError

@@ -20,6 +20,7 @@ def _compare(name: str, values: dict[str, Any]) -> None:
     text = json.dumps(values, indent=1, sort_keys=True) + "\n"
     if os.environ.get("PLAYSLOT_RENEW_GOLDEN") == "1":
         path.write_text(text)
+    assert json.loads(text) == json.loads(path.read_text())
     assert text == path.read_text()
 
 

@@ -9,7 +9,7 @@ Frames are most of it, so the journal is only appended to; its file is on the di
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -120,11 +120,11 @@ class OnlineCheckpoints(TrainingCheckpoints):
 
     Args:
         folder: `RUN/METHOD`.
-        identity: nested plain values that must be equal for a resumed run to be the same run.
+        identity, typed: see `TrainingCheckpoints`.
     """
 
-    def __init__(self, folder: Path, identity: Mapping[str, Any]) -> None:
-        super().__init__(folder / "checkpoints", identity)
+    def __init__(self, folder: Path, identity: Mapping[str, Any], typed: Callable[[str], str] = str) -> None:
+        super().__init__(folder / "checkpoints", identity, typed)
         self.journal = ReplayJournal(folder / "replay")
         self._counted: list[int] = []
 

@@ -20,9 +20,8 @@ import torch
 from tensordict import TensorDictBase
 
 from playslot_rl.acting.episodes import LOCKSTEP, TaskPool
-from playslot_rl.config import to_dict
 from playslot_rl.config.baselines import OnlineConfig
-from playslot_rl.config.roles import fixed_keys
+from playslot_rl.config.roles import without
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.methods.online.acting import PlayedEpisodes, play
 from playslot_rl.methods.online.checkpoints import OnlineCheckpoints, OnlineState
@@ -106,8 +105,8 @@ class _Run:
         self.learner, self.online, self.config, self.folder = learner, online, config, folder
         self.title, self.device, self.prior_steps = title, device, prior_steps
         self.replay = Replay(online, config.env.max_steps + 1)
-        own = {name: fixed_keys(to_dict(online)), "seed": config.seed}
-        self.checkpoints = OnlineCheckpoints(folder, {**own, **record.resumes()})
+        own = {name: without(online, "free"), "seed": config.seed}
+        self.checkpoints = OnlineCheckpoints(folder, {**own, **record.resumes()}, record.spec.typed)
         cure = f"lower its learning rate (baselines.{name}.*)"
         self.watch = Watch(name, folder, self.checkpoints, cure)
         self.state = self.checkpoints.resume_online(learner.modules, learner.optimizers, self.replay)

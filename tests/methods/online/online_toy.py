@@ -16,12 +16,15 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig, ExperimentConfig, LoggingConfig, RenderConfig
 from playslot_rl.config.baselines import OnlineConfig
+from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.methods.online.checkpoints import OnlineState
 from playslot_rl.methods.online.loop import train_online
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.tensors import module_tensors
 from playslot_rl.training.record import StageRecord
+
+SPEC = StageSpec("toy", settings=("baselines.dreamer",), data="", names={"baselines.dreamer": "toy"})
 
 STEPS = 4
 
@@ -165,6 +168,6 @@ def train(run: Path, learner: ToyLearner | None = None, **changes: Any) -> tuple
     config = ExperimentConfig(
         env=EnvConfig(max_steps=STEPS), seed=3, logging=LoggingConfig(backend="none", progress=False)
     )
-    record = StageRecord("toy", run, config, stored={}, role="")
+    record = StageRecord(SPEC, run, config)
     done = train_online(learner, toy_online(**changes), record, title="Toy", device=torch.device("cpu"))
     return learner, Trained(*done)

@@ -160,7 +160,7 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(tmp_path:
 
 def test_a_run_begun_with_other_values_is_refused(tmp_path: Path) -> None:
     train(tmp_path)
-    with pytest.raises(CheckpointError, match=r"toy\.batch_size: got 5, expected 3"):
+    with pytest.raises(CheckpointError, match=r"baselines\.dreamer\.batch_size: got 5, expected 3"):
         train(tmp_path, batch_size=5)
 
 
@@ -170,7 +170,7 @@ def test_a_run_from_before_rewards_were_scaled_had_a_scale_of_one(tmp_path: Path
     stored = json.loads(state.read_text())
     assert stored["identity"]["toy"].pop("reward_scale") == 1.0
     state.write_text(json.dumps(stored))
-    with pytest.raises(CheckpointError, match=r"toy\.reward_scale: got 2\.0, expected 1\.0"):
+    with pytest.raises(CheckpointError, match=r"baselines\.dreamer\.reward_scale: got 2\.0, expected 1\.0"):
         train(tmp_path, reward_scale=2.0)
     _, result = train(tmp_path)
     assert (result.resumed_from, result.state.step) == (8, 64)

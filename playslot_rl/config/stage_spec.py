@@ -1,0 +1,79 @@
+"""What one training of a method is, said once, by the full dotted names under which its keys are typed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+BASELINES = "baselines."
+
+
+def renamed(key: str, names: Mapping[str, str]) -> str:
+    """A dotted key with the longest of its beginnings that has another name replaced by that.
+
+    Examples:
+        >>> renamed("policy.optim.lr", {"policy": "behaviour", "policy.optim.lr": "behaviour.decoder_lr"})
+        'behaviour.decoder_lr'
+        >>> renamed("policy_from", {"policy": "behaviour"})
+        'policy_from'
+    """
+    begins = [name for name in names if f"{key}.".startswith(f"{name}.")]
+    longest = max(begins, key=len, default="")
+    return names[longest] + key[len(longest) :] if begins else key
+
+
+@dataclass(frozen=True)
+class StageSpec:
+    """A stage of a method.
+
+    Attributes:
+        name: of its folder in a run.
+        keys: keys and groups that a finished and a half-finished one must share.
+        settings: further ones that a finished one must share: those of its trainings, each of which compares its own
+            when it is carried on.
+        begun: further ones that only a half-finished one must share.
+        parents: stages it is trained on.
+        data: what it learns from: `videos`, `demos`, the `labelled` ones of these alone; empty learns by acting.
+        parts: `module:function` that makes what is trained from a `StageRecord`.
+        stores: groups that its checkpoint keeps beside `env` and those of `keys` and `settings`.
+        names: what checkpoints call a key or group that has another name there.
+        begun_names: what half-finished trainings call it.
+    """
+
+    name: str
+    keys: tuple[str, ...] = ()
+    settings: tuple[str, ...] = ()
+    begun: tuple[str, ...] = ()
+    parents: tuple[str, ...] = ()
+    data: Literal["videos", "demos", "labelled", ""] = "videos"
+    parts: str = ""
+    stores: tuple[str, ...] = ()
+    names: Mapping[str, str] = field(default_factory=dict)
+    begun_names: Mapping[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def groups(self) -> tuple[str, ...]:
+        """Groups that its checkpoint keeps, `env` first."""
+        return tuple(dict.fromkeys(["env", *map(group_of, (*self.stores, *self.keys, *self.settings))]))
+
+    def stored_name(self, key: str, begun: bool = False) -> str:
+        """What a checkpoint, or a half-finished training, calls a key."""
+        return renamed(key, {**self.names, **(self.begun_names if begun else {})}).removeprefix(BASELINES)
+
+    def typed(self, stored: str) -> str:
+        """The key that a checkpoint or a half-finished training calls so."""
+        groups = {group.removeprefix(BASELINES): group for group in self.groups}
+        return renamed(stored, groups | {name: key for key, name in {**self.names, **self.begun_names}.items()})
+
+
+def group_of(key: str) -> str:
+    """The group of the config that a key is in, as checkpoints keep them: of a method its own.
+
+    Examples:
+        >>> group_of("model.savi.dim"), group_of("baselines.lapo.code_dim")
+        ('model', 'baselines.lapo')
+    """
+    first, *rest = key.split(".")
+    return f"{BASELINES}{rest[0]}" if f"{first}." == BASELINES else first

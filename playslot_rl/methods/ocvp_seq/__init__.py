@@ -1,0 +1,1 @@
+"""OCVP-Seq: slots predicted without actions."""

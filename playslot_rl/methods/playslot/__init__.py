@@ -1,0 +1,1 @@
+"""PlaySlot: the world model on slots, and the policy in its latent actions."""

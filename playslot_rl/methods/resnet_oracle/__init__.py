@@ -1,0 +1,1 @@
+"""ResNet oracle and ResNet BC: real actions cloned from frames."""

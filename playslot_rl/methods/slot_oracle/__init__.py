@@ -1,0 +1,1 @@
+"""Slot oracle and slot BC: real actions cloned from slots."""

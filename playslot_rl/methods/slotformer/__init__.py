@@ -1,0 +1,1 @@
+"""SlotFormer: slots predicted without actions."""
