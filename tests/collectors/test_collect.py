@@ -163,10 +163,10 @@ def test_episodes_that_start_solved_are_redrawn(monkeypatch: pytest.MonkeyPatch)
     env.close()
 
 
-@pytest.mark.parametrize("seed", [4242, 2**32 - 1])
-def test_any_seed_is_taken_and_its_data_are_whole(tmp_path: Path, seed: int) -> None:
+def test_any_seed_is_taken_and_its_data_are_whole(tmp_path: Path) -> None:
     from playslot_rl.evaluation.seeds import recorded_seeds
 
+    seed = 2**32 - 1
     out = collect(config(), "random", 2, STEPS, tmp_path / "data", seed=seed, workers=1)
     spec = CollectionSpec.make(config(), "random", 2, STEPS, seed)
     assert recorded_seeds(out) == {spec.episode_seed(0), spec.episode_seed(1)}

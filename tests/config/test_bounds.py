@@ -116,7 +116,7 @@ def test_the_defaults_lie_within_and_the_table_is_large() -> None:
     assert {"", "env", "collect", "slots.optim", "model.savi", "baselines.sold", "adopt", "plan", "play"} <= groups
 
 
-@pytest.mark.parametrize("key", NUMBERS)
+@pytest.mark.parametrize("key", FIRST)
 def test_a_bad_number_is_one_line_that_names_its_key(key: str, capsys: pytest.CaptureFixture[str]) -> None:
     for text in bad_values(key):
         began = time.monotonic()
@@ -128,6 +128,15 @@ def test_a_bad_number_is_one_line_that_names_its_key(key: str, capsys: pytest.Ca
         assert "unexpected" not in err
         assert f"{key.rpartition('.')[2]}: got " in err
         assert took < LIMIT_S
+
+
+def test_no_group_takes_a_bad_number() -> None:
+    for key, owner, field, hint in fields(ExperimentConfig):
+        for text in bad_values(key) if key in NUMBERS and key not in FIRST else ():
+            number = text.strip("[]")
+            value = int(number) if number.lstrip("-").isdecimal() else float(number)
+            with pytest.raises(ValueError, match=f"{field.name}: got "):
+                owner(**{field.name: (value,) if get_origin(hint) is tuple else value})
 
 
 @pytest.mark.parametrize(

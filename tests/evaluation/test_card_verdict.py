@@ -76,7 +76,9 @@ def card_of(damage: Callable[[WorldModel], None], name: str) -> Card:
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("name", ["pretrained/button_press", "pretrained/block_push_easy"])
+@pytest.mark.parametrize(
+    "name", ["pretrained/button_press", pytest.param("pretrained/block_push_easy", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("damage", KINDS)
 def test_a_dead_model_is_not_praised(damage: Callable[[WorldModel], None], name: str) -> None:
     card = card_of(damage, name)

@@ -109,7 +109,7 @@ TABLE: Final[dict[str, Row]] = {
         ALL,
         passing=("run/planning/",),  # a search by the clock
     ),
-    "export": Row(("export", "run=run", "out=out", *ONE_CORE), ALL, quick=3),
+    "export": Row(("export", "run=run", "out=out", *ONE_CORE), ALL),
     "pipeline": Row(("pipeline", "episodes=2", "out=out", *SMOKE), (), heavy=True),
     "adopt": Row(
         ("adopt", "data.root=any", "out=out", "minutes=0.02", "adopt.slots=[2,3]", "adopt.prototypes=4", *SMOKE),
@@ -133,7 +133,7 @@ TABLE: Final[dict[str, Row]] = {
     ),
     "demo": Row(("demo", "episodes=2", "out=out", *SMOKE), (), heavy=True),
     "dataset merge": Row(
-        ("dataset", "merge", "run/data/random", "run/data/expert", "--out", "out"), quick=3, done=THERE
+        ("dataset", "merge", "run/data/random", "run/data/expert", "--out", "out"), quick=2, done=THERE
     ),
     "dataset split": Row(
         ("dataset", "split", "run/data/random", "--out", "out", "--fractions", "a=0.5,b=0.5"), done=THERE

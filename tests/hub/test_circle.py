@@ -23,7 +23,13 @@ Client = Callable[..., dict[str, Any]]
 EPISODES = 3
 
 
-@pytest.mark.parametrize("name", [*ENVIRONMENTS, *PROCEDURAL])
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name in ("button_press", "grid_shapes") else pytest.param(name, marks=pytest.mark.slow)
+        for name in (*ENVIRONMENTS, *PROCEDURAL)
+    ],
+)
 def test_the_whole_circle(name: str, hub: FakeHub, client: Client, tmp_path: Path) -> None:
     small = [f"env={name}", "preset=smoke", "threads=1", "device=cpu", "logging.progress=false"]
     policy = "random" if name in PROCEDURAL else "expert"

@@ -1,13 +1,17 @@
-"""Who gets in: raw requests and WebSockets to a real server, as another site, another program or a user sends them."""
+"""Who gets in: raw requests and WebSockets to a real server, as another site, another program or a user sends them; and
+how it ends."""
 
 from __future__ import annotations
 
 import asyncio
 import http.client
 import re
+import signal
+import subprocess
 import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
@@ -18,7 +22,7 @@ pytest.importorskip("nicegui", reason="the extra `play` is not installed")
 import socketio
 from nicegui import __version__ as nicegui_version
 from picture_file import png
-from served import served
+from served import OUTPUT, served
 
 from playslot_rl.play.gate import MOST_BODY, Gate
 from playslot_rl.play.pages import MOST_PAGES
@@ -48,10 +52,12 @@ TRAVERSALS = [
 
 @dataclass(frozen=True)
 class Server:
-    """A server that runs, its port, and the token of the printed address."""
+    """A server that runs, its port, the token of the printed address, and its folder and process."""
 
     port: int
     token: str
+    folder: Path
+    process: subprocess.Popen[str]
 
     @property
     def cookie(self) -> str:
@@ -115,11 +121,12 @@ class Page:
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """`playslot play` with a shipped model."""
-    with served(tmp_path_factory.mktemp("gate"), "run=pretrained/block_push_easy") as (address, _):
-        found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]+)", address)
+    """`playslot play` with a shipped model, and without the browser that it is to open."""
+    folder, asked = tmp_path_factory.mktemp("gate"), ("run=pretrained/block_push_easy", "play.show=true")
+    with served(folder, *asked, BROWSER=str(folder / "none")) as (address, process):
+        found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=([\w-]{32,})", address)
         assert found is not None, address
-        yield Server(int(found[1]), found[2])
+        yield Server(int(found[1]), found[2], folder, process)
 
 
 @pytest.mark.parametrize(
@@ -275,3 +282,15 @@ def test_a_session_begins_with_the_socket_and_a_page_too_many_waits_for_one_to_c
             await page.socket.disconnect()
 
     asyncio.run(script())
+
+
+def test_ctrl_c_ends_it_and_the_token_was_said_once(server: Server) -> None:
+    """The last of this file: it ends the server."""
+    server.process.send_signal(signal.SIGINT)
+    _, err = server.process.communicate(timeout=60)
+    out = (server.folder / OUTPUT).read_text()
+    assert server.token in out.splitlines()[0]
+    assert "stopped" in out
+    assert "Traceback" not in err, err
+    assert (out.count(server.token), err.count(server.token)) == (1, 0)
+    assert server.process.returncode == 0

@@ -125,6 +125,7 @@ def test_a_killed_one_goes_on_with_its_plan_and_the_time_that_is_left(
     assert clock.now == third, "finished is finished"
 
 
+@pytest.mark.slow
 def test_minutes_that_are_too_few_are_said_to_be_at_the_start(
     small: Path, tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -37,6 +37,7 @@ def test_a_policy_refuses_weights_and_adopt_several_sets(
     )
 
 
+@pytest.mark.slow
 def test_a_streamed_training_ends_as_before_after_a_kill(videos: Path, tmp_path: Path) -> None:
     data = (f"data.root={videos}", f"data.cache={tmp_path / 'cache'}", "data.stream=true", "data.shuffle_buffer=4")
     smoke("train-slots", *data, *STEPS, f"out={tmp_path / 'whole'}")

@@ -77,9 +77,8 @@ def _wait_for_checkpoint(folder: Path, alive: Callable[[], bool]) -> None:
     raise AssertionError(f"no checkpoint came up in {folder}")
 
 
-@pytest.mark.parametrize(
-    "part", ["policy", *(pytest.param(part, marks=pytest.mark.slow) for part in ("slots", "dynamics", "decoder"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("part", LONG)
 def test_a_killed_stage_ends_with_the_weights_of_one_that_was_not(
     shared_run: Path, videos: Path, demos: Path, tmp_path: Path, part: str, start: Callable[..., object]
 ) -> None:

@@ -189,6 +189,7 @@ def _rank_one_is_killed(run: Path, killed: Path) -> Callable[[], None]:
     return patch
 
 
+@pytest.mark.slow
 def test_a_rank_that_is_killed_ends_the_others_within_seconds(
     launch: Callable[..., Launched], tmp_path: Path, videos: Path
 ) -> None:
@@ -198,6 +199,7 @@ def test_a_rank_that_is_killed_ends_the_others_within_seconds(
     assert time.monotonic() - float(killed.read_text()) < 20
 
 
+@pytest.mark.slow
 def test_an_error_of_all_ranks_is_said_once(launch: Callable[..., Launched], tmp_path: Path, videos: Path) -> None:
     done = launch(*slots(tmp_path / "run", videos, "slots.batch_size=3"))
     assert done.end() != 0
@@ -206,6 +208,7 @@ def test_an_error_of_all_ranks_is_said_once(launch: Callable[..., Launched], tmp
     assert not (tmp_path / "run" / "slots").exists()
 
 
+@pytest.mark.slow
 def test_a_command_for_one_process_says_so(launch: Callable[..., Launched], tmp_path: Path) -> None:
     done = launch("collect", "preset=smoke", "episodes=2", f"out={tmp_path / 'data'}")
     assert done.end() != 0
@@ -225,7 +228,8 @@ def test_none_of_the_others_starts_on_several(
     assert said.count("\n") == 1
 
 
-@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_what_was_stopped_carries_on(
     launch: Callable[..., Launched], tmp_path: Path, videos: Path, number: signal.Signals
 ) -> None:

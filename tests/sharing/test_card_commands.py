@@ -111,6 +111,7 @@ def test_the_card_of_a_run_on_recordings_can_be_followed(
         assert wrong not in card
 
 
+@pytest.mark.integration
 def test_a_policy_of_every_third_frame_says_at_which_rate_it_acts(strided: Path, tmp_path: Path) -> None:
     card = exported(strided, tmp_path / "policy")
     assert "| frames | 10 a second: one frame in 3 of 30, and each action is held until the next |" in card
@@ -125,6 +126,7 @@ def test_a_policy_of_every_third_frame_says_at_which_rate_it_acts(strided: Path,
     assert "one frame in 3 of 30" in (tmp_path / "saved" / "README.md").read_text()
 
 
+@pytest.mark.integration
 def test_frames_of_another_size_are_resized_as_those_of_the_training_to_the_last_digit(
     strided: Path, recordings: Path, tmp_path: Path
 ) -> None:
@@ -178,12 +180,12 @@ def test_where_the_training_did_not_resize_other_sizes_are_refused_in_one_line()
         assert "\n" not in str(got.value)
 
 
-def policy_of(*arguments: str, **source: Any) -> tuple[Any, dict[str, Any]]:
+def policy_of(*arguments: str, **source: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
     known = {"seed": 0, "world_model_seed": 0, "demos": 6, "shipped_world_model": False}
-    return compose(["preset=smoke", *arguments]), known | source
+    return ("preset=smoke", *arguments), known | source
 
 
-KINDS: dict[str, tuple[Any, dict[str, Any]]] = {
+KINDS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
     **{f"pipeline of {env}": policy_of(f"env={env}") for env in ENVIRONMENTS},
     "shipped world model": policy_of(shipped_world_model=True, recorded={"episodes": 6, "seed": 7}, seed=7),
     "demonstrations of a robot": policy_of(shipped_world_model=True, recorded_elsewhere=True, world_model_seed=3),
@@ -205,7 +207,8 @@ KINDS: dict[str, tuple[Any, dict[str, Any]]] = {
 def test_the_commands_are_accepted_and_bring_back_the_config(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config, source = KINDS[kind]
+    typed, source = KINDS[kind]
+    config = compose(typed)
     monkeypatch.chdir(tmp_path)
     last: Any = None
     commands = [shlex.split(line)[1:] for line in reproduce(config, source, [])]
@@ -230,7 +233,7 @@ def test_the_commands_are_accepted_and_bring_back_the_config(
 
 
 def test_every_environment_with_a_preset_is_of_some_kind() -> None:
-    assert {config.env.name for config, _ in KINDS.values()} == {*choices("env")} - {*PROCEDURAL}
+    assert {compose(typed).env.name for typed, _ in KINDS.values()} == {*choices("env")} - {*PROCEDURAL}
     assert {*RECORDED, *ENVIRONMENTS, *PROCEDURAL} == {*choices("env")}
 
 
