@@ -270,8 +270,9 @@ COMMANDS: Final[dict[str, Command]] = {
         ("env", "episodes", "workers", *TRAINED, *MADE, "collector", "behaviour", "evaluation"),
     ),
     "bench": Command(
-        "speed of this machine, as ratios: training steps, rollout, sampling, rendering",
-        "Times the fast paths against the plain ones in one run, medians over repeats. Leave the machine idle.",
+        "speed of this machine: training steps, rollout, playing, planning, data sets, rendering",
+        "Times the fast paths in one run, medians over repeats, and counts what a training step of the preset costs. "
+        "Leave the machine idle.",
         ("playslot bench", "playslot bench --json bench.json"),
         ("preset", "threads"),
     ),

@@ -1,4 +1,4 @@
-"""`playslot bench [--json FILE]`: speed of this machine, as ratios (see docs/performance.md)."""
+"""`playslot bench [--json FILE]`: speed of this machine, and what a training step costs (see docs/performance.md)."""
 
 from __future__ import annotations
 
@@ -8,26 +8,28 @@ from playslot_rl.config import ExperimentConfig
 
 
 def main(config: ExperimentConfig, json_path: Path | None = None) -> None:
-    """Time the fast paths against the plain ones at the paper's sizes and print the ratios.
+    """Time the fast paths at the paper's sizes, count the preset's steps, and print both.
 
     Args:
-        config: `threads` is used; `preset=smoke` takes tiny sizes that only show that everything runs.
+        config: `threads` and `preset` are used; `preset=smoke` takes tiny sizes that only show that everything runs.
         json_path: also write the figures there.
 
     Raises:
-        PlaySlotError: a child died. RenderError: no GL backend. OutputError: the file cannot be written.
+        RenderError: no GL backend. OutputError: the file cannot be written.
     """
     from playslot_rl.speed.cases import Sizes, quick_sizes
-    from playslot_rl.speed.report import measure, table
+    from playslot_rl.speed.report import cost_tables, measure, table
     from playslot_rl.storage.atomic import write_json
 
+    def say(text: str) -> None:
+        print(f"{text} ...", flush=True)
+
     quick = config.preset == "smoke"
-    figures = measure(
-        quick_sizes() if quick else Sizes(), config.threads, quick, say=lambda text: print(f"{text} ...", flush=True)
-    )
+    figures = measure(quick_sizes() if quick else Sizes(), config.threads, quick, say)
     print(f"\n{table(figures)}")
     if quick:
         print("tiny sizes (preset=smoke): these figures say nothing about speed")
     if json_path is not None:
         write_json(json_path, figures)
         print(f"written: {json_path}")
+    print(f"\nA training step of preset={config.preset}:\n\n{cost_tables(config, lambda _: None)}")

@@ -1,6 +1,4 @@
-"""`playslot bench`: this machine's speed as ratios of medians, fast path against plain path, in one run.
+"""`playslot bench`: how fast this machine is, and what a training step costs. Nothing is imported here.
 
-Torch cases run in child processes, because the allocator's setting cannot be undone in a process. The children of a
-case are all started first; then they take turns, one step each a round, one at a time, so that every variant sees the
-same state of the machine. Nothing is imported here.
+`torch.utils.benchmark` times. The fast paths race plain code in `tests/benchmarks`.
 """

@@ -1,8 +1,7 @@
 """What a training step costs, counted: floating-point operations, calls of kernels, bytes kept for the backward pass.
 
-A stage's own loss is computed once with two clips and once with three, forward and backward, on random frames; the
-counts are straight lines in the batch (but for a batch of one, which skips some copies), so that two points give any
-batch without its time and memory. Nothing is timed here: `estimate` turns the counts into seconds under assumptions.
+A stage's own loss is computed with two clips and with three, forward and backward, on random frames; the counts are
+straight lines in the batch (but for a batch of one, which skips some copies), so that two points give any batch.
 
     c(B) = c(2) + (B - 2) (c(3) - c(2))
 
@@ -11,7 +10,6 @@ Shapes: B clips (or rows) a batch.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -22,15 +20,10 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from playslot_rl import keys
-from playslot_rl.config import ExperimentConfig, StageConfig
-from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
+from playslot_rl.config import ExperimentConfig
 from playslot_rl.losses.common import total_loss
-from playslot_rl.losses.dynamics import DynamicsLoss
-from playslot_rl.losses.slots import SlotsLoss
-from playslot_rl.world_model import Agent, WorldModel
+from playslot_rl.speed.steps import begin, fresh_agent, parts, stage_config
 
-STAGES: Final = ("slots", "dynamics", "policy", "decoder")
 BYTES: Final = 4
 """Of a number; everything is counted in fp32."""
 STATE: Final = 4
@@ -54,16 +47,8 @@ class Count:
 
 @dataclass(frozen=True)
 class StageCost:
-    """A stage at the sizes of a config.
-
-    Attributes:
-        stage: one of `STAGES`.
-        steps: of the whole stage.
-        batch: B.
-        parameters: that are trained.
-        frozen: parameters that are only used.
-        two, three: counts with two clips and with three.
-    """
+    """A stage at the sizes of a config: parameters that are trained and that are only used, counts with two clips and
+    with three."""
 
     stage: str
     steps: int
@@ -89,14 +74,8 @@ class StageCost:
 
 @dataclass(frozen=True)
 class Machine:
-    """What is assumed of the processes' devices; nothing of it is measured.
-
-    Attributes:
-        teraflops: sustained on these networks, of one device.
-        call_us: that a kernel takes at least, be it ever so small, microseconds.
-        gigabytes_s: at which gradients travel between devices.
-        exchange_us: that an exchange takes at least, microseconds.
-    """
+    """What is assumed of the processes' devices: what one sustains on these networks, what a kernel takes at least, how
+    fast gradients travel between two, and what an exchange of them takes at least."""
 
     teraflops: float = 20.0
     call_us: float = 8.0
@@ -118,11 +97,7 @@ def estimate(cost: StageCost, processes: int, machine: Machine) -> float:
 
 
 def stage_cost(config: ExperimentConfig, stage: str) -> StageCost:
-    """Count a step of a stage.
-
-    Args:
-        config: sizes, clips and batch; precision is not looked at.
-        stage: one of `STAGES`.
+    """Count a step of a stage, in fp32.
 
     Raises:
         ValueError: another stage.
@@ -144,54 +119,6 @@ def stage_cost(config: ExperimentConfig, stage: str) -> StageCost:
     )
 
 
-def config_group(stage: str) -> str:
-    """Where a stage's settings are; policy and decoder share theirs."""
-    return stage if stage in ("slots", "dynamics") else "behaviour"
-
-
-def stage_config(config: ExperimentConfig, stage: str) -> StageConfig:
-    """The settings of a stage."""
-    found: StageConfig = getattr(config, config_group(stage))
-    return found
-
-
-def fresh_agent(config: ExperimentConfig) -> Agent:
-    """Untrained networks of a config's sizes, in fp32."""
-    torch.manual_seed(0)
-    agent = Agent.untrained(WorldModel(config.model, config.env), oracle=False).train()
-    agent.world_model.savi.precision = "fp32"
-    return agent
-
-
-def parts(config: ExperimentConfig, stage: str, agent: Agent) -> tuple[nn.Module, Callable[[int], TensorDict]]:
-    """A stage's loss, and a random batch of a size for it.
-
-    Raises:
-        ValueError: another stage.
-    """
-    model, side = agent.world_model, config.env.image_size
-    slots, frames = model.slot_shape, (3, side, side)
-    latent, action = model.latent_shape, (config.env.action_dim,)
-
-    def batch(clips: int, *shapes: tuple[str, tuple[int, ...]]) -> TensorDict:
-        return TensorDict({key: torch.rand(clips, *shape) for key, shape in shapes}, [clips])
-
-    if stage == "slots":
-        clip = (config.slots.clip_frames, *frames)
-        return SlotsLoss(model.savi), lambda n: batch(n, (keys.PIXELS, clip))
-    if stage == "dynamics":
-        T = config.dynamics.seed_frames + config.dynamics.predicted_frames
-        criterion = DynamicsLoss(model.inverse_dynamics, model.predictor, model.savi, config.dynamics)
-        own = ((keys.SLOTS, (T, *slots)), (keys.PIXELS, (T, *frames)), (keys.ACTION, (T, *action)))
-        return criterion, lambda n: batch(n, *own)
-    if stage == "policy":
-        return BehaviourLoss(agent.policy), lambda n: batch(n, (keys.SLOTS, slots), (keys.LATENT_ACTION, latent))
-    if stage == "decoder":
-        seen = ((keys.SLOTS, slots), (keys.LATENT_ACTION, latent), (keys.ACTION, action))
-        return ActionDecoderLoss(agent.action_decoder), lambda n: batch(n, *seen)
-    raise ValueError(f"stage: got {stage}, expected one of {', '.join(STAGES)}")
-
-
 class _Calls(TorchDispatchMode):
     """Counts operators that compute something."""
 
@@ -200,12 +127,6 @@ class _Calls(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         self.number += not func.is_view
         return func(*args, **(kwargs or {}))
-
-
-def begin(criterion: nn.Module, batch: TensorDict) -> None:
-    """One step that is not counted: the codebook begins by k-means."""
-    with torch.no_grad():
-        criterion(batch)
 
 
 def _count(criterion: nn.Module, batch: TensorDict) -> Count:

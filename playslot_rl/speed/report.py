@@ -1,124 +1,75 @@
-"""The benchmark's figures: a dict for JSON, a table for people, and the machine they belong to."""
+"""What was measured and counted: a dict for JSON, tables for people, and the machine it belongs to."""
 
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from playslot_rl.config import BlocksConfig, EnvConfig
-from playslot_rl.runtime.threads import available_cores
-from playslot_rl.speed.cases import (
-    Sizes,
-    computed_here,
-    dynamics_variants,
-    play_variants,
-    rollout_variants,
-    savi_variants,
-)
-from playslot_rl.speed.plan import plan_variants
+from playslot_rl.config import BlocksConfig, EnvConfig, ExperimentConfig
+from playslot_rl.runtime.threads import available_cores, set_threads
 from playslot_rl.visualization import document
 
-TARGETS: Final = {
-    "savi_step": 2.5,
-    "dynamics_step": 2.5,
-    "rollout_cache": 3.0,
-    "window_sampling": 20.0,
-    "render": 12.0,
-    "render_block_push": 5.0,
-    "play_step": 10.0,
-    "plan_step": 3.0,
-    "verify": 20.0,
-    "export": 20.0,
-    "slot_cache": 20.0,
-    "ddp_2": 1.0,
-}
-"""Ratios that the project asks of itself (on two CPU cores); of `play_step`, imagined frames a second, of `verify` and
-`export` episodes a second, of `slot_cache` frames a second.
-"""
-FAST_SAVI: Final = "collapsed_{}_allocator"
-"""The fast path of `savi_step`, in the precision that this processor is fastest in."""
+if TYPE_CHECKING:
+    import torch
+
+    from playslot_rl.speed.cases import Sizes
+    from playslot_rl.speed.cost import Machine, StageCost
+
 RATES: Final = {"verify": "episodes/s", "export": "episodes/s", "slot_cache": "frames/s"}
+PROCESSES: Final = (1, 8, 32)
+"""One device, one node of eight, four nodes."""
+CPU_BATCH: Final = 4
+"""Clips a step on a CPU, on which the paper's 64 would take minutes and 15 GiB."""
 
-Figures = dict[str, Any]
+Figures = dict[str, dict[str, Any]]
+Say = Callable[[str], None]
 
 
-def measure(
-    sizes: Sizes, threads: int = 0, quick: bool = False, say: Callable[[str], None] = lambda _: None
-) -> Figures:
-    """Time everything.
-
-    Args:
-        sizes: sizes and repeats.
-        threads: torch threads of each child; 0 leaves torch's choice.
-        quick: recorded in the result: the sizes are not the paper's.
-        say: told what is being timed.
+def measure(sizes: Sizes, threads: int, quick: bool, say: Say) -> Figures:
+    """Time everything; `say` is told what is being timed, `quick` is recorded.
 
     Returns:
-        For each key of `TARGETS` a dict with `ratio`, `unit` and the medians it was made of (see `computed_here`), and
-        `machine`. The `ratio` of `play_step` is imagined frames a second, that of `RATES` what they say.
+        For each case a dict with `unit` and the median of each variant in it, and `machine`.
 
     Raises:
-        PlaySlotError: a child died. RenderError: no GL backend.
+        RenderError: no GL backend.
     """
     from playslot_rl.envs import block_config
     from playslot_rl.runtime.allocator import tune_allocator
-    from playslot_rl.runtime.precision import resolve_precision
-    from playslot_rl.speed.frames import render_seconds, sampling_rates
-    from playslot_rl.speed.race import race
-    from playslot_rl.speed.sets import set_rates
-    from playslot_rl.speed.several import several_seconds
+    from playslot_rl.speed import cases
+    from playslot_rl.speed.sets import render_seconds, set_rates
 
-    tune_allocator()  # of this process, which samples windows, as every recipe does; each child sets its own
-    say("SAVi training step, its variants")
-    savi = race(computed_here(savi_variants()), sizes, threads)
-    say("dynamics training step")
-    dynamics = race(dynamics_variants(sizes.decoded_frames), sizes, threads)
-    say("SAVi training step, two processes against two threads")
-    several = several_seconds(sizes)
-    say("rollout, cached against full")
-    rollout = race(rollout_variants(), sizes, threads)
-    say("playing in imagination")
-    play = race(computed_here(play_variants()), sizes, threads)
-    say("planning, our CEM against TorchRL's")
-    plan = race(plan_variants(), sizes, threads)
-    say("window sampling against LeRobotDataset + DataLoader")
-    rates = sampling_rates(sizes)
-    say("export, verify, slot cache")
-    sets = set_rates(sizes)
-    say("rendering, fast against default")
-    render = render_seconds(EnvConfig(image_size=sizes.image_size, warmup_steps=1), sizes)
-    block_push = replace(block_config("block_push", BlocksConfig()), image_size=sizes.image_size)
-    blocks = render_seconds(block_push, sizes)
-    return {
-        "savi_step": _entry(savi, "plain_fp32_glibc", FAST_SAVI.format(resolve_precision("auto", "cpu"))),
-        "dynamics_step": _entry(dynamics, "plain_fp32_glibc", "fast"),
-        "rollout_cache": _entry(rollout, "full", "cached"),
-        "window_sampling": {"ratio": rates["cache"] / rates["lerobot"], "unit": "frames/s", **rates},
-        "render": _entry(render, "full", "fast"),
-        "render_block_push": _entry(blocks, "full", "fast"),
-        "play_step": _played(play, sizes.play_steps),
-        "plan_step": _entry(plan, "torchrl", "own"),
-        **{name: {"ratio": sets[name], "unit": unit, "rate": sets[name]} for name, unit in RATES.items()},
-        "ddp_2": _entry(several, "one_process_two_threads", "two_processes"),
-        "machine": {**_machine(), "threads": threads, "repeats": sizes.repeats, "quick": quick},
-    }
+    tune_allocator()  # as every recipe does
+    threads = set_threads(threads)
+    side = sizes.config.env.image_size
+    button, blocks = EnvConfig(image_size=side, warmup_steps=1), block_config("block_push", BlocksConfig())
+    timed: dict[str, tuple[str, Callable[[], dict[str, float]]]] = {
+        "savi_step": ("SAVi training step", lambda: cases.savi_step(sizes)),
+        "dynamics_step": ("dynamics training step", lambda: cases.dynamics_step(sizes)),
+        "rollout_cache": ("rollout", lambda: cases.rollout(sizes)),
+        "play_step": ("playing in imagination", lambda: cases.play_step(sizes)),
+        "plan_step": ("planning", lambda: cases.plan_step(sizes)),
+        "render": ("rendering ButtonPress", lambda: render_seconds(button, sizes.rounds)),
+        "render_block_push": (
+            "rendering BlockPush", lambda: render_seconds(replace(blocks, image_size=side), sizes.rounds),
+        ),
+    }  # fmt: skip
+    found: Figures = {}
+    for name, (title, run) in timed.items():
+        say(title)
+        found[name] = {"unit": "s", **run()}
+    say("window sampling, export, verify, slot cache")
+    rates = set_rates(sizes)
+    found["window_sampling"] = {"unit": "frames/s", "cache": rates["cache"], "stream": rates["stream"]}
+    found |= {name: {"unit": unit, "rate": rates[name]} for name, unit in RATES.items()}
+    return {**found, "machine": {**_machine(), "threads": threads, "repeats": sizes.rounds, "quick": quick}}
 
 
-def _entry(seconds: Mapping[str, float], slow: str, fast: str) -> Figures:
-    return {"ratio": seconds[slow] / seconds[fast], "unit": "s", **seconds}
-
-
-def _played(seconds: Mapping[str, float], steps: int) -> Figures:
-    """Imagined frames a second with the shipped model, and the seconds of one frame, by name."""
-    one = {name: value / steps for name, value in seconds.items()}
-    return {"ratio": 1.0 / one["shipped"], "unit": "s", **one}
-
-
-def _machine() -> Figures:
-    """What the figures were measured on."""
+def _machine() -> dict[str, Any]:
     from importlib.metadata import version
 
     return {
@@ -126,9 +77,7 @@ def _machine() -> Figures:
         "cores": available_cores(),
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
-        "torch": version("torch"),
-        "mujoco": version("mujoco"),
-        "lerobot": version("lerobot"),
+        **{name: version(name) for name in ("torch", "mujoco", "lerobot")},
     }
 
 
@@ -142,20 +91,89 @@ def _cpu() -> str:
 
 
 def table(figures: Figures) -> str:
-    """Markdown: one table of ratios, one of the medians behind them."""
-    ratios = [[f"`{key}`", f"{figures[key]['ratio']:.1f}", f"{target:g}"] for key, target in TARGETS.items()]
-    medians = []
-    for key in TARGETS:
-        unit = figures[key]["unit"]
-        for name, value in figures[key].items():
-            if name not in ("ratio", "unit"):
-                shown = f"{value * 1000:,.1f} ms" if unit == "s" else f"{value:,.0f} {unit}"
-                medians.append([f"`{key}`", f"`{name}`", shown])
+    """The medians, and the machine, in Markdown."""
+    rows = []
+    for key, entry in figures.items():
+        for name, value in entry.items() if key != "machine" else ():
+            if name != "unit":
+                shown = f"{value * 1000:,.1f} ms" if entry["unit"] == "s" else f"{value:,.0f} {entry['unit']}"
+                rows.append([f"`{key}`", f"`{name}`", shown])
     m = figures["machine"]
     versions = f"Python {m['python']}, torch {m['torch']}, mujoco {m['mujoco']}, lerobot {m['lerobot']}"
-    parts = [
-        document.table(["case", "ratio", "target"], ratios),
-        document.table(["case", "variant", "median"], medians),
-        f"{m['cpu']}, {m['cores']} cores, {m['system']}, {versions}; medians of {m['repeats']}",
-    ]
-    return "\n\n".join(parts)
+    ending = f"{m['cpu']}, {m['cores']} cores, {m['system']}, {versions}; medians of {m['repeats']}"
+    return f"{document.table(['case', 'variant', 'median'], rows)}\n\n{ending}"
+
+
+def cost_tables(config: ExperimentConfig, say: Say) -> str:
+    """What each stage's steps take, counted, then estimated; with `config.device` also measured there."""
+    import torch
+
+    from playslot_rl.speed.cost import Machine, stage_cost
+    from playslot_rl.speed.steps import STAGES
+
+    costs = []
+    for stage in STAGES:
+        say(stage)
+        costs.append(stage_cost(config, stage))
+    tables = [counted(costs), estimated(costs, Machine())]
+    if config.device:
+        tables.append(measured(config, costs, torch.device(config.device), say))
+    return "\n\n".join(tables)
+
+
+def counted(costs: Sequence[StageCost]) -> str:
+    """What was counted, a row a stage."""
+    titles = ["counted", "parameters trained", "batch", "TFLOP a step", "calls a step"]
+    titles += ["kept for backward, fp32", "steps", "PFLOP in all"]
+    rows = []
+    for cost in costs:
+        count = cost.at(cost.batch)
+        rows.append([
+            cost.stage, f"{cost.parameters:,}", str(cost.batch), f"{count.flops / 1e12:.3g}", f"{count.calls:,.0f}",
+            f"{count.kept / 2**30:.2f} GiB", f"{cost.steps:,}", f"{count.flops * cost.steps / 1e15:,.3g}",
+        ])  # fmt: skip
+    return document.table(titles, rows)
+
+
+def estimated(costs: Sequence[StageCost], machine: Machine) -> str:
+    """Memory and time on `PROCESSES`, a row a stage; what is assumed stands in the first line."""
+    from playslot_rl.speed.cost import estimate
+
+    assumed = (
+        f"Estimated, assuming {machine.teraflops:g} TFLOP/s sustained a device, {machine.call_us:g} us a kernel at "
+        f"least, {machine.gigabytes_s:g} GB/s and {machine.exchange_us:g} us an exchange; "
+        "GiB a device, seconds a step, hours:"
+    )
+    rows, hours = [], dict.fromkeys(PROCESSES, 0.0)
+    for cost in costs:
+        cells = [cost.stage]
+        for n in PROCESSES:
+            step = estimate(cost, n, machine)
+            hours[n] += step * cost.steps / 3600
+            memory = cost.memory(cost.batch / n) / 2**30
+            cells.append(f"{memory:.2f} GiB, {step:.3g} s, {step * cost.steps / 3600:.1f} h")
+        rows.append(cells)
+    rows.append(["all stages", *(f"{total:.0f} h" for total in hours.values())])
+    titles = ["estimated", *(f"{n} device{'s' * (n > 1)}" for n in PROCESSES)]
+    return f"{assumed}\n\n{document.table(titles, rows)}"
+
+
+def measured(config: ExperimentConfig, costs: Sequence[StageCost], device: torch.device, say: Say) -> str:
+    """Seconds a step and the operations they sustain, a row a stage and precision; on a CPU of `CPU_BATCH` clips."""
+    import torch
+
+    from playslot_rl.speed.steps import precisions, stage_config, time_step
+
+    on_gpu, rows = device.type == "cuda", []
+    where = torch.cuda.get_device_name(device) if on_gpu else f"this CPU, {torch.get_num_threads()} threads"
+    for cost in costs:
+        batch = cost.batch if on_gpu else min(cost.batch, CPU_BATCH)
+        ways = (False, True) if stage_config(config, cost.stage).compile else (False,)
+        for precision, compiled in product(precisions(device.type), ways):
+            how = f"{precision}, compiled" if compiled else precision
+            say(f"{cost.stage}, {how}")
+            took, peak = time_step(config, cost.stage, device, precision, batch, 10 if on_gpu else 3, compiled)
+            rate, memory = cost.at(batch).flops / took / 1e12, "–" if peak is None else f"{peak / 2**30:.2f} GiB"
+            rows.append([cost.stage, how, str(batch), f"{took:.4g}", f"{rate:.3g}", memory])
+    titles = ["measured", "precision", "batch", "s a step", "TFLOP/s", "peak memory"]
+    return f"Measured on {where}, torch {torch.__version__}:\n\n{document.table(titles, rows)}"
