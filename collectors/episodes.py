@@ -78,7 +78,6 @@ class SeededView(TensorView):
     the renderer, and its observation is all zeros.
 
     Args:
-        env: the task.
         jobs: the first episodes.
 
     Attributes:
@@ -128,7 +127,6 @@ class SeededView(TensorView):
         )
 
     def step(self, action: npt.NDArray[np.float32]) -> tuple[View, Any, bool, bool, dict[str, Any]]:
-        """Gymnasium's step."""
         self._step += 1
         result = super().step(action)
         if result[2] or result[3]:
@@ -141,11 +139,7 @@ class SeededView(TensorView):
 
 
 class TaskMaker:
-    """Makes a worker's environment and hands it its jobs; goes to other processes and machines as it is.
-
-    Args:
-        spec: the collection.
-    """
+    """Makes a worker's environment and hands it its jobs; goes to other processes and machines as it is."""
 
     def __init__(self, spec: CollectionSpec) -> None:
         self.spec = spec

@@ -37,7 +37,6 @@ class ImageSetWriter:
 
     Args:
         meta: LeRobot's metadata of it (`LeRobotDatasetMetadata`); one image feature.
-        root: its folder.
         task: of every frame.
     """
 

@@ -100,7 +100,6 @@ class Journal:
 
     Args:
         folder: made if needed.
-        spec: what is collected.
 
     Raises:
         OutputError: the folder holds something else, or a collection with other settings, or cannot be written.

@@ -33,7 +33,6 @@ class RayWorkers:
 
     Args:
         journal: where this process stores their episodes.
-        count: how many.
         address: of the cluster; empty means `$RAY_ADDRESS`, or a cluster of this machine alone.
 
     Raises:

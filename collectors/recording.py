@@ -88,12 +88,7 @@ def serve(pipe: Connection[Any, Any], journal: Journal) -> None:
 
 
 class LocalWorkers:
-    """Worker processes.
-
-    Args:
-        journal: where they store episodes.
-        count: how many.
-    """
+    """Worker processes."""
 
     def __init__(self, journal: Journal, count: int) -> None:
         self.journal = journal
@@ -102,7 +97,6 @@ class LocalWorkers:
         self._pipes: list[Connection[Any, Any] | None] = [None] * count
 
     def start(self, slot: int) -> None:
-        """See `Workers`."""
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=serve, args=(theirs, self.journal), daemon=True)
         process.start()
@@ -110,14 +104,12 @@ class LocalWorkers:
         self._processes[slot], self._pipes[slot] = process, ours
 
     def submit(self, slot: int, index: int) -> None:
-        """See `Workers`."""
         pipe = self._pipes[slot]
         assert pipe is not None
         with contextlib.suppress(ConnectionError):  # `reports` says that it died
             pipe.send(index)
 
     def reports(self, timeout: float) -> list[Report]:
-        """See `Workers`."""
         open_pipes = [pipe for pipe in self._pipes if pipe is not None]
         ready = wait(open_pipes, timeout)
         return [report for slot, pipe in enumerate(self._pipes) if pipe in ready for report in self._read(slot)]
@@ -141,7 +133,6 @@ class LocalWorkers:
             yield Report(slot, dead=f"ended with {ending}")
 
     def kill(self, slot: int) -> None:
-        """See `Workers`."""
         process, pipe = self._processes[slot], self._pipes[slot]
         self._processes[slot] = self._pipes[slot] = None
         if pipe is not None:
@@ -167,10 +158,7 @@ def record_into(
 
     Args:
         journal: locked by the caller.
-        indices: which episodes.
         workers: how many; 1 local one records in this process. The episodes do not depend on it, only their order.
-        settings: backend and patience.
-        say: told of workers that were replaced.
 
     Yields:
         Each index once, when its episode is stored.
@@ -207,10 +195,6 @@ def record_into(
 
 def draw(spec: CollectionSpec, indices: Sequence[int]) -> Iterator[RecordedEpisode]:
     """Draw the episodes `indices` of an environment without a simulator (GridShapes): no policy, no workers.
-
-    Args:
-        spec: the collection.
-        indices: which of its episodes.
 
     Yields:
         Each episode once. Actions say what the objects did, states where they were; reward and success are zero.

@@ -22,14 +22,10 @@ class CollectionSpec:
 
     Attributes:
         policy: `random` or `expert`.
-        episodes: how many.
         steps: agent steps of each; an episode has one more frame.
-        seed: base seed.
         noise: standard deviation of Gaussian noise on the expert's actions.
         storage: `image` or `video`.
         env: the task; its `max_steps` equals `steps`.
-        render: how frames are drawn.
-        format: version of this record.
     """
 
     policy: str

@@ -34,7 +34,6 @@ class ButtonPressEnv(PixelTask):
     first observation come from two independent streams of that seed.
 
     Args:
-        env: the task; None means the defaults.
         render: how frames are drawn; None means the defaults.
         render_mode: `rgb_array` or None.
 

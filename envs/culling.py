@@ -38,7 +38,6 @@ class FrustumCuller:
     """Hides the geoms of a model that a camera fixed in the world cannot see.
 
     Args:
-        model: the model.
         scene: a scene updated with the camera to be used; frames are square.
     """
 

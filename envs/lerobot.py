@@ -27,7 +27,6 @@ class LeRobotTask(gym.Wrapper[Observation, npt.NDArray[np.float32], Any, npt.NDA
 
     Args:
         env: the task, or its name; its `max_steps` is the longest episode, in agent steps.
-        render: how frames are drawn.
 
     Attributes:
         task: name of the task in our configuration.

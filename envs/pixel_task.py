@@ -57,7 +57,6 @@ class PixelTask(gym.Env[Observation, Action]):
     same action. Success does not terminate: clips have a fixed length, `max_steps`.
 
     Args:
-        config: the task.
         render_mode: `rgb_array` or None.
 
     Attributes:
@@ -174,7 +173,6 @@ class PixelTask(gym.Env[Observation, Action]):
 
         Args:
             seed: the episode's seed; None draws the next one from the environment's generator.
-            options: unused.
 
         Returns:
             The first observation and `{"success": bool}`: True for an episode that starts solved, which only random

@@ -23,7 +23,6 @@ class TensorView(gym.Wrapper[View, npt.NDArray[np.float32], dict[str, npt.NDArra
     step solved the task (after a reset: whether the episode starts solved).
 
     Args:
-        env: the task.
         more: spaces of what a subclass's `view` adds.
     """
 
@@ -61,7 +60,6 @@ class TensorView(gym.Wrapper[View, npt.NDArray[np.float32], dict[str, npt.NDArra
         return self.view(observation, info), info
 
     def step(self, action: npt.NDArray[np.float32]) -> tuple[View, Any, bool, bool, dict[str, Any]]:
-        """Gymnasium's step."""
         self._seed = None
         observation, reward, terminated, truncated, info = self.env.step(action)
         return self.view(observation, info), reward, terminated, truncated, info

@@ -58,7 +58,6 @@ class ActionLimits:
         return (self.low > self.smallest) | (self.high < self.largest)
 
     def give(self, known: ActionRange) -> None:
-        """Set the range of a network."""
         import torch
 
         known.take(torch.from_numpy(self.low), torch.from_numpy(self.high))

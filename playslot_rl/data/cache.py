@@ -65,7 +65,6 @@ def cache_folder(cache: CachePlace = "") -> Path:
 
 
 def settings(cache: CachePlace) -> Cache:
-    """The cache with its settings."""
     return cache if isinstance(cache, Cache) else Cache(cache)
 
 
@@ -129,8 +128,6 @@ def load_cached(folder: Path, name: str, make: Callable[[], object] | None = Non
     """Memory-map an array of a cache folder, read-only. The folder is in use as long as the array, or a view of it.
 
     Args:
-        folder: of the entry.
-        name: of the file.
         make: makes the entry; called where it is not there (any more: another process may make room at any time).
 
     Raises:
@@ -179,9 +176,6 @@ class ArrayWriter:
     the beginning, all holes.
 
     Args:
-        path: the file.
-        shape: of the array.
-        dtype: of its elements.
         rows: so many are in the file already, and it is gone on with.
     """
 

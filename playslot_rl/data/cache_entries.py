@@ -30,10 +30,8 @@ class Entry:
     """One entry of a cache.
 
     Attributes:
-        path: its folder.
         kind: `frames` or `slots`.
         data: folder of the data set it was made from, as it was named then; empty where an older version made it.
-        bytes: on disk.
         used: when it was last opened, seconds since 1970.
         in_use: whether a process has it open, or makes it.
         part: whether it is not finished: it is being made, or a kill has left it.
@@ -54,7 +52,6 @@ class Entry:
         return _key(folder) if self.part else folder.name
 
     def line(self) -> str:
-        """For people."""
         when = time.strftime("%Y-%m-%d %H:%M", time.localtime(self.used))
         state = "in use" if self.in_use else "unfinished" if self.part else "free"
         return f"{self.name}  {self.kind:6}  {shown(self.bytes):>8}  {when}  {state:10}  {self.data or '-'}"
@@ -173,12 +170,10 @@ class Listing:
     entries: Sequence[Entry]
 
     def to_json(self) -> str:
-        """One JSON object."""
         rows = [{"name": entry.name, **asdict(entry)} for entry in self.entries]
         return json.dumps({"folder": self.folder, "entries": rows}, indent=2)
 
     def lines(self) -> list[str]:
-        """For people."""
         total = f"{self.folder}: {len(self.entries)} entries, {shown(sum(entry.bytes for entry in self.entries))}"
         return [*(entry.line() for entry in self.entries), total]
 
@@ -198,12 +193,10 @@ class Cleared:
     kept: Sequence[Entry]
 
     def to_json(self) -> str:
-        """One JSON object."""
         names = {"removed": [entry.name for entry in self.removed], "in_use": [entry.name for entry in self.kept]}
         return json.dumps({"folder": self.folder, **names, "bytes": self._freed()}, indent=2)
 
     def lines(self) -> list[str]:
-        """For people."""
         lines = [f"{entry.name}: in use, left" for entry in self.kept]
         return [*lines, f"{self.folder}: {len(self.removed)} entries removed, {shown(self._freed())} free again"]
 

@@ -18,8 +18,6 @@ def full_name(wanted: str, cameras: Sequence[str], where: str) -> str:
     """The feature that a name means: itself, or the only one that ends with it after a dot.
 
     Args:
-        wanted: as it was typed.
-        cameras: all there are.
         where: they are in, for the error.
 
     Raises:
@@ -50,7 +48,6 @@ def camera_list(text: str) -> list[str]:
 
 
 def cameras_of(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Names of the image and video features."""
     return [name for name, feature in features.items() if feature["dtype"] in CAMERAS]
 
 

@@ -41,7 +41,6 @@ class Span:
 
     @property
     def length(self) -> int:
-        """Rows."""
         return self.stop - self.start
 
 
@@ -50,7 +49,6 @@ class Contents:
     """A data set as its files tell it.
 
     Attributes:
-        root: its folder.
         info: `meta/info.json`.
         episodes: the readable ones, by index.
         tasks: `task_index` -> words.
@@ -84,7 +82,6 @@ class Contents:
 
     @property
     def features(self) -> dict[str, dict[str, Any]]:
-        """Features by name."""
         features: dict[str, dict[str, Any]] = self.info["features"]
         return features
 
@@ -95,7 +92,6 @@ class Contents:
 
     @property
     def fps(self) -> float:
-        """Frames a second."""
         return float(self.info["fps"])
 
     @property
@@ -110,7 +106,6 @@ class Contents:
 
     @property
     def cameras(self) -> list[str]:
-        """Names of the image and video features."""
         return cameras_of(self.features)
 
     def camera(self, wanted: str) -> str:
@@ -179,8 +174,6 @@ def read_contents(root: str | Path, problems: Problems, *, statistics: bool = Tr
     """Read all but the frames. What cannot be read is left out and noted in `problems`.
 
     Args:
-        root: folder of the data set.
-        problems: what is wrong with it.
         statistics: read those of each episode.
 
     Raises:

@@ -132,7 +132,6 @@ def split_demonstrations(
     """Train on the first demonstrations, and measure on the last ones.
 
     Args:
-        source: the data set.
         demos: how many are trained on; None for all that are not kept.
         kept: the last ones, which were recorded to measure (`data.held_out`).
         measured: at most so many of the last ones beyond those that are trained on measure, if more than `kept`.

@@ -41,10 +41,7 @@ class FrameArray:
     """The array that is being made.
 
     Attributes:
-        contents: the data set; its columns are not read.
-        camera: whose frames.
         size: side to resize to; None keeps them.
-        path: the file.
     """
 
     contents: Contents
@@ -112,8 +109,6 @@ def build_frames(contents: Contents, camera: str, size: int | None, folder: Path
     """Decode a data set to `folder/frames.npy`.
 
     Args:
-        contents: the data set.
-        camera: whose frames.
         size: side to resize to; None keeps them.
         folder: of the entry that is being made; it may hold some units already.
         workers: processes; 0 means one for each core, 1 decodes in this one.

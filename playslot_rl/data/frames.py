@@ -41,8 +41,6 @@ def decoded_frames(
     """Frames of a camera with their row numbers, ascending within a file.
 
     Args:
-        contents: the data set.
-        camera: image or video feature.
         problems: notes what cannot be decoded or has another size than stated; such frames are left out.
         spans: episodes to read; None means all.
     """

@@ -25,9 +25,7 @@ class GridShapesStream(IterableDataset[dict[str, Tensor]]):
     OBJECT_MASKS uint8 (T + 1, H, W) and SEED int64 (). Workers of a DataLoader share the seeds: each comes once.
 
     Args:
-        first: first seed.
         clips: how many; None goes on for ever.
-        steps: T.
         env: settings; None means `EnvConfig(name="grid_shapes")`.
 
     Raises:

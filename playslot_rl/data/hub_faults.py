@@ -25,8 +25,6 @@ class Asked:
     Attributes:
         name: `user/name`, or the address as it was typed.
         what: `data set` or `model`.
-        endpoint: address of the Hub.
-        root: local folder.
         revision: the one asked for; empty if none was.
         writing: a push.
         has_token: whether a token is sent.

@@ -17,7 +17,6 @@ def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path])
     """One or several data sets as one, by `env.image_size` and what `data` says of cameras, caches, size and stride.
 
     Args:
-        config: of the command.
         roots: folders, or a text with commas and weights (`playslot_rl.config.weights`).
 
     Raises:

@@ -22,21 +22,17 @@ class Problems:
         self._warnings.setdefault(kind, []).append(message)
 
     def of(self, kind: str) -> list[str]:
-        """Errors of one kind."""
         return self._errors.get(kind, [])
 
     def warnings_of(self, kind: str) -> list[str]:
-        """Warnings of one kind."""
         return self._warnings.get(kind, [])
 
     @property
     def errors(self) -> list[str]:
-        """One line each."""
         return _lines(self._errors)
 
     @property
     def warnings(self) -> list[str]:
-        """One line each."""
         return _lines(self._warnings)
 
 

@@ -75,7 +75,6 @@ class Remote:
         return _asking(self.address, self.token, self.root)
 
     def holds(self, path: Path) -> bool:
-        """Whether the commit has the file."""
         return path.relative_to(self.root).as_posix() in self.hashes
 
     def fingerprint(self, camera: str) -> str:

@@ -39,7 +39,6 @@ def row_numbers(rows: Any, count: int) -> tuple[IntArray, tuple[int, ...]]:
 
     Args:
         rows: an integer, a slice or an integer array of any shape; negative numbers count from the end.
-        count: of all rows.
 
     Raises:
         IndexError: there is no such row.

@@ -58,7 +58,6 @@ def slot_cache(
         savi: SAVi with frozen weights; moved to `device` and put in eval mode.
         savi_fingerprint: of its weights (`StageCheckpoint.fingerprint`).
         cache: the cache; empty means the default one.
-        device: where to compute.
         progress: print a line to standard error before a long computation.
 
     Returns:

@@ -57,8 +57,6 @@ class EpisodeFrames:
         success: bool (F,), or None.
         seeds: int64 (E,), or None.
         fingerprint: content hash, 16 hex digits.
-        fps: frames a second.
-        task: the task in words.
         camera: feature the frames come from.
         robot: what was recorded, as the data set says; empty where it says nothing.
         name: the folder it was read from, for people.
@@ -100,7 +98,6 @@ class EpisodeFrames:
         return torch.from_numpy(frames).movedim(-1, -3)
 
     def episode_rows(self, episode: int) -> npt.NDArray[np.int64]:
-        """Row numbers of an episode."""
         return np.arange(self.starts[episode], self.starts[episode] + self.lengths[episode])
 
     def require_actions(self, width: int | None = None) -> npt.NDArray[np.float32]:

@@ -45,7 +45,6 @@ class FrameStream:
 
     Args:
         contents: the data set; its columns are not kept.
-        camera: whose frames.
         size: side to resize to; None keeps them.
         buffer: frames of the shuffle buffer.
     """

@@ -35,8 +35,6 @@ class Episode:
 
     Attributes:
         index: `episode_index`.
-        length: frames.
-        tasks: in words.
         row: all its values but the statistics.
         stats: feature -> statistic -> array, float64.
     """
@@ -54,9 +52,7 @@ def read_columns(
     """The readable ones of some data files, rows of each, and every feature that is no camera.
 
     Args:
-        paths: of the files.
         info: `meta/info.json`.
-        problems: notes what cannot be read.
         opened: a file as pyarrow takes one.
     """
     features = info["features"]

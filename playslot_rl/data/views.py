@@ -171,7 +171,6 @@ def split_tested(source: EpisodeFrames, fraction: float) -> tuple[EpisodeFrames,
     """The episodes that are trained on, and those that are kept for a test, the same ones for every seed.
 
     Args:
-        source: the data set.
         fraction: of its episodes that are kept, at least two.
 
     Raises:

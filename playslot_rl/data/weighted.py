@@ -51,7 +51,6 @@ def weighted(sources: Sequence[EpisodeFrames], weights: Sequence[float | None], 
     """Several data sets as one. Nothing is copied: each keeps its own frame cache.
 
     Args:
-        sources: the sets.
         weights: of each; all None draws every window of all sets alike, as `concatenate`.
         names: what to call each in a message.
 
@@ -96,11 +95,8 @@ def draw_episodes(
     """Draw a set by its weight, then one of the places in its episodes.
 
     Args:
-        shares: sets and weights.
         starts: first row of each episode (E,).
         places: how many there are in each episode (E,), 0 or more.
-        batch: B.
-        generator: source of randomness.
 
     Returns:
         Episode and place in it, int64 (B,) each.

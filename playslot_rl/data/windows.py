@@ -31,9 +31,6 @@ def sample_windows(
     Args:
         starts: first row of each episode (E,).
         lengths: frames of each episode (E,).
-        window: T.
-        batch: B.
-        generator: source of randomness.
         episodes: episodes to draw from; None means all.
 
     Returns:
@@ -101,9 +98,7 @@ def split_episodes(episodes: int, validation: float, seed: int) -> tuple[IntArra
     """Split episode indices into training and validation, at random but always the same for a seed.
 
     Args:
-        episodes: E.
         validation: fraction held out; at least one episode is, if the fraction is not 0 and there are two.
-        seed: of the split.
 
     Returns:
         Sorted training and validation indices; with nothing held out, validation is the training set.
@@ -120,10 +115,7 @@ class Clips:
     """Clips of unlabelled videos: windows of the training episodes, and spread ones of the episodes held out.
 
     Args:
-        source: the videos.
-        frames: T.
         validation: fraction of episodes held out.
-        seed: of the split.
         shown: windows that a validation looks at, at most.
 
     Attributes:

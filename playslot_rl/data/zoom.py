@@ -20,10 +20,7 @@ def corners(clips: int, size: int, zoom: float, generator: np.random.Generator) 
     """Upper left corners (B, 2) of the squares, row and column, pixels.
 
     Args:
-        clips: B.
-        size: side of the frames, H.
         zoom: how many times things are enlarged, 1 or more.
-        generator: draws them.
     """
     return generator.integers(0, size - _side(size, zoom) + 1, (clips, 2))
 

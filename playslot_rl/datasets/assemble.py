@@ -48,7 +48,6 @@ class Choice:
     """Episodes of one data set.
 
     Attributes:
-        contents: the data set.
         spans: rows of the episodes to take, in order.
         episodes: their metadata, in the same order; statistics as they shall be, those of places are made anew.
     """
@@ -68,7 +67,6 @@ def assemble(choices: Sequence[Choice], out: Path, made_by: str) -> None:
 
     Args:
         choices: of data sets with the same features and rate.
-        out: folder, new or empty.
         made_by: command, for our own record.
 
     Raises:

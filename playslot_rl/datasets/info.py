@@ -25,10 +25,8 @@ class DatasetSummary:
     """Summary of a data set.
 
     Attributes:
-        root: its folder.
         format: LeRobot's version of it.
         robot: robot type, empty if not stated.
-        fps: frames a second.
         episodes, frames: how many.
         lengths: shortest, mean and longest episode, frames.
         tasks: words -> episodes.
@@ -54,7 +52,6 @@ class DatasetSummary:
     source: dict[str, Any] | None
 
     def to_json(self) -> str:
-        """One JSON object."""
         return json.dumps(asdict(self), indent=2)
 
     def facts(self) -> list[tuple[str, str]]:
@@ -78,7 +75,6 @@ class DatasetSummary:
         return found
 
     def lines(self) -> list[str]:
-        """For people."""
         head = f"{self.root}: LeRobot {self.format}, robot {self.robot or 'not stated'}"
         found = [head, *(f"{name:<8}  {value}" for name, value in self.facts())]
         width = max(map(len, self.features))

@@ -19,7 +19,6 @@ class MergeResult:
     """What `merge` made.
 
     Attributes:
-        out: the new data set.
         sources: those it was made from, with their numbers of episodes.
         verification: of the new one.
     """
@@ -29,7 +28,6 @@ class MergeResult:
     verification: Verification
 
     def lines(self) -> list[str]:
-        """For people."""
         made = self.verification
         named = ", ".join(f"{root} ({episodes})" for root, episodes in self.sources)
         counts = f"{made.episodes} episodes, {made.frames} frames"
@@ -43,7 +41,6 @@ def merge(roots: Sequence[str | Path], out: str | Path) -> MergeResult:
 
     Args:
         roots: two or more data sets with the same features, rate and robot.
-        out: folder that does not exist yet.
 
     Raises:
         DataError: fewer than two, a damaged one, or ones that do not fit together.

@@ -34,7 +34,6 @@ class RepairResult:
     """What `repair` did.
 
     Attributes:
-        root: the sound data set.
         verification: of it.
         stated: episodes the damaged one said it had; None where nothing was wrong.
         lost: what is not there any more, a line each.
@@ -50,7 +49,6 @@ class RepairResult:
     journal: Path | None
 
     def lines(self) -> list[str]:
-        """For people."""
         made = self.verification
         if self.stated is None:
             return [f"{self.root}: sound, nothing to repair ({made.episodes} episodes, {made.frames} frames)"]

@@ -228,8 +228,6 @@ def convert_sketchy(
     All is written under a temporary name and renamed at the end: an error or a kill leaves no `out`.
 
     Args:
-        source: Sketchy's folder.
-        out: folder to make.
         cameras: names out of `CAMERAS`; each is a feature `observation.images.NAME`.
         image_size: side of the frames, pixels.
         storage: `image` (PNG in parquet) or `video` (h264 yuv444p, crf 0).

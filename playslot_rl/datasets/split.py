@@ -30,7 +30,6 @@ class SplitResult:
     verifications: dict[str, Verification]
 
     def lines(self) -> list[str]:
-        """For people."""
         return [
             f"{self.out / name}: {made.episodes} episodes, {made.frames} frames, fingerprint {made.fingerprint}"
             for name, made in self.verifications.items()
@@ -44,8 +43,6 @@ def split(root: str | Path, out: str | Path, fractions: Mapping[str, float], *, 
     leaves no `out`.
 
     Args:
-        root: the data set.
-        out: folder that does not exist yet.
         fractions: name -> share, each more than 0, together 1.
         seed: of the draw.
 

@@ -148,7 +148,6 @@ def typical_motion(episodes: Sequence[Frames], stride: int, threshold: float) ->
 
     Args:
         episodes: frames of each, uint8 (F, S, S, 3).
-        stride: k.
         threshold: theta, grey levels.
     """
     found = []

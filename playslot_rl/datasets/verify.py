@@ -29,9 +29,6 @@ class Verification:
     """Result of `verify`.
 
     Attributes:
-        root: the data set.
-        ok: nothing is wrong.
-        errors, warnings: one line each.
         episodes, frames: that are there.
         fingerprint: of the content (see `fingerprint.py`); empty where it cannot be read.
     """
@@ -45,11 +42,9 @@ class Verification:
     fingerprint: str
 
     def to_json(self) -> str:
-        """One JSON object."""
         return json.dumps(asdict(self), indent=2)
 
     def lines(self) -> list[str]:
-        """For people."""
         found = [f"error: {line}" for line in self.errors] + [f"warning: {line}" for line in self.warnings]
         counts = f"{self.episodes} episodes, {self.frames} frames"
         if not self.ok:
@@ -63,7 +58,6 @@ def verify(root: str | Path, *, statistics: bool = True) -> Verification:
     Never raises for what is wrong with the data set: that is what the result says.
 
     Args:
-        root: its folder.
         statistics: also compare statistics and our own record; others' may be made in another way.
     """
     problems = Problems()
@@ -203,9 +197,6 @@ def episode_statistics(
     """Statistics of the episode of span `number`; cameras whose frames cannot be decoded are left out.
 
     Args:
-        contents: the data set.
-        scans: its frames.
-        number: of the span.
         as_lerobot: means and standard deviations with LeRobot's rounding, not exact.
     """
     span: Span = contents.spans[number]

@@ -26,11 +26,7 @@ class VideoCopier:
     """Writes the files of one camera of a new data set.
 
     Args:
-        root: the new data set.
-        camera: feature.
-        fps: frames a second.
         limit: bytes after which the next file begins.
-        files: files in a folder.
     """
 
     def __init__(self, root: Path, camera: str, fps: float, limit: int, files: int) -> None:
@@ -48,9 +44,7 @@ class VideoCopier:
         """Copy an episode.
 
         Args:
-            path: source file.
             begin: seconds of the episode's first frame in it.
-            length: frames.
 
         Returns:
             The new `chunk_index`, `file_index`, `from_timestamp` and `to_timestamp`, as in `meta/episodes`.

@@ -41,8 +41,6 @@ class Clip:
     """An episode as it is shown.
 
     Attributes:
-        span: its rows.
-        episode: its metadata.
         frames: camera -> uint8 (T, H, W, 3).
     """
 
@@ -62,7 +60,6 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
     """Write one HTML file about a data set; styles and pictures are inside it.
 
     Args:
-        root: the data set.
         out: file to write, replaced if it exists; None means `ROOT.html` beside the data set, never in it.
         episodes: episodes to show, evenly spread.
 

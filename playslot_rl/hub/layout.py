@@ -91,7 +91,6 @@ def same_content(item: Path | bytes, remote: RepoFile) -> bool:
 
 
 def size_of(item: Path | bytes) -> int:
-    """Bytes of a file's content."""
     return len(item) if isinstance(item, bytes) else item.stat().st_size
 
 
@@ -105,7 +104,6 @@ class HubRecord:
 
     Attributes:
         fingerprint: content hash of the data set, as `playslot dataset verify` prints it.
-        episodes, frames: counts.
         scheme: how the fingerprint is made.
         playslot_rl: version that pushed.
     """

@@ -24,7 +24,6 @@ class PolicyPushResult(Pushed):
     fingerprint: str
 
     def lines(self) -> list[str]:
-        """For people."""
         return self.report(f"{self.size / 1e6:.1f} MB, weights {self.fingerprint}")
 
 
@@ -43,7 +42,6 @@ def push_policy(
 
     Args:
         folder: made by `playslot export`; nothing is written into it.
-        repo_id: `user/name`; made if it is not there.
         private: make it private; refused where it is public.
         branch: made from main if it is not there; None means main.
         tag: a name for the commit; never moved.
@@ -66,7 +64,6 @@ def pull_policy(repo_id: str, revision: str = "", cache: str | Path = "", token:
     """Download a policy, unless that commit of it is in the cache.
 
     Args:
-        repo_id: `user/name`.
         revision: branch, tag or commit; empty means main.
         cache: folder of the caches; empty means `$PLAYSLOT_CACHE`, or else `~/.cache/playslot_rl`.
         token: None takes HF_TOKEN or what `hf auth login` stored; not needed for public models.

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from playslot_rl.data.metadata import FORMAT_TAG, INFO_NAME, damaged, parsed, read_info
+from playslot_rl.data.metadata import FORMAT_TAG, INFO_NAME, read_info
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, HubError, OutputError
 from playslot_rl.hub.layout import LOCAL_RECORD, SCHEME, HubRecord, is_pulled, read_record, require_plain
@@ -31,14 +31,9 @@ class PullResult:
     """What a pull did.
 
     Attributes:
-        repo_id: `user/name`.
-        root: the new folder.
         revision: what was fetched: a branch, tag or commit.
         why: how it was chosen; empty if it was asked for.
-        commit: the full commit.
-        episodes, frames: counts.
         files, size: how many files and bytes.
-        fingerprint: content hash.
         compared: whether the Hub named a fingerprint to compare it with.
     """
 
@@ -55,7 +50,6 @@ class PullResult:
     compared: bool
 
     def lines(self) -> list[str]:
-        """For people."""
         checked = "as pushed" if self.compared else "the Hub names none to compare; files and counts were checked"
         return [
             f"pulled: {self.episodes} episodes, {self.frames} frames, {self.files} files of {self.size / 1e6:.1f} MB",
@@ -70,7 +64,6 @@ def pull(repo_id: str, root: Path, *, revision: str | None = None, token: str | 
     """Download a LeRobot data set. After an interruption the same command carries on with the files still missing.
 
     Args:
-        repo_id: `user/name`.
         root: a folder that is not there, or empty.
         revision: branch, tag or commit; None means the tag of LeRobot's format version, or main where there is none.
         token: None takes HF_TOKEN or what `hf auth login` stored; not needed for public data sets.
@@ -145,24 +138,13 @@ def _choose(hub: Repository, revision: str | None) -> tuple[str, str, str]:
 
 def _check_version(hub: Repository, partial: Path, commit: str) -> None:
     """Look at the metadata before gigabytes are fetched."""
-    try:
-        version = str(parsed(hub.read(INFO_NAME, commit, partial))["codebase_version"])
-    except (ValueError, KeyError, TypeError) as error:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise DataError(
-            f"{hub.name}: got a damaged {INFO_NAME} ({damaged(error)}), expected LeRobot's metadata"
-        ) from error
-    if not version.startswith("v3."):
-        shutil.rmtree(partial, ignore_errors=True)
-        raise DataError(
-            f"{hub.name}: got LeRobot format {version}, expected v3.0: ask for another revision, or convert it by "
-            "LeRobot's convert_dataset_v21_to_v30"
-        )
+    hub.read(INFO_NAME, commit, partial)
     try:
         read_info(partial)
     except DataError as error:
         shutil.rmtree(partial, ignore_errors=True)
-        raise DataError(f"{hub.name}: {str(error).replace(f'{partial}/', '')}") from error
+        said = str(error).removeprefix(f"{partial}: ").replace(f"{partial}/", "")
+        raise DataError(f"{hub.name}: {said}; or ask for another revision") from error
 
 
 def _check_room(root: Path, partial: Path, wanted: Mapping[str, RepoFile]) -> None:

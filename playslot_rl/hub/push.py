@@ -40,8 +40,6 @@ def make_card(data: DatasetSummary, repo_id: str, fingerprint: str) -> str:
 
     Args:
         data: summary of a checked data set.
-        repo_id: `user/name`.
-        fingerprint: content hash.
     """
     note = read_record(Path(data.root)) or {}
     made = _made(note)
@@ -115,7 +113,6 @@ class PushResult(Pushed):
     """What a push of a data set did.
 
     Attributes:
-        record: fingerprint and counts.
         left: local files that stayed here.
     """
 
@@ -123,7 +120,6 @@ class PushResult(Pushed):
     left: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """For people."""
         record, more = self.record, []
         if not self.tags:
             more.append(f"tag: none moved; pull this branch by revision={self.branch}")
@@ -143,7 +139,6 @@ def push(
 
     Args:
         root: its folder; nothing is written into it.
-        repo_id: `user/name`; made if it is not there.
         private: make it private; refused where it is public.
         branch: made from main if it is not there; None means main. The version tag moves with main only.
         tag: one more tag for the commit; never moved.

@@ -50,7 +50,6 @@ class Repository(Asked):
 
     @property
     def address(self) -> str:
-        """Its page."""
         return f"{self.endpoint}/{'datasets/' if self.kind == 'dataset' else ''}{self.name}"
 
     def call(self, function: Callable[..., Any], **arguments: Any) -> Any:
@@ -87,7 +86,6 @@ class Repository(Asked):
         return is_private
 
     def refs(self) -> tuple[dict[str, str], dict[str, str]]:
-        """Commits of the branches and of the tags, by name."""
         refs = self.call(self.api.list_repo_refs, **self.here)
         return ({ref.name: ref.target_commit for ref in refs.branches},
                 {ref.name: ref.target_commit for ref in refs.tags})  # fmt: skip
@@ -188,7 +186,6 @@ def open_repository(
     """Talk to the Hub about one data set or model.
 
     Args:
-        repo_id: `user/name`.
         root: local folder, for messages.
         token: None takes HF_TOKEN or what `hf auth login` stored.
         writing: needs a token.
@@ -226,13 +223,6 @@ class Pushed:
     """What every push says.
 
     Attributes:
-        repo_id: `user/name`.
-        address: its page.
-        branch: pushed to.
-        commit: what the branch now is.
-        changed: whether there was anything to send.
-        private: whether the repository is.
-        tags: set on the commit.
         files, size: how many files and bytes were compared.
         stale: files deleted on the Hub because they are no longer part of what is pushed.
         card_kept: whether the card is one that somebody wrote by hand.
@@ -288,11 +278,9 @@ def send(
     """Push, or find that everything is there already. Nothing is visible on the Hub before the one commit.
 
     Args:
-        hub: opened for writing.
         root: local folder, which may hold a card written by hand.
         files: what to send, by path, with the card as it is made here.
         mark: line of a card by which those made here are known.
-        message: of the commit.
         private: make it private; refused where it is public.
         branch: made from main if it is not there.
         tag: one more tag for the commit; never moved.

@@ -55,11 +55,7 @@ def make_card(
     """The card as Markdown with a YAML header: `card.md`, filled in.
 
     Args:
-        name: title.
-        policy: config of the model folder.
-        agent: the networks.
         experiment: config of the run; None where it is not known.
-        results: evaluations of this policy.
     """
     env = policy.env
     header = {
@@ -102,7 +98,6 @@ def front_matter(header: dict[str, Any], mark: str) -> str:
 
 
 def facts_table(rows: dict[str, str]) -> str:
-    """Names and values as a Markdown table."""
     return table(("", ""), rows.items())
 
 

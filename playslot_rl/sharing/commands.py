@@ -67,9 +67,7 @@ def reproduce(config: ExperimentConfig, source: Mapping[str, Any], results: Sequ
     """Command lines from nothing (from the data sets, where these were recorded elsewhere) to the evaluated policy.
 
     Args:
-        config: of the run.
         source: see `playslot_rl.sharing.run.read_source`.
-        results: what was measured of it.
     """
     evaluate = [
         _line("evaluate", f"run={RUN}", f"protocol={r.protocol}", f"episodes={r.episodes}", f"seed={r.seed}")
@@ -214,7 +212,6 @@ def use(policy: SharedPolicyConfig, experiment: ExperimentConfig | None = None) 
     """The paragraph on LeRobot's programs, as Markdown.
 
     Args:
-        policy: config of the model folder.
         experiment: config of the run; None where it is not known.
     """
     if policy.env.name not in ENVIRONMENTS:

@@ -46,7 +46,10 @@ WEIGHTS: Final = "model.safetensors"
 LICENCE: Final = "apache-2.0"
 TAGS: Final = ("robotics", "lerobot", TYPE)
 
-OURS: Final = ("env", "model", "resize", "stride", "fps", "fingerprint", "source", "actions")
+_PLAIN: Final[dict[str, Callable[[Any], Any]]] = {
+    "resize": bool, "stride": int, "fps": float, "fingerprint": str, "source": dict, "actions": dict,
+}  # fmt: skip
+OURS: Final = ("env", "model", *_PLAIN)
 """Keys of `config.json` that LeRobot does not know; `actions` only where they may have a range of their own."""
 
 
@@ -56,7 +59,6 @@ class SharedPolicyConfig:
 
     Attributes:
         env: the task it was trained on: frame size, action width, agent steps.
-        model: sizes of the networks.
         camera: LeRobot feature of the frames it looks at.
         resize: frames of another size are resized by area averaging, as in training; False refuses them.
         stride: every so-many-th frame of the demonstrations' videos was trained on, and is what it has to be shown.
@@ -113,17 +115,9 @@ class SharedPolicyConfig:
         Raises:
             ValueError: unknown keys, wrong types, or values outside their range.
         """
-        return cls(
-            env=from_dict(EnvConfig, ours["env"], "env."),
-            model=from_dict(ModelConfig, ours["model"], "model."),
-            camera=camera,
-            resize=bool(ours.get("resize", False)),
-            stride=int(ours.get("stride", 1)),
-            fps=float(ours.get("fps", 0.0)),
-            fingerprint=str(ours.get("fingerprint", "")),
-            source=dict(ours.get("source") or {}),
-            actions=dict(ours.get("actions") or {}),
-        )
+        env, model = from_dict(EnvConfig, ours["env"], "env."), from_dict(ModelConfig, ours["model"], "model.")
+        plain = {name: kind(ours[name]) for name, kind in _PLAIN.items() if ours.get(name) is not None}
+        return cls(env=env, model=model, camera=camera, **plain)
 
 
 def camera_of(inputs: dict[str, Any]) -> str:
@@ -305,7 +299,6 @@ def load_pretrained(folder: Path, device: torch.device | str = "cpu") -> tuple[A
 
 
 def files_of(config: SharedPolicyConfig) -> tuple[str, ...]:
-    """Everything a folder of such a policy holds."""
     return (*FILES, RANGE) if scaled(config.actions) else FILES
 
 
@@ -329,7 +322,6 @@ def make_processors(device: str, actions: dict[str, Any] | None = None) -> tuple
     LeRobot's own normaliser turns them into those of the robot, on the CPU, where they have another range.
 
     Args:
-        device: torch device of the policy.
         actions: of its config; None or empty for [-1, 1].
     """
     from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature

@@ -140,7 +140,6 @@ def export_run(
 
     Args:
         run: with a finished policy.
-        folder: must not exist.
         config: of the run; `data.camera` and `data.resize` say what the policy looks at.
         source: `read_source(run)`, if it has been read.
 
