@@ -42,7 +42,7 @@ exit 1
 endef
 export FIND_PYTHON
 
-.PHONY: help setup demo test test-integration test-all test-browser docs tables animation lint format typing lock clean FORCE
+.PHONY: help setup demo test test-integration test-all test-browser docs tables animation notebook lint format typing lock clean FORCE
 
 help:
 	@echo "make demo      set up, then the main job: success in simulation and in imagination, in minutes"
@@ -53,6 +53,7 @@ help:
 	@echo "make docs      the site of README, docs/ and the API, in build/site"
 	@echo "make tables    the tables and plots of README and docs/, from results/*.json"
 	@echo "make animation  the README's pictures and the shipped episodes, from the shipped models"
+	@echo "make notebook  run examples/quickstart.ipynb and store what it shows"
 	@echo "make lint      ruff, format check, mypy strict"
 	@echo "make setup     .venv with the pinned packages and $(BIN)/playslot"
 	@echo "make format    format the code"
@@ -121,6 +122,9 @@ tables: $(STAMP)
 
 animation: $(STAMP)
 	@$(BIN)/python docs/_site/animation.py
+
+notebook: $(STAMP)
+	@$(BIN)/python docs/_site/notebook.py
 
 # mypy, mkdocs and editors do not know the mapped folders: links that look like the installed package.
 typing:
