@@ -1,7 +1,7 @@
 """The blocks family: a Fetch arm that reaches for spheres, pushes cubes or picks them up.
 
 `BlockPush` is Push with the task `odd` and three distractors. Written anew after the multi-object-fetch tasks, on
-gymnasium-robotics' `MujocoFetchEnv`; see docs/environments.md.
+gymnasium-robotics' `MujocoFetchEnv`; see docs/reference/environments.md.
 
 The scripted experts are proportional control of the grip, a function of the present state alone.
 

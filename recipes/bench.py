@@ -1,4 +1,4 @@
-"""`playslot bench [--json FILE]`: speed of this machine, and what a training step costs (see docs/performance.md)."""
+"""`playslot bench [--json FILE]`: speed of this machine, and what a training step costs (see docs/results/speed.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`playslot compare methods=M,... demos=N,... seeds=S,... out=DIR`: methods side by side (docs/baselines.md)."""
+"""`playslot compare methods=M,... demos=N,... seeds=S,... out=DIR`: methods side by side (docs/how-to/compare.md)."""
 
 from __future__ import annotations
 

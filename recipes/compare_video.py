@@ -1,4 +1,4 @@
-"""`playslot compare-video methods=M,... seeds=S,... out=DIR`: video predictors side by side (docs/video.md)."""
+"""`playslot compare-video methods=M,... seeds=S,... out=DIR`: predictors side by side (docs/how-to/compare.md)."""
 
 from __future__ import annotations
 

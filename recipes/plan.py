@@ -1,7 +1,7 @@
 """`playslot plan run=DIR planner=NAME proposal=none|policy episodes=N seed=S`: goal images reached by planning.
 
 Writes `RUN/planning/GOALS/METHOD/eval_info.json`, `plan.png` beside it, `GOALS/cost.png`, and the table
-`RUN/planning/planning.md` and `.json` (docs/planning.md).
+`RUN/planning/planning.md` and `.json` (docs/how-to/plan.md).
 """
 
 from __future__ import annotations

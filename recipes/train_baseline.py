@@ -1,4 +1,4 @@
-"""`playslot train-baseline method=M out=DIR`: one of the methods that PlaySlot is compared with (docs/baselines.md)."""
+"""`playslot train-baseline method=M out=DIR`: a method to compare with (docs/explanation/methods.md)."""
 
 from __future__ import annotations
 

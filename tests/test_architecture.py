@@ -1,4 +1,4 @@
-"""No import points upwards: the layers are those of docs/architecture.md, the imports are read from the source."""
+"""No import points upwards: the layers are those of docs/explanation/architecture.md, imports are read."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ LIMIT = 60
 
 
 def layers() -> dict[str, int]:
-    """Rank of each package, from the list in docs/architecture.md; those of one line have the same."""
-    page = (ROOT / "docs" / "architecture.md").read_text()
+    """Rank of each package, from the list in docs/explanation/architecture.md; those of one line have the same."""
+    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text()
     listed = re.search(r"those before it:\n\n```text\n(.*?)```", page, re.DOTALL)
     assert listed is not None
     return {name: rank for rank, line in enumerate(listed[1].splitlines()) for name in line.split()}
@@ -102,5 +102,5 @@ def test_no_function_is_longer_than_a_screen() -> None:
 
 def test_nothing_cites_a_page_that_readers_do_not_have() -> None:
     """`system.md` is a page of ours that a reader of the repository does not have."""
-    pages = [path for path, _ in sources()] + [*(ROOT / "docs").glob("*.md"), *(ROOT / "recipes").rglob("*.yaml")]
+    pages = [path for path, _ in sources()] + [*(ROOT / "docs").rglob("*.md"), *(ROOT / "recipes").rglob("*.yaml")]
     assert [str(path.relative_to(ROOT)) for path in pages if "system.md" in path.read_text()] == []

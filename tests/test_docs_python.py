@@ -25,12 +25,12 @@ def blocks(page: Path) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
 
 
-PAGES = [page for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))] if blocks(page)]
+PAGES = [page for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))] if blocks(page)]
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`runs/demo` with the stored policy, two data sets, and `policies/press`: what the pages start from."""
+    """Runs with the stored policy, two data sets, and `policies/press`: what the pages start from."""
     from playslot_rl.api import load
     from playslot_rl.collectors import collect
     from playslot_rl.config import to_dict
@@ -43,6 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_json(run / "world_model.json", {"source": "pretrained/button_press"})
     config = compose(["preset=compact", "logging.progress=false"])
     write_json(run / "config.json", to_dict(config))
+    shutil.copytree(run, root / "runs" / "first")
     load(run, "cpu").save_pretrained(root / "policies" / "press")
     for seed, name in enumerate(("expert", "noisy")):
         collect(config, "expert", 6, 8, root / "data" / name, seed=seed, workers=1)
@@ -62,16 +63,15 @@ def given(page: str, block: int) -> dict[str, Any]:
     """Names that a block takes as the reader's own."""
     import torch
 
-    if page != "policies.md":
+    if page != "export.md":
         return {}
     frame = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(0))
     return {"frame": frame.mul(255).byte().movedim(0, -1).numpy() if block == 0 else frame}
 
 
 def test_every_page_with_python_is_run() -> None:
-    assert {"README.md", "python.md", "data.md", "datasets.md", "hub.md", "play.md", "policies.md", "torchrl.md"} <= {
-        page.name for page in PAGES
-    }
+    names = {"README.md", "first-policy.md", "python.md", "data.md", "data-sets.md", "hub.md", "play.md", "export.md"}
+    assert names | {"environments.md", "plan.md", "torchrl.md"} <= {page.name for page in PAGES}
 
 
 @pytest.mark.usefixtures("forking")
@@ -106,7 +106,7 @@ def test_the_python_blocks_about_the_hub_run(folder: Path) -> None:
         }
         # RepoCard.validate asks the real Hub, whatever the endpoint.
         code = "import huggingface_hub\nhuggingface_hub.RepoCard.validate = lambda *_, **__: None\n"
-        code += "".join(blocks(ROOT / "docs" / "hub.md")).replace("me/button-press", "owner/button-press")
+        code += "".join(blocks(ROOT / "docs" / "how-to" / "hub.md")).replace("me/button-press", "owner/button-press")
         done = subprocess.run([sys.executable, "-c", code], cwd=folder, env=variables, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     assert (folder / "data" / "mine" / "meta" / "info.json").is_file()

@@ -38,17 +38,17 @@ def site(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_page_of_docs_is_built_and_reached_from_every_tab(repository: Path, site: Path) -> None:
-    pages = {path.relative_to(repository / "docs").with_suffix(".html") for path in (repository / "docs").glob("*.md")}
+    pages = {path.relative_to(repository / "docs").with_suffix(".html") for path in (repository / "docs").rglob("*.md")}
     home = (site / "index.html").read_text()
     for page in {*map(str, pages), "index.html", "changelog.html"}:
         assert (site / page).is_file()
-    for tab in ("Start", "Guides", "Methods", "Reference"):
+    for tab in ("Start", "Tutorials", "How-to", "Reference", "Explanation", "Results"):
         assert tab in home
 
 
 def test_links_of_the_readme_lead_to_pages_of_the_site(repository: Path, site: Path) -> None:
     home, readme = (site / "index.html").read_text(), (repository / "README.md").read_text()
-    linked = re.findall(r"\]\(docs/([a-z]+)\.md(#[^)]*)?\)", readme)
+    linked = re.findall(r"\]\(docs/([a-z/-]+)\.md(#[^)]*)?\)", readme)
     assert linked
     for page, anchor in linked:
         assert f'href="{page}.html{anchor}"' in home
@@ -84,3 +84,8 @@ def test_the_strict_build_fails_where_a_link_is_broken(repository: Path, tmp_pat
     assert done.returncode != 0
     assert "nowhere.md" in done.stderr
     assert "#nowhere" in done.stderr
+
+
+def test_the_notebook_is_built_and_stands_in_no_navigation(site: Path) -> None:
+    assert (site / "notebook" / "labels.html").is_file()
+    assert "notebook/" not in (site / "index.html").read_text()

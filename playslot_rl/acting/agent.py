@@ -67,7 +67,7 @@ def imagine(agent: Agent, first: TensorDictBase, steps: int, generator: torch.Ge
     """Unfold the policy in latent space, by a rollout of the imagination environment: nothing is observed afterwards.
 
     The latents are decoded alone: a decoder that reads slots learned from those that it sees when it acts, and imagined
-    ones mislead it (docs/trials.md).
+    ones mislead it (docs/notebook/labels.md).
 
     Args:
         agent: in evaluation mode.

@@ -46,13 +46,13 @@ def explained(command: str, keys: Sequence[str]) -> str:
 def _rows(command: str, group: str) -> list[tuple[str, str]]:
     """Names of a group's keys; a group of groups has a row for each of them."""
     names, inner = [], []
-    for name, hint in _keys(_hint(group)).items():
+    for name, hint in fields_of(_hint(group)).items():
         if not dataclasses.is_dataclass(hint):
             names.append(name)
-        elif all(map(dataclasses.is_dataclass, _keys(_hint(group)).values())) or len(_keys(hint)) > _INLINE:
+        elif all(map(dataclasses.is_dataclass, fields_of(_hint(group)).values())) or len(fields_of(hint)) > _INLINE:
             inner += _rows(command, f"{group}.{name}")
         else:
-            names.append(f"{name}.{{{','.join(_keys(hint))}}}")
+            names.append(f"{name}.{{{','.join(fields_of(hint))}}}")
     if group.replace("_", "-") != command:
         return ([(f"{group}.", " ".join(names))] if names else []) + inner
     short = [name for name in names if name in COMPARISONS.get(command, ()) or name in NAMES.get(command, ())]
@@ -63,7 +63,7 @@ def _rows(command: str, group: str) -> list[tuple[str, str]]:
     return ([("without a group:", " ".join(words))] if words else []) + [(f"{group}.", " ".join(own)), *inner]
 
 
-def _keys(cls: Any) -> dict[str, Any]:
+def fields_of(cls: Any) -> dict[str, Any]:
     """The fields of a config class, with their types."""
     hints = type_hints(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
@@ -80,7 +80,7 @@ def _is_group(key: str) -> bool:
 def _hint(key: str) -> Any:
     hint: Any = ExperimentConfig
     for part in key.split("."):
-        hint = _keys(hint)[part]
+        hint = fields_of(hint)[part]
     return hint
 
 
@@ -108,10 +108,17 @@ def _words(key: str) -> str:
     """What a key says, from its class's docstring."""
     if key in GROUPS:
         return f"{_CHOSEN[key]}: {', '.join(choices(key))}"
-    owner, name = _owner(key)
-    text = inspect.cleandoc(owner.__doc__ or "")
-    found = re.search(rf"^    (?:\w+, )*{name}(?:, \w+)*: (.*(?:\n {{8}}.*)*)", text, re.MULTILINE)
-    return " ".join(found[1].split()).rstrip(".") if found else ""
+    return meaning(*_owner(key))
+
+
+def meaning(owner: type, name: str) -> str:
+    """What the docstring of a config class, or of the class it inherits from, says of a field."""
+    for cls in owner.__mro__:
+        text = inspect.cleandoc(cls.__doc__ or "")
+        found = re.search(rf"^    (?:\w+, )*{name}(?:, \w+)*: (.*(?:\n {{8}}.*)*)", text, re.MULTILINE)
+        if found:
+            return " ".join(found[1].split()).rstrip(".")
+    return ""
 
 
 def _line(name: str, words: str) -> str:

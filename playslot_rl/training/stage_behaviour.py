@@ -40,7 +40,7 @@ PAYS: Final = 0.85
 """Largest error of a decoder with slots, over one without, at which the slots are trusted.
 
 Acting leaves the demonstrations' states, where what few labels have taught about slots does harm: on easy BlockPush
-0.93 (25 labels) costs eight points of success, 0.78 (100 labels) brings four (docs/trials.md).
+0.93 (25 labels) costs eight points of success, 0.78 (100 labels) brings four (docs/notebook/labels.md).
 """
 
 

@@ -1,6 +1,6 @@
 """The fast paths compute what the plain ones do (quick), and are quicker (slow; on an idle machine).
 
-`pytest -m slow -s tests/benchmarks` prints the ratios that docs/performance.md shows.
+`pytest -m slow -s tests/benchmarks` prints the ratios that docs/results/speed.md shows.
 """
 
 from __future__ import annotations

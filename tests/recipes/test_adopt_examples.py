@@ -1,4 +1,4 @@
-"""The scripts of docs/adopt.md record sets that are sound; they need a renderer and take a while."""
+"""The scripts of docs/ that record sets to adopt: the sets are sound. They need a renderer and take a while."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from commands import smoke
 
 pytestmark = pytest.mark.integration
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "adopt.md"
-SCRIPTS = re.findall(r"^```py\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGES = (DOCS / "tutorials" / "your-own-videos.md", DOCS / "notebook" / "slots.md")
+SCRIPTS = [
+    script for page in PAGES for script in re.findall(r"^```py\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+]
 
 
 def test_there_are_two() -> None:

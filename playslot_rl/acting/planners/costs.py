@@ -71,7 +71,7 @@ class DynamicsDistance:
 
     A latent action is a difference of InvDyn's means, z_t = mu_{t+1} - mu_t, so mu(G) - mu(S) is the sum of the latent
     actions that lead from S to G, and W^-1 counts it in steps of a typical motion. Slots saturate: once an object is
-    out of the place where the goal has it, they no longer say how far (docs/planning.md).
+    out of the place where the goal has it, they no longer say how far (docs/how-to/plan.md).
 
     Args:
         inverse_dynamics: in evaluation mode, of a mode that infers latent actions.

@@ -1,0 +1,126 @@
+"""Writes docs/reference/keys.md, every key of the config with its default and its meaning, from the config's classes:
+
+    .venv/bin/python docs/_site/keys.py
+
+A test holds the page against what this makes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final, Literal, get_args, get_origin
+
+from playslot_rl.config import ExperimentConfig, key_help
+from playslot_rl.config.compose import GROUPS, choices, compose
+
+PAGE: Final = Path(__file__).resolve().parents[1] / "reference" / "keys.md"
+INTRODUCTION: Final = """\
+# Keys
+
+Every key of the config, made from its classes by `.venv/bin/python docs/_site/keys.py`. Type it as `group.key=value`.
+The default is the class's, which is the paper's size; the column `compact` has what ButtonPress's `preset=compact`, the
+preset of a command that names none, changes. A task's own values are in `recipes/conf/env_model` and `env_preset`.
+
+`compare`, `compare-video` and `plan` take keys of their own group without its name: `methods=`, `seeds=`, `planner=`.
+
+| key | chooses | names |
+|---|---|---|
+| `env` | the task | ENVS |
+| `preset` | sizes and schedule | PRESETS |
+"""
+
+
+def sections() -> dict[type, list[str]]:
+    """Each class of the config that has keys of its own, with the groups that have them; a base class comes first."""
+    found: dict[type, list[str]] = {}
+
+    def walk(cls: type, group: str) -> None:
+        for base in reversed(cls.__mro__):
+            if own(base):
+                found.setdefault(base, []).append(group)
+        for name, hint in key_help.fields_of(cls).items():
+            if dataclasses.is_dataclass(hint):
+                walk(hint, f"{group}{name}.")
+
+    walk(ExperimentConfig, "")
+    return found
+
+
+def own(cls: type) -> dict[str, dataclasses.Field[Any]]:
+    """The keys that a class adds to those of its base."""
+    if not dataclasses.is_dataclass(cls):
+        return {}
+    bases = [base for base in cls.__mro__[1:] if dataclasses.is_dataclass(base)]
+    inherited = {field.name for base in bases for field in dataclasses.fields(base)}
+    hints = key_help.fields_of(cls)
+    return {
+        field.name: field
+        for field in dataclasses.fields(cls)
+        if field.name not in inherited and not dataclasses.is_dataclass(hints[field.name])
+    }
+
+
+def rows(cls: type, groups: list[str], compact: Any) -> Iterator[str]:
+    """The table of a class: a row a key."""
+    shared = len(groups) > 1
+    yield "| key | default | meaning |" if shared else "| key | default | `compact` | meaning |"
+    yield "|---|---|---|" if shared else "|---|---|---|---|"
+    for field in own(cls).values():
+        if groups[0] + field.name in GROUPS:
+            continue
+        hint = key_help.fields_of(cls)[field.name]
+        meaning = key_help.meaning(cls, field.name).replace("|", "\\|")
+        if get_origin(hint) is Literal and not all(f"`{name}`" in meaning for name in get_args(hint)):
+            meaning += " (" + ", ".join(f"`{name}`" for name in get_args(hint)) + ")"
+        default = shown(field.default)
+        cells = [f"`{field.name}`", default]
+        if not shared:
+            here = shown(value(compact, groups[0] + field.name))
+            cells.append("" if here == default else here)
+        yield "| " + " | ".join([*cells, meaning]) + " |"
+
+
+def value(config: Any, key: str) -> Any:
+    """Of a key, by its full name."""
+    for name in key.split("."):
+        config = getattr(config, name)
+    return config
+
+
+def shown(default: Any) -> str:
+    """A value as it is typed."""
+    if default is None or default in ("", ()):
+        return "–"
+    if isinstance(default, bool):
+        return str(default).lower()
+    if isinstance(default, tuple):
+        return ",".join(map(str, default))
+    return str(default)
+
+
+def page() -> str:
+    """The whole page."""
+    compact = compose(["preset=compact"])
+    names = {"ENVS": "env", "PRESETS": "preset"}
+    text = INTRODUCTION
+    for word, group in names.items():
+        text = text.replace(word, ", ".join(f"`{name}`" for name in choices(group)))
+    for cls, groups in sections().items():
+        first = (inspect.getdoc(cls) or "").split("\n\n")[0].replace("\n", " ")
+        title = ", ".join(f"`{group.removesuffix('.')}`" for group in groups) if groups != [""] else "Without a group"
+        text += f"\n## {title}\n\n{first}\n\n" + "\n".join(rows(cls, groups, compact)) + "\n"
+    return text
+
+
+def main() -> None:
+    """Write it."""
+    PAGE.parent.mkdir(exist_ok=True)
+    PAGE.write_text(page())
+    print("docs/reference/keys.md")
+
+
+if __name__ == "__main__":
+    main()
