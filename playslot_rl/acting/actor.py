@@ -30,18 +30,13 @@ RANDOM_STREAM: Final = 7
 class Actor(TensorDictModuleBase):
     """Observation to action, with a memory that travels in the tensordict, never on the module.
 
-    Reads PIXELS (n, 3, H, W), uint8 [0, 255] or float [0, 1], and the memory's keys; writes ACTION (n, A), in [-1, 1]
-    but for what `executed` clips, and the memory's keys anew. In evaluation mode it is a function of
-    these inputs, so that episodes in a batch do not touch each other. `playslot_rl.acting.episodes` runs it.
-
-    Args:
-        memory: the memory's keys.
-        reads: what it reads of the observation: PIXELS, or EXPERT_ACTION, or nothing.
+    Reads PIXELS (n, 3, H, W), uint8 [0, 255] or float [0, 1], or what `reads` names, and the keys of its `memory`; writes
+    ACTION (n, A), in [-1, 1] but for what `executed` clips, and the memory's keys anew. In evaluation mode it is a
+    function of these inputs, so that episodes in a batch do not touch each other.
 
     Attributes:
         looks: at which frames: `always`, `first` (it never sees what its actions did) or `never`. Frames that nobody
             looks at need not be drawn.
-        memory_keys: as given.
     """
 
     looks: Literal["always", "first", "never"] = "always"
@@ -79,14 +74,10 @@ class Actor(TensorDictModuleBase):
 
 
 class SlotActor(Actor):
-    """Frame to slots by SAVi, whose recurrent state is the memory; slots to action by the heads.
+    """Frame to slots by SAVi, whose recurrent state is the memory; slots (n, N, D) to ACTION (n, A) by the heads.
 
     Note: initial slots that are sampled (SAVi with `initial: gaussian`) come from one generator, which `reset` seeds
     with the first episode's seed; learned ones draw nothing.
-
-    Args:
-        savi: in evaluation mode.
-        heads: modules that together read SLOTS (n, N, D) and write ACTION (n, A).
     """
 
     def __init__(self, savi: SAVi, *heads: TensorDictModuleBase) -> None:
@@ -109,11 +100,7 @@ class SlotActor(Actor):
 
 
 class ReactiveActor(Actor):
-    """Observation to action without memory.
-
-    Args:
-        module: reads PIXELS (n, 3, H, W), or whatever its `in_keys` say, writes ACTION (n, A).
-    """
+    """Observation to action without memory, by a module that reads PIXELS (n, 3, H, W) or what its `in_keys` say."""
 
     def __init__(self, module: TensorDictModuleBase) -> None:
         super().__init__(reads=module.in_keys)
@@ -144,14 +131,7 @@ class ExpertActor(Actor):
 
 
 class PlannedActor(Actor):
-    """Executes a plan, PLANNED_ACTIONS (n, T, A), that lies in its memory beside STEP_COUNT (n, 1).
-
-    Args:
-        steps: T.
-        action_dim: A.
-        memory: further keys of the memory.
-        reads: see `Actor`.
-    """
+    """Executes a plan, PLANNED_ACTIONS (n, T, A), that lies in its memory beside STEP_COUNT (n, 1)."""
 
     looks: Literal["always", "first", "never"] = "never"
 

@@ -29,32 +29,20 @@ def playslot_actor(agent: Agent) -> SlotActor:
 
 
 def load_actor(run: Path, device: torch.device | str = "cpu") -> SlotActor:
-    """The actor of a run with a trained policy.
-
-    Raises:
-        CheckpointError: a stage is missing or damaged.
-    """
+    """The actor of a run with a trained policy; a CheckpointError as of `Run.load_agent`."""
     return playslot_actor(Run.open(run).load_agent(device))
 
 
 def oracle_actor(agent: Agent) -> SlotActor:
-    """The slot oracle beside the agent, which gives real actions.
-
-    Raises:
-        ValueError: the agent has none.
-    """
+    """The slot oracle beside the agent, which gives real actions; a ValueError where there is none."""
     if agent.oracle is None:
         raise ValueError("oracle_actor: got an agent without a slot oracle, expected one trained with behaviour.oracle")
     return SlotActor(agent.world_model.savi, oracle_module(agent.oracle))
 
 
 class Imagination(NamedTuple):
-    """An imagined rollout.
-
-    Attributes:
-        slots: (E, T + 1, N, D); the first are given or parsed, the others predicted.
-        latents: (E, T, Z) latent actions of the policy.
-        actions: (E, T, A) decoded actions in [-1, 1].
+    """An imagined rollout: slots (E, T + 1, N, D), the first given or parsed; the policy's latents (E, T, Z); and decoded
+    actions (E, T, A) in [-1, 1].
     """
 
     slots: Tensor
@@ -64,16 +52,11 @@ class Imagination(NamedTuple):
 
 @torch.no_grad()
 def imagine(agent: Agent, first: TensorDictBase, steps: int, generator: torch.Generator | None = None) -> Imagination:
-    """Unfold the policy in latent space, by a rollout of the imagination environment: nothing is observed afterwards.
+    """Unfold the policy for T steps in latent space: nothing is observed after `first`, SLOTS (E, N, D) or PIXELS
+    (E, 3, H, W) on the agent's device.
 
     The latents are decoded alone: a decoder that reads slots learned from those that it sees when it acts, and imagined
     ones mislead it (docs/notebook/labels.md).
-
-    Args:
-        agent: in evaluation mode.
-        first: batch size [E], on the agent's device: SLOTS (E, N, D), or PIXELS (E, 3, H, W) to parse.
-        steps: T.
-        generator: of sampled initial slots (SAVi with `initial: gaussian`).
     """
     env = ImaginationEnv(agent.world_model, first.batch_size, generator=generator)
     start = env.reset(first)
@@ -85,13 +68,9 @@ def imagine(agent: Agent, first: TensorDictBase, steps: int, generator: torch.Ge
 
 
 class ImaginationActor(PlannedActor):
-    """Executes the actions of an imagined rollout; the frames that follow the first are never looked at.
+    """Executes the actions of a rollout of T imagined steps; the frames that follow the first are never looked at.
 
     The rollout's slots stay in the memory, PREDICTED_SLOTS (n, T + 1, N, D), for pictures.
-
-    Args:
-        agent: in evaluation mode.
-        steps: T, agent steps to imagine.
     """
 
     looks = "first"

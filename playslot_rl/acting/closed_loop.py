@@ -19,10 +19,9 @@ from playslot_rl.frames import to_uint8
 
 
 class ClosedLoop:
-    """An actor with its memory.
+    """An actor in evaluation mode, with its memory.
 
     Args:
-        actor: in evaluation mode.
         image_size: side of the frames that `act` takes; 0 takes them as they come.
         resize: whether `act` resizes frames of another size, by area averaging as in training, or refuses them.
         seed: of episodes that begin without one.
@@ -38,11 +37,7 @@ class ClosedLoop:
 
     @torch.no_grad()
     def step(self, observation: TensorDictBase, rows: Sequence[int] | None = None) -> TensorDictBase:
-        """See the present observation of episodes that have begun, and choose.
-
-        Args:
-            observation: batch size [n], on the actor's device.
-            rows: which of the episodes they are; None means all.
+        """See the present observation, batch size [n], of episodes `rows` (all if None) that have begun, and choose.
 
         Returns:
             What the actor writes, batch size [n]: ACTION (n, A), its memory, and whatever it found on the way.
@@ -60,14 +55,8 @@ class ClosedLoop:
         return seen
 
     def act(self, frames: Tensor, name: str = "frames") -> Tensor:
-        """Actions for the present frames of all episodes.
-
-        Args:
-            frames: (B, 3, H, W), float in [0, 1] or uint8 [0, 255]; rows keep their place until `reset`.
-            name: of the frames, for messages.
-
-        Returns:
-            (B, A) in [-1, 1], on the actor's device; `actor.executed` gives them in the robot's units.
+        """Actions (B, A) in [-1, 1] for the present frames (B, 3, H, W), float in [0, 1] or uint8 [0, 255], of all episodes;
+        rows keep their place until `reset`. `actor.executed` gives them in the robot's units.
 
         Raises:
             ValueError: another shape, or another number of episodes than at the last call.

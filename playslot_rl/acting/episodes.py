@@ -71,13 +71,8 @@ LookOn = Callable[[Moment], None]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of one episode.
-
-    Attributes:
-        seed: the seed it ran with.
-        success: whether the task was solved within the step limit.
-        steps: agent steps to the first success, from 1; None without one.
-        redrawn: seeds passed over because the episode started solved.
+    """The seed an episode ran with, whether the task was solved within the step limit, agent steps to the first success
+    (from 1; None without one), and seeds passed over because the episode started solved.
     """
 
     seed: int
@@ -117,12 +112,7 @@ class TaskPool:
 
 
 def start_episode(task: Task, seed: int, stride: int) -> tuple[Frames, int, int]:
-    """Reset to an episode that does not start solved.
-
-    Args:
-        task: the environment.
-        seed: the episode's seed.
-        stride: distance to the seed tried next.
+    """Reset to an episode that does not start solved; the seed tried next is `stride` further.
 
     Returns:
         First frame (H, W, 3), the seed that was used, and how many were passed over.
@@ -149,19 +139,15 @@ def run_episodes(
     stride: int | None = None,
     lockstep: int = LOCKSTEP,
 ) -> list[Outcome]:
-    """Run one episode for each seed, in the order of the list.
+    """Run one episode for each seed, in the order of the list; the actor begins anew with every lock-step.
 
     Args:
-        pool: environments.
-        actor: in evaluation mode; it begins anew with every lock-step.
-        seeds: the fixed list.
         look_on: called before every agent step, and after the last one.
         stop: end an episode at its first success (its outcome is known); False runs all `max_steps`.
         see_last: show the actor the last frame too, though it cannot act any more.
         draw: draw also the frames that the actor does not look at, where there is a `look_on`.
         stride: distance between the seeds of an episode that is drawn anew because it starts solved. None is the number
             of episodes: redrawn seeds meet no other episode's, and every actor redraws the same ones.
-        lockstep: episodes side by side.
     """
     outcomes: list[Outcome] = []
     for first in range(0, len(seeds), lockstep):

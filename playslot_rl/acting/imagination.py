@@ -42,21 +42,15 @@ class ImaginationEnv(ModelBasedEnvBase):
     keys.LATENT_ACTION, ("next", keys.SLOTS))` keeps what is wanted.
 
     Args:
-        world_model: put into evaluation mode; its device is the environment's.
-        batch_size: episodes imagined at once; tensordicts of other batch sizes are taken too.
-        first_slots: draws first slots, e.g. from a data set.
         horizon: steps after which an episode is truncated; 0 never does.
         differentiable: keep the graph, for learning through imagination.
         reward: of the slots that a step leads to.
         generator: of sampled initial slots where a reset parses frames.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from playslot_rl.testing import tiny_config
-        >>> from playslot_rl.world_model import Agent, WorldModel, latent_policy_module
-        >>> config = tiny_config()
-        >>> agent = Agent.untrained(WorldModel(config.model, config.env)).eval()
+        >>> from playslot_rl.testing import tiny_agent
+        >>> from playslot_rl.world_model import latent_policy_module
+        >>> agent = tiny_agent()
         >>> env = ImaginationEnv(agent.world_model, batch_size=[2])
         >>> start = env.reset(TensorDict({"pixels": torch.rand(2, 3, 64, 64)}, [2]))
         >>> rollout = env.rollout(5, latent_policy_module(agent.policy), tensordict=start, auto_reset=False)
@@ -201,15 +195,8 @@ def _rewards(reward: Reward, slots: Tensor) -> Tensor:
 
 
 def latent_actions(world_model: WorldModel, given: npt.NDArray[Any] | Tensor, n_slots: int | None = None) -> Tensor:
-    """Latent actions of some steps, given as they are or as prototypes by number.
-
-    Args:
-        world_model: whose they are.
-        given: float ([B,] P, [N,] Z), or integer ([B,] P, [N]) numbers of prototypes.
-        n_slots: N, where it is not the world model's (`ImaginationSession.keep`).
-
-    Returns:
-        ([B,] P, [N,] Z), on the world model's device.
+    """Latent actions ([B,] P, [N,] Z) of some steps, given as they are or as integer ([B,] P, [N]) numbers of prototypes;
+    `n_slots` is N, where it is not the world model's (`ImaginationSession.keep`).
 
     Raises:
         TypeError: no numbers.
@@ -237,10 +224,6 @@ class ImaginationSession:
 
     Everything there is to know between two steps is `state`, a tensordict: keep it, and `restore` goes back to it.
 
-    Args:
-        world_model: put into evaluation mode.
-        generator: of sampled initial slots where a reset parses frames.
-
     Examples:
         >>> from playslot_rl.testing import tiny_agent
         >>> session = ImaginationSession(tiny_agent().world_model)
@@ -260,14 +243,8 @@ class ImaginationSession:
         self._state: TensorDictBase | None = None
 
     def reset(self, *, frames: Tensor | None = None, slots: Tensor | None = None) -> Tensor:
-        """Start B episodes, from their frames or from their slots.
-
-        Args:
-            frames: (B, 3, H, W), uint8 [0, 255] or float [0, 1], parsed as first frames.
-            slots: (B, N, D), such as SAVi found in the middle of an episode.
-
-        Returns:
-            (B, N, D).
+        """Start B episodes from their first frames (B, 3, H, W), uint8 [0, 255] or float [0, 1], or from slots (B, N, D), such as
+        SAVi found in the middle of an episode; returns their slots.
 
         Raises:
             ValueError: neither or both are given, or another shape.
@@ -281,11 +258,7 @@ class ImaginationSession:
 
     @property
     def state(self) -> TensorDictBase:
-        """A copy of where the session stands, batch size [B]: SLOTS, the histories and their length.
-
-        Raises:
-            ValueError: before `reset`.
-        """
+        """A copy of where the session stands, batch size [B]: SLOTS, the histories and their length; a ValueError before `reset`."""
         return self._present().clone()
 
     def _present(self) -> TensorDictBase:
@@ -309,11 +282,8 @@ class ImaginationSession:
         self._state = self._present().repeat_interleave(candidates, dim=0)
 
     def put(self, slots: Tensor, *, forget: bool = False) -> None:
-        """Put other slots in the place of the present ones, as the newest frame that the predictor sees.
-
-        Args:
-            slots: (B, N, D), of as many slots as there are.
-            forget: drop the earlier frames too, which another scene would contradict.
+        """Put other slots (B, N, D) in the place of the present ones, as the newest frame that the predictor sees; `forget` drops
+        the earlier frames too, which another scene would contradict.
 
         Raises:
             ValueError: another shape.
@@ -331,10 +301,7 @@ class ImaginationSession:
         self._state = state
 
     def keep(self, rows: Sequence[int]) -> None:
-        """Go on with some of the slots only: the others have never been there.
-
-        Args:
-            rows: of the present slots, in the order in which they go on; at least one.
+        """Go on with some rows of the present slots only, in that order: the others have never been there.
 
         Raises:
             ValueError: none, one twice, or one that is not there.
@@ -351,14 +318,7 @@ class ImaginationSession:
         self._state = state
 
     def step(self, latents: Tensor | None = None, *, prototypes: Sequence[int] | Tensor | None = None) -> Tensor:
-        """One step of all episodes.
-
-        Args:
-            latents: latent actions (B, [N,] Z).
-            prototypes: or the numbers of prototypes, (B, [N]).
-
-        Returns:
-            Slots of the next frames (B, N, D).
+        """One step of all episodes by latent actions (B, [N,] Z), or by numbers of prototypes (B, [N]), to slots (B, N, D).
 
         Raises:
             ValueError: neither or both are given, another shape, or no such prototype.

@@ -43,24 +43,15 @@ _MEMORY = (
 
 
 class PlanningActor(Actor):
-    """Plans every few steps towards a goal image, and executes the plan's latent actions by the action decoder.
+    """Plans every few steps towards goal images, and executes the plan's latent actions by the action decoder.
 
     A plan begins where the last one ends: shifted by what was executed, the mean latent action at its end. With
     `policy` the latent policy's imagined rollout from the present slots is a plan to begin with too, so that what is
     found costs no more in imagination than what the policy would do.
 
     The plan, its imagined slots PREDICTED_SLOTS (n, H + 1, N, D), its cost and the seconds it took stay in the memory,
-    for who looks on. Candidates are drawn by the episode's seed and the step, so that episodes side by side do not
+    for who looks on. Candidates are drawn by `seed`, the episode's seed and the step, so that episodes side by side do not
     touch each other.
-
-    Args:
-        agent: in evaluation mode.
-        planner: the search.
-        plan: cost, history and bounds.
-        size: horizon, how much of it is executed, and the price of straying from the policy's plan.
-        goals: images to reach.
-        policy: begin with the latent policy's rollout.
-        seed: of the candidates, beside that of the episode.
     """
 
     def __init__(

@@ -25,24 +25,14 @@ from playslot_rl.world_model import Agent
 
 
 class Performance(NamedTuple):
-    """Whole episodes of the expert.
-
-    Attributes:
-        frames: (n, T + 1, 3, H, W) uint8 [0, 255].
-        actions: (n, T, A) in [-1, 1].
-    """
+    """Whole episodes of the expert: frames (n, T + 1, 3, H, W) uint8 [0, 255] and actions (n, T, A) in [-1, 1]."""
 
     frames: Tensor
     actions: Tensor
 
 
 def perform(pool: TaskPool, seeds: Sequence[int]) -> Performance:
-    """Let the scripted expert play episodes to their last step, and film it.
-
-    Args:
-        pool: environments; none of them in an episode that goes on.
-        seeds: of the episodes, none of which starts solved.
-    """
+    """Let the scripted expert play episodes, none of which starts solved, to their last step, and film it."""
     actions = torch.zeros(len(seeds), pool.env.max_steps, pool.env.action_dim)
 
     def note(moment: Moment) -> None:
@@ -54,14 +44,7 @@ def perform(pool: TaskPool, seeds: Sequence[int]) -> Performance:
 
 
 class ReplayActor(PlannedActor):
-    """Executes what the latents of the expert's videos decode to.
-
-    The latents are decoded alone, as in imagination.
-
-    Args:
-        agent: in evaluation mode; its policy is not asked.
-        performed: the expert's episodes of some seeds.
-    """
+    """Executes what the latents of the expert's videos decode to, decoded alone as in imagination; the policy is not asked."""
 
     def __init__(self, agent: Agent, performed: Callable[[Sequence[int]], Performance]) -> None:
         env = agent.world_model.env

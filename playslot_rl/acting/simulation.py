@@ -22,15 +22,10 @@ from playslot_rl.world_model import WorldModel, frame_parser_module, module_devi
 
 
 class SlotTransform(Transform):
-    """Adds SLOTS to each observation, parsing PIXELS with SAVi's recurrent state.
+    """Adds SLOTS to each observation, parsing PIXELS with SAVi's recurrent state, on SAVi's device.
 
     The state travels in the tensordict (SLOT_STATE (..., N, D), SLOT_AGE (..., 1)), never on the transform, so that
     batched environments, partial resets and interleaved rollouts each keep their own.
-
-    Args:
-        savi: the parser, in evaluation mode; its device is where it runs, the environment keeps its own.
-        slot_shape: (N, D).
-        generator: of sampled initial slots.
     """
 
     def __init__(self, savi: SAVi, slot_shape: tuple[int, int], generator: torch.Generator | None = None) -> None:
@@ -79,13 +74,8 @@ class SlotTransform(Transform):
 
 
 class ActionDecoderTransform(Transform):
-    """Turns the policy's LATENT_ACTION, with the SLOTS it was chosen at, into the ACTION the task wants, on the way in,
-    in the units that it was recorded in.
-
-    Args:
-        action_decoder: latent action to real action, in evaluation mode.
-        latent_shape: ([N,] Z).
-        slot_shape: (N, D).
+    """Turns the policy's LATENT_ACTION ([N,] Z), with the SLOTS (N, D) it was chosen at, into the ACTION the task wants, on
+    the way in, in the units that it was recorded in.
     """
 
     def __init__(
@@ -124,14 +114,8 @@ def latent_env(
     max_steps: int,
     generator: torch.Generator | None = None,
 ) -> TransformedEnv:
-    """Wrap any TorchRL environment with PIXELS uint8 (..., 3, H, W) and ACTION (..., A), batched or not.
-
-    Args:
-        base: the environment.
-        world_model: put into evaluation mode.
-        action_decoder: put into evaluation mode.
-        max_steps: steps after which an episode is truncated.
-        generator: of sampled initial slots.
+    """Wrap any TorchRL environment with PIXELS uint8 (..., 3, H, W) and ACTION (..., A), batched or not; an episode is
+    truncated after `max_steps`.
 
     Raises:
         ValueError: the environment's frames or actions are not what the world model was made for.
@@ -164,12 +148,9 @@ def make_simulation_env(
     actions again, in [-1, 1]. Seed by `env.set_seed(seed)` before a reset.
 
     Args:
-        env_config: the task.
-        render_config: rendering; use the one of the training data.
-        world_model: put into evaluation mode.
-        action_decoder: put into evaluation mode.
+        render_config: use the one of the training data.
         generator: of sampled initial slots.
-        device: device of the environment's tensors; the networks stay where they are.
+        device: of the environment's tensors; the networks stay where they are.
 
     Raises:
         ConfigError: unknown environment.
@@ -178,10 +159,10 @@ def make_simulation_env(
 
     Examples:
         >>> from playslot_rl.config import RenderConfig
-        >>> from playslot_rl.testing import tiny_config
-        >>> from playslot_rl.world_model import Agent, WorldModel, latent_policy_module
+        >>> from playslot_rl.testing import tiny_agent, tiny_config
+        >>> from playslot_rl.world_model import latent_policy_module
         >>> config = tiny_config(max_steps=3)
-        >>> agent = Agent.untrained(WorldModel(config.model, config.env)).eval()
+        >>> agent = tiny_agent(config)
         >>> env = make_simulation_env(config.env, RenderConfig(), agent.world_model, agent.action_decoder)
         >>> rollout = env.rollout(3, latent_policy_module(agent.policy))
         >>> rollout["slots"].shape, rollout["next", "success"].shape

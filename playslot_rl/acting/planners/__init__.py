@@ -31,17 +31,7 @@ __all__ = [
 
 
 def build_planner(name: PlannerName, plan: PlanConfig, size: SearchSize, world_model: WorldModel) -> Planner:
-    """A planner by its name.
-
-    Args:
-        name: which.
-        plan: its settings.
-        size: of the search.
-        world_model: whose prototypes the categorical planner combines.
-
-    Raises:
-        ConfigError: `prototypes` with a world model that has none.
-    """
+    """A planner by its name; a ConfigError for `prototypes` with a world model that has none."""
     c, n = plan, size
     if name == "gradient":
         return GradientPlanner(c.descents, n.iterations, c.learning_rate, c.spread, c.start_spread, c.correlation)

@@ -26,13 +26,12 @@ class CEMPlanner:
         candidates: M, plans drawn in an iteration.
         iterations: of drawing and fitting; not counted where the search is given seconds.
         elites: K, at most M.
-        spread: first standard deviation, in units of the training latents'.
-        start_spread: the same where the search is given plans to begin with.
+        spread, start_spread: first standard deviation in units of the training latents', without and with plans to begin
+            with.
         floor: least standard deviation.
         correlation: of the noise of neighbouring steps, 0 to under 1.
 
     Examples:
-        >>> import torch
         >>> from playslot_rl.modules.whitening import Whitening
         >>> goal = torch.tensor([[1.0, -1.0], [0.5, 0.0]])
         >>> search = Search(lambda z: (z - goal).square().sum((1, 2)), (2, 2), Whitening(2), torch.empty(0, 2, 2))

@@ -30,12 +30,10 @@ Distance = Callable[[Tensor], Tensor]
 
 
 class SlotDistance:
-    """Mean squared difference of slots to the goal's.
+    """Mean squared difference of slots to the goal's (N, D).
 
-    Args:
-        goal: (N, D).
-        match: whether the order of the slots is free: each frame is then matched with the goal by the Hungarian
-            algorithm. Learned initial slots keep their order, and matching only lets things change places.
+    With `match` the order of the slots is free: each frame is then matched with the goal by the Hungarian algorithm.
+    Learned initial slots keep their order, and matching only lets things change places.
 
     Examples:
         >>> goal = torch.tensor([[0.0, 1.0], [2.0, 3.0]])
@@ -65,7 +63,7 @@ def assignment(pairs: Tensor) -> Tensor:
 
 
 class DynamicsDistance:
-    """Mean squared difference of the scene dynamics, in whitened coordinates of the latent actions.
+    """Mean squared difference of the scene dynamics to those of goal slots (N, D), in whitened latent actions.
 
         d(S, G) = 1/Z |W^-1 (mu(S) - mu(G))|^2
 
@@ -73,13 +71,8 @@ class DynamicsDistance:
     actions that lead from S to G, and W^-1 counts it in steps of a typical motion. Slots saturate: once an object is
     out of the place where the goal has it, they no longer say how far (docs/how-to/plan.md).
 
-    Args:
-        inverse_dynamics: in evaluation mode, of a mode that infers latent actions.
-        whitening: of its latent actions.
-        goal: (N, D).
-
     Raises:
-        ValueError: it has no encoder (modes `ground_truth` and `none`).
+        ValueError: InvDyn has no encoder (modes `ground_truth` and `none`).
     """
 
     def __init__(self, inverse_dynamics: InverseDynamics, whitening: Whitening, goal: Tensor) -> None:
@@ -97,11 +90,8 @@ class DynamicsDistance:
 
 
 class ImageDistance:
-    """Mean squared difference of decoded frames to the goal image: dearer, and blind to what is hidden.
-
-    Args:
-        savi: decodes slots.
-        goal: (3, H, W), uint8 [0, 255] or float [0, 1].
+    """Mean squared difference of decoded frames to the goal image (3, H, W), uint8 [0, 255] or float [0, 1]: dearer, and
+    blind to what is hidden.
     """
 
     def __init__(self, savi: SAVi, goal: Tensor) -> None:
@@ -114,14 +104,8 @@ class ImageDistance:
 
 
 def goal_distance(agent: Agent, kind: CostName, goal: Tensor, image: Tensor, match: bool | None = None) -> Distance:
-    """The distance to a goal by its name.
-
-    Args:
-        agent: whose world model and latent actions.
-        kind: `slots`, `dynamics` or `image`.
-        goal: slots (N, D).
-        image: (3, H, W), uint8 [0, 255] or float [0, 1]; read by `image` alone.
-        match: whether the order of the slots is free; None says so where SAVi's initial slots are sampled.
+    """The distance to a goal by its name, from its slots (N, D) and, for `image`, its picture (3, H, W), uint8 [0, 255] or
+    float [0, 1]. `match` None: the order of the slots is free where SAVi's initial slots are sampled.
     """
     model = agent.world_model
     if kind == "image":
@@ -136,10 +120,8 @@ class GoalCost:
     """Cost of latent actions from where an episode stands.
 
     Args:
-        world_model: in evaluation mode.
         slots: (S, N, D) of the frames seen so far, the present one last; at most the predictor's context.
         past: (S - 1, [N,] Z), the latent actions between them.
-        distance: to the goal.
         along: a, 0 to 1.
         rows: candidates imagined at once, for the memory.
     """
@@ -178,19 +160,13 @@ class GoalCost:
 
 
 class NearProposal:
-    """A cost, and what straying from a proposed plan costs beside it, in whitened coordinates of the latent actions.
+    """A cost J, and what straying from a proposed plan z^ (H, [N,] Z) costs beside it, in whitened latent actions.
 
         J'(z) = J(z) + w / HZ sum_t |W^-1 (z_t - z^_t)|^2
 
     As in model-based offline planning (Argenson and Dulac-Arnold, ICLR 2021) the search stays where the demonstrations
     were: latents far from the policy's lead to futures that the model guesses and to actions that the decoder guesses,
     and a search finds the guesses that please it. The proposal itself costs what it did.
-
-    Args:
-        cost: J.
-        proposal: z^, (H, [N,] Z).
-        whitening: W, of the latent actions.
-        weight: w, at least 0.
 
     Examples:
         >>> near = NearProposal(lambda z: torch.zeros(len(z)), torch.zeros(2, 1), Whitening(1), 3.0)
@@ -209,18 +185,10 @@ class NearProposal:
 
 @torch.no_grad()
 def parse_goal(savi: SAVi, state: Tensor, goal: Tensor, looks: int = 1) -> Tensor:
-    """Slots of a goal image as SAVi would track them there: parsed as the frame after the first one, not as a first.
+    """Slots (n, N, D) of goal images (n, 3, H, W) as SAVi would track them: parsed as the frame after the first one, with the
+    state (n, N, D) that it left. Parsed as a first frame they lie five times as far from the tracked ones.
 
-    Parsed as a first frame the slots of the same picture lie five times as far from the tracked ones.
-
-    Args:
-        savi: in evaluation mode.
-        state: (n, N, D), SAVi's state after the first frame of the episodes.
-        goal: (n, 3, H, W), uint8 [0, 255] or float [0, 1].
-        looks: how many times the image is shown; a far goal may take the slots more than one correction to reach.
-
-    Returns:
-        (n, N, D).
+    `looks` is how many times the image is shown; a far goal may take the slots more than one correction to reach.
     """
     clip = normalise(goal)[:, None].expand(-1, looks, -1, -1, -1)
     slots: Tensor = savi(clip, state)[0]

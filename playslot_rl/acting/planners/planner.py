@@ -82,12 +82,8 @@ class Search:
 
 
 class Plan(NamedTuple):
-    """What was found.
-
-    Attributes:
-        latents: (H, [N,] Z), the best of all candidates whose cost was computed.
-        cost: its cost.
-        costs: the best cost known after each iteration; never rises.
+    """The best latents (H, [N,] Z) of all candidates whose cost was computed, their cost, and the best cost known after each
+    iteration, which never rises.
     """
 
     latents: Tensor
@@ -99,15 +95,7 @@ class Planner(Protocol):
     """A way of searching."""
 
     def __call__(self, search: Search, generator: torch.Generator) -> Plan:
-        """Search.
-
-        Args:
-            search: the problem.
-            generator: draws all candidates, on the device of the search.
-
-        Raises:
-            ValueError: the search has no finite cost at all.
-        """
+        """Search; the generator, on the device of the search, draws all candidates. A ValueError where no cost is finite."""
 
 
 class Best:
@@ -137,11 +125,7 @@ class Best:
         self.costs.append(self.cost)
 
     def plan(self) -> Plan:
-        """The result.
-
-        Raises:
-            ValueError: no candidate had a finite cost.
-        """
+        """The result; a ValueError where no candidate had a finite cost."""
         if self.cost == float("inf"):
             raise ValueError("plan: got no finite cost, expected one: look at the goal and at the model's predictions")
         return Plan(self.latents, self.cost, self.costs)

@@ -20,11 +20,10 @@ from playslot_rl.acting.planners.planner import Best, Plan, Search
 
 @dataclass(frozen=True)
 class PrototypePlanner:
-    """Categorical CEM. Plans to begin with are candidates as they are, and the first distribution leans to the
-    prototypes nearest to the best of them.
+    """Categorical CEM over prototypes (K, Z). Plans to begin with are candidates as they are, and the first distribution leans
+    to the prototypes nearest to the best of them.
 
     Args:
-        prototypes: (K, Z).
         candidates: M.
         iterations: of drawing and counting; not counted where the search is given seconds.
         elites: how many are counted.
@@ -32,7 +31,6 @@ class PrototypePlanner:
         lean: part of the first distribution on the prototypes of a plan to begin with.
 
     Examples:
-        >>> import torch
         >>> from playslot_rl.modules.whitening import Whitening
         >>> search = Search(lambda z: (z - 2.0).square().sum((1, 2)), (3, 1), Whitening(1), torch.empty(0, 3, 1))
         >>> planner = PrototypePlanner(torch.tensor([[0.0], [1.0], [2.0]]))

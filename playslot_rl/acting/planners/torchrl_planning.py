@@ -27,14 +27,10 @@ from playslot_rl.world_model import WorldModel
 
 
 class GoalReward(Transform):
-    """Puts a goal's cost in the place of the reward, so that the sum over a horizon is minus the cost of `GoalCost`.
+    """Puts a goal's cost, with weight a of the way, in the place of the reward, so that the sum over a horizon, at which the
+    environment truncates, is minus the cost of `GoalCost`.
 
         r_t = -a / H d(S_t, G) - (1 - a) [t = H] d(S_t, G)
-
-    Args:
-        distance: to the goal.
-        horizon: H, that of the environment, which truncates there.
-        along: a, weight of the way.
     """
 
     def __init__(self, distance: Distance, horizon: int, along: float) -> None:
@@ -76,13 +72,7 @@ def planning_env(
 ) -> TransformedEnv:
     """The imagination environment for `CEMPlanner` and `MPPIPlanner` (with `ReturnAdvantage`), batch size ().
 
-    Args:
-        world_model: one latent action a step; put into evaluation mode.
-        distance: to the goal.
-        whitening: mean and scale of the latent actions (`latent_statistics`). Its axes are left out: TorchRL's
-            normalisation is a number for each latent dimension.
-        horizon: steps to plan.
-        along: weight of the way.
+    The whitening's axes are left out: TorchRL's normalisation is a number for each latent dimension.
 
     Raises:
         ValueError: one latent action a slot, which TorchRL's planners cannot hold.
