@@ -1,4 +1,4 @@
-"""The front door: load a run or the shipped model, then parse, infer, imagine, decode and act.
+"""The front door: load a run or a pretrained model, then parse, infer, imagine, decode and act.
 
     model = playslot_rl.load("runs/demo")
     slots = model.parse(video)                       # frames to object slots
@@ -87,7 +87,6 @@ class PlaySlot:
     """A world model, maybe with an agent, behind five methods.
 
     Args:
-        world_model: put into evaluation mode.
         agent: the agent of that world model; without one `act` is refused.
         seed: of sampled initial slots; equal calls give equal results.
         resize: whether frames of another size are resized by area averaging, as those of the training were
@@ -150,13 +149,10 @@ class PlaySlot:
         return model
 
     def save_pretrained(self, folder: str | Path) -> None:
-        """Write the policy as a folder that LeRobot loads (`playslot_rl.sharing.folder`).
+        """Write the policy as a new folder that LeRobot loads (`playslot_rl.sharing.folder`).
 
         What a loaded policy says of its origin is written again; of one that was just trained nothing is known here:
         `playslot export` reads it from the run, with the results for the card.
-
-        Args:
-            folder: must not exist, or be empty.
 
         Raises:
             CheckpointError: the model has no policy.
@@ -181,20 +177,13 @@ class PlaySlot:
 
     @torch.no_grad()
     def parse(self, frames: Array) -> Tensor:
-        """Slots of a frame, a clip or a batch of clips; each clip starts an episode.
-
-        Args:
-            frames: ([B,] [T,] H, W, 3) or ([B,] [T,] 3, H, W).
-
-        Returns:
-            ([B,] [T,] N, D).
+        """Slots ([B,] [T,] N, D) of frames ([B,] [T,] H, W, 3) or ([B,] [T,] 3, H, W); each clip starts an episode.
 
         Raises:
             ValueError: other shapes, another frame size than the model's where its training did not resize either, or
                 floats outside [0, 1].
 
         Examples:
-            >>> import numpy as np
             >>> video = np.random.default_rng(0).integers(256, size=(5, 64, 64, 3), dtype=np.uint8)
             >>> PlaySlot.untrained().parse(video).shape
             torch.Size([5, 4, 32])
@@ -210,19 +199,13 @@ class PlaySlot:
 
     @torch.no_grad()
     def infer_actions(self, slots: Array) -> LatentActions:
-        """Latent actions between consecutive frames, from the slots of a clip or of a batch of clips.
-
-        Args:
-            slots: ([B,] T, N, D) as `parse` gives them, T at least 2.
-
-        Returns:
-            z, its mean, prototype, variability ([B,] T-1, [N,] Z), code ([B,] T-1, [N]) and the quantiser's loss.
+        """Latent actions between consecutive frames, from slots ([B,] T, N, D) as `parse` gives them, T at least 2: z,
+        its mean, prototype and variability ([B,] T-1, [N,] Z), code ([B,] T-1, [N]) and the quantiser's loss.
 
         Raises:
             ValueError: other shapes, or a model of mode `ground_truth`, which infers none.
 
         Examples:
-            >>> import torch
             >>> model = PlaySlot.untrained()
             >>> actions = model.infer_actions(model.parse(torch.rand(5, 3, 64, 64)))
             >>> actions.z.shape, actions.code.shape
@@ -239,21 +222,17 @@ class PlaySlot:
 
     @torch.no_grad()
     def imagine(self, first_frame: Array, actions: Array) -> Tensor:
-        """Slots of the future that follows a frame under given latent actions.
+        """Slots ([B,] P, N, D) of the frames that follow one, ([B,] H, W, 3) or ([B,] 3, H, W), under given latent
+        actions.
 
         Args:
-            first_frame: ([B,] H, W, 3) or ([B,] 3, H, W).
             actions: latent actions, float ([B,] P, [N,] Z), or prototypes by number, integer ([B,] P, [N]); of a model
                 of mode `ground_truth` real actions, in the units of the data set.
-
-        Returns:
-            ([B,] P, N, D): the imagined frames, the first one not included.
 
         Raises:
             ValueError: other shapes, unequal batches, or a prototype that does not exist.
 
         Examples:
-            >>> import torch
             >>> model = PlaySlot.untrained()
             >>> frame = torch.rand(3, 64, 64)
             >>> model.imagine(frame, torch.randn(6, 8)).shape
@@ -278,16 +257,10 @@ class PlaySlot:
 
     @torch.no_grad()
     def decode(self, slots: Array) -> Decoded:
-        """Frames and masks of slots.
-
-        Args:
-            slots: (..., N, D).
-
-        Returns:
-            frames (..., 3, H, W), about [0, 1]; rgb (..., N, 3, H, W); masks (..., N, 1, H, W) that sum to one over N.
+        """Frames and masks of slots (..., N, D): frames (..., 3, H, W), about [0, 1]; rgb (..., N, 3, H, W); and masks
+        (..., N, 1, H, W) that sum to one over N.
 
         Examples:
-            >>> import torch
             >>> PlaySlot.untrained().decode(torch.randn(5, 4, 32)).masks.shape
             torch.Size([5, 4, 1, 64, 64])
         """
@@ -296,22 +269,17 @@ class PlaySlot:
 
     @torch.no_grad()
     def act(self, frame: Array) -> npt.NDArray[np.float32]:
-        """The real action for an observed frame; the frames of an episode are given one after the other.
+        """The real action (A,) for an observed frame, (H, W, 3) or (3, H, W), in the units of the demonstrations' data
+        set; of our simulators, in [-1, 1].
 
-        SAVi's recurrent state is carried from call to call: `reset` before each episode.
-
-        Args:
-            frame: (H, W, 3) or (3, H, W).
-
-        Returns:
-            (A,) in the units of the demonstrations' data set; of our simulators, in [-1, 1].
+        The frames of an episode are given one after the other: SAVi's recurrent state is carried from call to call, so
+        `reset` before each episode.
 
         Raises:
             CheckpointError: the model has no policy.
             ValueError: not one frame of the model's size.
 
         Examples:
-            >>> import torch
             >>> model = PlaySlot.untrained()
             >>> model.reset()
             >>> [model.act(torch.rand(3, 64, 64)).shape for _ in range(2)]
@@ -337,12 +305,7 @@ class PlaySlot:
     def imagination(
         self, batch_size: Sequence[int] = (), horizon: int = 0, reward: Reward | None = None
     ) -> ImaginationEnv:
-        """The world model as a TorchRL environment (`playslot_rl.acting.imagination`).
-
-        Args:
-            batch_size: episodes imagined at once.
-            horizon: steps after which an episode is truncated; 0 never does.
-            reward: (..., 1) of the slots (..., N, D) that a step leads to; without there is none.
+        """The world model as a TorchRL environment, see `playslot_rl.acting.imagination.ImaginationEnv`.
 
         Examples:
             >>> PlaySlot.untrained().imagination([2]).rollout(3)["slots"].shape
@@ -360,10 +323,8 @@ class PlaySlot:
         return ImaginationSession(self.world_model, self._generator())
 
     def simulation(self, render: RenderConfig | None = None) -> TransformedEnv:
-        """The simulated task with slots as observation and latent actions as action (`playslot_rl.acting.simulation`).
-
-        Args:
-            render: how frames are drawn; use what the training data were drawn with.
+        """The simulated task with slots as observation and latent actions as action (`playslot_rl.acting.simulation`),
+        drawn as `render` says: use what the training data were drawn with.
 
         Raises:
             CheckpointError: the model has no action decoder.

@@ -27,19 +27,10 @@ from playslot_rl.modules.savi import SAVi
 class WorldModel(nn.Module):
     """SAVi, InvDyn and the predictor: parse, infer latent actions, predict (paper, Figure "PlaySlot").
 
-    Args:
-        config: sizes.
-        env: the task, for the frame size and the width of the real action.
-
-    Attributes:
-        savi, inverse_dynamics, predictor: the three modules.
-        config, env: as given.
-
     Raises:
         ConfigError: a predictor that cannot take the latent actions.
 
     Examples:
-        >>> import torch
         >>> from playslot_rl.testing import tiny_config
         >>> config = tiny_config()
         >>> model = WorldModel(config.model, config.env).eval()
@@ -71,13 +62,8 @@ class WorldModel(nn.Module):
 
 
 class Agent(nn.Module):
-    """A world model, the latent policy and the action decoder, and maybe the slot oracle.
-
-    Args:
-        world_model: the world model whose slots and latent actions the others were trained on.
-        policy: slots (..., N, D) to a latent action.
-        action_decoder: latent action to real action.
-        oracle: the policy's architecture on real actions (..., A); clamp its output to [-1, 1] in use.
+    """A world model, the latent policy and the action decoder that were trained on it, and maybe the slot oracle: the
+    policy's architecture on real actions, whose output is clamped to [-1, 1] in use.
     """
 
     def __init__(

@@ -47,7 +47,6 @@ def make_parser(
 
     Args:
         actions: by name.
-        command: its name.
         usage: what follows the name.
         description: of all of them.
         kind: says how bad arguments end.

@@ -19,7 +19,6 @@ class Decisions:
     """What was decided, by name, in `RUN/adopt.json`.
 
     Args:
-        run: the run folder.
         facts: what the decisions depend on.
         began: `time.monotonic()` when this process began with the work.
 

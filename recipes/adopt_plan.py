@@ -72,8 +72,6 @@ class Plan:
 
         Args:
             name: of the stage, in words.
-            run: the run.
-            stage: its name.
             seconds: that it may take.
             milliseconds: of a step.
             before: seconds that an earlier version, which planned all at the beginning, gave it.

@@ -44,11 +44,7 @@ def main(config: ExperimentConfig) -> None:
 
 
 def check_out(config: ExperimentConfig) -> Path:
-    """The folder to write.
-
-    Raises:
-        ConfigError: none was named, or the run is a baseline's.
-    """
+    """The folder to write. Raises ConfigError: none was named, or the run is a baseline's."""
     if not config.out or Path(config.out).resolve() == Path(config.run).resolve():
         raise ConfigError("out: got nothing or the run itself, expected a new folder, such as out=policies/press")
     if config.method != "playslot":

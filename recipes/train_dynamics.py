@@ -21,7 +21,6 @@ def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
     """Train the dynamics into `RUN/dynamics`; killed, the same command carries on; finished, it says so.
 
     Args:
-        config: of the command.
         pace: the time that it has (`adopt`); None trains as many steps as the config says.
 
     Raises:

@@ -17,7 +17,6 @@ def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
     """Train SAVi into `RUN/slots`; killed, the same command carries on; finished, it says so.
 
     Args:
-        config: of the command.
         pace: the time that it has (`adopt`); None trains as many steps as the config says.
 
     Raises:

@@ -30,9 +30,9 @@ RANDOM_STREAM: Final = 7
 class Actor(TensorDictModuleBase):
     """Observation to action, with a memory that travels in the tensordict, never on the module.
 
-    Reads PIXELS (n, 3, H, W), uint8 [0, 255] or float [0, 1], or what `reads` names, and the keys of its `memory`; writes
-    ACTION (n, A), in [-1, 1] but for what `executed` clips, and the memory's keys anew. In evaluation mode it is a
-    function of these inputs, so that episodes in a batch do not touch each other.
+    Reads PIXELS (n, 3, H, W), uint8 [0, 255] or float [0, 1], or what `reads` names, and the keys of its `memory`;
+    writes ACTION (n, A), in [-1, 1] but for what `executed` clips, and the memory's keys anew. In evaluation mode it is
+    a function of these inputs, so that episodes in a batch do not touch each other.
 
     Attributes:
         looks: at which frames: `always`, `first` (it never sees what its actions did) or `never`. Frames that nobody

@@ -41,8 +41,8 @@ def oracle_actor(agent: Agent) -> SlotActor:
 
 
 class Imagination(NamedTuple):
-    """An imagined rollout: slots (E, T + 1, N, D), the first given or parsed; the policy's latents (E, T, Z); and decoded
-    actions (E, T, A) in [-1, 1].
+    """An imagined rollout: slots (E, T + 1, N, D), the first given or parsed; the policy's latents (E, T, Z); and
+    decoded actions (E, T, A) in [-1, 1].
     """
 
     slots: Tensor

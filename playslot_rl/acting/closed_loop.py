@@ -55,8 +55,8 @@ class ClosedLoop:
         return seen
 
     def act(self, frames: Tensor, name: str = "frames") -> Tensor:
-        """Actions (B, A) in [-1, 1] for the present frames (B, 3, H, W), float in [0, 1] or uint8 [0, 255], of all episodes;
-        rows keep their place until `reset`. `actor.executed` gives them in the robot's units.
+        """Actions (B, A) in [-1, 1] for the present frames (B, 3, H, W), float in [0, 1] or uint8 [0, 255], of all
+        episodes; rows keep their place until `reset`. `actor.executed` gives them in the robot's units.
 
         Raises:
             ValueError: another shape, or another number of episodes than at the last call.

@@ -195,8 +195,8 @@ def _rewards(reward: Reward, slots: Tensor) -> Tensor:
 
 
 def latent_actions(world_model: WorldModel, given: npt.NDArray[Any] | Tensor, n_slots: int | None = None) -> Tensor:
-    """Latent actions ([B,] P, [N,] Z) of some steps, given as they are or as integer ([B,] P, [N]) numbers of prototypes;
-    `n_slots` is N, where it is not the world model's (`ImaginationSession.keep`).
+    """Latent actions ([B,] P, [N,] Z) of some steps, given as they are or as integer ([B,] P, [N]) numbers of
+    prototypes; `n_slots` is N, where it is not the world model's (`ImaginationSession.keep`).
 
     Raises:
         TypeError: no numbers.
@@ -243,8 +243,8 @@ class ImaginationSession:
         self._state: TensorDictBase | None = None
 
     def reset(self, *, frames: Tensor | None = None, slots: Tensor | None = None) -> Tensor:
-        """Start B episodes from their first frames (B, 3, H, W), uint8 [0, 255] or float [0, 1], or from slots (B, N, D), such as
-        SAVi found in the middle of an episode; returns their slots.
+        """Start B episodes from their first frames (B, 3, H, W), uint8 [0, 255] or float [0, 1], or from slots (B, N,
+        D), such as SAVi found in the middle of an episode; returns their slots.
 
         Raises:
             ValueError: neither or both are given, or another shape.
@@ -258,7 +258,9 @@ class ImaginationSession:
 
     @property
     def state(self) -> TensorDictBase:
-        """A copy of where the session stands, batch size [B]: SLOTS, the histories and their length; a ValueError before `reset`."""
+        """A copy of where the session stands, batch size [B]: SLOTS, the histories and their length; a ValueError
+        before `reset`.
+        """
         return self._present().clone()
 
     def _present(self) -> TensorDictBase:
@@ -282,8 +284,8 @@ class ImaginationSession:
         self._state = self._present().repeat_interleave(candidates, dim=0)
 
     def put(self, slots: Tensor, *, forget: bool = False) -> None:
-        """Put other slots (B, N, D) in the place of the present ones, as the newest frame that the predictor sees; `forget` drops
-        the earlier frames too, which another scene would contradict.
+        """Put other slots (B, N, D) in the place of the present ones, as the newest frame that the predictor sees;
+        `forget` drops the earlier frames too, which another scene would contradict.
 
         Raises:
             ValueError: another shape.
@@ -318,7 +320,8 @@ class ImaginationSession:
         self._state = state
 
     def step(self, latents: Tensor | None = None, *, prototypes: Sequence[int] | Tensor | None = None) -> Tensor:
-        """One step of all episodes by latent actions (B, [N,] Z), or by numbers of prototypes (B, [N]), to slots (B, N, D).
+        """One step of all episodes by latent actions (B, [N,] Z), or by numbers of prototypes (B, [N]), to slots (B, N,
+        D).
 
         Raises:
             ValueError: neither or both are given, another shape, or no such prototype.

@@ -50,8 +50,8 @@ class PlanningActor(Actor):
     found costs no more in imagination than what the policy would do.
 
     The plan, its imagined slots PREDICTED_SLOTS (n, H + 1, N, D), its cost and the seconds it took stay in the memory,
-    for who looks on. Candidates are drawn by `seed`, the episode's seed and the step, so that episodes side by side do not
-    touch each other.
+    for who looks on. Candidates are drawn by `seed`, the episode's seed and the step, so that episodes side by side do
+    not touch each other.
     """
 
     def __init__(

@@ -44,7 +44,9 @@ def perform(pool: TaskPool, seeds: Sequence[int]) -> Performance:
 
 
 class ReplayActor(PlannedActor):
-    """Executes what the latents of the expert's videos decode to, decoded alone as in imagination; the policy is not asked."""
+    """Executes what the latents of the expert's videos decode to, decoded alone as in imagination; the policy is not
+    asked.
+    """
 
     def __init__(self, agent: Agent, performed: Callable[[Sequence[int]], Performance]) -> None:
         env = agent.world_model.env

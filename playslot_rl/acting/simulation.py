@@ -74,8 +74,8 @@ class SlotTransform(Transform):
 
 
 class ActionDecoderTransform(Transform):
-    """Turns the policy's LATENT_ACTION ([N,] Z), with the SLOTS (N, D) it was chosen at, into the ACTION the task wants, on
-    the way in, in the units that it was recorded in.
+    """Turns the policy's LATENT_ACTION ([N,] Z), with the SLOTS (N, D) it was chosen at, into the ACTION the task
+    wants, on the way in, in the units that it was recorded in.
     """
 
     def __init__(
@@ -158,7 +158,6 @@ def make_simulation_env(
         ValueError: frame size or action width differ from the world model's.
 
     Examples:
-        >>> from playslot_rl.config import RenderConfig
         >>> from playslot_rl.testing import tiny_agent, tiny_config
         >>> from playslot_rl.world_model import latent_policy_module
         >>> config = tiny_config(max_steps=3)

@@ -25,25 +25,14 @@ from playslot_rl.runtime.shares import averaged
 
 
 class _CloningLoss(LossModule):
-    """Mean squared (or absolute) error of a network's output to an action; the two losses below name the keys.
-
-    Args:
-        network: the one that is trained.
-        loss_function: `l2` (paper) or `l1`.
-
-    Raises:
-        ValueError: another loss function.
+    """Mean squared (or absolute) error of a network's output to an action; the two losses below name the keys. A
+    ValueError for a loss function that is neither `l2` (paper) nor `l1`.
     """
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that `set_keys` can rename.
-
-        Attributes:
-            observation: what the network reads.
-            action: the target.
-            state: what a decoder with `reads_slots` reads beside it.
-            mask: optional bool (...); False leaves an element's target out. Not read where missing.
+        """Keys that `set_keys` can rename: what the network reads, the target, what a decoder with `reads_slots` reads
+        beside it, and an optional mask, bool (...), that leaves targets out where it is False.
         """
 
         observation: NestedKey = keys.SLOTS
@@ -78,11 +67,7 @@ class _CloningLoss(LossModule):
         return [self.out_name]
 
     def forward(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDictBase:  # noqa: ARG002
-        """Compare.
-
-        Args:
-            tensordict: observation and target of equal leading shape, maybe a mask.
-            generator: not used, nothing is drawn; the three stages' losses are called alike.
+        """Compare; the generator is not used, nothing is drawn: the three stages' losses are called alike.
 
         Raises:
             ValueError: output and target differ in shape, which broadcasting would hide.
@@ -119,13 +104,7 @@ class BehaviourLoss(_CloningLoss):
     Note: equal to TorchRL's `BCLoss` with the same `loss_function` (a test holds it to that), not used because
     its functional conversion hides the network from `.train()`, `.eval()` and the checkpoints.
 
-    Args:
-        network: the policy that is trained, (..., N, D) to (..., Z).
-        loss_function: `l2` (paper) or `l1`.
-
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from playslot_rl.testing import tiny_agent
         >>> loss = BehaviourLoss(tiny_agent().policy)
         >>> demos = TensorDict({"slots": torch.randn(2, 5, 4, 32), "latent_action": torch.randn(2, 5, 8)}, [2, 5])
@@ -141,13 +120,7 @@ class ActionDecoderLoss(_CloningLoss):
     Reads LATENT_ACTION (..., Z), SLOTS (..., N, D) where the decoder does, and ACTION (..., A) in [-1, 1]; writes
     `loss_action`.
 
-    Args:
-        network: the action decoder that is trained, (..., Z) to (..., A).
-        loss_function: `l2` (paper) or `l1`.
-
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from playslot_rl.testing import tiny_agent
         >>> loss = ActionDecoderLoss(tiny_agent().action_decoder)
         >>> labelled = TensorDict({"latent_action": torch.randn(6, 8), "action": torch.rand(6, 4)}, [6])

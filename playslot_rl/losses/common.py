@@ -13,11 +13,7 @@ from playslot_rl.runtime.shares import averaged, own_noise
 
 
 def total_loss(losses: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
-    """Sum of the entries named `loss_*` (scalars, weights included).
-
-    Raises:
-        ValueError: there is none.
-    """
+    """Sum of the entries named `loss_*` (scalars, weights included). Raises ValueError: there is none."""
     parts = [value for key, value in losses.items() if key.startswith("loss_")]
     if not parts:
         raise ValueError(f"losses: got keys {sorted(losses.keys())}, expected some named loss_*")
@@ -25,16 +21,11 @@ def total_loss(losses: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
 
 
 def draw_frames(batch: int, frames: int, count: int, generator: torch.Generator | None) -> Tensor | None:
-    """Which frames of each clip are decoded for an image loss.
-
-    Args:
-        batch: clips B.
-        frames: of each clip, T.
-        count: k; 0, or as many as there are, means all.
-        generator: draws them, uniformly without replacement, for each clip; None is torch's own, on the CPU.
+    """Which k = `count` of the T frames of B clips are decoded for an image loss, uniformly without replacement, for
+    each clip; None for all of them, where k is 0 or not below T. Without a generator torch's own draws, on the CPU.
 
     Returns:
-        Numbers from 0 (B, k), int64, on the generator's device, or None for all.
+        Numbers from 0 (B, k), int64, on the generator's device, or None.
     """
     if not 0 < count < frames:
         return None

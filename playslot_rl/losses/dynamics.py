@@ -47,9 +47,6 @@ class DynamicsLoss(LossModule):
         config: seed frames, decoded frames and weights.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from playslot_rl.config import DynamicsStageConfig
         >>> from playslot_rl.testing import tiny_agent
         >>> model = tiny_agent().world_model
         >>> config = DynamicsStageConfig(seed_frames=1, predicted_frames=4, decoded_frames=2)
@@ -64,12 +61,8 @@ class DynamicsLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that `set_keys` can rename.
-
-        Attributes:
-            slots: parsed slots.
-            pixels: the frames they were parsed from.
-            action: real actions, read in mode `ground_truth` only.
+        """Keys that `set_keys` can rename: parsed slots, the frames they were parsed from, and the real actions of mode
+        `ground_truth`.
         """
 
         slots: NestedKey = keys.SLOTS
@@ -108,7 +101,6 @@ class DynamicsLoss(LossModule):
         """Infer latent actions, roll out, compare.
 
         Args:
-            tensordict: SLOTS, PIXELS and maybe ACTION, as above.
             generator: draws z (in training mode) and the frames to decode.
             teacher: every input is a parsed slot and no prediction is fed back: one parallel pass.
 

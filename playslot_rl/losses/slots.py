@@ -42,8 +42,6 @@ class SlotsLoss(LossModule):
         motion_weight: lambda.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from playslot_rl.testing import tiny_agent
         >>> loss = SlotsLoss(tiny_agent().world_model.savi)
         >>> clips = TensorDict({"pixels": torch.randint(256, (2, 3, 3, 64, 64), dtype=torch.uint8)}, [2])
@@ -55,11 +53,7 @@ class SlotsLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that `set_keys` can rename.
-
-        Attributes:
-            pixels: frames of the clips.
-        """
+        """Keys that `set_keys` can rename."""
 
         pixels: NestedKey = keys.PIXELS
 
@@ -77,12 +71,7 @@ class SlotsLoss(LossModule):
         return [self.tensor_keys.pixels]
 
     def forward(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDictBase:
-        """Parse, render, compare.
-
-        Args:
-            tensordict: PIXELS (B, T, 3, H, W).
-            generator: of sampled initial slots.
-        """
+        """Parse, render, compare; the generator is of sampled initial slots."""
         frames, decoded = self.reconstruct(tensordict, generator)
         error = (decoded.frames - frames).square()
         mse = error.mean()

@@ -34,9 +34,6 @@ class ActionDecoder(nn.Module):
     """Real action from a latent action.
 
     Args:
-        config: sizes.
-        latent_dim: Z.
-        action_dim: A.
         slot_dim: D of the slots that it reads beside z where `config.reads_slots`.
 
     Attributes:

@@ -17,9 +17,6 @@ class ActionRange(nn.Module):
 
     At first they are -1 and 1: nothing is computed then, and nothing stored with the weights. A dimension whose ends
     are equal never changes: it is -1 inside, and that constant outside.
-
-    Args:
-        action_dim: A.
     """
 
     low: Tensor
@@ -32,10 +29,8 @@ class ActionRange(nn.Module):
         self.register_buffer("high", torch.ones(action_dim), persistent=False)
 
     def take(self, low: Tensor, high: Tensor) -> None:
-        """Take the ends (A,), finite and in order; -1 and 1 in every dimension are what it began with.
-
-        Raises:
-            ValueError: other shapes, or ends that are none.
+        """Take the ends (A,), finite and in order (else a ValueError); -1 and 1 in every dimension are what it began
+        with.
         """
         if low.shape != self.low.shape or high.shape != self.low.shape or not bool((low <= high).all()):
             raise ValueError(

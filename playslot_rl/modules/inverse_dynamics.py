@@ -56,12 +56,9 @@ class InverseDynamics(nn.Module):
 
     Args:
         config: sizes and mode; in mode `none` latents have width 0, and say only how many frames there are.
-        slot_dim: D.
         action_dim: A, the width of z in mode `ground_truth`.
 
     Example:
-        >>> import torch
-        >>> from playslot_rl.config import InverseDynamicsConfig
         >>> model = InverseDynamics(InverseDynamicsConfig(), slot_dim=128, action_dim=4).eval()
         >>> model(torch.randn(2, 5, 4, 128)).z.shape
         torch.Size([2, 4, 16])
@@ -116,10 +113,9 @@ class InverseDynamics(nn.Module):
     def forward(
         self, slots: Tensor, actions: Tensor | None = None, generator: torch.Generator | None = None
     ) -> LatentActions:
-        """Infer the latent actions of a clip.
+        """Infer the latent actions of a clip (B, T, N, D).
 
         Args:
-            slots: (B, T, N, D).
             actions: real actions (B, T-1, A) in the robot's units, needed in mode `ground_truth` only; z are these in
                 [-1, 1] (`action_range`), and beyond it where they are beyond the range.
             generator: draws z in training, and at evaluation with `config.sample`.

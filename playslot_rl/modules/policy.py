@@ -20,8 +20,6 @@ class LatentPolicy(nn.Module):
     (`behaviour.whiten`); the paper clones latents as they are.
 
     Args:
-        config: sizes.
-        slot_dim: D.
         out_dim: Z, or A for the oracle.
         whiten: have a `whitening`, to be fitted before training.
         acts: it gives real actions, and has their `action_range`.

@@ -29,8 +29,6 @@ class ActionQuantizer(nn.Module):
     """vector-quantize-pytorch's EMA codebook in the paper's symbols.
 
     Args:
-        latent_dim: Z.
-        n_prototypes: K.
         decay: EMA decay.
         dead_threshold: EMA cluster size below which a code is revived.
         commitment: beta.
@@ -58,10 +56,7 @@ class ActionQuantizer(nn.Module):
         return cast(Tensor, self.vq.codebook)
 
     def forward(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Quantise.
-
-        Args:
-            z: latent actions (..., Z).
+        """Quantise latent actions (..., Z).
 
         Returns:
             p (..., Z) with a straight-through gradient, code (...) int64, and the commitment loss (scalar, beta

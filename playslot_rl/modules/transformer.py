@@ -27,15 +27,10 @@ those of products do: results of several processes would drift from those of one
 
 
 def attention(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tensor:
-    """softmax(q k^T / sqrt(d) + bias) v by whichever way is quicker for the device, the precision and the keys.
+    """softmax(q k^T / sqrt(d) + bias) v (B, heads, S, d) by whichever way is quicker for the device, the precision and
+    the keys, of queries (B, heads, S, d), keys and values (B, heads, L, d).
 
-    Args:
-        q: queries (B, heads, S, d).
-        k, v: keys and values (B, heads, L, d).
-        mask: bool, True where attention is allowed, or a bias of the logits, broadcastable to (B, heads, S, L).
-
-    Returns:
-        (B, heads, S, d).
+    The mask is bool, True where attention is allowed, or a bias of the logits, broadcastable to (B, heads, S, L).
     """
     short = q.device.type == "cpu" and q.dtype == torch.bfloat16 and k.shape[2] <= PRODUCTS_UP_TO
     by = products if short else F.scaled_dot_product_attention
@@ -51,15 +46,7 @@ def products(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Ten
 
 
 class TransformerBlock(nn.Module):
-    """One pre-norm block.
-
-    Args:
-        dim: token width.
-        heads: attention heads.
-        head_dim: width of each head.
-        mlp_dim: hidden width of the MLP (GELU).
-        project_out: output projection; SAVi's transition has none, since there heads * head_dim = dim.
-    """
+    """One pre-norm block with a GELU; SAVi's transition has no output projection: there heads * head_dim = dim."""
 
     def __init__(self, dim: int, heads: int, head_dim: int, mlp_dim: int, project_out: bool = True) -> None:
         super().__init__()
@@ -82,10 +69,9 @@ class TransformerBlock(nn.Module):
         past: KeysValues | None = None,
         wanted: slice = slice(None),
     ) -> tuple[Tensor, KeysValues]:
-        """Transform S new tokens that attend to the past and to each other.
+        """Transform S new tokens (B, S, dim) that attend to the past and to each other.
 
         Args:
-            x: new tokens (B, S, dim).
             mask: bool, True where attention is allowed, or a bias of the logits, broadcastable to
                 (B, heads, S, S_past + S).
             past: keys and values of earlier tokens.
@@ -112,13 +98,8 @@ class TransformerBlock(nn.Module):
 
 
 class SlotTokenEncoder(nn.Module):
-    """Summarise the slots of one frame in one vector (paper, appendix A.2).
-
-    No position code, so the result does not depend on the order of the slots.
-
-    Args:
-        slot_dim: D.
-        dim, layers, heads, head_dim, mlp_dim: the transformer.
+    """Summarise the slots of one frame in one vector (paper, appendix A.2). No position code, so the result does not
+    depend on the order of the slots.
     """
 
     def __init__(self, slot_dim: int, dim: int, layers: int, heads: int, head_dim: int, mlp_dim: int) -> None:

@@ -21,9 +21,6 @@ FADE: Final = 0.01
 class Whitening(nn.Module):
     """An invertible linear map of latent actions (..., Z) to coordinates (..., Z); the identity until it is fitted.
 
-    Args:
-        width: Z.
-
     Examples:
         >>> z = torch.randn(100, 3) * torch.tensor([5.0, 1.0, 1e-4]) + 2.0
         >>> whitening = Whitening(3)

@@ -25,12 +25,8 @@ _KNOWN: Final = ("slots", "dynamics", "policy", "world_model.json", "adopt.json"
 
 
 def run_to_read(config: ExperimentConfig, command: str, expected: str) -> Run:
-    """The run that a command reads, and writes its results into unless it is a pretrained model.
-
-    Args:
-        config: `run` and `out`.
-        command: for the message.
-        expected: what `run` is to name, for the message.
+    """The run that a command reads, and writes its results into unless it is a pretrained model. `expected` is what
+    `run` is to name, for the message.
 
     Raises:
         ConfigError: none is named, or `out` names another folder.
@@ -108,16 +104,7 @@ def run_of_pretrained(config: ExperimentConfig, model: Run) -> Run:
 
 
 def require_task(config: ExperimentConfig, trained: EnvConfig, names: Sequence[str] = SAME_TASK) -> None:
-    """Refuse an environment that is not the one a run was trained on.
-
-    Args:
-        config: of the command.
-        trained: the environment that a checkpoint of the run names.
-        names: of the settings that have to agree.
-
-    Raises:
-        ConfigError: they differ.
-    """
+    """Refuse, by a ConfigError, an environment other than the one a run was trained on in one of these settings."""
     for name in names:
         got, expected = getattr(config.env, name), getattr(trained, name)
         if got != expected:
@@ -128,10 +115,8 @@ def require_task(config: ExperimentConfig, trained: EnvConfig, names: Sequence[s
 
 
 def require_parent(config: ExperimentConfig, run: Run, parent: StageCheckpoint, *sizes: str) -> None:
-    """Check that a parent is of the task's `image_size` or `action_dim`, and that a run can build on it.
-
-    Raises:
-        CheckpointError: it is of others, or the run has another one of its own.
+    """Check that a parent is of the task's `image_size` or `action_dim`, and that a run can build on it and has no
+    other; else a CheckpointError.
     """
     from playslot_rl.storage.checkpoints import require_config
 

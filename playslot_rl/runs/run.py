@@ -35,11 +35,7 @@ if TYPE_CHECKING:
 
 
 def pretrained_folder(env: str = "button_press") -> Path:
-    """Folder of a task's pretrained model.
-
-    Raises:
-        CheckpointError: there is none.
-    """
+    """Folder of a task's pretrained model; a CheckpointError where there is none."""
     import importlib.resources
 
     root = Path(str(importlib.resources.files("playslot_rl.pretrained")))
@@ -53,7 +49,8 @@ def pretrained_folder(env: str = "button_press") -> Path:
 
 
 class Run:
-    """A run, opened once; what was read of it is kept, so open it again after it was trained on.
+    """A run, opened once; what was read of it is kept, so open it again after it was trained on. Whatever reads a stage
+    raises a CheckpointError where that is missing, damaged, of another version, or was trained on other parents.
 
     Args:
         folder: may not be there yet, for a run to write.
@@ -69,10 +66,7 @@ class Run:
 
     @classmethod
     def open(cls, name: Path | str) -> Run:
-        """`pretrained/ENV`, `pretrained` (ButtonPress's) or a folder.
-
-        Raises:
-            CheckpointError: there is no such run.
+        """`pretrained/ENV`, `pretrained` (ButtonPress's) or a folder; a CheckpointError where there is none.
 
         Examples:
             >>> run = Run.open("pretrained/block_push")
@@ -91,11 +85,7 @@ class Run:
 
     @classmethod
     def of(cls, config: ExperimentConfig, otherwise: Path | str = "") -> Run:
-        """The run that a command reads: `run`, where `pretrained` is the task's own, or else another.
-
-        Raises:
-            CheckpointError: there is no such run.
-        """
+        """The run that a command reads: `run`, where `pretrained` is the task's own, or else another."""
         return cls.open(f"{PRETRAINED}/{config.env.name}" if config.run == PRETRAINED else config.run or otherwise)
 
     @property
@@ -105,11 +95,7 @@ class Run:
 
     @cached_property
     def view(self) -> DataConfig:
-        """Camera, resizing and stride with which the frames were read; the defaults where the run says nothing.
-
-        Raises:
-            CheckpointError: its config is damaged.
-        """
+        """Camera, resizing and stride with which the frames were read; the defaults where the run says nothing."""
         path = self.folder / "config.json"
         data = read_json(path, "restore it").get("data", {}) if path.is_file() else {}
         try:
@@ -127,11 +113,7 @@ class Run:
 
     @cached_property
     def world_run(self) -> Run:
-        """The run that holds the world model of this one: itself, or the one that `world_model.json` names.
-
-        Raises:
-            CheckpointError: a link that leads nowhere.
-        """
+        """The run that holds the world model of this one: itself, or the one that `world_model.json` names."""
         link = self.folder / "world_model.json"
         if self.place("dynamics").is_dir() or not link.is_file():
             return self
@@ -149,11 +131,7 @@ class Run:
         return (self.place(stage) / "meta.json").is_file()
 
     def own(self, stage: str) -> StageCheckpoint:
-        """A finished stage of this run's own folder.
-
-        Raises:
-            CheckpointError: it is missing or damaged.
-        """
+        """A finished stage of this run's own folder, whatever its parents."""
         from playslot_rl.storage.checkpoints import read_stage
 
         if stage not in self._stages:
@@ -161,14 +139,8 @@ class Run:
         return self._stages[stage]
 
     def stage(self, stage: str, *parents: str) -> StageCheckpoint:
-        """A finished stage, those of the world model from where it lives.
-
-        Args:
-            stage: its name.
-            parents: of other methods' stages; `dynamics` and `policy` are held against theirs in any case.
-
-        Raises:
-            CheckpointError: it is missing or damaged, or was trained on other parents.
+        """A finished stage, those of the world model from where it lives, and trained on the parents of that name;
+        `dynamics` and `policy` are held against theirs in any case.
         """
         from playslot_rl.storage.checkpoints import require_parents
 
@@ -181,20 +153,12 @@ class Run:
 
     @property
     def world_stages(self) -> dict[str, StageCheckpoint]:
-        """`slots` and `dynamics`.
-
-        Raises:
-            CheckpointError: one is missing or damaged, or the dynamics were trained on other slots.
-        """
+        """`slots` and `dynamics`."""
         return {name: self.stage(name) for name in ("slots", "dynamics")}
 
     @property
     def world_config(self) -> tuple[ModelConfig, EnvConfig]:
-        """Sizes and task of the world model.
-
-        Raises:
-            CheckpointError: a stage is missing, damaged or of another version.
-        """
+        """Sizes and task of the world model."""
         slots, dynamics = self.world_stages.values()
         model, env = dynamics.sizes
         return replace(model, savi=slots.sizes[0].savi), env
@@ -202,11 +166,7 @@ class Run:
     # Networks, restored in evaluation mode, without gradients
 
     def load_savi(self, device: torch.device | str = "cpu") -> SAVi:
-        """SAVi.
-
-        Raises:
-            CheckpointError: no finished `slots`, or damaged ones.
-        """
+        """SAVi."""
         from playslot_rl.modules.savi import SAVi
 
         slots = self.stage("slots")
@@ -214,11 +174,7 @@ class Run:
         return slots.restore(lambda: SAVi(model.savi, env.image_size), "savi", device)
 
     def load_world_model(self, device: torch.device | str = "cpu") -> WorldModel:
-        """SAVi, inverse dynamics and predictor.
-
-        Raises:
-            CheckpointError: a stage is missing or damaged, or the dynamics were trained on other slots.
-        """
+        """SAVi, inverse dynamics and predictor."""
         from playslot_rl.world_model import WorldModel
 
         dynamics, sizes = self.stage("dynamics"), self.world_config
@@ -227,11 +183,7 @@ class Run:
         return world
 
     def load_agent(self, device: torch.device | str = "cpu") -> Agent:
-        """World model, policy, action decoder and, if trained, slot oracle.
-
-        Raises:
-            CheckpointError: a stage is missing or damaged, or was trained on other parents.
-        """
+        """World model, policy, action decoder and, if trained, slot oracle."""
         from playslot_rl.world_model import Agent
 
         policy = self.stage("policy")
@@ -246,18 +198,11 @@ class Run:
     def store(self, config: ExperimentConfig) -> None:
         """Write the run's config, with cameras by their full names; called when everything fits, so that a refused
         command leaves the stored one as it was.
-
-        Raises:
-            OutputError: the folder cannot be written.
         """
         write_json(self.folder / "config.json", to_dict(with_full_cameras(config)))
 
     def require_room(self, checkpoint: StageCheckpoint) -> None:
-        """Check that the run has no checkpoint of that stage, or this one.
-
-        Raises:
-            CheckpointError: it has another one.
-        """
+        """Check that the run has no checkpoint of that stage, or this one; else a CheckpointError."""
         if not self.has(checkpoint.stage):
             return
         own = self.own(checkpoint.stage)
@@ -269,12 +214,7 @@ class Run:
             )
 
     def take(self, checkpoint: StageCheckpoint) -> None:
-        """Copy a finished stage into this run, so that it is whole.
-
-        Raises:
-            CheckpointError: the run has another checkpoint of that stage.
-            OutputError: full disk.
-        """
+        """Copy a finished stage into this run, so that it is whole, if there is room for it."""
         self.require_room(checkpoint)
         target = self.place(checkpoint.stage)
         if not target.exists():
@@ -285,9 +225,6 @@ class Run:
 
         The training that carries on from it refuses it unless it is the same one. Nothing is copied from a training
         that has not reached `steps`: this run then trains for itself, to the same weights.
-
-        Raises:
-            OutputError: full disk.
         """
         name = f"step_{steps:08d}"
         there, target = Path(source) / stage / "checkpoints" / name, self.folder / stage / "checkpoints" / name
@@ -295,12 +232,7 @@ class Run:
             _copy_files(there, target)
 
     def build_on(self, parent: Run) -> None:
-        """Name the world model of `parent` as that of this run, unless it is its own.
-
-        Raises:
-            CheckpointError: the parent's link leads nowhere.
-            OutputError: full disk.
-        """
+        """Name the world model of `parent` as that of this run, unless it is its own."""
         home = parent.world_run.folder
         if self.folder.resolve() not in (home.resolve(), parent.folder.resolve()):
             source = parent.name if parent.pretrained else os.path.relpath(home, self.folder)

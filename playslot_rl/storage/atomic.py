@@ -37,11 +37,7 @@ _REASONS = {
 
 @contextlib.contextmanager
 def explain_write_errors(path: Path) -> Iterator[None]:
-    """Turn a failed write below `path` into one line.
-
-    Raises:
-        OutputError: the disk is full, or the folder cannot be written.
-    """
+    """Turn a write below `path` that fails for a full disk or a closed folder into an OutputError of one line."""
     try:
         yield
     except OSError as error:
@@ -74,12 +70,9 @@ def fsync_folder(folder: Path) -> None:
 
 
 def lock(handle: int, *, shared: bool = False, without_locks: bool = True) -> bool:
-    """Whether an open file or folder now is this process's until it closes it or ends: alone, or shared with others.
-
-    Args:
-        handle: the open file or folder.
-        shared: with all that share it; waits for one that has it alone.
-        without_locks: the answer on a file system that has no locks, where nobody knows.
+    """Whether an open file or folder now is this process's until it closes it or ends: alone, or shared with others,
+    for which it waits for one that has it alone. On a file system that has no locks, where nobody knows,
+    `without_locks`.
     """
     try:
         import fcntl
@@ -103,9 +96,8 @@ def is_open_at(handle: int, path: Path) -> bool:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file atomically; its folder is made if needed.
-
-    What a process that was killed in here has left is written over by the next one.
+    """Write a file atomically; its folder is made if needed. What a process that was killed in here has left is written
+    over by the next one.
 
     Raises:
         OutputError: full disk or a folder that cannot be written; `path` keeps its old content.
@@ -143,20 +135,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, obj: Any) -> None:
-    """Write JSON atomically (see `write_bytes`).
-
-    Raises:
-        ValueError: a number is not finite, which JSON cannot hold.
-    """
+    """Write JSON atomically (see `write_bytes`). Raises ValueError: a number is not finite, which JSON cannot hold."""
     write_text(path, json.dumps(obj, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path, cure: str = "train that stage again") -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        CheckpointError: it is missing or damaged; ends with the `cure`.
-    """
+    """Read a JSON object. Raises CheckpointError: it is missing or damaged; ends with the `cure`."""
     try:
         values = json.loads(path.read_text())
     except (OSError, ValueError) as error:
@@ -167,13 +151,11 @@ def read_json(path: Path, cure: str = "train that stage again") -> dict[str, Any
 
 
 def replace_dir(tmp: Path, final: Path) -> None:
-    """Rename the finished folder `tmp` to `final`, after an fsync of everything in it.
+    """Rename the finished folder `tmp` to `final`, after an fsync of everything in it; errors as of
+    `explain_write_errors`.
 
     Where `final` exists it is set aside first and removed afterwards. That is two renames: a kill between them leaves
     no `final`, but both contents on disk; callers can make `final` again.
-
-    Raises:
-        OutputError: full disk or a folder that cannot be written.
     """
     with explain_write_errors(final):
         for folder, _, files in os.walk(tmp):

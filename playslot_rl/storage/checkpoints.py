@@ -53,8 +53,6 @@ class StageCheckpoint:
     """A finished stage on disk.
 
     Attributes:
-        path: its folder.
-        stage: `slots`, `dynamics` or `policy`.
         config: `{"env": ..., "model": ..., STAGE: ...}`, the plain values it was trained with.
         meta: how it was made: commit, data, parents, metrics, steps, seconds, command.
         fingerprint: first 16 hex digits of the SHA-256 of its weights.
@@ -67,10 +65,8 @@ class StageCheckpoint:
     fingerprint: str
 
     def group[Group](self, cls: type[Group], name: str) -> Group:
-        """A group of the config it was trained with; all stages store `env`.
-
-        Raises:
-            CheckpointError: its config.json is not one of this version.
+        """A group of the config it was trained with; all stages store `env`. A CheckpointError where this version has
+        no such one.
         """
         try:
             return from_dict(cls, self.config[name], f"{name}.")
@@ -82,11 +78,7 @@ class StageCheckpoint:
 
     @property
     def sizes(self) -> tuple[ModelConfig, EnvConfig]:
-        """The groups `model` and `env`.
-
-        Raises:
-            CheckpointError: its config.json is not one of this version.
-        """
+        """The groups `model` and `env`. Raises CheckpointError: its config.json is not one of this version."""
         return self.group(ModelConfig, "model"), self.group(EnvConfig, "env")
 
     def restore[Network: nn.Module](
@@ -127,17 +119,14 @@ def save_stage(
     seconds: float,
     extra: Mapping[str, Any] | None = None,
 ) -> StageCheckpoint:
-    """Write a finished stage, atomically.
+    """Write a finished stage, atomically, to a folder that is replaced if it exists.
 
     Args:
-        path: the folder to make (`checkpoint_folder(run, stage)`); replaced if it exists.
-        stage: `slots`, `dynamics` or `policy`.
         modules: what to store, by name.
         config: `{"env": ..., "model": ..., STAGE: ...}`, plain values.
         data: fingerprints of the data sets, by role (`train`, `demos`).
         parents: fingerprints of the parents' weights, by stage.
         metrics: final numbers.
-        steps: optimiser steps.
         seconds: wall-clock seconds of training.
         extra: more plain values for `meta.json` (`labelled_demos`, `demos`).
 
@@ -203,11 +192,7 @@ def load_weights(checkpoint: StageCheckpoint, modules: Mapping[str, nn.Module]) 
 
 
 def require_whole(checkpoint: StageCheckpoint) -> None:
-    """Check that the weights are the ones that were saved.
-
-    Raises:
-        CheckpointError: they are not.
-    """
+    """Check that the weights are the ones that were saved. Raises CheckpointError: they are not."""
     saved = checkpoint.meta.get("fingerprint")
     if checkpoint.fingerprint != saved:
         raise CheckpointError(
@@ -217,11 +202,7 @@ def require_whole(checkpoint: StageCheckpoint) -> None:
 
 
 def require_parents(child: StageCheckpoint, parents: Mapping[str, StageCheckpoint]) -> None:
-    """Check that a child was trained on exactly these parents.
-
-    Raises:
-        CheckpointError: a parent is another one, or damaged.
-    """
+    """Check that a child was trained on exactly these parents, and that they are whole; else a CheckpointError."""
     for name, parent in parents.items():
         require_whole(parent)
         expected = child.meta.get("parents", {}).get(name)

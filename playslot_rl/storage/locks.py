@@ -17,12 +17,8 @@ def locked(path: Path, busy: str = "", patience: float = 0.0) -> Iterator[None]:
     """Hold the lock of a file, which is made if needed; its folder must exist.
 
     Args:
-        path: the lock file.
-        busy: one line for the error where another process holds it; empty waits for that process instead.
+        busy: one line for the OutputError where another process holds it; empty waits for that process instead.
         patience: seconds until that error; children of a killed process hold its locks until they notice.
-
-    Raises:
-        OutputError: `busy`, or the file cannot be written.
     """
     lock = FileLock(path, timeout=patience if busy else -1)
     try:

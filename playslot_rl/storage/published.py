@@ -13,13 +13,13 @@ from playslot_rl.errors import CheckpointError
 
 
 def read_published(path: Path, key: str, network: str, cure: str) -> dict[str, Tensor]:
-    """Tensors by name.
+    """Tensors by name from a `.safetensors` file, or a `.pth` as published; of that tensors are read only, nothing is
+    run.
 
     Args:
-        path: a `.safetensors` file, or a `.pth` as published; of that tensors are read only, nothing is run.
-        key: config key that named it, for the message.
+        key: config key that named it.
         network: whose weights are expected.
-        cure: what to do without them.
+        cure: what to do without them, for the message.
 
     Raises:
         CheckpointError: it is missing or damaged.
@@ -42,14 +42,8 @@ def read_published(path: Path, key: str, network: str, cure: str) -> dict[str, T
 def pick_published(
     state: Mapping[str, Tensor], names: Mapping[str, str], shapes: Mapping[str, Tensor], where: str, cure: str
 ) -> dict[str, Tensor]:
-    """The tensors a network of ours takes.
-
-    Args:
-        state: as published.
-        names: published name of each of ours.
-        shapes: ours, for their shapes.
-        where: the key and the file, for the message.
-        cure: what to do without them.
+    """The tensors a network of ours, with these shapes, takes; `names` are the published ones of each of ours. `where`
+    (the key and the file) and `cure` (what to do without them) are for the message.
 
     Raises:
         CheckpointError: one is missing or of another shape.

@@ -74,11 +74,7 @@ def last_use(folder: Path) -> float:
 
 
 def remove_unused(folder: Path) -> bool:
-    """Remove a folder that nobody uses.
-
-    Returns:
-        Whether it is gone.
-    """
+    """Remove a folder that nobody uses; whether it is gone."""
     with alone(folder) as free:
         if not free:
             return not folder.is_dir()

@@ -42,21 +42,13 @@ def tensor_bytes(tensors: Mapping[str, Tensor]) -> bytes:
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Write tensors to a safetensors file, atomically.
-
-    Raises:
-        OutputError: full disk.
-    """
+    """Write tensors to a safetensors file, atomically. Raises OutputError: full disk."""
     # Serialised in memory and written by us: safetensors' own writer hides the errno of a full disk.
     write_bytes(path, tensor_bytes(tensors))
 
 
 def load_tensors(path: Path) -> dict[str, Tensor]:
-    """Read a safetensors file onto the CPU.
-
-    Raises:
-        CheckpointError: the file is missing, truncated, or no safetensors file.
-    """
+    """Read a safetensors file onto the CPU; a CheckpointError where it is missing, truncated, or no safetensors file."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 
@@ -73,11 +65,7 @@ def load_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def _check_header(path: Path) -> None:
-    """Refuse a file whose header does not account for its size, before more than the header is read.
-
-    Raises:
-        ValueError: a header that is absurdly long or no JSON, or tensors that end elsewhere than the file.
-    """
+    """Refuse, by a ValueError, a file whose header does not account for its size, before more than the header is read."""
     size = path.stat().st_size
     with path.open("rb") as file:
         length = int.from_bytes(file.read(8), "little")
@@ -90,12 +78,8 @@ def _check_header(path: Path) -> None:
 
 
 def load_modules(modules: Mapping[str, nn.Module], tensors: Mapping[str, Tensor], where: str) -> None:
-    """Copy `MODULE.NAME` tensors into the modules, in place; nothing is changed unless everything fits.
-
-    Parts that are `SometimesStored` learn whether they were.
-
-    Raises:
-        CheckpointError: a tensor is missing, unexpected, or of another shape.
+    """Copy `MODULE.NAME` tensors into the modules as `load_into` does; parts that are `SometimesStored` learn whether
+    they were.
     """
     expected, parts = module_tensors(modules), dict[SometimesStored, bool]()
     for name, module in modules.items():

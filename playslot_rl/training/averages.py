@@ -15,15 +15,7 @@ from torch import Tensor, nn
 
 
 class WeightAverage:
-    """The average of parameters.
-
-    Args:
-        parameters: by name; at first, the average.
-        decay: in (0, 1).
-
-    Attributes:
-        tensors: the average, by name.
-    """
+    """The average (`tensors`) of parameters, by name; at first they are the average. The decay is in (0, 1)."""
 
     def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float) -> None:
         self.parameters, self.decay = parameters, decay

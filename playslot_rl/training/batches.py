@@ -23,13 +23,8 @@ from playslot_rl.training.stage import Stage
 
 
 class GlobalBatches:
-    """One process's part in the batches of a stage.
-
-    Args:
-        stage: its BatchNorm layers are made global where there are other processes, its weights are made equal.
-        config: batch size and accumulation.
-        parameters: what is trained, by name.
-        key: dotted config group of the stage, for messages.
+    """One process's part in the batches of a stage, whose BatchNorm layers are made global where there are other
+    processes, and whose weights are made equal; `key` is its dotted config group, for messages.
 
     Raises:
         ConfigError: the shares do not divide the batch, or the stage cannot accumulate.

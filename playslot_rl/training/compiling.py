@@ -16,14 +16,8 @@ COMPILERS = ("g++", "gcc", "clang++", "clang")
 def compile_parts(modules: Mapping[str, nn.Module], key: str) -> None:
     """Compile what the networks call step by step (SAVi's encoder, corrector, transition), in place; names stay.
 
-    Whole networks draw random numbers from generators, which torch.compile cannot trace; their parts do not.
-
-    Args:
-        modules: of the stage.
-        key: dotted name of the setting, for the error.
-
-    Raises:
-        ConfigError: there is no C++ compiler.
+    Whole networks draw random numbers from generators, which torch.compile cannot trace; their parts do not. A
+    ConfigError with the dotted name of the setting, `key`, where there is no C++ compiler.
     """
     if not (os.environ.get("CXX") or any(map(shutil.which, COMPILERS))):
         raise ConfigError(

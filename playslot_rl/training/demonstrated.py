@@ -27,13 +27,7 @@ def demonstration_views(
     config: ExperimentConfig, demos: DemonstrationSplit, savi: SAVi, slots_print: str
 ) -> tuple[list[ParsedVideos], list[ParsedVideos]]:
     """Demonstrations and their shifted copies (`behaviour.shift`), each with the slots (F, N, D) of its frames, and the
-    held-out ones, none or one, likewise; cached on disk.
-
-    Args:
-        config: of the command.
-        demos: what is trained on, and what is held out.
-        savi: parses the frames, on its device.
-        slots_print: fingerprint of SAVi's checkpoint.
+    held-out ones, none or one, likewise; cached on disk by the fingerprint of SAVi's checkpoint.
     """
 
     def parse(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
@@ -61,7 +55,6 @@ def cloned(
     """What a stage that clones demonstrations says of them: its closing line, less its folder, and for `meta.json`.
 
     Args:
-        name: of the stage.
         split: the demonstrations; those of one frame show nothing and are not counted.
         rows: how many of their rows trimming left.
         labelled: how many of them showed their actions; None: all.

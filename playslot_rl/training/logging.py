@@ -51,11 +51,7 @@ class History:
         write_text(self.path, "".join(json.dumps(row) + "\n" for row in kept))
 
     def append(self, split: str, step: int, values: Mapping[str, float]) -> None:
-        """Add one line.
-
-        Raises:
-            OutputError: full disk.
-        """
+        """Add one line. Raises OutputError: full disk."""
         with explain_write_errors(self.path), self.path.open("a") as file:
             file.write(json.dumps({"step": step, "split": split, **values}) + "\n")
 
@@ -110,13 +106,8 @@ class _RunLogger:
 
 
 def open_logger(config: LoggingConfig, folder: Path, name: str, resumed: int) -> _TensorBoardLogger | _RunLogger | None:
-    """Open a backend; None where there is none.
-
-    Args:
-        config: the backend and its project.
-        folder: where it writes.
-        name: the stage, part of the run's name.
-        resumed: step a run carries on from; later entries of a killed run are hidden.
+    """Open a backend in a folder, for the training of that name; None where there is none. Entries that a killed run
+    wrote after the step it carries on from, `resumed`, are hidden.
 
     Raises:
         ConfigError: the backend's package is not installed.
@@ -146,13 +137,8 @@ def finite(values: Mapping[str, float]) -> dict[str, float]:
 
 
 class Watch:
-    """The numbers and the errors of one training.
-
-    Args:
-        name: the training, for messages and logs.
-        folder: gets `metrics.jsonl` and `logs/`.
-        checkpoints: of the training.
-        cure: what to try where a number is not finite.
+    """The numbers and the errors of one training; its folder gets `metrics.jsonl` and `logs/`, and `cure` is what to
+    try where a number is not finite.
     """
 
     def __init__(self, name: str, folder: Path, checkpoints: TrainingCheckpoints, cure: str) -> None:
@@ -180,11 +166,8 @@ class Watch:
 
     @contextlib.contextmanager
     def running(self, logging: LoggingConfig, start: int) -> Iterator[None]:
-        """Log to the backend, too, inside the block; an interrupt in it says where the same command carries on.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C, with that message.
-            ConfigError: the backend's package is not installed.
+        """Log to the backend, too, inside the block; a KeyboardInterrupt in it says where the same command carries on.
+        A ConfigError where the backend's package is not installed.
         """
         self._logger = open_logger(logging, self.folder / "logs", self.name, start)
         try:
@@ -198,16 +181,8 @@ class Watch:
                 self._logger.close()
 
     def log(self, split: str, step: int, values: Mapping[str, float], *, at: int | None) -> None:
-        """Record numbers.
-
-        Args:
-            split: `train`, `validation` or `acting`.
-            step: of `metrics.jsonl`.
-            values: their names and values; those that are not finite are left out.
-            at: step of the backend; None leaves it out.
-
-        Raises:
-            OutputError: full disk.
+        """Record the numbers that are finite: in `metrics.jsonl` by `step`, in the backend by the step `at` unless it
+        is None; the split is `train`, `validation` or `acting`. An OutputError where the disk is full.
         """
         kept = finite(values)
         self.history.append(split, step, kept)
@@ -219,10 +194,8 @@ class Watch:
             self._logger.log(named, at)
 
     def require_finite(self, modules: Mapping[str, nn.Module], when: str) -> None:
-        """A finite loss may still have made an infinite weight or buffer: never keep that as a good checkpoint.
-
-        Raises:
-            TrainingError: names the tensor.
+        """A finite loss may still have made an infinite weight or buffer: never keep that as a good checkpoint. The
+        TrainingError names the tensor.
         """
         for key, value in module_tensors(modules).items():
             if value.is_floating_point() and not bool(value.isfinite().all()):

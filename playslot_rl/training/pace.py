@@ -35,14 +35,8 @@ class Pace:
         return steps >= max(1, total // LOOKS) or seconds >= self.seconds / LOOKS
 
     def steps(self, done: int, spent: float, a_step: float, total: int, last: float = 0.0) -> int:
-        """Steps of the whole training, as it looks now.
-
-        Args:
-            done: steps done.
-            spent: seconds spent on them.
-            a_step: seconds of one of the latest.
-            total: as it looked before.
-            last: seconds of a validation, which comes at the end once more.
+        """Steps of the whole training, as it looks now: `done` of them took `spent` seconds, one of the latest
+        `a_step`; `total` is how it looked before, `last` the seconds of a validation, which comes at the end once more.
         """
         fits = max(done, self.least, done + int((self.seconds - spent - last) / max(a_step, 1e-9)))
         if abs(fits - total) <= TOLERANCE * (total - done) or (fits > total and done <= self.settled):

@@ -27,12 +27,7 @@ def patience_of(checks: int, watched: str) -> Patience | None:
 
 @dataclass(frozen=True)
 class Patience:
-    """When to stop.
-
-    Attributes:
-        checks: P, at least 1.
-        watched: name of the number, lower is better.
-    """
+    """When to stop: after so many checks, at least 1, without a new lowest value of the watched number."""
 
     checks: int
     watched: str
@@ -43,14 +38,10 @@ class Patience:
 
     def judge(self, state: TrainingState, modules: Mapping[str, nn.Module], folder: Path) -> TrainingState:
         """The state after a validation; the weights are written to `FOLDER/best.safetensors` if it is the best one, by
-        the first of several processes.
+        the first of several processes. A KeyError where it has no such number, an OutputError where the disk is full.
 
         A training that is killed and carries on from an older checkpoint comes to the same weights, and writes them
         again.
-
-        Raises:
-            KeyError: the validation has no such number.
-            OutputError: full disk; the earlier file stays.
         """
         if state.best and state.metrics[self.watched] >= state.best[self.watched]:
             return replace(state, stale=state.stale + 1)

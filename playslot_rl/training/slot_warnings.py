@@ -27,13 +27,9 @@ MOTION: Final = 30
 
 
 def slot_warnings(values: Mapping[str, float], savi: SAViConfig, stage: SlotsStageConfig) -> dict[str, str]:
-    """Kind -> one line, for each thing that is wrong.
-
-    Args:
-        values: of `playslot_rl.modules.savi.health.SlotHealth`, and of `playslot_rl.evaluation.slots`; what is not
-            among them is not judged.
-        savi: sizes and settings, so that no cure is named that is in use already.
-        stage: likewise; and no cure that takes longer than the stage.
+    """Kind -> one line, for each thing that is wrong with the values of `SlotHealth` and of
+    `playslot_rl.evaluation.slots`; what is not among them is not judged. No cure is named that is in use already, or
+    takes longer than the stage.
     """
     found: dict[str, str] = {}
     slots, entropy = savi.n_slots, values.get("mask_entropy", 0.0)

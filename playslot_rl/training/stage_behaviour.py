@@ -96,11 +96,7 @@ class CloneStage:
     of both stands still.
 
     Args:
-        policy: trained in place.
-        oracle: trained in place on the real actions of all demonstrations, from parsed slots; None for none.
-        demos: labelled by the world model.
-        config: batch and options.
-        held_out: demonstrations that are not trained on, labelled likewise; None for none.
+        demos, held_out: labelled by the world model; the held-out ones are not trained on.
         horizon: steps that the predictor was trained to roll out; None for any number.
 
     Raises:
@@ -174,19 +170,12 @@ def _acted(demos: Demonstrations | None) -> Demonstrations | None:
 
 
 class DecoderStage(RegressionStage):
-    """Regress real actions of the labelled demonstrations from latents, and from slots where the decoder reads them.
+    """Regress real actions of the labelled demonstrations from latents, and from slots where the decoder reads them;
+    the actions of held-out ones only measure.
 
     Note: with `config.decoder_inputs=policy` the inputs are the trained policy's outputs, on parsed slots and (with
     `config.imagined`) on imagined ones, which is what the decoder gets at test time; the paper feeds InvDyn's latents.
     `both` takes them all.
-
-    Args:
-        decoder: trained in place.
-        policy: trained, frozen.
-        demos: with actions.
-        config: options.
-        held_out: demonstrations that are not trained on; None for none. Their actions only measure.
-        horizon: see `CloneStage`.
 
     Raises:
         DataError: no actions, or fewer demonstrations than `config.labelled_demos`.
@@ -264,19 +253,11 @@ class DecoderStage(RegressionStage):
 
 
 class FinetuneStage:
-    """Policy and decoder together on real actions, L_a(D_a(f_pi(S_t))), while the policy goes on cloning: + L_pi; where
-    the decoder trusts slots, L_a(D_a(f_pi(S_t), S_t)) too.
+    """Policy and decoder together on real actions, L_a(D_a(f_pi(S_t))), while the policy goes on cloning (`clone`): +
+    L_pi; where the decoder trusts slots, L_a(D_a(f_pi(S_t), S_t)) too.
 
     Note: not in the paper, whose decoder is trained beside a finished policy. The cloning term keeps the policy's
     latents what the predictor understands.
-
-    Args:
-        clone: the policy's training, whose rows and loss go on.
-        decoder: trained.
-        demos: with actions.
-        config: options.
-        held_out: demonstrations that only measure; None for none.
-        horizon: see `CloneStage`.
 
     Raises:
         DataError: no actions, or fewer demonstrations than `config.labelled_demos`.
@@ -348,9 +329,8 @@ def oracle_stage(
     config: BehaviourStageConfig,
     held_out: tuple[Tensor, Tensor] | None = None,
 ) -> RegressionStage:
-    """The slot oracle's training: real actions (M, A) from parsed slots (M, N, D) of all demonstrations.
-
-    `held_out` are slots and actions of demonstrations that only measure.
+    """The slot oracle's training: real actions (M, A) from parsed slots (M, N, D) of all demonstrations; the held-out
+    ones only measure.
     """
     criterion = BehaviourLoss(oracle, config.loss)
     criterion.set_keys(action=keys.ACTION)

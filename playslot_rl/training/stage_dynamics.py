@@ -24,13 +24,11 @@ from playslot_rl.world_model import WorldModel, module_device
 
 
 class DynamicsStage:
-    """Roll out from parsed seed frames under inferred latent actions.
+    """Roll out from parsed seed frames under inferred latent actions. SAVi is frozen, the rest is trained in place.
 
     Args:
-        model: world model; its SAVi is frozen, the rest is trained in place.
         clips: of unlabelled videos, as long as seed and predicted frames.
         slots: cached slots (F, N, D) of the videos.
-        config: rollout lengths, weights.
 
     Raises:
         DataError: mode `ground_truth`, and no actions, of another width, or such that are no numbers.

@@ -45,12 +45,8 @@ class Inputs(Protocol):
 
 
 class TensorInputs:
-    """Rows of a tensor (M, ...), with Gaussian noise in training.
-
-    Args:
-        values: on the device that computes; or several tensors (M_i, ...) that are read as one, which nobody holds.
-        noise: standard deviation; 0 adds none.
-        stream: name of the noise's generator.
+    """Rows of a tensor (M, ...) on the device that computes, or of several (M_i, ...) that are read as one, which
+    nobody holds; with Gaussian noise of that deviation in training, drawn by the generator of that stream.
     """
 
     def __init__(self, values: Tensor | tuple[Tensor, ...], noise: float = 0.0, stream: str = "noise") -> None:
@@ -88,11 +84,7 @@ class TensorInputs:
 
 
 class PairedInputs:
-    """Several inputs by row, for a network that reads more than one.
-
-    Args:
-        parts: equally long, in the order in which the network takes them.
-    """
+    """Several inputs by row, equally long, for a network that reads more than one."""
 
     def __init__(self, *parts: TensorInputs) -> None:
         self.parts = parts
@@ -110,13 +102,8 @@ class PairedInputs:
 
 
 class FrameInputs:
-    """Frames by row: uint8 (b, 3, H, W), [0, 255].
-
-    Args:
-        source: the data set.
-        rows: its frames' row numbers, int64 (M,).
-        device: where the frames go.
-        shift: largest shift in training, pixels.
+    """Frames by row: uint8 (b, 3, H, W), [0, 255], in training shifted by so many pixels at most; `rows` are the row
+    numbers of the frames, int64 (M,).
     """
 
     def __init__(
@@ -165,9 +152,6 @@ class RegressionStage:
     Args:
         name: of the network in checkpoints, and of the generator that draws the rows.
         criterion: compares `criterion.network`'s outputs, trained in place, with the targets.
-        inputs: M of them.
-        targets: (M, ...), on the device that computes.
-        batch_size: b.
         checks: what a validation looks at, by the name of the error; the training data as `unexplained` if empty.
         held_out: demonstrations that are not trained on, checked as `unexplained_held_out`.
         validated: at most so many rows of each, evenly spread, are looked at in a validation; 0 takes all.

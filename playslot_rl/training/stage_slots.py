@@ -30,13 +30,8 @@ INITIAL_SLOTS = "initializer.mean"
 
 
 class SlotsStage:
-    """Reconstruct clips from slots.
-
-    Args:
-        savi: trained in place.
-        clips: of unlabelled videos.
-        config: batch, precision.
-        segmented: further numbers of each validation, from what a simulator knows of the objects; one rank is enough.
+    """Reconstruct clips of unlabelled videos from slots; `segmented` adds numbers to each validation, from what a
+    simulator knows of the objects, on one rank.
     """
 
     def __init__(
@@ -114,19 +109,12 @@ class SlotsStage:
 
 
 def warm_start(savi: SAVi, source: SAVi, where: str) -> None:
-    """Copy weights in place. With another number of learned initial slots the first ones are copied and the rest kept.
+    """Copy weights in place. With another number of learned initial slots the first ones are copied and the rest kept;
+    a CheckpointError, with the name `where`, where other sizes differ.
 
     Note: the paper trains each SAVi from scratch. Slot Attention first fits what all frames share and only then takes
     scenes apart; where objects are small and of any colour, that plateau outlasts what a CPU can pay for, and a SAVi
     that has learned elsewhere to take scenes apart leaves it early.
-
-    Args:
-        savi: what will be trained.
-        source: what it starts from; all sizes but the number of slots must be equal.
-        where: its name, for the error.
-
-    Raises:
-        CheckpointError: sizes differ.
     """
     own, other = savi.state_dict(), source.state_dict()
     shapes = [

@@ -26,7 +26,7 @@ class CEMPlanner:
         candidates: M, plans drawn in an iteration.
         iterations: of drawing and fitting; not counted where the search is given seconds.
         elites: K, at most M.
-        spread, start_spread: first standard deviation in units of the training latents', without and with plans to begin
+        spread, start_spread: first standard deviation, as of the training latents, without and with plans to begin
             with.
         floor: least standard deviation.
         correlation: of the noise of neighbouring steps, 0 to under 1.

@@ -90,8 +90,8 @@ class DynamicsDistance:
 
 
 class ImageDistance:
-    """Mean squared difference of decoded frames to the goal image (3, H, W), uint8 [0, 255] or float [0, 1]: dearer, and
-    blind to what is hidden.
+    """Mean squared difference of decoded frames to the goal image (3, H, W), uint8 [0, 255] or float [0, 1]: dearer,
+    and blind to what is hidden.
     """
 
     def __init__(self, savi: SAVi, goal: Tensor) -> None:
@@ -104,8 +104,8 @@ class ImageDistance:
 
 
 def goal_distance(agent: Agent, kind: CostName, goal: Tensor, image: Tensor, match: bool | None = None) -> Distance:
-    """The distance to a goal by its name, from its slots (N, D) and, for `image`, its picture (3, H, W), uint8 [0, 255] or
-    float [0, 1]. `match` None: the order of the slots is free where SAVi's initial slots are sampled.
+    """The distance to a goal by its name, from its slots (N, D) and, for `image`, its picture (3, H, W), uint8 [0, 255]
+    or float [0, 1]. `match` None: the order of the slots is free where SAVi's initial slots are sampled.
     """
     model = agent.world_model
     if kind == "image":
@@ -185,8 +185,8 @@ class NearProposal:
 
 @torch.no_grad()
 def parse_goal(savi: SAVi, state: Tensor, goal: Tensor, looks: int = 1) -> Tensor:
-    """Slots (n, N, D) of goal images (n, 3, H, W) as SAVi would track them: parsed as the frame after the first one, with the
-    state (n, N, D) that it left. Parsed as a first frame they lie five times as far from the tracked ones.
+    """Slots (n, N, D) of goal images (n, 3, H, W) as SAVi would track them: parsed as the frame after the first one,
+    with the state (n, N, D) that it left. Parsed as a first frame they lie five times as far from the tracked ones.
 
     `looks` is how many times the image is shown; a far goal may take the slots more than one correction to reach.
     """

@@ -23,7 +23,6 @@ class MPPIPlanner:
     """MPPI in whitened coordinates.
 
     Args:
-        candidates: M.
         iterations: of drawing and averaging; not counted where the search is given seconds.
         temperature: in units of the standard deviation of the candidates' costs; small follows the best alone.
         spread, start_spread: standard deviation of the noise, without and with plans to begin with.

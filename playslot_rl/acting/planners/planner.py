@@ -82,8 +82,8 @@ class Search:
 
 
 class Plan(NamedTuple):
-    """The best latents (H, [N,] Z) of all candidates whose cost was computed, their cost, and the best cost known after each
-    iteration, which never rises.
+    """The best latents (H, [N,] Z) of all candidates whose cost was computed, their cost, and the best cost known after
+    each iteration, which never rises.
     """
 
     latents: Tensor
@@ -95,7 +95,9 @@ class Planner(Protocol):
     """A way of searching."""
 
     def __call__(self, search: Search, generator: torch.Generator) -> Plan:
-        """Search; the generator, on the device of the search, draws all candidates. A ValueError where no cost is finite."""
+        """Search; the generator, on the device of the search, draws all candidates. A ValueError where no cost is
+        finite.
+        """
 
 
 class Best:

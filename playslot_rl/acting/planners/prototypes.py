@@ -20,11 +20,10 @@ from playslot_rl.acting.planners.planner import Best, Plan, Search
 
 @dataclass(frozen=True)
 class PrototypePlanner:
-    """Categorical CEM over prototypes (K, Z). Plans to begin with are candidates as they are, and the first distribution leans
-    to the prototypes nearest to the best of them.
+    """Categorical CEM over prototypes (K, Z). Plans to begin with are candidates as they are, and the first
+    distribution leans to the prototypes nearest to the best of them.
 
     Args:
-        candidates: M.
         iterations: of drawing and counting; not counted where the search is given seconds.
         elites: how many are counted.
         floor: s, part of the probability that stays spread evenly.

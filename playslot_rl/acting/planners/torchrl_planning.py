@@ -27,8 +27,8 @@ from playslot_rl.world_model import WorldModel
 
 
 class GoalReward(Transform):
-    """Puts a goal's cost, with weight a of the way, in the place of the reward, so that the sum over a horizon, at which the
-    environment truncates, is minus the cost of `GoalCost`.
+    """Puts a goal's cost, with weight a of the way, in the place of the reward, so that the sum over a horizon, at
+    which the environment truncates, is minus the cost of `GoalCost`.
 
         r_t = -a / H d(S_t, G) - (1 - a) [t = H] d(S_t, G)
     """

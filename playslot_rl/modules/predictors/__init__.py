@@ -18,8 +18,6 @@ def build_predictor(
     """The world model's predictor, conditioned on prototype p and variability v, by `config.kind`.
 
     Args:
-        config: kind and sizes.
-        slot_dim: D.
         latent_dim: Z, of p and of v; 0 where nothing is inferred.
         per_slot: each slot has a latent action of its own.
 

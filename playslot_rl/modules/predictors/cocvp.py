@@ -19,14 +19,8 @@ from playslot_rl.modules.transformer import TransformerBlock
 class COCVP(AutoregressivePredictor):
     """Conditional object-centric video predictor.
 
-    Args:
-        config: sizes.
-        slot_dim: D.
-        latent_dim: Z.
-
     Example:
         >>> import torch
-        >>> from playslot_rl.config import PredictorConfig
         >>> model = COCVP(PredictorConfig(), slot_dim=128, latent_dim=16)
         >>> z = torch.randn(2, 5, 16)
         >>> model.rollout(torch.randn(2, 1, 4, 128), z, z).shape

@@ -27,12 +27,9 @@ class OCVPSeq(AutoregressivePredictor):
 
     Args:
         config: sizes; a layer is one block over objects and one over time.
-        slot_dim: D.
         action_dim: A, of all conditions together; 0 has none.
 
     Example:
-        >>> import torch
-        >>> from playslot_rl.config import PredictorConfig
         >>> model = OCVPSeq(PredictorConfig(layers=1), slot_dim=16, action_dim=4)
         >>> model.rollout(torch.randn(2, 3, 5, 16), torch.rand(2, 7, 4)).shape
         torch.Size([2, 7, 5, 16])

@@ -26,31 +26,24 @@ Layers = list[KeysValues]
 
 
 class Predictor(Protocol):
-    """Predicts the slots of the next frame.
-
-    Attributes:
-        context: frames that it sees at most.
-    """
+    """Predicts the slots of the next frame; `context` is how many frames it sees at most."""
 
     context: int
 
     def __call__(self, slots: Tensor, *condition: Tensor, valid: Tensor | None = None) -> Tensor:
-        """Predict the frame after each given frame, in one parallel pass.
+        """Slots (B, T, N, D) of the frame after each given one (B, T, N, D), T at most the context, in one parallel
+        pass.
 
         Args:
-            slots: (B, T, N, D), T at most the context.
             condition: the latent actions taken at these frames, such as p and v.
-            valid: bool (B, T), False on left padding (right-aligned histories); positions count valid frames only.
-
-        Returns:
-            Predicted slots (B, T, N, D); entry t is frame t+1. Entries of padding are meaningless.
+            valid: bool (B, T), False on left padding (right-aligned histories); positions count valid frames only, and what
+                is predicted at padding is meaningless.
         """
 
     def rollout(self, seed: Tensor, *condition: Tensor) -> Tensor:
-        """Predict on from its own predictions.
+        """Predict on from its own predictions, after the parsed slots (B, S, N, D) of the seed frames.
 
         Args:
-            seed: parsed slots (B, S, N, D) of the seed frames.
             condition: of frames 1..T, T >= S: T - S + 1 frames lie past the seed.
 
         Returns:
@@ -66,11 +59,7 @@ class Past(NamedTuple):
 
 
 class AutoregressivePredictor(nn.Module):
-    """A causal transformer over frames. What a token is, and which layers see it, is the subclass's (`_predict`).
-
-    Args:
-        config: sizes.
-    """
+    """A causal transformer over frames. What a token is, and which layers see it, is the subclass's (`_predict`)."""
 
     code: Tensor
     norm: nn.LayerNorm
@@ -82,11 +71,7 @@ class AutoregressivePredictor(nn.Module):
         self.register_buffer("code", sinusoidal_code(config.context, config.dim), persistent=False)
 
     def forward(self, slots: Tensor, *condition: Tensor, valid: Tensor | None = None) -> Tensor:
-        """See `Predictor.__call__`.
-
-        Raises:
-            ValueError: more frames than the context.
-        """
+        """See `Predictor.__call__`. Raises ValueError: more frames than the context."""
         if valid is None:
             return self.step(slots, *condition)[0]
         t = slots.shape[1]
@@ -99,15 +84,8 @@ class AutoregressivePredictor(nn.Module):
         return self._predict(slots, condition, self.code[position].unsqueeze(2), mask, None)[0]
 
     def step(self, slots: Tensor, *condition: Tensor, past: Past | None = None) -> tuple[Tensor, Past]:
-        """Predict the frame after each of S new frames.
-
-        Args:
-            slots: (B, S, N, D).
-            condition: of these frames.
-            past: what the call on the P earlier frames returned.
-
-        Returns:
-            Predicted slots (B, S, N, D), and the past of the next call.
+        """Slots (B, S, N, D) of the frame after each of S new frames (B, S, N, D), and the past of the next call;
+        `past` is what the call on the P earlier frames returned.
 
         Raises:
             ValueError: P + S frames are more than the context.
@@ -165,13 +143,12 @@ class AutoregressivePredictor(nn.Module):
     def _predict(
         self, slots: Tensor, condition: Condition, code: Tensor, mask: Tensor | None, past: Layers | None
     ) -> tuple[Tensor, Layers]:
-        """Predictions (B, S, N, D) and the layers' keys and values.
+        """Predictions (B, S, N, D) of the S new frames and the layers' keys and values; `past` is those of the P
+        earlier frames.
 
         Args:
-            slots, condition: of the S new frames.
             code: position code (1 or B, S, 1, dim).
             mask: which frame sees which, bool (S, P + S) or (B, 1, S, P + S); None: all.
-            past: the layers' keys and values of the P earlier frames.
         """
         raise NotImplementedError
 

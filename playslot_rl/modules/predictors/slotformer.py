@@ -29,11 +29,8 @@ class SlotFormer(nn.Module):
 
     Args:
         config: sizes; `context` is C.
-        slot_dim: D.
 
     Example:
-        >>> import torch
-        >>> from playslot_rl.config import PredictorConfig
         >>> model = SlotFormer(PredictorConfig(layers=1, context=6), slot_dim=16)
         >>> model.rollout(torch.randn(2, 3, 5, 16), torch.zeros(2, 7, 0)).shape
         torch.Size([2, 7, 5, 16])

@@ -94,7 +94,6 @@ class SlotHealth:
     """Gathers the numbers over batches of clips.
 
     Examples:
-        >>> import torch
         >>> masks = torch.eye(2)[:, :, None, None, None].expand(2, 2, 1, 4, 4)[None]  # one slot, then the other
         >>> health = SlotHealth(2)
         >>> health.add(torch.zeros(1, 2, 3, 4, 4), torch.zeros(1, 2, 3, 4, 4), masks)

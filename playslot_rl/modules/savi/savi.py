@@ -37,8 +37,6 @@ class SAVi(nn.Module):
         image_size: side of the square frames.
 
     Example:
-        >>> import torch
-        >>> from playslot_rl.config import Precision, SAViConfig
         >>> savi = SAVi(SAViConfig(n_slots=3), image_size=32)
         >>> slots, state = savi(torch.rand(2, 4, 3, 32, 32))
         >>> slots.shape, savi.decode(slots).frames.shape
