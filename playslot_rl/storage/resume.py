@@ -38,8 +38,7 @@ class TrainingState:
     """Where a stage stands.
 
     Attributes:
-        step: finished optimiser steps.
-        seconds: wall-clock seconds spent on them, over all processes.
+        seconds: wall-clock seconds spent on its steps, over all processes.
         metrics: the last validation's numbers.
         best: those of the best validation, where a training stops early; else empty.
         stale: validations since then.
@@ -77,12 +76,8 @@ def first_difference(
 
 
 class TrainingCheckpoints:
-    """The `checkpoints` folder of a stage.
-
-    Args:
-        folder: where the `step_XXXXXXXX` folders live.
-        identity: nested plain values that must be equal for a resumed run to be the same run.
-        typed: from a key of the identity to the full name under which it is typed, for messages.
+    """The `checkpoints` folder of a stage, whose `identity`, nested plain values, must be equal for a resumed run to be
+    the same run. Saving on a full disk raises an OutputError; the earlier checkpoints stay.
     """
 
     def __init__(self, folder: Path, identity: Mapping[str, Any], typed: Callable[[str], str] = str) -> None:
@@ -106,11 +101,7 @@ class TrainingCheckpoints:
         parameters: Mapping[str, nn.Parameter],
         average: Mapping[str, Tensor] | None = None,
     ) -> Path:
-        """Write a checkpoint, with an average of the weights if there is one, and remove all but the newest two.
-
-        Raises:
-            OutputError: full disk; the earlier checkpoints stay.
-        """
+        """Write a checkpoint, with an average of the weights if there is one, and remove all but the newest two."""
         tensors = {"modules": module_tensors(modules), "optimizer": optimizer_tensors(optimizer, list(parameters))}
         return self._write(state.step, tensors | ({"average": average} if average else {}), asdict(state))
 
@@ -140,11 +131,7 @@ class TrainingCheckpoints:
         return TrainingState(stored["step"], stored["seconds"], stored["metrics"], best, stale, planned)
 
     def _write(self, step: int, files: Mapping[str, Mapping[str, Tensor]], state: Mapping[str, Any]) -> Path:
-        """Write `step_STEP` of tensors `NAME.safetensors` and a `state.json`; keep the newest two.
-
-        Raises:
-            OutputError: full disk; the earlier checkpoints stay.
-        """
+        """Write `step_STEP` of tensors `NAME.safetensors` and a `state.json`; keep the newest two."""
         final = self.folder / f"step_{step:08d}"
         with new_folder(final, replace=True) as temporary:
             for name, tensors in files.items():
@@ -155,11 +142,8 @@ class TrainingCheckpoints:
         return final
 
     def _newest(self) -> tuple[Path, dict[str, Any]] | None:
-        """The newest checkpoint and its `state.json`, checked to belong to this run; None if there is none.
-
-        Raises:
-            CheckpointError: the config differs from the stored one, or the checkpoint is damaged.
-            OutputError: a file stands where the folder should be.
+        """The newest checkpoint and its `state.json`, checked to belong to this run; None if there is none. Errors as
+        of `resume`.
         """
         if self.folder.exists() and not self.folder.is_dir():
             raise OutputError(f"{self.folder} is a file, expected a folder of checkpoints: use another out=")
@@ -189,13 +173,8 @@ class TrainingCheckpoints:
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer, names: Sequence[str] = ()) -> dict[str, Tensor]:
-    """State as `PARAMETER/STATE` tensors, and `groupI/step` of groups that count their steps themselves.
-
-    Parameters that never had a gradient have none.
-
-    Args:
-        optimizer: any that keeps tensors and numbers by parameter.
-        names: of its parameters, in its order; empty takes their numbers.
+    """State as `PARAMETER/STATE` tensors, and `groupI/step` of groups that count their steps themselves. Parameters
+    that never had a gradient have none. They have numbers where `names`, in the optimiser's order, is empty.
     """
     stored = optimizer.state_dict()
     tensors = {
@@ -211,10 +190,8 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer, names: Sequence[str] = (
 def restore_optimizer(
     optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], where: str, names: Sequence[str] = ()
 ) -> None:
-    """Put `optimizer_tensors` back; settings such as the learning rate stay those of `optimizer`.
-
-    Raises:
-        CheckpointError: a tensor is unexpected, missing, or of another shape.
+    """Put `optimizer_tensors` back; settings such as the learning rate stay those of `optimizer`. A CheckpointError
+    where a tensor is unexpected, missing, or of another shape.
     """
     groups = optimizer.state_dict()["param_groups"]
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]

@@ -48,7 +48,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
 
 def load_tensors(path: Path) -> dict[str, Tensor]:
-    """Read a safetensors file onto the CPU; a CheckpointError where it is missing, truncated, or no safetensors file."""
+    """Read a safetensors file onto the CPU; a CheckpointError where it is missing, truncated, or of another kind."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 
@@ -65,7 +65,7 @@ def load_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def _check_header(path: Path) -> None:
-    """Refuse, by a ValueError, a file whose header does not account for its size, before more than the header is read."""
+    """Refuse, by a ValueError, a file whose header does not account for its size, before more is read."""
     size = path.stat().st_size
     with path.open("rb") as file:
         length = int.from_bytes(file.read(8), "little")

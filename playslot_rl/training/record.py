@@ -78,8 +78,6 @@ class StageRecord:
 
     Attributes:
         spec: what identifies it.
-        run: the run folder.
-        config: of the command.
         parents: checkpoints it is trained on, by stage.
         groups: groups of the config that are the parents' instead of the command's.
         ready: called before the first step; puts what the stage builds on into the run.
@@ -120,11 +118,7 @@ class StageRecord:
 
     @cached_property
     def videos(self) -> EpisodeFrames:
-        """What the command names.
-
-        Raises:
-            DataError: nothing, or it cannot be read.
-        """
+        """What the command names. Raises DataError: nothing, or it cannot be read."""
         return open_videos(self.config, self.roots, training_command(self.name).partition(" ")[0])
 
     @cached_property

@@ -21,7 +21,7 @@ from playslot_rl import cli
 from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.errors import OutputError
-from playslot_rl.runs.opening import run_to_write
+from playslot_rl.runs.opening import STAGE_LOCK, run_to_write
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.locks import locked
 from playslot_rl.training import record
@@ -141,10 +141,10 @@ def test_a_stage_that_another_command_trains_is_refused(
     own = () if stage in ("slots", "resnet_oracle", "lapo", "dreamer") else (f"run={shared_run}",)
     (run / "config.json").write_bytes((shared_run / "config.json").read_bytes())
     before = contents(run).keys()
-    with locked(folder / record.LOCK):
+    with locked(folder / STAGE_LOCK):
         busy = f"got a run whose {folder.name} another command is training, expected none: wait for it"
         refused(*TRAININGS[stage], "preset=smoke", *own, f"out={run}", f"data.root={data}", message=busy)
-    assert contents(run).keys() == before | {f"{folder.name}/{record.LOCK}"}
+    assert contents(run).keys() == before | {f"{folder.name}/{STAGE_LOCK}"}
 
 
 def test_a_new_run_is_one_commands_too(

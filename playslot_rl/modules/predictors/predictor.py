@@ -36,8 +36,8 @@ class Predictor(Protocol):
 
         Args:
             condition: the latent actions taken at these frames, such as p and v.
-            valid: bool (B, T), False on left padding (right-aligned histories); positions count valid frames only, and what
-                is predicted at padding is meaningless.
+            valid: bool (B, T), False on left padding (right-aligned histories); positions count valid frames only.
+                What is predicted at padding is meaningless.
         """
 
     def rollout(self, seed: Tensor, *condition: Tensor) -> Tensor:
