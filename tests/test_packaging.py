@@ -16,7 +16,7 @@ import playslot_rl
 
 MAPPED = ("envs", "collectors", "recipes")
 PLUGIN = "lerobot_policy_playslot"
-DATA_SUFFIXES = {".yaml", ".safetensors", ".json", ".png", ".md", ".typed"}
+DATA_SUFFIXES = {".yaml", ".safetensors", ".json", ".png", ".css", ".md", ".typed"}
 # Machines have hosts and folders of their own: none of them belongs into a file that is shared.
 INDEX_ADDRESS = re.compile(r"(?i)https?://|file:|--(extra-)?index-url|--find-links|^-i |^-f ")
 

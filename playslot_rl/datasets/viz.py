@@ -27,11 +27,14 @@ from playslot_rl.storage.folders import require_outside
 from playslot_rl.visualization.charts import DARK, LIGHT, curve_chart
 from playslot_rl.visualization.document import Block, Document, Picture, Section, Table, Text, to_html
 from playslot_rl.visualization.grid import animation, image_grid, png
+from playslot_rl.visualization.words import feature_text
 
 STRIP: Final = 8
 """Frames of the strip: the first, the last, and some between."""
 SHOWN_SIDE: Final = 128
-"""Frames are shown about this large: small ones enlarged pixel for pixel, large ones reduced."""
+"""Frames are stored about this large: small ones enlarged pixel for pixel, large ones reduced."""
+ENLARGED: Final = 3
+"""How many times larger the page shows an animation."""
 ANIMATED: Final = 60
 """At most this many frames of an animation."""
 
@@ -76,8 +79,9 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
     require_outside(target, [contents.root], "--out ", "file")
     chosen = spread(len(contents.spans), episodes)
     summary = info(root)
-    about = Table(["fact", "value"], summary.facts())
-    features = Table(("feature", "type and shape"), [[f"`{name}`", kind] for name, kind in summary.features.items()])
+    about = Table(["what", "value"], summary.facts())
+    rows = [[feature_text(name), f"`{name}`", kind] for name, kind in summary.features.items()]
+    features = Table(["feature", "name in the data set", "type and shape"], rows)
     sections = [Section("Data set", [about, features])]
     sections += [_episode_section(contents, clip) for clip in _clips(contents, chosen)]
     lead = f"{summary.episodes} episodes, {summary.frames} frames at {summary.fps:g} fps; shown: {_names(chosen)}."
@@ -195,14 +199,18 @@ def _camera_pictures(contents: Contents, clip: Clip, camera: str, frames: npt.ND
     moving = [image_grid(frame[None, None], scale=scale) for frame in small[::every]]
     still = png(moving[0])
     at = spread(len(small), STRIP)
-    strip = png(image_grid(small[at][None], columns=[str(t) for t in at], scale=max(1, scale // 2)))
+    strip = png(image_grid(small[at][None], columns=[str(t) for t in at], scale=scale))
     name, rate = f"episode-{clip.span.index}-{camera}", contents.fps / every
     shown = f"{contents.fps:g} fps" if every == 1 else f"every {ordinal(every)} frame"
     alt = f"Episode {clip.span.index} from {camera}"
+    width = ENLARGED * moving[0].width
+    words = feature_text(camera)
     alt_strip = f"Frames {_names(at)} of episode {clip.span.index} from {camera}"
     return [
-        Picture(name, animation(moving, rate), alt, f"`{camera}`, {shown}", still=still),
-        Picture(f"{name}-strip", strip, alt_strip, "Frames by number"),
+        Picture(
+            name, animation(moving, rate), alt, f"{words[:1].upper()}{words[1:]}, {shown}", still=still, width=width
+        ),
+        Picture(f"{name}-strip", strip, alt_strip, "Frames by their numbers in the episode"),
     ]
 
 
@@ -214,9 +222,9 @@ def _curve_pictures(contents: Contents, clip: Clip) -> list[Picture]:
         labels = contents.features[name].get("names") or []
         labels = labels if isinstance(labels, list) and len(labels) == values.shape[1] else []
         parts = itertools.zip_longest(labels, values.T)
-        panels[name] = {str(label or number): line for number, (label, line) in enumerate(parts)}
+        panels[feature_text(name)] = {str(label or number): line for number, (label, line) in enumerate(parts)}
     if not panels:
         return []
     alt = f"{', '.join(panels)} of episode {clip.span.index} over its frames"
     light, dark = (curve_chart(panels, theme) for theme in (LIGHT, DARK))
-    return [Picture(f"episode-{clip.span.index}-curves", light, alt, "By frame number", dark=dark)]
+    return [Picture(f"episode-{clip.span.index}-curves", light, alt, "Over the numbers of the frames", dark=dark)]

@@ -9,10 +9,16 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from html import escape
+from importlib.resources import files
 from pathlib import Path
+from typing import Final
 
 from playslot_rl.storage.atomic import write_bytes, write_text
+
+VERDICTS: Final = ("good", "fair", "BAD")
+"""Cells that have a colour in HTML."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,7 @@ class Picture:
         caption: one line under it.
         dark: PNG for a dark page; None means that `light` suits both.
         still: picture to show instead where the reader asks for less motion.
+        width: in CSS pixels, of a small picture that HTML shows enlarged, pixel for pixel; 0 shows its own.
     """
 
     name: str
@@ -56,6 +63,7 @@ class Picture:
     caption: str
     dark: bytes | None = None
     still: bytes | None = None
+    width: int = 0
 
 
 @dataclass(frozen=True)
@@ -133,33 +141,10 @@ def _markdown_block(block: Block) -> str:
     return table(block.headers, block.rows) + (f"\n\n*{block.caption}*" if block.caption else "")
 
 
-STYLE = """
-:root { color-scheme: light dark; --text: #22262b; --soft: #5d646d; --ground: #ffffff; --line: #d8dbe0;
-  --accent: #0062a3; --note: #fff5e0; }
-@media (prefers-color-scheme: dark) { :root { --text: #e4e6ea; --soft: #a3aab4; --ground: #16181c; --line: #3b4048;
-  --accent: #6cbcf0; --note: #33290f; } }
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 62rem; padding: 1.5rem 1rem 4rem; background: var(--ground); color: var(--text);
-  font: 1rem/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
-h1 { font-size: 1.7rem; line-height: 1.2; margin: 0 0 .5rem; }
-h2 { font-size: 1.2rem; margin: 2.5rem 0 .75rem; padding-top: .75rem; border-top: 1px solid var(--line); }
-p, figure, .scroll { margin: 0 0 1rem; max-width: 100%; }
-.lead { color: var(--soft); font-size: 1.05rem; }
-nav { font-size: .92rem; line-height: 1.9; }
-nav a { margin-right: 1rem; white-space: nowrap; }
-a { color: var(--accent); }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-caption { caption-side: bottom; text-align: left; color: var(--soft); font-size: .9rem; padding-top: .4rem; }
-th, td { text-align: left; padding: .35rem 1.2rem .35rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-thead th { color: var(--soft); font-weight: 600; font-size: .9rem; }
-tbody th { font-weight: 600; }
-figure img { display: block; max-width: 100%; height: auto; }
-figcaption { color: var(--soft); font-size: .9rem; margin-top: .4rem; }
-code { font: .9em ui-monospace, Consolas, monospace; overflow-wrap: anywhere; }
-.missing { background: var(--note); border-left: 4px solid #e69f00; padding: .6rem .9rem; }
-@media print { nav { display: none; } h2 { break-after: avoid; } figure { break-inside: avoid; } }
-"""
+@cache
+def style() -> str:
+    """The one style sheet of all pages."""
+    return files(__package__).joinpath("style.css").read_text()
 
 
 def to_html(document: Document) -> str:
@@ -169,7 +154,7 @@ def to_html(document: Document) -> str:
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(document.title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"<title>{escape(document.title)}</title>\n<style>{style()}</style>\n</head>\n<body class='report'>\n"
         f"<header><h1>{escape(document.title)}</h1>\n<p class='lead'>{_inline(document.lead)}</p>\n"
         f"<nav aria-label='Sections'>{links}</nav></header>\n<main>\n{sections}\n</main>\n</body>\n</html>\n"
     )
@@ -199,7 +184,8 @@ def _html_block(block: Block) -> str:
             sources += f'<source media="(prefers-reduced-motion: reduce)" srcset="{_data_uri(block.still)}">'
         if block.dark is not None:
             sources += f'<source media="(prefers-color-scheme: dark)" srcset="{_data_uri(block.dark)}">'
-        image = f'<img src="{_data_uri(block.light)}" alt="{escape(block.alt)}">'
+        size = f' class="pixels" width="{block.width}"' if block.width else ""
+        image = f'<img src="{_data_uri(block.light)}" alt="{escape(block.alt)}"{size}>'
         return (
             f'<figure><div class="scroll" tabindex="0"><picture>{sources}{image}</picture></div>\n'
             f"<figcaption>{_inline(block.caption)}</figcaption></figure>"
@@ -207,14 +193,18 @@ def _html_block(block: Block) -> str:
     assert isinstance(block, Table)
     head = "".join(f'<th scope="col">{_inline(h)}</th>' for h in block.headers)
     body = "\n".join(
-        f'<tr><th scope="row">{_inline(row[0])}</th>' + "".join(f"<td>{_inline(c)}</td>" for c in row[1:]) + "</tr>"
-        for row in block.rows
+        f'<tr><th scope="row">{_inline(row[0])}</th>{"".join(map(_cell, row[1:]))}</tr>' for row in block.rows
     )
     caption = f"<caption>{_inline(block.caption)}</caption>" if block.caption else ""
     return (
         f'<div class="scroll" tabindex="0"><table>{caption}<thead><tr>{head}</tr></thead>\n'
         f"<tbody>{body}</tbody></table></div>"
     )
+
+
+def _cell(text: str) -> str:
+    verdict = f' class="verdict {text.lower()}"' if text in VERDICTS else ""
+    return f"<td{verdict}>{_inline(text)}</td>"
 
 
 def _data_uri(png: bytes) -> str:

@@ -63,7 +63,7 @@ def run_rollouts(agent: Agent, pool: TaskPool, seeds: Sequence[int]) -> Rollouts
 
 def draw_animation(rollouts: Rollouts) -> list[Image.Image]:
     """One picture a step: a row an episode, the three ways of running it side by side."""
-    return side_by_side(rollouts.clips, COLUMNS, [f"episode {i + 1}" for i in range(len(rollouts.clips))])
+    return side_by_side(rollouts.clips, COLUMNS, [f"episode {i + 1}" for i in range(len(rollouts.clips))], scale=3)
 
 
 def draw_strip(rollouts: Rollouts) -> Image.Image:

@@ -16,6 +16,7 @@ from playslot_rl.evaluation.success import POLICY_PROTOCOLS, PROTOCOLS
 from playslot_rl.visualization.charts import DARK, LIGHT, Theme, loss_chart, loss_names, success_chart
 from playslot_rl.visualization.document import Block, Missing, Picture, Section, Table, Text
 from playslot_rl.visualization.grid import png
+from playslot_rl.visualization.words import HELD_OUT, METRICS, metric_text
 from playslot_rl.world_model import Agent, WorldModel
 
 STAGES = ("slots", "dynamics", "policy")
@@ -251,25 +252,12 @@ def read_history(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-LEARNED = {
-    "unexplained_parsed": "policy, from parsed slots",
-    "unexplained_imagined": "policy, from imagined slots",
-    "oracle_unexplained": "slot oracle",
-    "decoder_unexplained": "action decoder",
-}
-"""Errors of the behaviour stage -> what makes them."""
-
-
-def _held_out_errors(metrics: dict[str, Any]) -> list[Block]:
-    """Unexplained variance on the demonstrations trained on and on those that are not; none where none are held out."""
-    rows = [
-        [label, percent(metrics[name]), percent(metrics[f"{name}_held_out"])]
-        for name, label in LEARNED.items()
-        if f"{name}_held_out" in metrics and name in metrics
-    ]
-    if not rows:
-        return []
-    return [Table(["unexplained variance", "training demonstrations", "held-out demonstrations"], rows)]
+def _unexplained(metrics: dict[str, Any]) -> list[Block]:
+    """Variance of the actions that each network of the behaviour stage leaves unexplained, trained on and held out."""
+    names = [name for name in METRICS if "unexplained" in name and name in metrics]
+    rows = [[METRICS[n][0], percent(metrics[n]), percent(metrics.get(n + HELD_OUT))] for n in names]
+    headers = ["unexplained variance of the actions", "demonstrations trained on", "held-out demonstrations"]
+    return [Table(headers, rows)] if rows else []
 
 
 def training_section(given: ReportInput, stages: Sequence[str] = STAGES) -> Section:
@@ -281,15 +269,15 @@ def training_section(given: ReportInput, stages: Sequence[str] = STAGES) -> Sect
         if meta is None:
             blocks.append(Missing(f"Stage {stage} is not finished.", given.command(f"train-{stage}")))
             continue
-        metrics = ", ".join(f"{k} {v:.3g}" for k, v in meta.get("metrics", {}).items() if isinstance(v, (int, float)))
+        metrics = metric_text(meta.get("metrics", {}))
         took = seconds(meta.get("seconds"))
         machine = ", ".join(part for part in (meta.get("gpu"), meta.get("machine")) if part) or "–"
         rows.append(
-            [stage, str(meta.get("steps", "–")), took, machine, str(meta.get("commit", ""))[:12] or "–", metrics or "–"]
+            [stage, str(meta.get("steps", "–")), took, machine, str(meta.get("commit", ""))[:12] or "–", metrics]
         )
     if rows:
-        blocks.insert(0, Table(["stage", "steps", "time", "machine", "commit", "metrics at the end"], rows))
-        blocks[1:1] = _held_out_errors(given.metas.get("policy", {}).get("metrics", {}))
+        blocks.insert(0, Table(["stage", "steps", "time", "machine", "commit", "at the end"], rows))
+        blocks[1:1] = _unexplained(given.metas.get("policy", {}).get("metrics", {}))
     paths = {name: given.run / folder / "metrics.jsonl" for name, folder in HISTORIES.items()}
     histories = {name: history for name, path in paths.items() if loss_names(history := read_history(path))}
     if histories:
