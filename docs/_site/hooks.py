@@ -18,6 +18,7 @@ PACKAGE: Final = "playslot_rl"
 MAPPED: Final = ("envs", "collectors", "recipes")
 """Subpackages whose folders are at the top of the repository."""
 LINK: Final = re.compile(r"(?<=\]\()([^)#\s:]+)(?=[)#])")
+STYLE: Final = f"{PACKAGE}/visualization/style.css"
 MERMAID: Final = "elements/mermaid/dist"
 
 
@@ -53,6 +54,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         own = "\n    options:\n      members: false" if package == PACKAGE else ""
         blocks = [f"::: {package}{own}", *(f"::: {module}\n    options:\n      heading_level: 2" for module in modules)]
         files.append(File.generated(config, f"api/{package}.md", content="\n\n".join(blocks) + "\n"))
+    files.append(File.generated(config, "assets/style.css", abs_src_path=str(ROOT / STYLE)))
     nicegui = find_spec("nicegui")  # of the extra `play`: its wheel holds the program that draws the diagrams
     if nicegui is not None and nicegui.origin is not None:
         for path in sorted((Path(nicegui.origin).parent / MERMAID).glob("*.js")):

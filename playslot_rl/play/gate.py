@@ -35,12 +35,7 @@ HEADERS: Final = [
 
 @dataclass(frozen=True)
 class Gate:
-    """The page's own address, and the token.
-
-    Attributes:
-        port: that the page is served on.
-        token: without it nothing is served.
-    """
+    """The page's own address, and the token without which nothing is served."""
 
     port: int
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
@@ -92,12 +87,7 @@ class Gate:
 
 
 class GateMiddleware:
-    """Asks the gate about every HTTP request and every WebSocket, assets included.
-
-    Args:
-        app: is asked only where the gate lets in; it never sees the token.
-        gate: knows.
-    """
+    """Asks the gate about every HTTP request and every WebSocket, assets included; the app never sees the token."""
 
     def __init__(self, app: ASGIApp, gate: Gate) -> None:
         self.app, self.gate = app, gate

@@ -23,13 +23,10 @@ FLOOR: Final = 0.5
 
 
 def alike(frames: npt.NDArray[np.uint8]) -> dict[int, int]:
-    """The prototypes that do the same as one of a smaller number.
+    """The prototypes that do the same as one of a smaller number, by that number, which is like none before it.
 
     Args:
         frames: what holding each shows, uint8 (K, P, H, W, 3).
-
-    Returns:
-        Number of the prototype to the smallest one that does the same and is itself like none before it.
     """
     seen = frames.reshape(len(frames), -1).astype(np.float32)
     spread = float(np.sqrt(np.square(seen - seen.mean(0)).mean()))

@@ -14,22 +14,18 @@ from nicegui import events, ui
 
 from playslot_rl.errors import PlaySlotError, explain
 from playslot_rl.play import pictures
-from playslot_rl.play.gallery import Gallery
-from playslot_rl.play.prototype_panel import PrototypePanel
-from playslot_rl.play.record_panel import RecordPanel
-from playslot_rl.play.start_panel import StartPanel
+from playslot_rl.play.controls import ME, Controls
+from playslot_rl.play.pictures import Gallery
 from playslot_rl.play.starts import Start
 from playslot_rl.play.studio import Studio
-from playslot_rl.play.time_panel import TimePanel
 from playslot_rl.play.timeline import Frame
 
 TICK_S: Final = 0.02
-ME: Final = "me"
 GAP: Final = 4
 
 HELP: Final = (
-    "Keys: 0-9 prototypes, U undo, R reset, space free play, M masks. Click a slot in the picture or in the strip to "
-    "choose it."
+    "Keys: 0 to 9 press a prototype, U goes one moment back, R to the start, space goes on by itself, M colours the "
+    "slots."
 )
 
 
@@ -54,26 +50,18 @@ class PlayPage:
         self.donor = 0
         self._due = self._moved = 0.0
         self._lock = asyncio.Lock()
-        self.starts = StartPanel(studio, self._start, self._halt)
-        self.time = TimePanel(self.session, self._work, self._halt)
-        self.record = RecordPanel(self.session, studio, self._work)
-        self.prototypes = PrototypePanel(self.session, gallery, self._on_down, self._on_up)
+        self.controls = Controls(self)
 
     # --- layout ----------------------------------------------------------------------------------------------------
 
     def build(self) -> None:
         """Lay the page out; the session begins when it is there."""
-        with ui.row().classes("w-full no-wrap items-start gap-6 p-2"):
-            with ui.column().classes("gap-2"):
+        with ui.element("div").classes("layout"):
+            with ui.element("main").classes("scene"):
                 self._build_scene()
-            with ui.column().classes("gap-3 grow"):
-                self.starts.build()
-                self._build_steering()
-                self.time.build()
-                self._build_touch()
-                self.record.build()
+            self.controls.build()
         ui.keyboard(on_key=self._on_key, repeating=False, ignore=["input", "select", "textarea"])
-        ui.on("away", self._on_up)
+        ui.on("away", self.up)
         self.ticker = ui.timer(TICK_S, self._tick, active=False)
         ui.timer(0.4, self._refresh_previews)
         ui.timer(0.05, self._begin, once=True)
@@ -81,61 +69,30 @@ class PlayPage:
     def _build_scene(self) -> None:
         side, n = self.studio.world_model.env.image_size, self.studio.world_model.slot_shape[0]
         watched = ["mousedown", "mousemove"] if self.session.per_slot else ["mousedown"]
-        ui.label(self.studio.title).classes("text-lg font-medium")
+        ui.label(self.studio.title).classes("name").props("role=heading aria-level=1")
         self.status = ui.label("starting ...").mark("status")
-        self.beyond = ui.label("").classes("text-sm text-orange-700").mark("beyond")
+        self.beyond = ui.label("").classes("warning").mark("beyond")
         self.beyond.set_visibility(False)
-        with ui.row().classes("no-wrap gap-3"):
-            with ui.column().classes("gap-1"):
-                ui.label("imagined").classes("text-sm text-gray-500")
-                self.scene = ui.interactive_image(size=(side, side), on_mouse=self._on_scene, events=watched).mark(
-                    "scene"
-                )
-                self.scene.classes("pixels").style("width: 384px").on("mouseleave", lambda _: self._point(None))
-            with ui.column().classes("gap-1") as self.true_column:
-                self.true_title = ui.label("").classes("text-sm text-gray-500").mark("beside")
-                self.true = ui.interactive_image(size=(side, side)).classes("pixels").style("width: 384px")
+        with ui.element("div").classes("pair"):
+            with ui.element("figure"):
+                self.scene = ui.interactive_image(size=(side, side), on_mouse=self._on_scene, events=watched)
+                self.scene.classes("pixels").mark("scene").on("mouseleave", lambda _: self._point(None))
+                ui.label("imagined").classes("soft")
+            with ui.element("figure") as self.true_column:
+                self.true = ui.interactive_image(size=(side, side)).classes("pixels")
+                self.true_title = ui.label("").classes("soft").mark("beside")
+        ui.switch("Colour the slots", on_change=self._on_masks).props("dense").mark("masks").bind_value(self, "masks")
         width = n * side + (n - 1) * GAP
         self.strip = ui.interactive_image(size=(width, side), on_mouse=self._on_strip, events=["mousedown"])
-        self.strip.classes("pixels").style(f"width: {min(780, 110 * n)}px").mark("strip")
-        with ui.row().classes("items-center"):
-            ui.switch("masks", on_change=self._on_masks).mark("masks").bind_value(self, "masks")
-            self.curve_title = ui.label("error over time (RMS, of 1)").classes("text-sm text-gray-500")
-            self.curve = ui.html("", sanitize=False).mark("curve")
-        ui.label(HELP).classes("text-sm text-gray-500")
-
-    def _build_steering(self) -> None:
-        self.prototypes.build()
-        with ui.row().classes("items-center gap-4 no-wrap"):
-            ui.label("variability").classes("whitespace-nowrap")
-            slider = ui.slider(min=-3, max=3, step=0.1, value=0, on_change=self.prototypes.outdate).props("label")
-            slider.classes("w-48").mark("variability").bind_value(self, "variability")
-            if not self.session.varies:
-                slider.disable()
-                ui.label("the predictor of this model sees prototypes only").classes("text-sm text-gray-500")
-            ui.toggle({False: "tap", True: "hold"}, value=False).props("dense no-caps").bind_value(self, "hold")
-        with ui.row().classes("items-center gap-4"):
-            names = {ME: "I steer", **{name: driver.title for name, driver in self.session.drivers.items()}}
-            self.hand = ui.toggle(names, value=ME, on_change=self._on_driver).props("dense no-caps").mark("driver")
-            if "policy" not in names:
-                ui.button("latent policy").props("dense no-caps disable").mark("no-policy")
-                ui.label("this model has no policy: playslot train-policy makes one").classes("text-sm text-gray-500")
-            if self.session.planner is not None:
-                ui.button("Goal", on_click=self._on_goal).props("dense no-caps").mark("goal")
-            self.free_switch = ui.switch("free play", on_change=self._on_free).mark("free")
-            with ui.row().classes("items-center gap-2 no-wrap"):  # a label stays with its slider
-                ui.slider(min=1, max=15, step=1, value=self.fps).props("label").classes("w-32").bind_value(self, "fps")
-                ui.label("frames a second").classes("text-sm whitespace-nowrap")
-
-    def _build_touch(self) -> None:
-        with ui.row().classes("items-center gap-2"):
-            self.which = ui.label("no slot chosen").mark("which")
-            for title, work in (("Freeze or let go", self._freeze), ("Remove", self._remove), ("Swap", self._swap)):
-                ui.button(title, on_click=work).props("dense no-caps").mark(title.split()[0].lower())
+        self.strip.classes("pixels").mark("strip")
+        ui.label("What each slot draws. Click a slot here or in the imagined picture to choose it.").classes("soft")
+        self.curve = ui.html("", sanitize=False).classes("curve").mark("curve")
+        self.curve_title = ui.label("Difference of the two pictures at each moment (RMS, of 1)").classes("soft")
+        ui.label(HELP).classes("soft keys")
 
     # --- doing -----------------------------------------------------------------------------------------------------
 
-    async def _work(self, work: Callable[[], Any], *, begins: bool = False) -> bool:
+    async def work(self, work: Callable[[], Any], *, begins: bool = False) -> bool:
         """Have the worker do something with the session and show what came of it; an error is told in one line."""
         async with self._lock:
             if self.closed or not (self.begun or begins):
@@ -149,7 +106,7 @@ class PlayPage:
             except Exception as error:
                 if self._left():
                     return False  # what it was about is gone
-                self._halt()
+                self.halt()
                 known = isinstance(error, (PlaySlotError, ValueError))
                 if not known:
                     logging.getLogger(__name__).error("play", exc_info=error)
@@ -185,20 +142,15 @@ class PlayPage:
         if now.true is not None:
             self.curve.set_content(pictures.error_curve([moment.error for moment in branch], session.now.depth))
         # The list of branches is long, and nobody reads it while it grows.
-        self.time.show(len(branch), branches=not self.ticker.active)
+        self.controls.show(branches=not self.ticker.active)
         error = "" if now.error is None else f", error {now.error:.3f}"
         self.status.set_text(f"{session.start.title}; moment {now.depth}, {now.label}{error}")
-        if self.chosen is None:
-            self.which.set_text("no slot chosen" + (": actions go to all" if session.per_slot else ""))
-        else:
-            frozen = ", frozen" if self.chosen in now.frozen else ""
-            self.which.set_text(f"slot {self.chosen + 1}{frozen}")
         horizon = self.studio.horizon
         past = 0 < horizon < now.steps
         self.beyond.set_visibility(past)
         if past:
             self.beyond.set_text(f"step {now.steps}: past the {horizon} steps that the model was trained to predict")
-        self.prototypes.outdate()
+        self.controls.outdate()
 
     def _show_beside(self, picture: bytes | None) -> None:
         """What stands beside the imagined scene: the simulator, or the recorded episode."""
@@ -208,7 +160,7 @@ class PlayPage:
         if picture is not None:
             self.true.set_source(self.gallery.put("beside", picture))
         if now.true is not None:
-            self.true_title.set_text("simulator, the decoded actions")
+            self.true_title.set_text("the simulator, after the decoded actions")
         elif picture is not None:
             self.true_title.set_text(f"recorded at the same step ({now.steps}): it goes on by its own actions")
         else:
@@ -226,11 +178,11 @@ class PlayPage:
         """One step by whoever steers."""
         driver, session = self.driver, self.session
         if driver != ME:
-            await self._work(lambda: session.drive(driver))
+            await self.work(lambda: session.drive(driver))
         elif self.pressed is not None:
             k, s = self.pressed, self.variability
             slot = self.target
-            await self._work(lambda: session.press(k, s, slot))
+            await self.work(lambda: session.press(k, s, slot))
 
     async def _tick(self) -> None:
         """A step where one is due; the timer runs only while something is held or plays by itself."""
@@ -247,17 +199,17 @@ class PlayPage:
         playing = self.free and (self.driver != ME or self.pressed is not None)
         self.ticker.active = playing or (self.hold and self.pressed is not None)
 
-    def _halt(self) -> None:
+    def halt(self) -> None:
         self.free = False
         self.pressed = None
-        self.free_switch.set_value(False)
+        self.controls.free.set_value(False)
         self._run()
 
     async def _refresh_previews(self) -> None:
         """The prototypes' animations, when the player has paused."""
-        if self.closed or not self.begun or self.ticker.active or not self.prototypes.due:
+        if self.closed or not self.begun or self.ticker.active or not self.controls.due:
             return
-        self.time.show(len(self.session.timeline.branch()), branches=True)
+        self.controls.show(branches=True)
         slot = self.target
 
         def preview(number: int) -> tuple[Frame, bytes]:
@@ -266,20 +218,20 @@ class PlayPage:
 
         async def animate(number: int) -> tuple[Frame, bytes] | None:
             async with self._lock:
-                if self.closed or self.prototypes.stale:
+                if self.closed or self.controls.stale:
                     return None
                 made = await self.studio.do(lambda: preview(number))
             return None if self.closed else made
 
-        await self.prototypes.refresh(animate)
+        await self.controls.refresh(animate)
 
     async def _begin(self) -> None:
-        if not await self.starts.first():
+        if not await self.controls.first():
             self.status.set_text("nothing to start from: choose another start, upload a picture, or give data.root=")
 
-    async def _start(self, start: Callable[[], Start]) -> bool:
+    async def start(self, start: Callable[[], Start]) -> bool:
         """Have the session begin at a start, which the worker makes."""
-        return await self._work(lambda: self.session.begin(start()), begins=True)
+        return await self.work(lambda: self.session.begin(start()), begins=True)
 
     def _left(self) -> bool:
         """Whether the client has gone meanwhile."""
@@ -299,35 +251,35 @@ class PlayPage:
         number = event.key.number
         if number is not None and number < len(self.session.prototypes):
             if event.action.keydown:
-                await self._on_down(number)
+                await self.down(number)
             elif event.action.keyup:
-                self._on_up()
+                self.up()
         elif event.action.keydown:
             await self._on_letter(str(event.key.name).lower())
 
     async def _on_letter(self, name: str) -> None:
-        actions: dict[str, Callable[[], Awaitable[None]]] = {"u": self.time.undo, "r": self.time.reset}
+        actions: dict[str, Callable[[], Awaitable[None]]] = {"u": self.controls.undo, "r": self.controls.reset}
         if name in actions:
             await actions[name]()
         elif name == "m":
             self.masks = not self.masks
         elif name in (" ", "space"):
-            self.free_switch.set_value(not self.free)
+            self.controls.free.set_value(not self.free)
 
-    async def _on_down(self, prototype: int) -> None:
+    async def down(self, prototype: int) -> None:
         if self.driver != ME:
-            self.hand.set_value(ME)  # a press takes over
+            self.controls.hand.set_value(ME)  # a press takes over
         self.pressed = prototype
         await self._step()  # at once: a key held for less than a period counts, too
         self._due = time.monotonic() + 1.0 / self.fps
         self._run()
 
-    def _on_up(self) -> None:
+    def up(self) -> None:
         if not self.free:
             self.pressed = None
         self._run()
 
-    def _on_free(self, event: events.ValueChangeEventArguments[bool | None]) -> None:
+    def on_free(self, event: events.ValueChangeEventArguments[bool | None]) -> None:
         self.free = bool(event.value)
         if not self.free:
             self.pressed = None
@@ -335,19 +287,19 @@ class PlayPage:
             self.pressed = 0
         self._run()
 
-    def _on_driver(self, event: events.ValueChangeEventArguments[Any]) -> None:
+    def on_driver(self, event: events.ValueChangeEventArguments[Any]) -> None:
         self.driver = str(event.value)
         self.pressed = None
-        self.free_switch.set_value(self.driver != ME)  # who gives back stops
+        self.controls.free.set_value(self.driver != ME)  # who gives back stops
         self._run()
 
-    async def _on_goal(self) -> None:
+    async def on_goal(self) -> None:
         session, planner = self.session, self.session.planner
-        if planner is not None and await self._work(lambda: planner.aim(session)):
+        if planner is not None and await self.work(lambda: planner.aim(session)):
             ui.notify(f"goal: moment {session.now.depth}; go back, then let the planner steer")
 
     async def _on_masks(self) -> None:
-        await self._work(lambda: None)
+        await self.work(lambda: None)
 
     async def _on_scene(self, event: events.MouseEventArguments) -> None:
         if self._owner is None:
@@ -364,7 +316,7 @@ class PlayPage:
         """The mouse is over a slot, or has left the picture."""
         before, self.under = self.target, slot
         if self.target != before:
-            self.prototypes.outdate()
+            self.controls.outdate()
 
     async def _on_strip(self, event: events.MouseEventArguments) -> None:
         if not self.begun:
@@ -375,22 +327,22 @@ class PlayPage:
 
     async def _choose(self, slot: int) -> None:
         self.chosen = slot
-        await self._work(lambda: None)
+        await self.work(lambda: None)
 
     async def _touch(self, work: Callable[[int], Any]) -> None:
         slot = self.chosen
         if slot is None:
             ui.notify("choose a slot first: click it in the picture or in the strip", type="info")
         else:
-            await self._work(lambda: work(slot))
+            await self.work(lambda: work(slot))
 
-    async def _freeze(self) -> None:
+    async def freeze(self) -> None:
         await self._touch(lambda slot: self.session.freeze(slot, slot not in self.session.now.frozen))
 
-    async def _remove(self) -> None:
+    async def remove(self) -> None:
         await self._touch(self.session.remove)
 
-    async def _swap(self) -> None:
+    async def swap(self) -> None:
         donors = self.studio.donors
         if donors is None:
             ui.notify("there is no other scene to take a slot from: give data.root=", type="info")

@@ -22,16 +22,8 @@ FORMATS: Final = ("PNG", "JPEG", "WEBP", "GIF", "BMP", "TIFF")
 
 
 def read_picture(content: bytes, name: str, side: int, whole: bool = False) -> npt.NDArray[np.uint8]:
-    """A model's frame of a picture file, by area averaging: its largest centred square, or all of it.
-
-    Args:
-        content: of the file.
-        name: for messages.
-        side: H = W of the frame.
-        whole: squeeze all of it into the square.
-
-    Returns:
-        uint8 (H, W, 3).
+    """A model's frame, uint8 (side, side, 3), of a picture file, by area averaging: its largest centred square, or all
+    of it squeezed into one.
 
     Raises:
         DataError: it is no picture, or too large.

@@ -6,8 +6,10 @@ Shapes: T frames, n slots that are there, H W image height and width. Frames are
 from __future__ import annotations
 
 import io
+import itertools
+import uuid
 from collections.abc import Sequence
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 from PIL import Image
@@ -23,8 +25,37 @@ TINT: Final = 0.35
 ANIMATION_FPS: Final = 6.0
 MOST_PICTURES: Final = 300
 """In a session's animation: each takes memory and time, and nobody watches minutes of it."""
-CURVE: Final = (300, 110)
-"""Width and height of the error's curve, pixels."""
+PATH: Final = "/play/picture/{page}/{name}/{number}"
+"""Where the server has them."""
+CURVE: Final = (400, 96)
+"""Width and height of the error's curve; the style sheet colours it."""
+
+
+class Gallery:
+    """The newest pictures of one page, served to its browser; a slow browser skips some."""
+
+    open: ClassVar[dict[str, Gallery]] = {}
+    """Of all pages that are open, by their key."""
+
+    def __init__(self) -> None:
+        self.key = uuid.uuid4().hex
+        self._numbers = itertools.count()
+        self._newest: dict[str, tuple[bytes, str]] = {}
+        self.open[self.key] = self
+
+    def put(self, name: str, content: bytes, kind: str = "image/png") -> str:
+        """Show a picture under a name; returns an address that no picture had before."""
+        self._newest[name] = (content, kind)
+        return f"/play/picture/{self.key}/{name}/{next(self._numbers)}"
+
+    def get(self, name: str) -> tuple[bytes, str] | None:
+        """Content and kind of the newest picture of a name."""
+        return self._newest.get(name)
+
+    def close(self) -> None:
+        """Drop them."""
+        self.open.pop(self.key, None)
+        self._newest.clear()
 
 
 def colour_of(slot: int) -> str:
@@ -43,11 +74,7 @@ def encode(frame: Frame, scale: int = 1) -> bytes:
 
 
 def with_masks(look: Look, chosen: int | None = None) -> Frame:
-    """The frame tinted by the slot that owns each pixel, with the borders drawn; the chosen slot the strongest.
-
-    Returns:
-        uint8 (H, W, 3).
-    """
+    """The frame tinted by the slot that owns each pixel, with the borders drawn; the chosen slot the strongest."""
     owner = look.owner
     colours = np.array([getrgb(colour_of(slot)) for slot in range(int(owner.max()) + 1)], np.float32)
     border = np.zeros(owner.shape, bool)
@@ -140,14 +167,13 @@ def error_curve(errors: Sequence[float | None], at: int) -> str:
     line = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
     error_here = errors[at] if at < len(errors) else None
     here = None if error_here is None else place(at, error_here)
-    dot = f'<circle cx="{here[0]:.1f}" cy="{here[1]:.1f}" r="4" fill="#D55E00"/>' if here else ""
-    text = 'font-size="10" font-family="sans-serif" fill="#767676"'
+    dot = f'<circle cx="{here[0]:.1f}" cy="{here[1]:.1f}" r="4"/>' if here else ""
     return (
-        f'<svg width="{width}" height="{height}" xmlns="http://www.w3.org/2000/svg">'
-        f'<line x1="{left}" y1="{bottom}" x2="{width - 6}" y2="{bottom}" stroke="#d8dbe0"/>'
-        f'<line x1="{left}" y1="{top}" x2="{left}" y2="{bottom}" stroke="#d8dbe0"/>'
-        f'<text x="2" y="{top + 8}" {text}>{most:.2f}</text><text x="14" y="{bottom}" {text}>0</text>'
-        f'<text x="{left}" y="{height - 4}" {text}>0</text>'
-        f'<text x="{width - 6}" y="{height - 4}" text-anchor="end" {text}>step {steps}</text>'
-        f'<polyline points="{line}" fill="none" stroke="#0072B2" stroke-width="2"/>{dot}</svg>'
+        f'<svg viewBox="0 0 {width} {height}" xmlns="http://www.w3.org/2000/svg">'
+        f'<line x1="{left}" y1="{bottom}" x2="{width - 6}" y2="{bottom}"/>'
+        f'<line x1="{left}" y1="{top}" x2="{left}" y2="{bottom}"/>'
+        f'<text x="2" y="{top + 8}">{most:.2f}</text><text x="22" y="{bottom}">0</text>'
+        f'<text x="{left}" y="{height - 4}">start</text>'
+        f'<text x="{width - 6}" y="{height - 4}" text-anchor="end">moment {steps}</text>'
+        f'<polyline points="{line}"/>{dot}</svg>'
     )

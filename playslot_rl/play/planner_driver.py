@@ -31,14 +31,7 @@ ELITES: Final = 6
 
 
 class PlannerDriver:
-    """Plans to a goal with the cross-entropy method.
-
-    Args:
-        agent: in evaluation mode, with one latent action for all slots.
-
-    Attributes:
-        goal: slots (N, D) of the moment to reach; None until one is marked.
-    """
+    """Plans to a goal, the slots (N, D) of a moment, with the cross-entropy method; with one latent for all slots."""
 
     title = "planner"
 

@@ -38,7 +38,6 @@ def record(session: PlaySession, parent: Path, shown: Shown = "imagined", camera
     """Write the path from the session's start to its present moment.
 
     Args:
-        session: with at least one step on that path.
         parent: the recording becomes a folder `recording-NNN` in it, whole or not there.
         shown: the data set's frames: imagined, or those of the simulator.
         camera: feature that they become: the model's own, so that the recording goes with its data.

@@ -7,8 +7,8 @@ import socket
 from typing import Final
 
 from playslot_rl.errors import ConfigError
-from playslot_rl.play.gallery import PATH, Gallery
 from playslot_rl.play.gate import HOST, Gate, GateMiddleware
+from playslot_rl.play.pictures import PATH, Gallery
 from playslot_rl.play.studio import Studio
 
 DEFAULT_PORT: Final = 8080
@@ -19,10 +19,7 @@ TRIED: Final = 20
 
 
 def choose_port(port: int) -> int:
-    """The port to listen on.
-
-    Args:
-        port: the wanted one; 0 takes the first free one from 8080 on.
+    """The port to listen on; 0 takes the first free one from 8080 on.
 
     Raises:
         ConfigError: it is taken, or not allowed.
@@ -86,12 +83,7 @@ def close_to_others(gate: Gate) -> None:
 
 
 def serve(studio: Studio, gate: Gate, show: bool) -> None:
-    """Serve the page until Ctrl-C; what is being recorded is finished.
-
-    Args:
-        studio: closed at the end.
-        gate: who may come in, and the port, which is free.
-        show: open the page in the browser too.
+    """Serve the page until Ctrl-C; what is being recorded is finished, and the studio closed.
 
     Raises:
         ConfigError: another program has just taken the port.
@@ -112,6 +104,7 @@ def serve(studio: Studio, gate: Gate, show: bool) -> None:
                 title="playslot play",
                 show=gate.path if show else False,
                 reload=False,
+                dark=None,  # as the browser asks
                 show_welcome_message=False,
                 message_history_length=200,
                 reconnect_timeout=PATIENCE_S,

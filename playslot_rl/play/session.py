@@ -50,15 +50,12 @@ class PlaySession:
     Not for several threads at once: a page hands every call to one worker.
 
     Args:
-        world_model: put into evaluation mode; with prototypes.
-        agent: of that world model, for the policy and the decoded actions; None has neither.
+        world_model: put into evaluation mode.
+        agent: of that world model, for the policy and the decoded actions.
         directions: (K, Z), see `variability_directions`; None takes the codebook's.
 
     Attributes:
-        start: where the session began.
-        timeline: its moments.
         drivers: who may take over, by name.
-        planner: the one among them that has a goal; None without an agent.
 
     Raises:
         CheckpointError: the world model has no prototypes.
@@ -130,16 +127,11 @@ class PlaySession:
     # --- steps -----------------------------------------------------------------------------------------------------
 
     def latent(self, prototype: int, variability: float = 0.0, slot: int | None = None) -> Tensor:
-        """The latent action of a key press: z = p + s * d (see `playslot_rl.play.steering`).
+        """The latent action ([N,] Z) of a key press: z = p + s * d (see `playslot_rl.play.steering`).
 
         Args:
-            prototype: its number.
             variability: s, in standard deviations.
-            slot: number of the slot that it goes to, the others staying as they are; None goes to all. Only with one
-                latent action per slot.
-
-        Returns:
-            ([N,] Z).
+            slot: that it goes to, the others staying as they are; None goes to all. Only with one latent per slot.
 
         Raises:
             ValueError: no such prototype, or a slot that is not there.
@@ -174,11 +166,7 @@ class PlaySession:
 
     @torch.no_grad()
     def step(self, latent: Tensor, label: str = "latent action") -> SceneMoment:
-        """One imagined step, and the decoded action in the simulator where there is one.
-
-        Args:
-            latent: ([N,] Z); rows of slots that were removed are not read.
-            label: for the timeline.
+        """One imagined step by a latent ([N,] Z), and the decoded action in the simulator where there is one.
 
         Raises:
             ValueError: another shape, or the timeline is full.
@@ -284,12 +272,7 @@ class PlaySession:
         return self._land(f"slot {slot + 1} removed", present=rest, frozen=self.now.frozen - {slot})
 
     def swap(self, slot: int, other: Tensor, name: str = "another scene") -> SceneMoment:
-        """Put another slot in a slot's place; what came before is forgotten, since the new one was not in it.
-
-        Args:
-            slot: which one.
-            other: (D,), such as the same slot of another start.
-            name: where it is from, for the timeline.
+        """Put another slot (D,) in a slot's place; what came before is forgotten, since the new one was not in it.
 
         Raises:
             ValueError: it is not there, or `other` has another width.
@@ -330,16 +313,7 @@ class PlaySession:
         slot: int | None = None,
         steps: int = PREVIEW,
     ) -> Frame:
-        """What holding some prototypes would do here; the session is left as it is.
-
-        Args:
-            prototypes: their numbers, K' of them; None takes all.
-            variability, slot: see `latent`.
-            steps: P.
-
-        Returns:
-            uint8 (K', P + 1, H, W, 3), the present frame first.
-        """
+        """What holding some prototypes, or all, would do here: uint8 (K', P + 1, H, W, 3), the present frame first."""
         numbers = range(len(self.prototypes)) if prototypes is None else prototypes
         now, k = self.now, len(numbers)
         ahead = ImaginationSession(self.world_model)

@@ -59,13 +59,11 @@ class Start:
     """A first frame, parsed.
 
     Attributes:
-        title: in words.
         frame: uint8 (H, W, 3), as it was seen.
         slots: (1, N, D).
         fps: agent steps a second.
-        task: the task in words.
-        twin: the simulator in the same state; None where there is none.
-        recorded: what was recorded from here on; None without a recording, and beside a simulator.
+        twin: the simulator in the same state.
+        recorded: what was recorded from here on; None beside a simulator.
     """
 
     title: str
@@ -93,9 +91,8 @@ class RecordedStarts:
     """Frames of a data set.
 
     Args:
-        model: parses them.
         source: of the model's frame size.
-        make_task: makes the simulator of the data set's episodes; None where there is none.
+        make_task: makes the simulator of the data set's episodes.
         seed: of sampled initial slots.
     """
 
@@ -112,10 +109,6 @@ class RecordedStarts:
         """E."""
         return self.source.episodes
 
-    def length(self, episode: int) -> int:
-        """Frames of an episode."""
-        return int(self.source.lengths[episode])
-
     def start(self, episode: int, step: int) -> Start:
         """Start at a frame of an episode; with the simulator where it runs the recorded episode again, else with what
         was recorded after it.
@@ -123,18 +116,19 @@ class RecordedStarts:
         Raises:
             ValueError: there is no such frame.
         """
-        if not 0 <= episode < self.episodes or not 0 <= step < self.length(episode):
+        if not 0 <= episode < self.episodes or not 0 <= step < int(self.source.lengths[episode]):
             raise ValueError(
                 f"start: got frame {step} of episode {episode}, expected one of {self.episodes} episodes, and one of "
                 "its frames"
             )
         rows = self.source.episode_rows(episode)[: step + 1]
         frames = np.asarray(self.source.frames[rows])
-        title = f"episode {episode}, frame {step} of {self.length(episode)}"
+        length = int(self.source.lengths[episode])
+        title = f"episode {episode}, frame {step} of {length}"
         slots = parse_last(self.model, frames, self.seed)
         task = self.source.task or "playing in imagination"
         twin = self._twin(episode, rows, frames[-1])
-        recorded = Recorded(self.source.frames, int(rows[-1]), self.length(episode) - step) if twin is None else None
+        recorded = Recorded(self.source.frames, int(rows[-1]), length - step) if twin is None else None
         return Start(title, frames[-1].copy(), slots, self.source.fps, task, twin, recorded)
 
     def _twin(self, episode: int, rows: npt.NDArray[np.int64], seen: Frame) -> Twin | None:
@@ -168,15 +162,7 @@ class RecordedStarts:
 
 
 class SimulatedStarts:
-    """Fresh episodes of the simulator.
-
-    Args:
-        model: parses their first frames.
-        make_task: makes the simulator.
-        fps: agent steps a second.
-        task: in words.
-        first_seed: of the first episode; others follow.
-    """
+    """Fresh episodes of the simulator, from `first_seed` on, `fps` agent steps a second."""
 
     def __init__(
         self,
@@ -236,10 +222,6 @@ def picture_start(
     """Start from a picture of any size, resized by area averaging: its largest centred square, or all of it.
 
     Args:
-        model: parses it.
-        content: of a PNG, JPEG or other picture file.
-        name: for messages.
-        seed: of sampled initial slots.
         whole: squeeze all of it into a square, as the frames of a model that was trained with `data.resize` were.
 
     Raises:

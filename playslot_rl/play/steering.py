@@ -33,11 +33,7 @@ CODEBOOK_SHARE: Final = 0.25
 
 
 class Driver(Protocol):
-    """Whoever may take over: the latent policy, or a planner.
-
-    Attributes:
-        title: for the page.
-    """
+    """Whoever may take over: the latent policy, or a planner; the page shows its title."""
 
     title: str
 
@@ -46,11 +42,7 @@ class Driver(Protocol):
 
 
 class PolicyDriver:
-    """The latent policy.
-
-    Args:
-        policy: slots (..., N, D) to a latent action (..., Z), in evaluation mode.
-    """
+    """The latent policy: slots (..., N, D) to a latent action (..., Z), in evaluation mode."""
 
     title = "latent policy"
 
@@ -81,15 +73,11 @@ def require_prototypes(model: WorldModel) -> Tensor:
 
 @torch.no_grad()
 def variability_directions(model: WorldModel, clips: npt.NDArray[np.uint8] | None) -> Tensor:
-    """The direction of each prototype's variability, one standard deviation long.
+    """The direction (K, Z) of each prototype's variability, one standard deviation long.
 
     Args:
-        model: with a codebook.
         clips: videos uint8 (n, T, H, W, 3) that show what varies; None where there are none: then every prototype has
             the principal direction of the codebook itself, CODEBOOK_SHARE of the prototypes' spread along it.
-
-    Returns:
-        (K, Z).
 
     Raises:
         CheckpointError: the world model has no prototypes.

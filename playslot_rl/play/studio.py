@@ -28,17 +28,13 @@ class Studio:
     """A model to play with.
 
     Args:
-        world_model: with prototypes.
-        agent: for the policy and the simulator beside; None has neither.
-        recorded: frames of data sets; None has none.
-        simulated: fresh episodes; None has none.
+        agent: for the policy and the simulator beside.
         out: folder that recordings go to.
-        title: of the model, for the page.
         fps: of free play, at first.
+        drivers: further ones that may take over, by name.
         squeezes: the model's frames were squeezed into squares (`data.resize`), and uploaded pictures are likewise.
         horizon: steps that the model was trained to predict; 0 where that is not known.
         camera: feature that recordings carry.
-        drivers: further ones that may take over, such as planners, by name.
 
     Attributes:
         directions: (K, Z), see `variability_directions`.
@@ -90,12 +86,7 @@ class Studio:
         return session
 
     def start(self, source: str, number: int = 0, step: int = 0) -> Start:
-        """A start by its source.
-
-        Args:
-            source: `recorded` or `simulated`.
-            number: of the episode.
-            step: of the frame in a recorded episode.
+        """A start by its source, `recorded` or `simulated`; `step` is of the frame in a recorded episode.
 
         Raises:
             DataError: there is no such source.
@@ -110,12 +101,8 @@ class Studio:
     @property
     def sources(self) -> dict[str, str]:
         """Titles of the sources that are there, by name; the first is where a page starts."""
-        found = {}
-        if self.recorded is not None:
-            found["recorded"] = f"data set ({self.recorded.episodes} episodes)"
-        if self.simulated is not None:
-            found["simulated"] = "fresh simulator episode"
-        return found
+        recorded = {"recorded": f"data set ({self.recorded.episodes} episodes)"} if self.recorded is not None else {}
+        return recorded | ({"simulated": "fresh simulator episode"} if self.simulated is not None else {})
 
     def close(self) -> None:
         """End the worker when it has finished what it does."""

@@ -27,20 +27,16 @@ class SceneMoment:
 
     Attributes:
         number: its place in the timeline, in the order of making.
-        parent: number of the moment before it; None for the first.
         depth: moments before it on its branch.
         state: of the imagination session, batch size [1]; never changed.
         present: numbers (from 0) of the world model's slots that are still there, n of them, in their order.
-        frozen: those of them that do not move.
-        frame: imagined frame, uint8 (H, W, 3).
-        latent: latent action ([N,] Z) that led here; None at the start and after a touch.
-        code: number of its prototype, int64 () or (N,); None where `latent` is.
+        frame: imagined; all frames are uint8 (H, W, 3).
+        latent: ([N,] Z) that led here; None at the start and after a touch.
+        code: number of its prototype, int64 () or (N,).
         action: decoded, float32 (A,) in the robot's units; None without a decoder.
-        true: what the simulator showed after the same actions, uint8 (H, W, 3); None without one.
-        recorded: the recorded episode's frame of the same time, uint8 (H, W, 3); None where a simulator stands beside,
-            where nothing was recorded, and after the episode's end.
+        true: what the simulator showed after the same actions.
+        recorded: the recorded episode's frame of the same time; None beside a simulator and after the episode's end.
         steps: latent actions that led here; touches take no time.
-        label: how it came about, in words.
     """
 
     number: int
@@ -60,7 +56,7 @@ class SceneMoment:
 
     @cached_property  # drawn again at every step, of all moments
     def error(self) -> float | None:
-        """Root mean squared difference of the imagined frame to the true one, of [0, 1]; None without one."""
+        """Root mean squared difference of the imagined frame to the true one, of [0, 1]."""
         if self.true is None:
             return None
         difference = self.frame.astype(np.float32) - self.true.astype(np.float32)
@@ -68,11 +64,7 @@ class SceneMoment:
 
 
 class Timeline:
-    """A tree of moments with a place in it.
-
-    Args:
-        first: the start; its number is 0.
-    """
+    """A tree of moments with a place in it."""
 
     def __init__(self, first: SceneMoment) -> None:
         self.moments = [first]

@@ -23,8 +23,7 @@ class Twin:
     its actions: where the wanted actions do not go on from those that were executed, it is run again from its start.
 
     Args:
-        task: the environment; the twin's alone.
-        seed: of the episode.
+        task: the twin's alone.
         lead: actions (A,) that lead from the episode's first frame to where playing starts.
         stride: distance to the seed tried next where the episode starts solved; 0 never tries another.
     """
@@ -41,13 +40,10 @@ class Twin:
         return frame
 
     def follow(self, actions: Sequence[Action]) -> Frame:
-        """Bring the simulator to where these actions lead from the start, and look.
-
-        Args:
-            actions: (A,) each, clipped to [-1, 1].
+        """Bring the simulator to where these actions (A,), clipped to [-1, 1], lead from the start.
 
         Returns:
-            uint8 (H, W, 3), the caller's own.
+            What is seen there, uint8 (H, W, 3), the caller's own.
         """
         wanted = [*self._lead, *(np.clip(np.asarray(action, np.float32), -1, 1) for action in actions)]
         known = [action.tobytes() for action in wanted]

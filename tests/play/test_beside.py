@@ -98,8 +98,8 @@ def test_the_page_says_what_stands_beside(agent: Agent, robots: RecordedStarts, 
         with Image.open(io.BytesIO(shown.content)) as picture:
             assert np.array_equal(np.asarray(picture), robots.source.frames[FRAMES - 1])
         user.find(marker="record").click()
-        await until(lambda: "recording-001" in page.record.said.text)
-        await page._on_down(2)
+        await until(lambda: "recording-001" in page.controls.said.text)
+        await page.down(2)
         await user.should_see("the recorded episode has ended")
         assert not page.true.visible
 
@@ -144,12 +144,12 @@ def test_past_the_trained_horizon_the_page_says_so(agent: Agent, robots: Recorde
     async def script(user: User, pages: list[PlayPage]) -> None:
         page = pages[0]
         for _ in range(2):
-            await page._on_down(1)
-        page._on_up()
+            await page.down(1)
+        page.up()
         assert not page.beyond.visible
-        await page._on_down(1)
+        await page.down(1)
         await user.should_see("step 3: past the 2 steps that the model was trained to predict")
-        await page.time.undo()
+        await page.controls.undo()
         assert not page.beyond.visible
 
     simulate(studio, script)
@@ -170,9 +170,9 @@ def test_the_page_says_which_prototypes_do_the_same(studio: Studio) -> None:
         page.session.prototypes = page.session.prototypes.clone()
         page.session.directions = page.session.directions.clone()
         page.session.prototypes[3], page.session.directions[3] = page.session.prototypes[1], page.session.directions[1]
-        page.prototypes.outdate()
-        await until(lambda: "3 does the same as 1" in page.prototypes.same.text)
-        await page._on_down(0)
-        assert page.prototypes.same.text == "", "not yet known from here"
+        page.controls.outdate()
+        await until(lambda: "3 does the same as 1" in page.controls.same.text)
+        await page.down(0)
+        assert page.controls.same.text == "", "not yet known from here"
 
     simulate(studio, script)

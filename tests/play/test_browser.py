@@ -84,7 +84,7 @@ def test_hold_upload_and_touch(server: tuple[str, Path, subprocess.Popen[str]], 
     address, _, _ = server
     with chromium() as browser:
         page, _ = open_page(browser, address)
-        page.get_by_text("hold", exact=True).click()
+        page.get_by_text("steps while held", exact=True).click()
         button = page.locator("button:has(.proto)").nth(1)
         button.hover()
         page.mouse.down()
@@ -128,12 +128,12 @@ def test_hold_upload_and_touch(server: tuple[str, Path, subprocess.Popen[str]], 
         page.get_by_text("Remove", exact=True).click()
         wait(page, lambda: says(page, "choose a slot first"))
         page.locator(".pixels").first.click(position={"x": 190, "y": 190})
-        wait(page, lambda: re.search(r"slot \d", page.inner_text("body")) is not None)
-        page.get_by_text("Freeze or let go", exact=True).click()
+        wait(page, lambda: re.search(r"Slot \d", page.inner_text("body")) is not None)
+        page.get_by_text("Freeze", exact=True).click()
         wait(page, lambda: says(page, ", frozen"))
         before = picture(page)
         page.get_by_text("Remove", exact=True).click()
-        wait(page, lambda: says(page, "no slot chosen"))
+        wait(page, lambda: says(page, "None: click one"))
         assert picture(page) != before
 
 
@@ -142,7 +142,7 @@ def test_space_plays_and_presses_nothing_that_has_the_focus(server: tuple[str, P
     address, folder, _ = server
     with chromium() as browser:
         page, _ = open_page(browser, address)
-        plays = page.locator("[role=switch]", has_text="free play")
+        plays = page.locator("[role=switch]", has_text="Go on by itself")
 
         def toggled(focus: Callable[[], Any]) -> None:
             """Space after something got the focus plays, and space once more ends it."""
@@ -154,15 +154,15 @@ def test_space_plays_and_presses_nothing_that_has_the_focus(server: tuple[str, P
                 assert plays.get_attribute("aria-checked") == wanted
 
         page.locator(".pixels").first.click(position={"x": 190, "y": 190})
-        wait(page, lambda: re.search(r"slot \d", page.inner_text("body")) is not None)
+        wait(page, lambda: re.search(r"Slot \d", page.inner_text("body")) is not None)
         page.get_by_text("Remove", exact=True).click()
         wait(page, lambda: says(page, "removed"))
         page.locator(".pixels").first.click(position={"x": 30, "y": 30})
-        wait(page, lambda: re.search(r"slot \d", page.inner_text("body")) is not None)
+        wait(page, lambda: re.search(r"Slot \d", page.inner_text("body")) is not None)
         toggled(page.locator("button", has_text="Remove").focus)
-        page.get_by_text("Reset", exact=True).click()
-        toggled(lambda: page.get_by_role("switch", name="masks").focus())
-        assert page.get_by_role("switch", name="masks").get_attribute("aria-checked") == "false"
+        page.get_by_text("Back to the start", exact=True).click()
+        toggled(lambda: page.get_by_role("switch", name="Colour the slots").focus())
+        assert page.get_by_role("switch", name="Colour the slots").get_attribute("aria-checked") == "false"
         page.get_by_text("Record", exact=True).click()
         wait(page, lambda: says(page, "written: "))
         toggled(lambda: None)

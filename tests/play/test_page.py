@@ -21,7 +21,7 @@ from scene import DotTask
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.experiment import DataConfig
 from playslot_rl.errors import ConfigError, DataError
-from playslot_rl.play.gallery import Gallery
+from playslot_rl.play.pictures import Gallery
 from playslot_rl.play.page import PlayPage
 from playslot_rl.play.server import choose_port
 from playslot_rl.play.starts import RecordedStarts
@@ -55,7 +55,7 @@ def test_keys_step_undo_and_reset_and_the_buttons_touch_and_record(studio: Studi
         await until(lambda: len(session.now.present) == 3)
         await until(lambda: page.chosen is None)
         user.find(marker="record").click()
-        await until(lambda: "recording-001" in page.record.said.text)
+        await until(lambda: "recording-001" in page.controls.said.text)
         picture = await user.http_client.get(page.scene.source)
         assert picture.content.startswith(b"\x89PNG")
         assert picture.headers["cache-control"] == "no-store"
@@ -69,19 +69,19 @@ def test_keys_step_undo_and_reset_and_the_buttons_touch_and_record(studio: Studi
 def test_the_planner_steers_to_the_moment_that_goal_was_pressed_at(studio: Studio) -> None:
     async def script(user: User, pages: list[PlayPage]) -> None:
         page = pages[0]
-        page.hand.set_value("planner")
+        page.controls.hand.set_value("planner")
         await until(lambda: not page.free)  # no goal yet: it says so and stops
         assert page.session.now.depth == 0
-        page.hand.set_value("me")
+        page.controls.hand.set_value("me")
         press(user, "2")
         await until(lambda: page.session.now.depth == 1)
         user.find(marker="goal").click()
         await until(lambda: page.session.planner is not None and page.session.planner.goal is not None)
         press(user, "r")
         await until(lambda: page.session.now.depth == 0)
-        page.hand.set_value("planner")
+        page.controls.hand.set_value("planner")
         await until(lambda: page.session.now.label == "planner")
-        page.free_switch.set_value(False)
+        page.controls.free.set_value(False)
 
     simulate(studio, script)
 
@@ -90,13 +90,13 @@ def test_the_policy_takes_over_until_a_key_takes_back(studio: Studio) -> None:
     async def script(user: User, pages: list[PlayPage]) -> None:
         page = pages[0]
         page.fps = 15
-        page.hand.set_value("policy")
+        page.controls.hand.set_value("policy")
         await until(lambda: page.session.now.depth >= 2)
         assert page.session.now.label == "latent policy"
         press(user, "3")
         await until(lambda: page.session.now.label == "prototype 3")
         assert page.driver == "me"
-        page.free_switch.set_value(False)
+        page.controls.free.set_value(False)
         await asyncio.sleep(0.2)
         depth = page.session.now.depth
         await asyncio.sleep(0.2)
@@ -111,11 +111,11 @@ def test_two_pages_play_apart_and_a_closed_one_ends(studio: Studio) -> None:
     async def script(user: User, pages: list[PlayPage]) -> None:
         await user.open("/")
         await until(lambda: len(pages) == 2 and pages[1].begun)
-        pages[0].hand.set_value("policy")
+        pages[0].controls.hand.set_value("policy")
         await until(lambda: pages[0].session.now.depth >= 2)
         assert pages[1].session.now.depth == 0
         pages[0].close()
-        await pages[1]._on_down(1)
+        await pages[1].down(1)
         assert pages[1].session.now.depth == 1
         assert not pages[0].ticker.active
         assert pages[0].gallery.key not in Gallery.open
@@ -131,7 +131,7 @@ def test_without_a_policy_the_button_says_so(agent: Agent, recorded: RecordedSta
 
     async def script(user: User, pages: list[PlayPage]) -> None:
         await user.should_see("this model has no policy: playslot train-policy makes one")
-        await pages[0]._on_down(0)
+        await pages[0].down(0)
         assert pages[0].session.now.true is None
 
     simulate(studio, script)
@@ -146,9 +146,9 @@ def test_actions_go_to_the_slot_under_the_mouse_where_each_has_its_own(studio_of
             place = {"image_x": x + 0.5, "image_y": y + 0.5, **MOUSE}
             user.find(marker="scene").trigger("mouse", {"mouse_event_type": "mousemove", **place})
             await until(lambda: page.under == slot)  # noqa: B023
-            await page._on_down(1)
+            await page.down(1)
             assert page.session.now.label == f"prototype 1, slot {slot + 1}"
-            await page.time.undo()
+            await page.controls.undo()
 
     simulate(studio_of_many, script)
 
@@ -156,8 +156,8 @@ def test_actions_go_to_the_slot_under_the_mouse_where_each_has_its_own(studio_of
 def test_an_upload_starts_anew_and_a_bad_one_is_told(studio: Studio) -> None:
     async def script(user: User, pages: list[PlayPage]) -> None:
         page = pages[0]
-        await page._on_down(1)
-        await page._work(lambda: page.session.begin(play_picture(page, b"nothing")), begins=True)
+        await page.down(1)
+        await page.work(lambda: page.session.begin(play_picture(page, b"nothing")), begins=True)
         assert page.session.now.depth == 1, "what was there goes on"
         assert any("got no picture that can be read" in str(message) for message in user.notify.messages)
 

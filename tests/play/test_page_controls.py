@@ -42,12 +42,12 @@ def test_a_held_key_steps_at_the_rate_that_is_set_and_ends_with_the_window(studi
     async def script(user: User, pages: list[PlayPage]) -> None:
         page = pages[0]
         page.hold, page.fps = True, 2
-        await page._on_down(1)
+        await page.down(1)
         assert page.session.now.depth == 1, "the first step is at once"
         await asyncio.sleep(0.25)
         assert page.session.now.depth == 1, "the second is a period later"
         await until(lambda: page.session.now.depth == 2)
-        page._on_up()  # also what the browser's window calls when it loses the keyboard
+        page.up()  # also what the browser's window calls when it loses the keyboard
         assert not page.ticker.active
 
     simulate(studio, script)
@@ -70,14 +70,14 @@ def test_previews_are_made_anew_for_the_slot_that_the_mouse_moves_to(studio_of_m
         page, owner = pages[0], pages[0].session.look().owner
         slots = sorted(set(owner.flatten().tolist()))[:2]
         page._point(slots[0])
-        page.prototypes.stale = False
+        page.controls.stale = False
         page._point(slots[0])
-        assert not page.prototypes.stale, "the same slot"
+        assert not page.controls.stale, "the same slot"
         page._point(slots[1])
-        assert page.prototypes.stale
-        page.prototypes.stale = False
+        assert page.controls.stale
+        page.controls.stale = False
         page._point(None)
-        assert page.prototypes.stale
+        assert page.controls.stale
 
     simulate(studio_of_many, script)
 
@@ -87,10 +87,10 @@ def test_the_variability_slider_changes_what_a_press_does(studio: Studio) -> Non
         page, latents = pages[0], []
         for value in (0.0, 2.0):
             page.variability = value
-            await page._on_down(1)
-            page._on_up()
+            await page.down(1)
+            page.up()
             latents.append(page.session.now.latent)
-            await page.time.undo()
+            await page.controls.undo()
         assert latents[0] is not None
         assert latents[1] is not None
         assert float((latents[0] - latents[1]).abs().max()) > 0
@@ -103,20 +103,20 @@ def test_the_moment_slider_stays_on_the_branch_that_was_chosen(studio: Studio) -
         page, session = pages[0], pages[0].session
         for keys in ((1, 2), (3, 3, 3)):
             for key in keys:
-                await page._on_down(key)
-                page._on_up()
-            await page.time.reset()
+                await page.down(key)
+                page.up()
+            await page.controls.reset()
         old, new = session.timeline.tips()
-        await page._work(lambda: None)
-        page.time.tips.set_value(old.number)
+        await page.work(lambda: None)
+        page.controls.tips.set_value(old.number)
         await until(lambda: session.now.number == old.number)
-        await until(lambda: page.time.place.value == 2)
-        page.time.place.set_value(0)
+        await until(lambda: page.controls.place.value == 2)
+        page.controls.place.set_value(0)
         await until(lambda: session.now.number == 0)
-        page.time.place.set_value(2)
+        page.controls.place.set_value(2)
         await until(lambda: session.now.depth == 2)
         assert session.now.number == old.number, "not the newest child's branch"
-        page.time.tips.set_value(new.number)
+        page.controls.tips.set_value(new.number)
         await until(lambda: session.now.number == new.number)
 
     simulate(studio, script)
@@ -125,7 +125,7 @@ def test_the_moment_slider_stays_on_the_branch_that_was_chosen(studio: Studio) -
 def test_the_strip_chooses_a_slot_and_swap_puts_another_scenes_there(studio: Studio) -> None:
     async def script(user: User, pages: list[PlayPage]) -> None:
         page, side = pages[0], studio.world_model.env.image_size
-        await page._swap()
+        await page.swap()
         assert any("choose a slot first" in str(message) for message in user.notify.messages)
         place = {"image_x": 1.5 * (side + GAP), "image_y": 5, **MOUSE}
         user.find(marker="strip").trigger("mouse", {"mouse_event_type": "mousedown", **place})
@@ -143,14 +143,14 @@ def test_the_next_episode_and_an_uploaded_picture_start_anew(studio: Studio) -> 
     async def script(user: User, pages: list[PlayPage]) -> None:
         page = pages[0]
         first = page.session.start.title
-        await page._on_down(1)
+        await page.down(1)
         user.find(marker="next").click()
         await until(lambda: page.session.start.title != first and page.session.now.depth == 0)
         picture = io.BytesIO()
         Image.fromarray(np.full((96, 80, 3), 90, np.uint8)).save(picture, "png")
-        await page.starts._on_upload(Upload(picture.getvalue()))  # type: ignore[arg-type]
+        await page.controls.on_upload(Upload(picture.getvalue()))  # type: ignore[arg-type]
         assert "scene.png" in page.session.start.title
-        await page.starts._on_upload(Upload(b"nothing"))  # type: ignore[arg-type]
+        await page.controls.on_upload(Upload(b"nothing"))  # type: ignore[arg-type]
         assert "scene.png" in page.session.start.title, "what was there goes on"
 
     simulate(studio, script)

@@ -17,7 +17,7 @@ from page_script import simulate, until
 from scene import DotTask
 
 from playslot_rl.play import pages as pages_module
-from playslot_rl.play.gallery import Gallery
+from playslot_rl.play.pictures import Gallery
 from playslot_rl.play.page import PlayPage
 from playslot_rl.play.session import PlaySession
 from playslot_rl.play.studio import Studio
@@ -31,7 +31,7 @@ def test_a_page_that_goes_takes_its_session_with_it(studio: Studio) -> None:
 
     async def script(user: User, pages: list[PlayPage]) -> None:
         page = pages.pop()
-        await page._on_down(1)
+        await page.down(1)
         await asyncio.sleep(0.5)  # the timers have run
         held: list[weakref.ref[Any]] = [weakref.ref(part) for part in (page.session.timeline, page.session.start)]
         whole = [weakref.ref(page), weakref.ref(page.session), weakref.ref(page.scene)]
