@@ -21,8 +21,8 @@ from scene import DotTask
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.experiment import DataConfig
 from playslot_rl.errors import ConfigError, DataError
-from playslot_rl.play.pictures import Gallery
 from playslot_rl.play.page import PlayPage
+from playslot_rl.play.pictures import Gallery
 from playslot_rl.play.server import choose_port
 from playslot_rl.play.starts import RecordedStarts
 from playslot_rl.play.studio import Studio

@@ -17,8 +17,8 @@ from page_script import simulate, until
 from scene import DotTask
 
 from playslot_rl.play import pages as pages_module
-from playslot_rl.play.pictures import Gallery
 from playslot_rl.play.page import PlayPage
+from playslot_rl.play.pictures import Gallery
 from playslot_rl.play.session import PlaySession
 from playslot_rl.play.studio import Studio
 
