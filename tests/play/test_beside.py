@@ -29,7 +29,7 @@ from playslot_rl.play.session import PlaySession
 from playslot_rl.play.starts import RecordedStarts
 from playslot_rl.play.studio import Studio
 from playslot_rl.recipes import play
-from playslot_rl.runs import pretrained_folder
+from playslot_rl.runs import Run, pretrained_folder
 from playslot_rl.world_model import Agent
 
 pytestmark = pytest.mark.integration
@@ -157,11 +157,11 @@ def test_past_the_trained_horizon_the_page_says_so(agent: Agent, robots: Recorde
 
 
 def test_the_horizon_is_that_of_the_runs_dynamics(tmp_path: Path) -> None:
-    assert play.predicted_frames("pretrained/block_push_easy") == 24
-    assert play.predicted_frames("pretrained/button_press") == 18
+    assert play.predicted_frames(Run.open("pretrained/block_push_easy")) == 24
+    assert play.predicted_frames(Run.open("pretrained/button_press")) == 18
     run = tmp_path / "run"
     shutil.copytree(pretrained_folder("button_press"), run)
-    assert play.predicted_frames(str(run)) == 18
+    assert play.predicted_frames(Run.open(run)) == 18
 
 
 def test_the_page_says_which_prototypes_do_the_same(studio: Studio) -> None:
