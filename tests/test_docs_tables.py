@@ -124,6 +124,7 @@ def test_every_picture_of_the_numbers_is_looked_at(pictures: ModuleType, tables:
     assert set(pictures.PICTURES) == set(TASKS)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("task", TASKS)
 def test_a_picture_is_as_new_as_its_rows(pictures: ModuleType, task: str) -> None:
     """After a number has changed: `make tables`."""
