@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import subprocess
@@ -28,11 +29,29 @@ def commands(page: Path) -> list[str]:
     return [line for line in (shlex.join(shlex.split(line, comments=True)) for line in lines) if line]
 
 
-EVERY = [(page.name, command) for page in PAGES for command in commands(page)]
+def results() -> list[tuple[str, str]]:
+    """Commands that made the numbers in results/*.json."""
+    lots = []
+    for path in sorted((ROOT / "results").glob("*.json")):
+        tables = json.loads(path.read_text())["tables"].values()
+        lots += [(path.name, lot["command"] or []) for table in tables for lot in table["made"]]
+    joined = [(name, line) for name, lines in lots for line in "\n".join(lines).replace("\\\n", " ").splitlines()]
+    return sorted({(name, shlex.join(shlex.split(line, comments=True))) for name, line in joined})
+
+
+EVERY = [(page.name, command) for page in PAGES for command in commands(page)] + results()
 
 
 def test_the_first_commands_of_the_readme_are_demo_and_test() -> None:
     assert commands(ROOT / "README.md")[:2] == ["make demo", "make test"]
+
+
+def test_the_readme_is_short_and_begins_with_a_picture_and_a_quick_start() -> None:
+    text = (ROOT / "README.md").read_text()
+    assert len(text.split()) <= 1200
+    picture, start = text.index("](docs/images/imagined.webp)"), text.index("```python")
+    assert picture < start < text.index("```bash")
+    assert text[:start].count("\n") < 25
 
 
 def test_the_readme_names_every_command_of_the_pipeline() -> None:
@@ -65,13 +84,13 @@ def test_a_documented_command_is_accepted(page: str, command: str) -> None:
         typed = [word for word in typed if name != "plan" or not word.startswith("run=runs/")]
         assert compose(typed, name if own_keys else "collect")
     else:
-        assert program in {"cd", "cp", "git", "hf", "lerobot-eval", "python", "pip", "tensorboard"}, (
+        assert program in {"cd", "cp", "docker", "git", "hf", "lerobot-eval", "python", "pip", "tensorboard"}, (
             f"{page}: unknown program"
         )
 
 
 def test_the_cheap_commands_run() -> None:
-    cheap = {command for _, command in EVERY if re.search(r"(playslot doctor|--help|make help)$", command)}
+    cheap = {command for _, command in EVERY if re.search(r"^(?!docker).*(playslot doctor|--help|make help)$", command)}
     assert any(command.endswith("doctor") for command in cheap)
     for command in sorted({re.sub(r"^\.venv/bin/", "", command) for command in cheap}):
         program, *rest = shlex.split(command)
