@@ -82,7 +82,7 @@ def run_jobs_here(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def refused(command: str, *arguments: object, message: str, code: int = 1) -> Done:
     """A command that must fail with one line that matches `message`, and without a traceback."""
-    done = playslot(command, *_defaults(arguments), *map(str, arguments), *ONE_CORE)
+    done = playslot(command, *map(str, instead((*_defaults(arguments), *ONE_CORE), *arguments)))
     assert done.code == code, (done.code, done.err)
     assert_one_line(done.err, command)
     assert re.search(message, done.err), done.err

@@ -100,36 +100,22 @@ def test_videos_of_two_cameras_become_a_model_that_can_be_played(tmp_path: Path)
         studio.close()
 
 
-def test_what_cannot_be_adopted_is_refused_before_anything_is_written(
-    any_set: Path, foreign: Path, tmp_path: Path
-) -> None:
+def test_what_cannot_be_adopted_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     run, out = tmp_path / "run", f"out={tmp_path / 'run'}"
     still = write_set(tmp_path / "still", (4, 4), speed=0)
     frames = write_set(tmp_path / "frames", (1, 1), speed=2)
     short = write_set(tmp_path / "short", (2, 1, 2, 6, 2), speed=2)
     for message, given in {
-        r"got 2 cameras .* set data\.camera=": (f"data.root={foreign}", out),
         "frames of observation.images.top that never change": (f"data.root={still}", out),
         "episodes of one frame": (f"data.root={frames}", out),
         r"got episodes of 2 frames \(median\), expected at least 3": (f"data.root={short}", out),
-        r"data\.root: got nothing": (out,),
-        r"data\.root: got .*, expected one data set": (f"data.root={still},{frames}", out),
-        "env: got button_press, expected video": ("env=button_press", f"data.root={any_set}", out),
-        "out: got nothing": (f"data.root={any_set}",),
-        "no such folder, expected a LeRobot data set": (f"data.root={tmp_path / 'none'}", out),
     }.items():
         refused("adopt", *given, message=message)
-    refused("adopt", f"data.root={any_set}", out, "minutes=0", message="minutes: got 0.0, expected above 0", code=2)
     assert not run.exists()
 
 
-def test_playing_refuses_frames_that_the_model_does_not_take(any_set: Path, foreign: Path) -> None:
-    for message, given in {
-        r"got 2 cameras .* set data\.camera=": (f"data.root={foreign}",),
-        r"data\.resize=true": (f"data.root={any_set}",),
-        "no such folder|got no data set": (f"data.root={any_set}-none",),
-    }.items():
-        refused("play", "run=pretrained", *given, message=message)
+def test_playing_refuses_frames_that_the_model_does_not_take(any_set: Path) -> None:
+    refused("play", "run=pretrained", f"data.root={any_set}", message=r"data\.resize=true")
 
 
 @pytest.mark.parametrize("preset", ["smoke", "compact", "paper"])

@@ -58,15 +58,7 @@ def test_evaluate_says_that_there_is_nothing_to_act_on(shapes: Path) -> None:
     assert done.code == 0
     assert "nothing to act on" in done.out
     refused("evaluate", f"run={shapes}", "episodes=1", message="episodes: got 1, expected at least 2")
-
-
-def test_a_policy_and_a_demo_are_refused(shapes: Path, tmp_path: Path) -> None:
     refused("train-policy", f"run={shapes}", message="variant: got multi, expected single")
-    refused(
-        "demo", "env=grid_shapes", f"out={tmp_path / 'x'}", message="env=grid_shapes: got an environment without a sim"
-    )
-    refused("pipeline", "env=sketchy", f"out={tmp_path / 'y'}", message="env=sketchy: got an environment without a sim")
-    assert not list(tmp_path.iterdir())
 
 
 def test_collected_clips_are_those_of_their_seeds(tmp_path: Path) -> None:
@@ -82,13 +74,6 @@ def test_collected_clips_are_those_of_their_seeds(tmp_path: Path) -> None:
         rows = source.episode_rows(episode)
         np.testing.assert_array_equal(source.frames[rows], clips.frames[episode])
         np.testing.assert_array_equal(moves_of(source.actions[rows[:-1]]), clips.moves[episode])
-
-
-def test_an_expert_and_a_wrong_action_width_are_refused(tmp_path: Path) -> None:
-    out = f"out={tmp_path / 'set'}"
-    refused("collect", "env=grid_shapes", "policy=expert", out, message="policy: got expert .*move by themselves")
-    refused("collect", "env=grid_shapes", "env.grid.objects=5", out, message="expected 10, .*model.savi.n_slots=6")
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_record_without_the_groups_of_other_tasks_is_the_same_collection() -> None:

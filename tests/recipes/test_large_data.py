@@ -27,16 +27,6 @@ def test_both_stages_learn_from_sets_with_weights(videos: Path, demos: Path, tmp
     assert config["data"]["root"] == f"{videos}:3,{demos}:1"
 
 
-def test_a_policy_refuses_weights_and_adopt_several_sets(
-    world: Path, demos: Path, videos: Path, tmp_path: Path
-) -> None:
-    refused("train-policy", f"run={world}", f"data.demos={demos}:2,{videos}:1", message="got weights, expected none")
-    refused("adopt", f"data.root={videos}:2,{demos}", f"out={tmp_path / 'run'}", message="expected one data set")
-    refused(
-        "train-slots", f"data.root={videos}:0,{demos}", f"out={tmp_path / 'run'}", message="expected a number above 0"
-    )
-
-
 @pytest.mark.slow
 def test_a_streamed_training_ends_as_before_after_a_kill(videos: Path, tmp_path: Path) -> None:
     data = (f"data.root={videos}", f"data.cache={tmp_path / 'cache'}", "data.stream=true", "data.shuffle_buffer=4")
@@ -53,8 +43,3 @@ def test_another_buffer_is_another_training(videos: Path, tmp_path: Path) -> Non
     smoke("train-slots", *data, *STEPS, "data.shuffle_buffer=4")
     shutil.rmtree(tmp_path / "slots" / "checkpoint")
     refused("train-slots", *data, *STEPS, "data.shuffle_buffer=8", message=r"shuffle_buffer")
-
-
-@pytest.mark.parametrize("key", ["data.cache_limit=lots", "data.workers=-1", "data.shuffle_buffer=0"])
-def test_settings_that_say_nothing_are_refused(key: str, videos: Path, tmp_path: Path) -> None:
-    refused("train-slots", f"data.root={videos}", f"out={tmp_path}", key, message=key.partition("=")[0], code=2)

@@ -53,13 +53,6 @@ def test_it_is_evaluated_into_a_run_of_its_own(shipped: Path, tmp_path: Path) ->
     assert playslot_rl.load(tmp_path / "check", "cpu").agent is not None
 
 
-def test_another_task_than_its_own_is_refused(tmp_path: Path) -> None:
-    config = compose(["run=pretrained/block_push", "env=button_press", f"out={tmp_path / 'check'}"], "evaluate")
-    with pytest.raises(ConfigError, match="env: got button_press, expected block_push, with which run=pretrained"):
-        evaluate.main(config)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_it_acts(shipped: Path) -> None:
     assert (shipped / "policy").is_dir()
     action = playslot_rl.load("pretrained/button_press", "cpu").act(np.zeros((64, 64, 3), np.uint8))
