@@ -1,6 +1,6 @@
 """The `playslot` command: a thin front of the recipes.
 
-Every sub-command is one module of `playslot_rl.recipes` (except `doctor`); its arguments are `key=value` overrides.
+Every sub-command is one module of `playslot_rl.recipes`; its arguments are `key=value` overrides.
 Exit codes: 0 done, 1 an error of the run, 2 bad arguments, 130 interrupted.
 """
 
@@ -138,7 +138,7 @@ def _run(name: str, options: argparse.Namespace) -> int:
     if sys.platform == "linux":
         os.environ.setdefault("MUJOCO_GL", "egl")
     if name == "doctor":
-        from playslot_rl import doctor
+        from playslot_rl.recipes import doctor
 
         return doctor.main(config)
     from playslot_rl.config.weights import data_roots, is_remote

@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
-from playslot_rl import doctor
 from playslot_rl.config import DataConfig, ExperimentConfig
+from playslot_rl.recipes import doctor
+from playslot_rl.runtime import checks
 from playslot_rl.runtime.allocator import tune_allocator
 from playslot_rl.runtime.threads import available_cores, set_threads
 
@@ -30,7 +31,7 @@ def test_all_is_well_here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 def test_one_failure_fails_the_command_and_shows_its_cure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(doctor, "check_rendering", lambda: doctor.Check("rendering", "FAIL", "no GL", "install GL"))
+    monkeypatch.setattr(checks, "check_rendering", lambda: checks.Check("rendering", "FAIL", "no GL", "install GL"))
     (tmp_path / "file").touch()
     assert doctor.main(ExperimentConfig(data=DataConfig(cache=str(tmp_path / "file" / "cache")))) == 1
     out = capsys.readouterr().out
@@ -42,20 +43,20 @@ def test_one_failure_fails_the_command_and_shows_its_cure(
 
 def test_a_gl_backend_that_cannot_draw_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
-    found = doctor.check_rendering()
+    found = checks.check_rendering()
     assert found.status == "FAIL"
     assert "nonsense" in found.found
     assert "libegl1" in found.cure
 
 
 def test_a_device_that_is_not_there_is_found() -> None:
-    found = doctor.check_torch("cuda:99")
+    found = checks.check_torch("cuda:99")
     assert (found.status, found.cure) == ("FAIL", "choose device=cpu")
 
 
 def test_a_wrong_version_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.metadata.version", lambda name: "0.0.1")
-    found = doctor.check_packages()
+    found = checks.check_packages()
     assert found.status == "FAIL"
     assert "torch is 0.0.1, expected 2.11.0" in found.found
 
@@ -66,7 +67,7 @@ def test_little_disk_space_is_found(free: float, status: str, tmp_path: Path, mo
         return shutil._ntuple_diskusage(100e9, 0, free)  # type: ignore[attr-defined]
 
     monkeypatch.setattr(shutil, "disk_usage", usage)
-    assert doctor.check_disk(tmp_path / "not" / "there" / "yet").status == status
+    assert checks.check_disk(tmp_path / "not" / "there" / "yet").status == status
 
 
 def test_the_allocator_setting_is_accepted_and_changes_no_result() -> None:
@@ -104,17 +105,17 @@ def test_a_torchcodec_that_does_not_load_is_one_line(tmp_path: Path, monkeypatch
     (tmp_path / "torchcodec" / "__init__.py").write_text("raise RuntimeError('no library\\n' * 80)")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr("importlib.metadata.version", lambda name: "0.9.0")
-    found = doctor.check_torchcodec()
+    found = checks.check_torchcodec()
     assert found.status == "ok"
     assert "0.9.0 does not load here, pyav is used" in found.found
     assert "\n" not in found.line()
     (tmp_path / "torchcodec" / "__init__.py").write_text("")
     (tmp_path / "torchcodec" / "decoders.py").write_text("")
-    assert "0.9.0 loads" in doctor.check_torchcodec().found
+    assert "0.9.0 loads" in checks.check_torchcodec().found
 
 
 def test_the_doctor_prints_no_traceback(capfd: pytest.CaptureFixture[str]) -> None:
-    print(doctor.check_torchcodec().line())
+    print(checks.check_torchcodec().line())
     out, err = capfd.readouterr()
     assert (out.count("\n"), err) == (1, "")
     assert "Traceback" not in out

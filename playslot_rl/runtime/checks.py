@@ -1,4 +1,4 @@
-"""`playslot doctor`: what works on this machine, and the cure for what does not."""
+"""What works on this machine, one check each, and the cure for what does not."""
 
 from __future__ import annotations
 
@@ -10,23 +10,21 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
 from packaging.requirements import Requirement
 
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.runtime.devices import named_device
+from playslot_rl.runtime.precision import resolve_precision
 from playslot_rl.runtime.threads import available_cores
-
-Status = Literal["ok", "warn", "FAIL"]
 
 _MIN_DISK_GB: Final = 2.0
 _GOOD_DISK_GB: Final = 10.0
 _REINSTALL: Final = "run `make setup` again, or `pip install .` in a fresh environment of Python 3.12"
+_PATIENCE_S: Final = 120
 
-# In a process of its own: a broken GL library may end the process instead of raising.
 _DRAW_ONE_FRAME: Final = """
 import mujoco, os
 from playslot_rl.config import RenderConfig
@@ -43,22 +41,15 @@ print(f"drew a {frame.shape[0]}x{frame.shape[1]} frame with MUJOCO_GL={os.enviro
 
 @dataclass(frozen=True)
 class Check:
-    """One finding.
-
-    Attributes:
-        name: what was looked at.
-        status: `ok`, `warn` (works, but something is missing or slow) or `FAIL` (an essential part does not work).
-        found: what was found.
-        cure: what to do; empty where all is well.
-    """
+    """One finding: `warn` works, but something is missing or slow; `FAIL` is an essential part that does not work."""
 
     name: str
-    status: Status
+    status: Literal["ok", "warn", "FAIL"]
     found: str
     cure: str = ""
 
     def line(self) -> str:
-        """The finding as printed: one line, or two with a cure."""
+        """As printed: one line, or two with a cure."""
         text = f"{self.status:<5} {self.name:<14} {self.found}"
         return f"{text}\n{'':<21}-> {self.cure}" if self.cure else text
 
@@ -98,37 +89,39 @@ def check_torch(device: str = "") -> Check:
     try:
         import torch
 
-        from playslot_rl.runtime.devices import named_device
-
         name = str(named_device(device))
         total = float(torch.ones(8, 8, device=name).matmul(torch.ones(8, 8, device=name)).sum())
     except Exception as error:  # noqa: BLE001  a broken torch fails with whatever its libraries raise
         return Check("torch", "FAIL", _one_line(error), "choose device=cpu" if device else _REINSTALL)
     if total != 512.0:
         return Check("torch", "FAIL", f"a product of ones sums to {total}, expected 512", _REINSTALL)
-    from playslot_rl.runtime.precision import resolve_precision
-
     what = torch.cuda.get_device_name() if name.startswith("cuda") else f"{torch.get_num_threads()} threads"
     chosen = resolve_precision("auto", torch.device(name).type)
     return Check("torch", "ok", f"{torch.__version__}, device {name} ({what}), precision=auto is {chosen}")
 
 
-def check_rendering() -> Check:
-    """The GL backend, by drawing a frame."""
+def _ran(code: str) -> tuple[bool, str]:
+    """Whether code ran, in a process of its own, which a broken library may end or flood; and its last line."""
     try:
         done = subprocess.run(
-            [sys.executable, "-c", _DRAW_ONE_FRAME], capture_output=True, text=True, timeout=120, check=False
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=_PATIENCE_S, check=False
         )
     except subprocess.TimeoutExpired:
-        return Check("rendering", "FAIL", "no frame within 120 s", "try MUJOCO_GL=osmesa")
-    if done.returncode == 0:
-        return Check("rendering", "ok", done.stdout.strip().splitlines()[-1])
-    lines = done.stderr.strip().splitlines() or [f"the process ended with code {done.returncode}"]
+        return False, f"no end within {_PATIENCE_S} s"
+    said = (done.stderr if done.returncode else done.stdout).strip().splitlines()
+    return not done.returncode, said[-1] if said else f"the process ended with code {done.returncode}"
+
+
+def check_rendering() -> Check:
+    """The GL backend, by drawing a frame."""
+    drew, said = _ran(_DRAW_ONE_FRAME)
+    if drew:
+        return Check("rendering", "ok", said)
     cure = (
         "set MUJOCO_GL to egl, osmesa or glfw and install its library "
         "(Debian, Ubuntu: apt-get install libegl1 libgl1 libosmesa6)"
     )
-    return Check("rendering", "FAIL", f"MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r}: {lines[-1]}", cure)
+    return Check("rendering", "FAIL", f"MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r}: {said}", cure)
 
 
 def check_video() -> Check:
@@ -161,17 +154,9 @@ def check_torchcodec() -> Check:
         version = importlib.metadata.version("torchcodec")
     except importlib.metadata.PackageNotFoundError:
         return Check("torchcodec", "ok", "not installed (not needed: PyAV reads videos)")
-    # In a process of its own, since what it says of libraries that are missing goes on for eighty lines.
-    code = "import torchcodec.decoders"
-    try:
-        loads = not subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, timeout=120, check=False
-        ).returncode
-    except subprocess.TimeoutExpired:
-        loads = False
-    if loads:
-        return Check("torchcodec", "ok", f"{version} loads (LeRobot reads videos by it, this package by PyAV)")
     found = f"{version} does not load here, pyav is used (LeRobot's own reader takes it with video_backend='pyav')"
+    if _ran("import torchcodec.decoders")[0]:
+        found = f"{version} loads (LeRobot reads videos by it, this package by PyAV)"
     return Check("torchcodec", "ok", found)
 
 
@@ -214,41 +199,6 @@ def check_cache(folder: Path) -> Check:
     except OSError as error:
         return Check("cache", "FAIL", f"{folder}: {_one_line(error)}", cure)
     return Check("cache", "ok", f"{folder} can be written")
-
-
-def cache_folder(config: ExperimentConfig) -> Path:
-    """Where a command with this config keeps its caches."""
-    return Path(config.data.cache or os.environ.get("PLAYSLOT_CACHE") or Path.home() / ".cache" / "playslot_rl")
-
-
-def main(config: ExperimentConfig) -> int:
-    """Print one finding after the other.
-
-    Args:
-        config: `device`, `out` and `data.cache` are looked at.
-
-    Returns:
-        0 if everything essential works, otherwise 1.
-    """
-    failed = 0
-    checks: list[Callable[[], Check]] = [
-        check_python,
-        check_packages,
-        lambda: check_torch(config.device),
-        check_rendering,
-        check_video,
-        check_torchcodec,
-        check_ffmpeg,
-        lambda: check_disk(Path(config.out or ".").resolve()),
-        check_cores,
-        lambda: check_cache(cache_folder(config)),
-    ]
-    for check in checks:
-        finding = check()
-        print(finding.line(), flush=True)
-        failed += finding.status == "FAIL"
-    print("\neverything essential works" if not failed else f"\n{failed} essential part(s) do not work")
-    return 1 if failed else 0
 
 
 def _one_line(error: BaseException) -> str:
