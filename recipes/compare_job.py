@@ -10,13 +10,16 @@ import json
 import os
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.errors import explain
 from playslot_rl.studies.launch import Status, job_lock, read_status, write_status
+
+if TYPE_CHECKING:
+    from playslot_rl.studies.study import Commands
+    from playslot_rl.studies.success.measure import SuccessMeasure
+    from playslot_rl.studies.video.measure import VideoMeasure
 
 
 def main(file: Path) -> Status:
@@ -34,7 +37,7 @@ def main(file: Path) -> Status:
         began = time.monotonic()
         write_status(file, Status("running", job["fingerprint"]))
         try:
-            _run(job)
+            _measure(job).run(job, commands())
         except Exception as error:  # noqa: BLE001  whatever a method dies of is its row's business
             failed = Status("failed", job["fingerprint"], explain(error), round(time.monotonic() - began, 1))
             write_status(file, failed)
@@ -45,33 +48,27 @@ def main(file: Path) -> Status:
         return done
 
 
-def _run(job: dict[str, Any]) -> None:
+def _measure(job: dict[str, Any]) -> type[SuccessMeasure | VideoMeasure]:
     if job.get("kind") == "video":
-        from playslot_rl.recipes import compare_video_job
+        from playslot_rl.studies.video.measure import VideoMeasure
 
-        compare_video_job.run(job)
-        return
-    from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts, task_facts
-    from playslot_rl.recipes import evaluate, train_baseline
-    from playslot_rl.runs import Run
-    from playslot_rl.studies.several import train_on_several
+        return VideoMeasure
+    from playslot_rl.studies.success.measure import SuccessMeasure
 
-    config, processes = from_dict(ExperimentConfig, job["config"]), int(job["processes"])
-    if processes > 1:
-        train_on_several("train-baseline", config, processes)
-    else:
-        train_baseline.main(config)
-    run, seed = Path(config.out), int(job["evaluation_seed"])
-    facts = {
-        "episodes": config.episodes or DEFAULT_EPISODES,
-        "seed": seed,
-        "fingerprints": run_facts(run, job["method"]).fingerprints,
-        **task_facts(config, seed),
+    return SuccessMeasure
+
+
+def commands() -> Commands:
+    """The commands that jobs, and what they share, are made by."""
+    from playslot_rl.recipes import evaluate, train_baseline, train_dynamics, train_slots
+
+    return {
+        "train-slots": train_slots.main,
+        "train-dynamics": train_dynamics.main,
+        "train-baseline": train_baseline.main,
+        "train-videos": train_baseline.train_videos,
+        "evaluate": evaluate.once,
     }
-    for protocol in job["protocols"]:
-        if not evaluate.measured(Run(run), protocol, facts):
-            again = replace(config, run=config.out, out="", seed=seed, protocol=protocol)
-            evaluate.main(again, report=False)
 
 
 if __name__ == "__main__":

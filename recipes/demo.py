@@ -8,7 +8,6 @@ from dataclasses import replace
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.errors import ConfigError
 from playslot_rl.recipes import evaluate, inspect, train_policy
-from playslot_rl.recipes.pipeline import collect_demos
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import run_to_write
 from playslot_rl.seeds.episodes import LARGEST_SEED
@@ -21,6 +20,7 @@ def main(config: ExperimentConfig) -> None:
     """Collect demonstrations, train policy and decoder, inspect the world model on them, evaluate under both protocols,
     write the report.
     """
+    from playslot_rl.collectors.presets import collect_demos
     from playslot_rl.envs import gym_id
 
     began = time.monotonic()

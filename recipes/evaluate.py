@@ -88,21 +88,14 @@ def evaluate_baseline(config: ExperimentConfig, run: Run) -> None:
 
 def main_if_needed(config: ExperimentConfig) -> None:
     """Evaluate under both protocols and renew the report, leaving out what this policy was measured on before."""
-    from playslot_rl.evaluation.success import DEFAULT_EPISODES, POLICY_PROTOCOLS, run_facts, task_facts
+    from playslot_rl.evaluation.success import POLICY_PROTOCOLS, run_facts
 
     run = run_with_policy(config)
     if config.env.name in PROCEDURAL:
         objects.main_if_needed(config, run)
         return
-    facts = {
-        "episodes": config.episodes or DEFAULT_EPISODES,
-        "seed": config.seed,
-        "fingerprints": run_facts(run.folder).fingerprints,
-        **task_facts(config, config.seed),
-    }
-    due = [protocol for protocol in POLICY_PROTOCOLS if not measured(run, protocol, facts)]
-    for protocol in due:
-        main(replace(config, protocol=protocol), report=False)
+    run_facts(run.folder)  # a run without a policy is refused before anything is loaded
+    due = [protocol for protocol in POLICY_PROTOCOLS if once(replace(config, protocol=protocol))]
     if due or not renewed(run):
         from playslot_rl.visualization.report import write_report
 
@@ -118,13 +111,27 @@ def renewed(run: Run) -> bool:
     return report.is_file() and not (card.is_file() and card.stat().st_mtime_ns > report.stat().st_mtime_ns)
 
 
-def measured(run: Run, protocol: str, facts: dict[str, Any]) -> bool:
-    """Whether the run was measured under a protocol with the same `facts` (parts of its result); if so, say it."""
+def once(config: ExperimentConfig) -> bool:
+    """Evaluate under `config.protocol`, without a report, unless the same policy was measured so before.
+
+    Returns:
+        Whether it was measured now.
+    """
+    from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts, task_facts
+
+    run, protocol = Run.of(config), config.protocol
+    facts = {
+        "episodes": config.episodes or DEFAULT_EPISODES,
+        "seed": config.seed,
+        "fingerprints": run_facts(run.folder, config.method).fingerprints,
+        **task_facts(config, config.seed),
+    }
     stored = run.result(f"evaluation/{protocol}/eval_info.json", facts)
     if stored is None:
-        return False
+        main(config, report=False)
+        return True
     print(f"{protocol}: measured before, {100 * stored['success_rate']:.0f} % success, skipped", flush=True)
-    return True
+    return False
 
 
 def run_with_policy(config: ExperimentConfig, command: str = "evaluate") -> Run:

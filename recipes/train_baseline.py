@@ -33,5 +33,10 @@ def main(config: ExperimentConfig) -> None:
         )
     if method.actor:
         gym_id(config.env.name)
-    recipe = importlib.import_module(f"playslot_rl.recipes.{method.recipe}")
-    recipe.main(config)
+    importlib.import_module(f"playslot_rl.recipes.{method.recipe}").main(config)
+
+
+def train_videos(config: ExperimentConfig) -> None:
+    """Train the model of unlabelled videos that `config.method` builds on into `out`."""
+    recipe = importlib.import_module(f"playslot_rl.recipes.{METHODS[config.method].recipe}")
+    recipe.train_model(config, Path(config.out))

@@ -16,7 +16,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngImageFile
 
 from playslot_rl.config.methods import canonical_method
-from playslot_rl.studies.page import comparison_figure
+from playslot_rl.studies.success.figure import success_figure
 from playslot_rl.visualization.charts import LIGHT, figure_bytes
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -76,7 +76,7 @@ def draw(found: dict[str, Any]) -> bytes:
         seeds += [row | {"success_rate": end / 100, "seed": seed, "curve": None} for seed, end in enumerate(ends)]
     references = {name: {"success_rate": rate / 100} for name, rate in found["references"].items()}
     result = {"summary": summary, "rows": seeds, "labels": True, "references": references}
-    return figure_bytes(comparison_figure(result, LIGHT), LIGHT, facts={FACT: fingerprint(found)})
+    return figure_bytes(success_figure(result, LIGHT), LIGHT, facts={FACT: fingerprint(found)})
 
 
 def stale(path: Path, found: dict[str, Any]) -> bool:

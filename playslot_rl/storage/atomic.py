@@ -150,6 +150,15 @@ def read_json(path: Path, cure: str = "train that stage again") -> dict[str, Any
     return values
 
 
+def json_or_nothing(path: Path) -> dict[str, Any]:
+    """A JSON object; empty where the file is missing or damaged."""
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return values if isinstance(values, dict) else {}
+
+
 def replace_dir(tmp: Path, final: Path) -> None:
     """Rename the finished folder `tmp` to `final`, after an fsync of everything in it; errors as of
     `explain_write_errors`.

@@ -1,1 +1,1 @@
-"""Methods side by side: which jobs there are, how they are started, what came out."""
+"""Studies: methods side by side, by one engine of jobs and several measures."""

@@ -6,21 +6,24 @@ crash of a library) takes no other with it.
 
 from __future__ import annotations
 
-import json
+import importlib.util
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol
+from typing import Final, Literal
 
+from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.plain import from_dict
-from playslot_rl.errors import OutputError, PlaySlotError
-from playslot_rl.storage.atomic import explain_write_errors, write_json
+from playslot_rl.errors import ConfigError, OutputError, PlaySlotError
+from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing, write_json
 from playslot_rl.storage.locks import locked
 
 LOCK: Final = "comparison.lock"
+JOB_MODULE: Final = "playslot_rl.recipes.compare_job"
+SWEEP_MODULE: Final = "playslot_rl.recipes.compare_sweep"
 
 
 @dataclass(frozen=True)
@@ -48,8 +51,8 @@ def log_file(job_file: Path) -> Path:
 def read_status(job_file: Path) -> Status:
     """The stored status; `waiting` where there is none, or no readable one."""
     try:
-        return from_dict(Status, json.loads(job_file.with_suffix(".status.json").read_text()))
-    except (OSError, ValueError):
+        return from_dict(Status, json_or_nothing(job_file.with_suffix(".status.json")))
+    except ValueError:
         return Status()
 
 
@@ -93,75 +96,6 @@ def open_comparison(out: Path) -> None:
     names = {path.name for path in out.iterdir()} if out.is_dir() else set()
     if names and (not names & {LOCK, "jobs"} or names & {"meta", "config.json"}):
         raise OutputError(f"out={out}: got a folder that holds something else, expected none: choose another out=")
-
-
-class AnyJob(Protocol):
-    """What is asked of a job: its name, its file, and which of several waves of a launcher it belongs to, from 0 on."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def file(self) -> Path: ...
-    @property
-    def wave(self) -> int: ...
-
-
-class Report[J: AnyJob](Protocol):
-    """What gathers the jobs' results."""
-
-    out: Path
-
-    @property
-    def jobs(self) -> Mapping[J, Mapping[str, Any]]:
-        """All of them, with what their files say."""
-
-    def ended(self, job: J) -> None:
-        """Say how a job ended, and write what there is so far."""
-
-    def write(self) -> Sequence[Mapping[str, Any]]:
-        """Write everything."""
-
-
-def run_due[J: AnyJob](command: str, report: Report[J], launcher: str, hydra: Sequence[str]) -> None:
-    """Write every job's file, and run those that are not done as they stand there.
-
-    Args:
-        command: for the messages.
-        report: the jobs, and who is told.
-        launcher: Hydra's name of one; empty runs one after the other.
-        hydra: further overrides for Hydra.
-
-    Raises:
-        PlaySlotError: the launcher itself failed.
-        KeyboardInterrupt: Ctrl-C. In both cases what there is has been written.
-    """
-    due: dict[Path, J] = {}
-    for job, record in report.jobs.items():
-        write_json(job.file, record)
-        status = read_status(job.file)
-        if status.status == "done" and status.fingerprint == record["fingerprint"]:
-            print(f"{job.name}: done before, skipped", flush=True)
-        else:
-            due[job.file] = job
-    print(f"{command}: {len(due)} of {len(report.jobs)} jobs to run", flush=True)
-    try:
-        if due and launcher:
-            for wave in sorted({job.wave for job in due.values()}):
-                run_sweep([file for file, job in due.items() if job.wave == wave], launcher, hydra)
-        else:
-            for file, job in due.items():
-                run_process(file)
-                report.ended(job)
-    except KeyboardInterrupt:
-        report.write()
-        raise KeyboardInterrupt(f"{command} interrupted; the same command carries on in {report.out}") from None
-    except PlaySlotError:
-        report.write()
-        raise
-
-
-JOB_MODULE = "playslot_rl.recipes.compare_job"
-SWEEP_MODULE = "playslot_rl.recipes.compare_sweep"
 
 
 def job_command(job_file: Path) -> list[str]:
@@ -218,6 +152,26 @@ def sweep_command(files: Sequence[Path], launcher: str, overrides: Sequence[str]
         "hydra.job.chdir=false",
         *overrides,
     ]
+
+
+def require_launcher(name: str) -> None:
+    """Refuse a launcher that is not installed; none is needed for an empty name.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if name and not _installed(LAUNCHERS[name]):
+        raise ConfigError(
+            f"hydra.launcher: got {name}, expected an installed launcher: install it by `uv pip install -e "
+            "'.[launchers]'`"
+        )
+
+
+def _installed(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # of the package it is in
+        return False
 
 
 def run_sweep(files: Sequence[Path], launcher: str, overrides: Sequence[str]) -> None:

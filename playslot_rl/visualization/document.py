@@ -67,6 +67,21 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Linked:
+    """A picture in a file of its own, beside the page."""
+
+    alt: str
+    file: str
+
+
+@dataclass(frozen=True)
+class Notes:
+    """A list of sentences."""
+
+    lines: Sequence[str]
+
+
+@dataclass(frozen=True)
 class Missing:
     """What is not there, and the command that makes it."""
 
@@ -74,7 +89,7 @@ class Missing:
     command: str
 
 
-Block = Text | Table | Picture | Missing
+Block = Text | Table | Picture | Linked | Notes | Missing
 
 
 @dataclass(frozen=True)
@@ -93,16 +108,18 @@ class Document:
         title: of the page.
         lead: what was run, in a sentence or two.
         sections: in reading order.
+        opening: blocks before the first of them.
     """
 
     title: str
     lead: str
     sections: Sequence[Section] = ()
+    opening: Sequence[Block] = ()
 
 
 def to_markdown(document: Document) -> str:
     """Markdown text; its pictures are expected in the folder `figures` beside the file."""
-    parts = [f"# {document.title}", document.lead]
+    parts = [f"# {document.title}", document.lead, *map(_markdown_block, document.opening)]
     for section in document.sections:
         parts += [f"## {section.title}", *map(_markdown_block, section.blocks)]
     return "\n\n".join(parts) + "\n"
@@ -133,6 +150,10 @@ def table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def _markdown_block(block: Block) -> str:
     if isinstance(block, Text):
         return block.text
+    if isinstance(block, Linked):
+        return f"![{block.alt}]({block.file})"
+    if isinstance(block, Notes):
+        return "\n".join(f"- {line}" for line in block.lines)
     if isinstance(block, Missing):
         return f"> {block.what} To make it: `{block.command}`"
     if isinstance(block, Picture):
@@ -150,13 +171,14 @@ def style() -> str:
 def to_html(document: Document) -> str:
     """The whole file."""
     sections = "\n".join(_section(i, section) for i, section in enumerate(document.sections))
+    opening = "\n".join(map(_html_block, document.opening))
     links = "\n".join(f'<a href="#s{i}">{escape(s.title)}</a>' for i, s in enumerate(document.sections))
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(document.title)}</title>\n<style>{style()}</style>\n</head>\n<body class='report'>\n"
         f"<header><h1>{escape(document.title)}</h1>\n<p class='lead'>{_inline(document.lead)}</p>\n"
-        f"<nav aria-label='Sections'>{links}</nav></header>\n<main>\n{sections}\n</main>\n</body>\n</html>\n"
+        f"<nav aria-label='Sections'>{links}</nav></header>\n<main>\n{opening}{sections}\n</main>\n</body>\n</html>\n"
     )
 
 
@@ -176,6 +198,10 @@ def _inline(text: str) -> str:
 def _html_block(block: Block) -> str:
     if isinstance(block, Text):
         return f"<p>{_inline(block.text)}</p>"
+    if isinstance(block, Linked):
+        return f'<figure><img src="{escape(block.file)}" alt="{escape(block.alt)}"></figure>'
+    if isinstance(block, Notes):
+        return "<ul>" + "".join(f"<li>{_inline(line)}</li>" for line in block.lines) + "</ul>"
     if isinstance(block, Missing):
         return f'<p class="missing">{_inline(block.what)} To make it: <code>{escape(block.command)}</code></p>'
     if isinstance(block, Picture):

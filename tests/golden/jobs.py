@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl.config.compose import compose
-from playslot_rl.studies.plan import job_config, job_record, jobs
-from playslot_rl.studies.video_plan import video_job_config, video_job_record, video_jobs
+from playslot_rl.studies.success.jobs import success_config, success_jobs, success_record
+from playslot_rl.studies.video.jobs import video_config, video_jobs, video_record
 
 OUT = Path("/comparison")
 PARENTS = {"slots": "a", "dynamics": "b", "demos": "c", "videos": "d"}
@@ -38,12 +38,12 @@ def job_identities() -> dict[str, Any]:
     given = ("data.root=/videos", f"out={OUT}")
     for choice, arguments in CHOICES.items():
         config = compose([*arguments, *given, "data.demos=/demos"], "compare")
-        for job in jobs(config, OUT):
-            record = job_record(job, job_config(config, job, "pretrained/button_press"), PARENTS)
+        for job in success_jobs(config, OUT):
+            record = success_record(job, success_config(config, job, "pretrained/button_press"), PARENTS)
             values["compare"][f"{choice}: {job.name}"] = {**record, "config": _digest(record["config"])}
     for choice, arguments in VIDEO_CHOICES.items():
         config = compose([*arguments, *given], "compare-video")
         for video in video_jobs(config, OUT):
-            record = video_job_record(video, video_job_config(config, video, "pretrained"), PARENTS, lpips=True)
+            record = video_record(video, video_config(config, video, "pretrained"), PARENTS, lpips=True)
             values["compare-video"][f"{choice}: {video.name}"] = {**record, "config": _digest(record["config"])}
     return values

@@ -14,7 +14,7 @@ from commands import contents, instead, playslot, refused, run_jobs_here, smoke
 from playslot_rl.config.compare_video import TITLES, VIDEO_METHODS
 from playslot_rl.config.compose import compose
 from playslot_rl.studies.launch import sweep_command
-from playslot_rl.studies.video_plan import VideoJob, in_steps, video_job_config
+from playslot_rl.studies.video.jobs import VideoJob, in_steps, video_config
 
 pytestmark = pytest.mark.integration
 
@@ -323,7 +323,7 @@ def test_seeds_share_the_trials_whichever_comes_first(finished: Path, tmp_path: 
 def test_clips_are_drawn_alike() -> None:
     config = compose(["preset=compact", "env=button_press"], "compare-video")
     assert config.dynamics.from_start > 0
-    job = video_job_config(config, VideoJob("playslot", 0, Path("out")), "pretrained")
+    job = video_config(config, VideoJob("playslot", 0, Path("out")), "pretrained")
     assert job.dynamics.from_start == 0
 
 

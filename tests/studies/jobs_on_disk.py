@@ -11,10 +11,10 @@ from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.tensors import save_tensors
 from playslot_rl.studies.launch import Status, write_status
-from playslot_rl.studies.plan import Job
+from playslot_rl.studies.success.jobs import SuccessJob
 
 
-def finish(job: Job, successes: dict[str, int], episodes: int = 10, **meta: Any) -> Job:
+def finish(job: SuccessJob, successes: dict[str, int], episodes: int = 10, **meta: Any) -> SuccessJob:
     """Write what a finished job leaves, with so many successes under each protocol."""
     write_status(job.file, Status("done", "f", "", 12.0))
     checkpoint = job.run / job.stage / "checkpoint"

@@ -15,9 +15,9 @@ from playslot_rl.config.compose import compose
 from playslot_rl.config.roles import without
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_json
-from playslot_rl.studies.begun import require_begun_alike, require_same_choice
-from playslot_rl.studies.plan import job_config, jobs
-from playslot_rl.studies.video_plan import VideoJob, in_steps, video_job_config, video_jobs
+from playslot_rl.studies.success.jobs import success_config, success_jobs
+from playslot_rl.studies.video.begun import require_begun_alike, require_same_choice
+from playslot_rl.studies.video.jobs import VideoJob, in_steps, video_config, video_jobs
 
 CARRIED_ON: dict[str, Any] = {
     "methods": ("svg", "caddy", "playslot"),
@@ -54,7 +54,7 @@ def begin(config: ExperimentConfig, *, trained: bool = True) -> None:
     """Leave what a comparison leaves that was interrupted in its trials, or in its trainings."""
     out, own = Path(config.out), config.compare_video
     for job in video_jobs(config, out):
-        wanted = video_job_config(config, job, "")
+        wanted = video_config(config, job, "")
         for rate in own.rates:
             write_json(job.trial(rate) / "config.json", to_dict(in_steps(wanted, job.method, own.trial_steps)))
         if trained:
@@ -85,7 +85,7 @@ def test_a_setting_that_no_begun_training_has_is_carried_on_with(tmp_path: Path,
     after = video(tmp_path, **{name: (CARRIED_ON | AS_CHOSEN)[name]})
     require_begun_alike(video_jobs(after, tmp_path), after.compare_video)
     for job in set(video_jobs(before, tmp_path)) & set(video_jobs(after, tmp_path)):
-        made, again = (without(video_job_config(config, job, ""), "machine") for config in (before, after))
+        made, again = (without(video_config(config, job, ""), "machine") for config in (before, after))
         assert made | {"compare_video": ()} == again | {"compare_video": ()}
 
 
@@ -161,8 +161,8 @@ def test_no_setting_of_compare_makes_a_begun_training_another_one(tmp_path: Path
     before = compose(["preset=smoke", "methods=playslot,lapo,slot_oracle", "demos=2,3", "seeds=0,1"], "compare")
     changes = {name: COMPARE[name]} | ({"launcher": "basic"} if name == "hydra" else {})
     after = dataclasses.replace(before, compare=dataclasses.replace(before.compare, **changes))
-    same = set(jobs(before, tmp_path)) & set(jobs(after, tmp_path))
+    same = set(success_jobs(before, tmp_path)) & set(success_jobs(after, tmp_path))
     assert same
     for job in same:
-        made, again = (without(job_config(config, job, ""), "machine") for config in (before, after))
+        made, again = (without(success_config(config, job, ""), "machine") for config in (before, after))
         assert made == again

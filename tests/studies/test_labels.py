@@ -11,10 +11,13 @@ from jobs_on_disk import comparison, finish
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import ConfigError
-from playslot_rl.studies.page import comparison_figure, comparison_page
-from playslot_rl.studies.plan import Job, job_config, jobs
-from playslot_rl.studies.report import job_rows, summarise
+from playslot_rl.studies.launch import read_status
+from playslot_rl.studies.success.figure import success_figure
+from playslot_rl.studies.success.jobs import SuccessJob, success_config, success_jobs
+from playslot_rl.studies.success.page import success_page
+from playslot_rl.studies.success.rows import job_rows, summarise
 from playslot_rl.visualization.charts import LIGHT
+from playslot_rl.visualization.document import to_markdown
 
 OUT = Path("out")
 
@@ -25,7 +28,7 @@ def compared(*typed: str) -> ExperimentConfig:
 
 def test_bc_has_a_job_for_each_number_of_labels_and_the_oracles_one_for_all() -> None:
     typed = ("methods=playslot,lapo,slot_bc,resnet_bc,slot_oracle", "demos=100", "labels=25,5", "seeds=3")
-    assert [job.name for job in jobs(compared(*typed), OUT)] == [
+    assert [job.name for job in success_jobs(compared(*typed), OUT)] == [
         "slot_bc-d5-l5-s3", "resnet_bc-d5-l5-s3", "slot_bc-d25-l25-s3", "resnet_bc-d25-l25-s3",
         "playslot-d100-l5-s3", "playslot-d100-l25-s3", "lapo-d100-l5-s3", "lapo-d100-l25-s3", "slot_oracle-d100-s3",
     ]  # fmt: skip
@@ -33,11 +36,11 @@ def test_bc_has_a_job_for_each_number_of_labels_and_the_oracles_one_for_all() ->
 
 @pytest.mark.parametrize("method", ["playslot", "lapo", "caddy_policy"])
 def test_the_policy_is_trained_once_for_all_numbers_of_labels(method: str) -> None:
-    first, second = jobs(compared(f"methods={method}", "demos=100", "labels=5,25", "seeds=0"), OUT)
+    first, second = success_jobs(compared(f"methods={method}", "demos=100", "labels=5,25", "seeds=0"), OUT)
     assert (first.policy_of, second.policy_of) == (None, 5)
     config = compared(f"methods={method}", "demos=100", "labels=5,25")
-    assert job_config(config, first, "pretrained").behaviour.policy_from == ""
-    assert job_config(config, second, "pretrained").behaviour.policy_from == str(first.run.resolve())
+    assert success_config(config, first, "pretrained").behaviour.policy_from == ""
+    assert success_config(config, second, "pretrained").behaviour.policy_from == str(first.run.resolve())
 
 
 @pytest.mark.parametrize(
@@ -49,7 +52,7 @@ def test_the_policy_is_trained_once_for_all_numbers_of_labels(method: str) -> No
 def test_every_method_learns_from_the_draw_of_its_seed(
     method: Any, demos: int, labels: int | None, expected: tuple[int, int]
 ) -> None:
-    own = job_config(compared(), Job(method, demos, 7, OUT, labels), "pretrained")
+    own = success_config(compared(), SuccessJob(method, demos, 7, OUT, labels), "pretrained")
     assert (own.demos, own.behaviour.labelled_demos) == expected
     assert own.data.draw == 7, "the same draw for all methods: BC's labelled demonstrations are PlaySlot's"
 
@@ -74,24 +77,24 @@ def test_bad_labels_are_one_line(typed: list[str], message: str) -> None:
 def by_labels(tmp_path: Path) -> dict[str, Any]:
     """PlaySlot with two numbers of videos, BC, and an oracle."""
     ended = [
-        finish(Job("slot_bc", 5, 0, tmp_path, 5), {"simulation": 4}, labelled_demos=5),
-        finish(Job("slot_bc", 25, 0, tmp_path, 25), {"simulation": 5}, labelled_demos=25),
+        finish(SuccessJob("slot_bc", 5, 0, tmp_path, 5), {"simulation": 4}, labelled_demos=5),
+        finish(SuccessJob("slot_bc", 25, 0, tmp_path, 25), {"simulation": 5}, labelled_demos=25),
         *(
             finish(
-                Job("playslot", videos, 0, tmp_path, labels),
+                SuccessJob("playslot", videos, 0, tmp_path, labels),
                 {"simulation": won, "imagination": won - 1},
                 labelled_demos=labels,
             )
             for videos, labels, won in ((100, 5, 6), (100, 25, 7), (300, 5, 8), (300, 25, 9))
         ),
-        finish(Job("slot_oracle", 300, 0, tmp_path), {"simulation": 10}),
+        finish(SuccessJob("slot_oracle", 300, 0, tmp_path), {"simulation": 10}),
     ]
-    rows = [row for job in ended for row in job_rows(job, frame_skip=5)]
+    rows = [row for job in ended for row in job_rows(job, 5, read_status(job.file))]
     return comparison(tmp_path, rows, summarise(rows))
 
 
 def test_the_page_has_a_table_for_each_number_of_videos_with_bc_in_each(by_labels: dict[str, Any]) -> None:
-    page = comparison_page(by_labels)
+    page = to_markdown(success_page(by_labels))
     assert page.startswith("# button_press: success against labels")
     few, many = page.partition("## By labelled demonstrations, of 300 videos")[::2]
     assert "of 100 videos" in few
@@ -106,7 +109,7 @@ def test_the_page_has_a_table_for_each_number_of_videos_with_bc_in_each(by_label
 
 
 def test_the_plot_has_a_panel_for_each_number_of_videos(by_labels: dict[str, Any]) -> None:
-    panels = comparison_figure(by_labels, LIGHT).axes
+    panels = success_figure(by_labels, LIGHT).axes
     assert [axes.get_title() for axes in panels] == ["100 videos", "300 videos"]
     assert all(axes.get_xlabel() == "labelled demonstrations" for axes in panels)
     drawn = [{str(line.get_label()) for line in axes.lines} for axes in panels]

@@ -12,16 +12,17 @@ from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS, MethodName
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.studies.plan import (
-    Job,
-    absolute_roots,
-    check_comparison,
-    check_demos,
-    job_config,
-    job_record,
-    jobs,
+from playslot_rl.studies.job import absolute_roots
+from playslot_rl.studies.launch import require_launcher
+from playslot_rl.studies.success.jobs import (
+    SuccessJob,
     latent_models,
+    success_config,
+    success_jobs,
+    success_record,
 )
+from playslot_rl.studies.success.measure import check_success
+from playslot_rl.studies.success.shared import check_demos
 
 OUT = Path("out")
 
@@ -31,7 +32,7 @@ def compared(*typed: str) -> ExperimentConfig:
 
 
 def test_offline_methods_have_a_job_for_each_number_and_seed_and_online_ones_for_each_seed() -> None:
-    names = [job.name for job in jobs(compared("methods=playslot,lapo,sold", "demos=50,10", "seeds=0,4"), OUT)]
+    names = [job.name for job in success_jobs(compared("methods=playslot,lapo,sold", "demos=50,10", "seeds=0,4"), OUT)]
     assert names == [
         "playslot-d10-s0", "lapo-d10-s0", "playslot-d50-s0", "lapo-d50-s0",
         "playslot-d10-s4", "lapo-d10-s4", "playslot-d50-s4", "lapo-d50-s4",
@@ -41,21 +42,25 @@ def test_offline_methods_have_a_job_for_each_number_and_seed_and_online_ones_for
 
 def test_methods_that_act_may_have_fewer_seeds() -> None:
     typed = ("methods=slot_oracle,sold", "demos=10", "seeds=0,1", "compare.online_seeds=[1]")
-    assert [job.name for job in jobs(compared(*typed), OUT)] == ["slot_oracle-d10-s0", "slot_oracle-d10-s1", "sold-s1"]
+    assert [job.name for job in success_jobs(compared(*typed), OUT)] == [
+        "slot_oracle-d10-s0",
+        "slot_oracle-d10-s1",
+        "sold-s1",
+    ]
     with pytest.raises(ConfigError, match=r"online_seeds: got .*, expected some of seeds"):
         compared("seeds=0,1", "compare.online_seeds=[2]")
 
 
 def test_a_job_has_its_own_folder_and_playslot_both_protocols() -> None:
-    job = Job("playslot", 10, 0, OUT)
+    job = SuccessJob("playslot", 10, 0, OUT)
     assert (job.run, job.file) == (OUT / "runs" / "playslot-d10-s0", OUT / "jobs" / "playslot-d10-s0.json")
     assert (job.stage, job.protocols) == ("policy", ("simulation", "imagination"))
-    assert (Job("lapo", 10, 0, OUT).stage, Job("lapo", 10, 0, OUT).protocols) == ("lapo", ("simulation",))
+    assert (SuccessJob("lapo", 10, 0, OUT).stage, SuccessJob("lapo", 10, 0, OUT).protocols) == ("lapo", ("simulation",))
 
 
 @pytest.mark.parametrize(("demos", "labels"), [(10, 10), (50, 50), (150, 50)])
 def test_labels_are_the_presets_or_all_there_are(demos: int, labels: int) -> None:
-    own = job_config(compared(), Job("playslot", demos, 2, OUT), "pretrained")
+    own = success_config(compared(), SuccessJob("playslot", demos, 2, OUT), "pretrained")
     assert (own.behaviour.labelled_demos, own.demos, own.seed, own.run) == (labels, demos, 2, "pretrained")
     assert not own.behaviour.oracle
     assert not own.evaluation.references
@@ -63,8 +68,8 @@ def test_labels_are_the_presets_or_all_there_are(demos: int, labels: int) -> Non
 
 def test_only_methods_on_slots_get_the_world_model() -> None:
     config = compared()
-    assert job_config(config, Job("resnet_oracle", 10, 0, OUT), "world").run == ""
-    assert job_config(config, Job("sold", None, 0, OUT), "world").run == str(Path("world").resolve())
+    assert success_config(config, SuccessJob("resnet_oracle", 10, 0, OUT), "world").run == ""
+    assert success_config(config, SuccessJob("sold", None, 0, OUT), "world").run == str(Path("world").resolve())
 
 
 @pytest.mark.parametrize(
@@ -74,9 +79,9 @@ def test_a_model_of_videos_is_made_once_for_all_jobs_that_build_on_it(method: Me
     config = compared(f"methods=slot_oracle,{method}")
     assert latent_models(config) == {METHODS[method].model: method}
     for demos, seed in ((10, 0), (50, 4)):
-        own = job_config(config, Job(method, demos, seed, OUT), "world").baselines
+        own = success_config(config, SuccessJob(method, demos, seed, OUT), "world").baselines
         assert getattr(own, method).world == str((OUT / folder).resolve())
-    others = job_config(config, Job("slot_oracle", 10, 0, OUT), "world").baselines
+    others = success_config(config, SuccessJob("slot_oracle", 10, 0, OUT), "world").baselines
     assert getattr(others, method).world == ""
 
 
@@ -85,26 +90,28 @@ def test_caddys_policy_and_oracle_share_one_model() -> None:
 
 
 def test_a_jobs_name_for_its_content_ignores_the_machine_and_nothing_else() -> None:
-    config, job = compared(), Job("playslot", 10, 0, OUT)
-    own = job_config(config, job, "pretrained")
-    name = job_record(job, own, {"slots": "a"})["fingerprint"]
-    assert job_record(job, replace(own, device="cpu", threads=1, workers=3), {"slots": "a"})["fingerprint"] == name
+    config, job = compared(), SuccessJob("playslot", 10, 0, OUT)
+    own = success_config(config, job, "pretrained")
+    name = success_record(job, own, {"slots": "a"})["fingerprint"]
+    assert success_record(job, replace(own, device="cpu", threads=1, workers=3), {"slots": "a"})["fingerprint"] == name
     changed = replace(own, behaviour=replace(own.behaviour, steps=7))
     others = [
-        job_record(job, changed, {"slots": "a"}),
-        job_record(job, own, {"slots": "b"}),
-        job_record(job, replace(own, episodes=3), {"slots": "a"}),
-        job_record(job, replace(own, compare=CompareConfig(evaluation_seed=1)), {"slots": "a"}),
+        success_record(job, changed, {"slots": "a"}),
+        success_record(job, own, {"slots": "b"}),
+        success_record(job, replace(own, episodes=3), {"slots": "a"}),
+        success_record(job, replace(own, compare=CompareConfig(evaluation_seed=1)), {"slots": "a"}),
     ]
     assert name not in {other["fingerprint"] for other in others}
-    record = job_record(job, own, {"slots": "a"})
+    record = success_record(job, own, {"slots": "a"})
     assert from_dict(ExperimentConfig, record["config"]) == own
 
 
 def test_a_methods_settings_are_those_of_its_own_jobs_only() -> None:
     def names(*typed: str) -> list[str]:
         config = compared("methods=playslot,lapo,dreamer", "demos=10", "seeds=0", *typed)
-        return [job_record(job, job_config(config, job, ""), {})["fingerprint"] for job in jobs(config, OUT)]
+        return [
+            success_record(job, success_config(config, job, ""), {})["fingerprint"] for job in success_jobs(config, OUT)
+        ]
 
     playslot, lapo, dreamer = names()
     assert names("baselines.dreamer.minutes=5")[:2] == [playslot, lapo]
@@ -118,24 +125,29 @@ def test_a_methods_settings_are_those_of_its_own_jobs_only() -> None:
     [
         (["env=grid_shapes"], "env=grid_shapes: got an environment without a simulator"),
         (["env=block_reach", "env.blocks.reward=sparse", "methods=dreamer"], "got sparse with method=dreamer"),
-        (["hydra.launcher=ray"], "got ray, expected an installed launcher: install it by"),
         (["baselines.resnet_oracle.weights=none.pt"], "weights: got none.pt, expected a file, auto"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(typed: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(LAUNCHERS, "ray", "a_module_that_is_not_installed")
+def test_what_cannot_be_compared_is_refused(typed: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        check_comparison(compared(*typed))
+        check_success(compared(*typed))
+
+
+def test_a_launcher_that_is_not_installed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(LAUNCHERS, "ray", "a_module_that_is_not_installed")
+    require_launcher("")
+    with pytest.raises(ConfigError, match="got ray, expected an installed launcher: install it by"):
+        require_launcher("ray")
 
 
 def test_a_sparse_reward_is_no_hindrance_to_methods_that_do_not_act() -> None:
-    check_comparison(compared("env=block_reach", "env.blocks.reward=sparse", "methods=resnet_oracle,lapo"))
+    check_success(compared("env=block_reach", "env.blocks.reward=sparse", "methods=resnet_oracle,lapo"))
 
 
 def test_the_shipped_world_model_of_another_task_is_refused() -> None:
-    check_comparison(compared("run=pretrained"))
+    check_success(compared("run=pretrained"))
     with pytest.raises(CheckpointError, match="got a world model of env=button_press, expected env=block_reach"):
-        check_comparison(compared("run=pretrained", "env=block_reach"))
+        check_success(compared("run=pretrained", "env=block_reach"))
 
 
 def test_too_few_demonstrations_are_refused() -> None:

@@ -11,10 +11,15 @@ from jobs_on_disk import comparison, finish
 
 from playslot_rl.config.methods import METHODS
 from playslot_rl.evaluation.intervals import wilson
-from playslot_rl.studies.page import cell, comparison_figure, comparison_page
-from playslot_rl.studies.plan import Job
-from playslot_rl.studies.report import count_parameters, failures, job_rows, summarise
+from playslot_rl.runs import Run
+from playslot_rl.studies.job import count_parameters
+from playslot_rl.studies.launch import Status, read_status, write_status
+from playslot_rl.studies.success.figure import success_figure
+from playslot_rl.studies.success.jobs import SuccessJob
+from playslot_rl.studies.success.page import cell, success_page
+from playslot_rl.studies.success.rows import job_rows, summarise
 from playslot_rl.visualization.charts import LIGHT, METHOD_STYLES, figure_bytes
+from playslot_rl.visualization.document import to_markdown
 
 
 def _of(result: dict[str, Any], method: str, protocol: str = "simulation", demos: int | None = 10) -> dict[str, Any]:
@@ -32,36 +37,34 @@ def test_seeds_are_pooled_and_their_range_is_kept(ended: dict[str, Any]) -> None
 
 
 def test_a_failed_job_is_a_row_and_no_number(ended: dict[str, Any]) -> None:
-    assert [row["name"] for row in failures(ended["rows"])] == ["lapo-d10-s0"]
+    assert [row["name"] for row in ended["rows"] if row["status"] != "done"] == ["lapo-d10-s0"]
     row = next(row for row in ended["rows"] if row["method"] == "lapo")
     assert (row["status"], row["success_rate"], row["parameters"]) == ("failed", None, None)
     assert "lapo" not in {row["method"] for row in ended["summary"]}
 
 
 def test_what_an_older_run_of_a_failed_job_left_is_not_counted(tmp_path: Path) -> None:
-    from playslot_rl.studies.launch import Status, write_status
-
-    job = finish(Job("lapo", 10, 0, tmp_path), {"simulation": 9})
+    job = finish(SuccessJob("lapo", 10, 0, tmp_path), {"simulation": 9})
     write_status(job.file, Status("failed", "f", "out of memory", 1.0))
-    assert job_rows(job, frame_skip=5)[0]["success_rate"] is None
+    assert job_rows(job, 5, read_status(job.file))[0]["success_rate"] is None
 
 
 def test_parameters_count_floats_of_run_and_parents(tmp_path: Path) -> None:
-    job = finish(Job("lapo", 10, 0, tmp_path), {"simulation": 9})
-    assert count_parameters(job.run, "lapo") == 12
-    finish(Job("lapo", 10, 0, tmp_path), {"simulation": 9}, parents={"lapo_model": "x"})
+    job = finish(SuccessJob("lapo", 10, 0, tmp_path), {"simulation": 9})
+    assert count_parameters(Run(job.run), "lapo") == 12
+    finish(SuccessJob("lapo", 10, 0, tmp_path), {"simulation": 9}, parents={"lapo_model": "x"})
     (job.run / "lapo_model").mkdir()
     (job.run / "lapo" / "checkpoint").rename(job.run / "lapo_model" / "checkpoint")
     finish(job, {"simulation": 9}, parents={"lapo_model": "x"})
-    assert count_parameters(job.run, "lapo") == 24
+    assert count_parameters(Run(job.run), "lapo") == 24
 
 
 def test_the_page_has_the_table_the_footnotes_and_the_failure(ended: dict[str, Any]) -> None:
-    page = comparison_page(ended)
+    page = to_markdown(success_page(ended))
     assert "| PlaySlot, simulation | 70 % (40 to 89; seeds 60 to 80) | – |" in page
     assert "| Slot Oracle, simulation | 100 % (72 to 100; 1 of 2 seeds) | 100 % (72 to 100; 1 of 2 seeds) |" in page
     assert "| DreamerV3, 30 s on 2 cores | 10,000 | 70 % (40 to 89; 1 of 2 seeds) |" in page
-    assert "| DreamerV3, 30 s on 1 core |" in comparison_page({**ended, "threads": 1})
+    assert "| DreamerV3, 30 s on 1 core |" in to_markdown(success_page({**ended, "threads": 1}))
     assert "PlaySlot saw the real actions of 5 of 10 demonstrations" in page
     assert "Slot Oracle saw the real actions of 10 of 10, 50 of 50 demonstrations" in page
     assert "ResNet Oracle starts from scratch weights" in page
@@ -79,9 +82,9 @@ def test_the_page_has_the_table_the_footnotes_and_the_failure(ended: dict[str, A
 
 
 def test_a_job_that_waits_is_no_failure(tmp_path: Path) -> None:
-    jobs = [finish(Job("lapo", 10, 0, tmp_path), {"simulation": 8}), Job("lapo", 50, 0, tmp_path)]
-    rows = [row for job in jobs for row in job_rows(job, frame_skip=5)]
-    page = comparison_page({**comparison(tmp_path, rows, summarise(rows)), "jobs": 2})
+    jobs = [finish(SuccessJob("lapo", 10, 0, tmp_path), {"simulation": 8}), SuccessJob("lapo", 50, 0, tmp_path)]
+    rows = [row for job in jobs for row in job_rows(job, 5, read_status(job.file))]
+    page = to_markdown(success_page({**comparison(tmp_path, rows, summarise(rows)), "jobs": 2}))
     assert "Failures: none." in page
     assert "Not finished: 1 of 2 jobs" in page
 
@@ -108,14 +111,14 @@ def test_seeds_of_a_method_that_acts_are_dots_beside_their_mean(ended: dict[str,
     first = next(row for row in ended["rows"] if row["method"] == "dreamer")
     second = {**first, "name": "dreamer-s1", "seed": 1, "success_rate": 0.1, "env_steps": 9000}
     rows = [*ended["rows"], second]
-    figure = comparison_figure({**ended, "rows": rows, "summary": summarise(rows)}, LIGHT)
+    figure = success_figure({**ended, "rows": rows, "summary": summarise(rows)}, LIGHT)
     points = [(tuple(line.get_xdata()), tuple(line.get_ydata())) for line in figure.axes[1].lines]
     assert ((10000, 9000), (pytest.approx(70), pytest.approx(10))) in points
     assert ((9500,), (pytest.approx(40),)) in points
 
 
 def test_the_plot_shows_every_series_in_its_methods_colour(ended: dict[str, Any]) -> None:
-    figure = comparison_figure(ended, LIGHT)
+    figure = success_figure(ended, LIGHT)
     left, right = figure.axes
     labels = left.get_legend_handles_labels()[1]
     assert {"PlaySlot", "PlaySlot, imagination", "Slot Oracle", "ResNet Oracle", "expert actions"} <= set(labels)
@@ -136,7 +139,7 @@ def test_the_plot_shows_every_series_in_its_methods_colour(ended: dict[str, Any]
 @pytest.mark.integration
 @pytest.mark.parametrize("kind", ["png", "svg"])
 def test_the_same_comparison_is_the_same_picture(ended: dict[str, Any], kind: str) -> None:
-    pictures = [figure_bytes(comparison_figure(ended, LIGHT), LIGHT, kind) for _ in range(2)]
+    pictures = [figure_bytes(success_figure(ended, LIGHT), LIGHT, kind) for _ in range(2)]
     assert pictures[0] == pictures[1]
     assert pictures[0].startswith(b"\x89PNG" if kind == "png" else b"<?xml")
 
@@ -144,5 +147,5 @@ def test_the_same_comparison_is_the_same_picture(ended: dict[str, Any], kind: st
 def test_a_comparison_without_results_is_drawn_too(ended: dict[str, Any]) -> None:
     rows = [row for row in ended["rows"] if row["method"] == "lapo"]
     empty = {**ended, "rows": rows, "summary": []}
-    assert figure_bytes(comparison_figure(empty, LIGHT), LIGHT, "png")
-    assert "**lapo-d10-s0: failed.**" in comparison_page(empty)
+    assert figure_bytes(success_figure(empty, LIGHT), LIGHT, "png")
+    assert "**lapo-d10-s0: failed.**" in to_markdown(success_page(empty))

@@ -19,9 +19,9 @@ from playslot_rl.config.methods import METHODS
 from playslot_rl.config.spelling import spelled
 from playslot_rl.errors import ConfigError, PlaySlotError
 from playslot_rl.studies import several
-from playslot_rl.studies.plan import Job, job_config, job_record, jobs
 from playslot_rl.studies.several import train_on_several, training_command
-from playslot_rl.studies.video_plan import VideoJob, video_job_config, video_job_record
+from playslot_rl.studies.success.jobs import SuccessJob, success_config, success_jobs, success_record
+from playslot_rl.studies.video.jobs import VideoJob, video_config, video_record
 
 
 def of(folder: Path, *typed: str, command: str = "compare") -> ExperimentConfig:
@@ -33,8 +33,8 @@ def test_every_job_of_a_comparison_is_spelled_as_arguments_that_make_it(tmp_path
     config = of(tmp_path, "methods=playslot,lapo", "demos=2", "seeds=1", "processes=2")
     assert config.compare.processes == 2
     plain = replace(config, compare=CompareConfig(evaluation_seed=3, processes=2))
-    for job in jobs(config, tmp_path):
-        own = job_config(plain, job, "pretrained/block_push_easy")
+    for job in success_jobs(config, tmp_path):
+        own = success_config(plain, job, "pretrained/block_push_easy")
         assert compose(spelled(own, "train-baseline"), "train-baseline") == own
 
 
@@ -42,10 +42,10 @@ def test_every_job_of_a_comparison_is_spelled_as_arguments_that_make_it(tmp_path
 def test_every_job_of_a_video_comparison_is_spelled_as_arguments_that_make_it(method: str, tmp_path: Path) -> None:
     config = of(tmp_path, "processes=3", f"compare_video.test={tmp_path}/held out", command="compare-video")
     job = VideoJob(method, 1, tmp_path / "out", "")  # type: ignore[arg-type]
-    own = video_job_config(config, job, "pretrained/block_push_easy")
+    own = video_config(config, job, "pretrained/block_push_easy")
     command = "train-dynamics" if job.trained_as == "playslot" else "train-baseline"
     assert compose(spelled(own, command), command) == own
-    assert video_job_record(job, own, {}, lpips=False)["processes"] == 3
+    assert video_record(job, own, {}, lpips=False)["processes"] == 3
 
 
 def test_a_config_that_no_arguments_make_is_refused(tmp_path: Path) -> None:
@@ -60,9 +60,9 @@ def test_processes_are_no_part_of_a_jobs_identity_and_methods_that_act_have_one(
     config = of(tmp_path)
 
     def record(method: str, processes: int) -> dict[str, object]:
-        job = Job(method, None if METHODS[method].online else 2, 0, tmp_path)  # type: ignore[arg-type, index]
+        job = SuccessJob(method, None if METHODS[method].online else 2, 0, tmp_path)  # type: ignore[arg-type, index]
         plain = replace(config, compare=CompareConfig(processes=processes))
-        return job_record(job, job_config(plain, job, "pretrained"), {})
+        return success_record(job, success_config(plain, job, "pretrained"), {})
 
     assert record("lapo", 1)["fingerprint"] == record("lapo", 4)["fingerprint"]
     assert [record(method, 4)["processes"] for method in ("lapo", "dreamer")] == [4, 1]
@@ -71,8 +71,8 @@ def test_processes_are_no_part_of_a_jobs_identity_and_methods_that_act_have_one(
 
 
 def test_a_training_is_started_by_torchrun_with_a_port_of_its_own(tmp_path: Path) -> None:
-    job = Job("lapo", 2, 0, tmp_path)
-    command = training_command("train-baseline", job_config(of(tmp_path), job, ""), 2)
+    job = SuccessJob("lapo", 2, 0, tmp_path)
+    command = training_command("train-baseline", success_config(of(tmp_path), job, ""), 2)
     assert command[1:8] == [
         "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", "playslot_rl", "train-baseline",
     ]  # fmt: skip

@@ -1,8 +1,7 @@
-"""Which trainings a video comparison has: one for each method and training seed, the same clips and budget for all."""
+"""Jobs of a comparison of videos: one for each method and training seed, the same clips and budget for all."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 from collections.abc import Mapping
@@ -15,7 +14,7 @@ from playslot_rl.config.compare_video import ON_SLOTS, TITLES, CompareVideoConfi
 from playslot_rl.config.methods import MethodName
 from playslot_rl.config.roles import without
 from playslot_rl.errors import ConfigError
-from playslot_rl.studies.plan import absolute, absolute_roots
+from playslot_rl.studies.job import Job, absolute, absolute_roots, fingerprint_of
 
 VARIED = ("model.inverse_dynamics.", "model.predictor.", "dynamics.")
 """Where the settings are that change what PlaySlot predicts, on a SAVi that is there."""
@@ -28,13 +27,10 @@ NOT_OF_A_JOB = ("methods", "seeds", "vary", "values", "objects", "processes", "l
 
 
 @dataclass(frozen=True)
-class VideoJob:
+class VideoJob(Job):
     """One training and its scores.
 
     Attributes:
-        method: what is trained.
-        seed: of the training.
-        out: folder of the comparison.
         variant: setting and value it is trained with, as `mode=hybrid`; empty trains it as the config says.
     """
 
@@ -45,7 +41,7 @@ class VideoJob:
 
     @property
     def name(self) -> str:
-        """Such as `svg-s0`, or `playslot-mode-hybrid-s0`: a folder's, and a word to Hydra, which `=` would end."""
+        """Such as `svg-s0` or `playslot-mode-hybrid-s0`."""
         return f"{self._method_name}-s{self.seed}"
 
     @property
@@ -55,7 +51,6 @@ class VideoJob:
 
     @property
     def title(self) -> str:
-        """As tables and plots name it."""
         return f"{TITLES[self.method]}, {self.variant}" if self.variant else TITLES[self.method]
 
     @property
@@ -65,23 +60,7 @@ class VideoJob:
 
     @property
     def stage(self) -> str:
-        """Stage of the run whose checkpoint is the method's."""
         return "dynamics" if self.trained_as == "playslot" else self.method
-
-    @property
-    def file(self) -> Path:
-        """What it is told."""
-        return self.out / "jobs" / f"{self.name}.json"
-
-    @property
-    def run(self) -> Path:
-        """The run folder it writes."""
-        return self.out / "runs" / self.name
-
-    @property
-    def wave(self) -> int:
-        """All at once."""
-        return 0
 
     @property
     def _method_name(self) -> str:
@@ -140,7 +119,7 @@ def check_variants(config: ExperimentConfig) -> None:
     for job in video_jobs(config, Path()):
         if job.variant:
             wanted = _with_setting(config, own.vary, job.value)
-            if _setting(video_job_config(config, job, ""), own.vary) != _setting(wanted, own.vary):
+            if _setting(video_config(config, job, ""), own.vary) != _setting(wanted, own.vary):
                 raise ConfigError(
                     f"values: got {job.value} for {own.vary}, expected what a comparison leaves as it is: methods, "
                     "lengths of clips and the context they allow are its own (compare_video.*)"
@@ -221,7 +200,7 @@ def in_steps(config: ExperimentConfig, method: VideoMethod, steps: int) -> Exper
     return with_training(config, method, steps=steps, **changes)
 
 
-def video_job_config(config: ExperimentConfig, job: VideoJob, world: str) -> ExperimentConfig:
+def video_config(config: ExperimentConfig, job: VideoJob, world: str) -> ExperimentConfig:
     """What a job trains with: the preset's settings, on clips of the same lengths, drawn alike, for every method.
 
     Args:
@@ -275,14 +254,12 @@ def _with_context(config: ExperimentConfig, method: VideoMethod, frames: int) ->
     return config
 
 
-def video_job_record(
-    job: VideoJob, config: ExperimentConfig, parents: Mapping[str, str], lpips: bool
-) -> dict[str, Any]:
+def video_record(job: VideoJob, config: ExperimentConfig, parents: Mapping[str, str], lpips: bool) -> dict[str, Any]:
     """What the job's file says.
 
     Args:
         job: which one.
-        config: its own (`video_job_config`).
+        config: its own (`video_config`).
         parents: fingerprints of the slots and the videos it builds on.
         lpips: whether there are weights for LPIPS: scores without it are not those with it.
     """
@@ -294,8 +271,7 @@ def video_job_record(
         result = without(replace(config, seed=seed), "machine")
         result.pop("compare_video", None)
         result["baselines"] = result["baselines"].get(job.method, {})  # another method's are none of this job's
-        identity = json.dumps([result, content, dict(parents), lpips], sort_keys=True)
-        return hashlib.sha256(identity.encode()).hexdigest()[:16]
+        return fingerprint_of([result, content, dict(parents), lpips])
 
     return {
         "kind": "video",

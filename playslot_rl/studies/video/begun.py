@@ -6,7 +6,6 @@ they come from is known here.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -14,7 +13,8 @@ from typing import Any, Final
 from playslot_rl.config import to_dict
 from playslot_rl.config.compare_video import CompareVideoConfig
 from playslot_rl.errors import CheckpointError
-from playslot_rl.studies.video_plan import VideoJob, makes_trials
+from playslot_rl.storage.atomic import json_or_nothing
+from playslot_rl.studies.video.jobs import VideoJob, makes_trials
 
 TRAINED_WITH: Final = ("trained_seed", "trained_frames", "tested")
 """Settings that a trial and a training are made with."""
@@ -63,10 +63,7 @@ def require_same_choice(
 
 def _begun_with(folder: Path) -> dict[str, Any]:
     """The comparison's settings in a run's config; empty where there is no run."""
-    try:
-        stored = json.loads((folder / "config.json").read_text())["compare_video"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
+    stored = json_or_nothing(folder / "config.json").get("compare_video")
     return stored if isinstance(stored, dict) else {}
 
 

@@ -1,4 +1,4 @@
-"""`playslot compare-video env=grid_shapes objects=1,2,...`: one comparison for each number, and one table of all."""
+"""Videos of GridShapes by the number of objects: one study for each number, and one table of all."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from pathlib import Path
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.errors import ConfigError, PlaySlotError
+from playslot_rl.storage.atomic import write_json, write_text
+from playslot_rl.studies.video.page import objects_page
+from playslot_rl.visualization.document import to_markdown
 
 
 def each_number(config: ExperimentConfig, compare: Callable[[ExperimentConfig], None]) -> None:
-    """Run the comparison for each of `compare_video.objects`, and write `OUT/video.json` and `OUT/video.md`.
+    """Run the study for each of `compare_video.objects`, and write `OUT/video.json` and `OUT/video.md`.
 
     With N objects a frame has N + 1 slots, and an action two numbers for each object.
 
     Args:
         config: with `out`.
-        compare: one comparison.
+        compare: one study.
 
     Raises:
         ConfigError: another task, or videos that have their number of objects already.
         PlaySlotError: trainings failed; all others have finished, and the tables say so.
     """
-    from playslot_rl.storage.atomic import write_json, write_text
-    from playslot_rl.studies.video_page import objects_page
-
     own, out, failed = config.compare_video, Path(config.out), list[str]()
     if config.env.name != "grid_shapes" or config.data.root or own.test or config.run:
         raise ConfigError(
@@ -44,7 +44,7 @@ def each_number(config: ExperimentConfig, compare: Callable[[ExperimentConfig], 
             failed.append(str(error))
         found[str(number)] = json.loads((part / "video.json").read_text())
         write_json(out / "video.json", {"objects": found})
-        write_text(out / "video.md", objects_page(found))
+        write_text(out / "video.md", to_markdown(objects_page(found)))
     print(f"compare-video: {out / 'video.md'}", flush=True)
     if failed:
         raise PlaySlotError("; ".join(failed))

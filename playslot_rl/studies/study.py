@@ -1,0 +1,228 @@
+"""A study: methods side by side, by one measure. Runs the jobs that are not done and writes `OUT/NAME.json`, its page
+`NAME.md`, its plot `NAME.png` and `.svg`, and what pictures the measure has.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.errors import PlaySlotError
+from playslot_rl.evaluation.success import hardware
+from playslot_rl.storage.atomic import json_or_nothing, write_bytes, write_json, write_text
+from playslot_rl.storage.checkpoints import provenance
+from playslot_rl.studies import launch
+from playslot_rl.studies.job import Job
+from playslot_rl.visualization.charts import LIGHT, Theme, figure_bytes
+from playslot_rl.visualization.document import Document, to_markdown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Record = Mapping[str, Any]
+"""What a job's file says; `fingerprint` names it."""
+Result = Mapping[str, Any]
+"""What `OUT/NAME.json` holds."""
+Commands = Mapping[str, Callable[[ExperimentConfig], object]]
+"""The `playslot` commands that a study has run, by name: `train-slots`, `train-dynamics`, `train-baseline`, `evaluate`,
+and `train-videos` for a model of unlabelled videos. They lie above it in the layers."""
+FOOTNOTES = "Footnotes"
+
+
+class Measure[J: Job](Protocol):
+    """What methods are measured by, and all that a study asks of it.
+
+    Attributes:
+        command: that was typed.
+        name: of the files that are written.
+        unit: what messages call a job.
+        config: of the study; `out` is its folder, and `prepare` completes it.
+    """
+
+    command: str
+    name: str
+    unit: str
+    config: ExperimentConfig
+
+    @property
+    def launcher(self) -> tuple[str, Sequence[str]]:
+        """Hydra's name of the launcher that runs the jobs (empty: one after the other), and overrides for Hydra."""
+
+    def check(self) -> None:
+        """Refuse what cannot be measured, before anything is written or computed.
+
+        Raises:
+            ConfigError, DataError, CheckpointError: one line.
+        """
+
+    def prepare(self) -> Mapping[J, Record]:
+        """Make what the jobs share, finished parts excepted; all jobs, in the order in which they run."""
+
+    @staticmethod
+    def run(record: Record, commands: Commands) -> None:
+        """Do what a job's file says, in a process of its own; what is done is skipped."""
+
+    def rows(self, job: J, status: launch.Status) -> list[dict[str, Any]]:
+        """What came out of a job, finished or not; each row has its `name`, `status` and `error`."""
+
+    def said(self, rows: Sequence[Mapping[str, Any]]) -> str:
+        """A finished job's rows in a few words."""
+
+    def result(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """The measure's part of the result."""
+
+    def page(self, result: Result) -> Document:
+        """What is read; its last sections, from `FOOTNOTES` on, are not printed."""
+
+    def figure(self, result: Result, theme: Theme) -> Figure:
+        """The plot."""
+
+    def sheets(self) -> Mapping[str, bytes]:
+        """Further pictures, PNG, by name."""
+
+
+class Study[J: Job]:
+    """Jobs under way, and what there is of their results.
+
+    Args:
+        measure: prepared.
+        jobs: with what their files say.
+        began: `time.monotonic()` at the start of the command.
+    """
+
+    def __init__(self, measure: Measure[J], jobs: Mapping[J, Record], began: float) -> None:
+        self._measure, self._jobs, self._began = measure, jobs, began
+        self._out = Path(measure.config.out)
+        self._spent = float(json_or_nothing(self._out / f"{measure.name}.json").get("seconds", 0.0))
+
+    def run(self) -> None:
+        """Write every job's file, and run those that are not done as they stand there.
+
+        Raises:
+            PlaySlotError: the launcher itself failed.
+            KeyboardInterrupt: Ctrl-C. In both cases what there is has been written.
+        """
+        command, due = self._measure.command, self._due()
+        launcher, hydra = self._measure.launcher
+        print(f"{command}: {len(due)} of {len(self._jobs)} jobs to run", flush=True)
+        try:
+            if launcher:
+                for wave in sorted({job.wave for job in due}):
+                    launch.run_sweep([job.file for job in due if job.wave == wave], launcher, hydra)
+            else:
+                for job in due:
+                    launch.run_process(job.file)
+                    self._ended(job)
+        except KeyboardInterrupt:
+            self.write()
+            raise KeyboardInterrupt(f"{command} interrupted; the same command carries on in {self._out}") from None
+        except PlaySlotError:
+            self.write()
+            raise
+
+    def _due(self) -> list[J]:
+        due = []
+        for job, record in self._jobs.items():
+            write_json(job.file, record)
+            if self._status(job).status == "done":
+                print(f"{job.name}: done before, skipped", flush=True)
+            else:
+                due.append(job)
+        return due
+
+    def _status(self, job: J) -> launch.Status:
+        """How a job stands; done with other settings, data or parents than those asked for, it is still to be done."""
+        status = launch.read_status(job.file)
+        return status if status.fingerprint == self._jobs[job]["fingerprint"] else launch.Status()
+
+    def _ended(self, job: J) -> None:
+        status = self._status(job)
+        said = status.error or self._measure.said(self._measure.rows(job, status)) or status.status
+        print(f"{job.name}: {said} ({status.seconds:.0f} s)", flush=True)
+        self.write(pictures=False)
+
+    def write(self, pictures: bool = True) -> tuple[Document, list[str]]:
+        """Write the result; returns its page, and the names of jobs that are not done.
+
+        Raises:
+            OutputError: full disk.
+        """
+        measure, rows = self._measure, [row for job in self._jobs for row in self._measure.rows(job, self._status(job))]
+        result = self._result(rows)
+        page = measure.page(result)
+        write_json(self._out / f"{measure.name}.json", result)
+        write_text(self._out / f"{measure.name}.md", to_markdown(page))
+        if pictures:
+            for kind in ("png", "svg"):
+                plot = figure_bytes(measure.figure(result, LIGHT), LIGHT, kind)
+                write_bytes(self._out / f"{measure.name}.{kind}", plot)
+            for name, sheet in measure.sheets().items():
+                write_bytes(self._out / f"{name}.png", sheet)
+        return page, list(dict.fromkeys(str(row["name"]) for row in rows if row["status"] != "done"))
+
+    def _result(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        config, made = self._measure.config, provenance()
+        return {
+            "env": config.env.name,
+            "preset": config.preset,
+            **self._measure.result(rows),
+            "seconds": round(self._spent + time.monotonic() - self._began, 1),
+            "command": made["command"],
+            "commit": made["commit"],
+            "version": made["version"],
+            "hardware": hardware(),
+        }
+
+
+def run_study[J: Job](measure: Measure[J]) -> None:
+    """Run what is missing, reuse what is done, write and print the result.
+
+    Raises:
+        ConfigError, DataError, CheckpointError: what is asked for cannot be compared; before anything is computed.
+        PlaySlotError: a job failed; the others have finished, and the page says so.
+        KeyboardInterrupt: Ctrl-C; the same command carries on.
+    """
+    began, out, command = time.monotonic(), Path(measure.config.out), measure.command
+    launch.require_launcher(measure.launcher[0])
+    measure.check()
+    launch.open_comparison(out)
+    with launch.comparison_lock(out):
+        jobs = measure.prepare()
+        study = Study(measure, jobs, began)
+        study.run()
+        page, left = study.write()
+    print(_tables(page), flush=True)
+    path = out / f"{measure.name}.md"
+    print(f"{command}: {time.monotonic() - began:.0f} s, {path}", flush=True)
+    if left:
+        raise PlaySlotError(
+            f"{command}: {len(left)} of {len(jobs)} {measure.unit} failed ({', '.join(left)}), the others finished; "
+            f"{path} says why, and the same command tries them again"
+        )
+
+
+def _tables(page: Document) -> str:
+    text = to_markdown(page).partition(f"## {FOOTNOTES}")[0]
+    return "\n".join(line for line in text.splitlines() if line.startswith("|"))
+
+
+def open_jobs_notes(rows: Sequence[Result], unit: str) -> list[str]:
+    """A footnote for each job that failed, and one for those that have not had their turn."""
+    jobs = {row["name"]: row for row in rows}
+    failed = [row for row in jobs.values() if row["status"] == "failed"]
+    waiting = [name for name, row in jobs.items() if row["status"] not in ("done", "failed")]
+    notes = [f"**{row['name']}: failed.** {row['error'] or ''}".rstrip() for row in failed]
+    notes.append(f"Failures: {len(failed)} of {len(jobs)} {unit}, see above." if failed else "Failures: none.")
+    if waiting:
+        notes.append(f"Not finished: {len(waiting)} of {len(jobs)} {unit}; the same command carries on.")
+    return notes
+
+
+def machine_note(result: Result) -> str:
+    """The footnote on command, commit and machine, without its full stop."""
+    at = result["hardware"]
+    where = f"{at['machine']}, {at['cores']} cores, {at['gpu'] or 'no GPU'}"
+    return f"Made by `{result['command']}` at commit {result['commit'] or 'unknown'}; {where}"

@@ -1,0 +1,1 @@
+"""Success of policies, by demonstrations, labels or environment steps."""

@@ -1,0 +1,179 @@
+"""Jobs of a comparison of success: one for each method, number of demonstrations, of labels, and training seed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config.methods import METHODS, MethodName, method_stage
+from playslot_rl.config.roles import without
+from playslot_rl.studies.job import Job, absolute, absolute_roots, fingerprint_of
+
+
+@dataclass(frozen=True)
+class SuccessJob(Job):
+    """One training and its evaluation.
+
+    Attributes:
+        demos: demonstrations it learns from; None for a method that acts.
+        labels: those of them whose real actions it sees; None for a method that sees all or none, or where the
+            comparison has one number for all (`behaviour.labelled_demos`).
+        policy_of: labels of the job, with the same demonstrations and seed, whose policy is this one's too; None for
+            one that trains its own.
+    """
+
+    method: MethodName
+    demos: int | None
+    seed: int
+    out: Path
+    labels: int | None = None
+    policy_of: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Such as `lapo-d50-s0`, `lapo-d50-l10-s0` or `dreamer-s0`."""
+        demos = "" if self.demos is None else f"-d{self.demos}"
+        labels = "" if self.labels is None else f"-l{self.labels}"
+        return f"{self.method}{demos}{labels}-s{self.seed}"
+
+    @property
+    def title(self) -> str:
+        return METHODS[self.method].title
+
+    @property
+    def stage(self) -> str:
+        return method_stage(self.method)
+
+    @property
+    def online(self) -> bool:
+        """Whether it learns by acting."""
+        return METHODS[self.method].online
+
+    @property
+    def model(self) -> Path | None:
+        """Run folder of the model of unlabelled videos that it takes, made once for all; None where it takes none."""
+        stage = METHODS[self.method].model
+        return model_folder(self.out, stage) if stage else None
+
+    @property
+    def wave(self) -> int:
+        """Those whose policy others take over come first; these would train it again, side by side."""
+        return int(self.policy_of is not None)
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """How it is evaluated."""
+        return ("simulation", "imagination") if self.method == "playslot" else ("simulation",)
+
+
+def success_jobs(config: ExperimentConfig, out: Path) -> list[SuccessJob]:
+    """All jobs, in the order in which they run: few demonstrations first, the methods side by side."""
+    wanted, labels = config.compare, sorted(config.compare.labels)
+    online = [name for name in wanted.methods if METHODS[name].online]
+    alone = [name for name in wanted.methods if METHODS[name].labelled_only]
+    others = [name for name in wanted.methods if name not in (*online, *alone)]
+    found: list[SuccessJob] = []
+    for seed in wanted.seeds:
+        found += [SuccessJob(name, n, seed, out, n) for n in labels for name in alone]
+        for demos in sorted(wanted.demos):
+            for name in others:
+                found += _of_demonstrations(name, demos, seed, out, labels)
+    seeds = wanted.online_seeds or wanted.seeds
+    return [*found, *(SuccessJob(name, None, seed, out) for seed in seeds for name in online)]
+
+
+def _of_demonstrations(method: MethodName, demos: int, seed: int, out: Path, labels: Sequence[int]) -> list[SuccessJob]:
+    """One job, or one for each number of labels where the method's policy needs none and serves them all."""
+    if not labels or not METHODS[method].decodes:
+        return [SuccessJob(method, demos, seed, out)]
+    return [SuccessJob(method, demos, seed, out, n, None if n == labels[0] else labels[0]) for n in labels]
+
+
+def uses_demos(config: ExperimentConfig) -> bool:
+    """Whether a method learns from demonstrations."""
+    return any(not METHODS[name].online for name in config.compare.methods)
+
+
+def uses_slots(config: ExperimentConfig) -> bool:
+    """Whether a method builds on a world model."""
+    return any(METHODS[name].slots for name in config.compare.methods)
+
+
+def latent_models(config: ExperimentConfig) -> dict[str, MethodName]:
+    """Stages of the models of unlabelled videos that methods build on, and for each of them a method that does."""
+    return {METHODS[name].model: name for name in config.compare.methods if METHODS[name].model}
+
+
+def model_folder(out: Path, stage: str) -> Path:
+    """Run folder of such a model in a comparison: `OUT/lapo_world`, `OUT/caddy_world`."""
+    return out / f"{stage.removesuffix('_model')}_world"
+
+
+def success_config(config: ExperimentConfig, job: SuccessJob, world: str) -> ExperimentConfig:
+    """What a job trains with.
+
+    Labels are the job's, else `behaviour.labelled_demos` or, with fewer demonstrations, all of them. PlaySlot's own
+    oracle and the references of each evaluation are left out: the slot oracle is a method, and the references run once.
+    Paths are absolute, so that a job runs from any folder.
+
+    Args:
+        config: of the comparison, with `data` complete.
+        job: which one.
+        world: run folder of the world model, or `pretrained`.
+    """
+    labelled = job.labels or min(config.behaviour.labelled_demos, job.demos or config.behaviour.labelled_demos)
+    policy = "" if job.policy_of is None else absolute(str(replace(job, labels=job.policy_of).run))
+    own = {}
+    if job.model is not None:
+        own = {job.method: replace(getattr(config.baselines, job.method), world=absolute(str(job.model)))}
+    data = replace(
+        config.data,
+        root=absolute_roots(config.data.root),
+        demos=absolute(config.data.demos),
+        cache=absolute(config.data.cache),
+        draw=None if job.online else job.seed,
+    )
+    return replace(
+        config,
+        method=job.method,
+        demos=job.demos,
+        seed=job.seed,
+        data=data,
+        out=absolute(str(job.run)),
+        run=absolute(world) if METHODS[job.method].slots else "",
+        protocol="simulation",
+        behaviour=replace(config.behaviour, labelled_demos=labelled, oracle=False, policy_from=policy),
+        baselines=replace(config.baselines, **own),
+        evaluation=replace(config.evaluation, references=False),
+        logging=replace(config.logging, progress=False),
+    )
+
+
+def success_record(job: SuccessJob, config: ExperimentConfig, parents: Mapping[str, str]) -> dict[str, Any]:
+    """What the job's file says.
+
+    Args:
+        job: which one.
+        config: its own (`success_config`).
+        parents: fingerprints of the weights and demonstrations it builds on.
+    """
+    result = without(config, "machine")  # of data and parents the content counts
+    result["baselines"] = result["baselines"].get(job.stage, {})  # another method's settings are none of this job's
+    if result["model"]["predictor"]["kind"] == "cocvp":
+        del result["model"]["predictor"]["kind"]  # jobs from before there was a choice are the same jobs
+    return {
+        "name": job.name,
+        "method": job.method,
+        "demos": job.demos,
+        "labels": job.labels,
+        "seed": job.seed,
+        "evaluation_seed": config.compare.evaluation_seed,
+        "protocols": list(job.protocols),
+        "stage": job.stage,
+        "processes": 1 if job.online else config.compare.processes,
+        "fingerprint": fingerprint_of([result, config.compare.evaluation_seed, dict(parents)]),
+        "config": to_dict(config),
+    }

@@ -1,0 +1,237 @@
+"""`comparison.md`: success against demonstrations or labels and against environment steps, with footnotes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from playslot_rl.config.methods import LATENT_MODELS, METHODS
+from playslot_rl.runtime.progress import format_seconds
+from playslot_rl.studies.study import FOOTNOTES, Result, machine_note, open_jobs_notes
+from playslot_rl.visualization.document import Block, Document, Linked, Notes, Section, Table, Text
+
+
+def success_page(result: Result) -> Document:
+    """The page of what `comparison.json` holds."""
+    lead = (
+        f"Preset `{result['preset']}`, training seeds {_list(result['seeds'])}, {result['episodes']} held-out episodes "
+        f"(block {result['evaluation_seed']} of the evaluation seeds, the same for every method and seed), at most "
+        f"{result['max_steps']} agent steps. Success is the mean over the training seeds; in brackets its 95 % Wilson "
+        "interval over the episodes, which all seeds share, and after it the lowest and the highest seed."
+    )
+    sections = [
+        *(_by_labels if result["labels"] else _by_demonstrations)(result["summary"], len(result["seeds"])),
+        *_by_acting(result),
+        Section(FOOTNOTES, [Notes(_footnotes(result))]),
+        Section("Every job", [_jobs(result["rows"])]),
+    ]
+    title = f"{result['env']}: success against {'labels' if result['labels'] else 'demonstrations'}"
+    return Document(title, lead, sections, [Linked("Success rate", "comparison.png")])
+
+
+def _by_demonstrations(summary: Sequence[Result], seeds: int) -> list[Section]:
+    rows = [row for row in summary if row["demos"] is not None]
+    if not rows:
+        return []
+    return [Section("By demonstrations", [_success_table(rows, "demos", "demonstrations", seeds)])]
+
+
+def _by_labels(summary: Sequence[Result], seeds: int) -> list[Section]:
+    """A table for each number of videos: methods by labelled demonstrations, and the oracles, which see all actions."""
+    rows = [row for row in summary if row["demos"] is not None]
+    sections = []
+    for videos in sorted({row["demos"] for row in rows if not METHODS[row["method"]].labelled_only}) or [None]:
+        own = [row for row in rows if METHODS[row["method"]].labelled_only or row["demos"] == videos]
+        blocks: list[Block] = [_success_table(own, "labels", "labelled", seeds)]
+        ceiling = [f"{row['title']} {cell(row, seeds)}" for row in own if row["labels"] is None]
+        if ceiling:
+            blocks.append(Text(f"With the actions of all {videos}: {'; '.join(ceiling)}."))
+        sections.append(Section(f"By labelled demonstrations{f', of {videos} videos' if videos else ''}", blocks))
+    return sections
+
+
+def _success_table(rows: Sequence[Result], key: str, unit: str, seeds: int) -> Table:
+    """Methods and protocols by `demos` or `labels`; rows without that number are left out."""
+    own = [row for row in rows if row[key] is not None]
+    numbers = sorted({row[key] for row in own})
+    cells = {(row["title"], row["protocol"], row[key]): cell(row, seeds) for row in own}
+    series = dict.fromkeys((row["title"], row["protocol"]) for row in own)
+    body = [[f"{t}, {p}", *(cells.get((t, p, n), "–") for n in numbers)] for t, p in series]
+    return Table(["", *(f"{n} {unit}" for n in numbers)], body)
+
+
+def _by_acting(result: Result) -> list[Section]:
+    rows = [row for row in result["summary"] if row["demos"] is None]
+    if not rows:
+        return []
+    seeds = len(result["seeds"])
+    body = [[budgeted(row, result), _number(row["env_steps"]), cell(row, seeds)] for row in rows]
+    return [Section("By acting", [Table(["", "environment steps", "success"], body)])]
+
+
+def budgeted(row: Result, result: Result) -> str:
+    """A method that acts is only as good as its time: `DreamerV3, 1 h 00 min on 2 cores`; the cores are its threads."""
+    spent, cores = row["train_seconds"], result["threads"] or result["hardware"]["cores"]
+    if spent is None:
+        return str(row["title"])
+    return f"{row['title']}, {format_seconds(spent)} on {cores} core{'s' if cores > 1 else ''}"
+
+
+def cell(row: Result, seeds: int) -> str:
+    """Rate, interval and range of the seeds: `97 % (93 to 99; seeds 96 to 98)`; and how many of `seeds`, if not all."""
+    low, high = (100 * end for end in row["ci95"])
+    text = f"{100 * row['success_rate']:.0f} % ({low:.0f} to {high:.0f}"
+    if len(row["seeds"]) > 1:
+        text += f"; seeds {100 * row['lowest']:.0f} to {100 * row['highest']:.0f}"
+    if len(row["seeds"]) < seeds:
+        text += f"; {len(row['seeds'])} of {seeds} seeds"
+    return f"{text})"
+
+
+def _footnotes(result: Result) -> list[str]:
+    rows: Sequence[Result] = result["rows"]
+    done = [row for row in rows if row["status"] == "done"]
+    notes = [f"{name}: {_reference(value)}, on the same episodes." for name, value in result["references"].items()]
+    notes += _ratios(result["summary"])
+    notes += [
+        f"Labels: {row['title']} saw the real actions of {row['labels']}."
+        for row in ({"title": t, "labels": _labels(done, t)} for t in _titles(done) if _labels(done, t))
+    ]
+    notes += _acting_cost(result)
+    notes += _one_each(done, "pretraining", "{title} starts from {value} weights.")
+    sizes = _one_each(done, "parameters", "{title} {value}")
+    notes += [f"Parameters, those of the models it builds on included: {'; '.join(sizes)}."] if sizes else []
+    kept = [f"{title} {_kept(shares)}" for title in _titles(done) if (shares := _shares(done, title))]
+    notes += [f"Rows learned from; still stretches of the videos are left out: {'; '.join(kept)}."] if kept else []
+    samples = _one_each(done, "samples", "{title} {value}")
+    counted = "Training of the policy, optimiser steps times batch (decoder and fine-tuning, which follow, not counted)"
+    notes += [f"{counted}: {'; '.join(samples)}."] if samples else []
+    notes.append(_times(done, result))
+    notes += _shared(result)
+    return [*notes, *open_jobs_notes(rows, "jobs"), f"{machine_note(result)}."]
+
+
+def _acting_cost(result: Result) -> list[str]:
+    """What acting cost, in both kinds of steps."""
+    notes = []
+    for row in result["summary"]:
+        if row["demos"] is None and row["agent_steps"] is not None:
+            prior = ", those of the videos its slots were trained on included" if METHODS[row["method"]].slots else ""
+            notes.append(
+                f"{row['title']}: {row['env_steps']:,} environment steps, which are {row['agent_steps']:,} agent steps "
+                f"of {result['frame_skip']}{prior}; mean over the seeds."
+            )
+    return notes
+
+
+def _shared(result: Result) -> list[str]:
+    """Models that were trained once, on unlabelled videos, for all demonstrations and seeds."""
+    notes, world = [], result.get("world_model")
+    rest = "the same for every number of demonstrations and every seed"
+    if result["learn_from_demos"]:
+        rest += "; the preset's own demonstrations are among them, as videos"
+    if world:
+        notes.append(
+            f"World model of the methods on slots ({world['source']}; slots {world['fingerprints']['slots']}): "
+            f"{world['seconds']:.0f} s of training on {world['episodes']} videos without actions, {rest}."
+        )
+    for stage, model in result["latent_models"].items():
+        notes.append(
+            f"{LATENT_MODELS[stage]}: {model['seconds']:.0f} s of training on {model['episodes']} videos without "
+            f"actions, {rest}."
+        )
+    return notes
+
+
+def _ratios(summary: Sequence[Result]) -> list[str]:
+    """PlaySlot's success in simulation as a share of the Slot Oracle's, which sees all real actions."""
+    rates = {
+        (row["method"], row["demos"]): row["success_rate"]
+        for row in summary
+        if row["protocol"] == "simulation" and row["labels"] is None
+    }
+    shares = [
+        f"{100 * rate / rates['slot_oracle', demos]:.0f} % at {demos}"
+        for (method, demos), rate in rates.items()
+        if method == "playslot" and rates.get(("slot_oracle", demos))
+    ]
+    if not shares:
+        return []
+    return [f"PlaySlot's success in simulation over the Slot Oracle's: {', '.join(shares)} demonstrations."]
+
+
+def _titles(rows: Sequence[Result]) -> list[str]:
+    return list(dict.fromkeys(row["title"] for row in rows))
+
+
+def _labels(rows: Sequence[Result], title: str) -> str:
+    found: dict[int, set[int]] = {}
+    for row in rows:
+        if row["title"] == title and row["demos"] is not None and row["labelled_demos"] is not None:
+            found.setdefault(row["demos"], set()).add(row["labelled_demos"])
+    said = _list(f"{_list(sorted(labels))} of {demos}" for demos, labels in sorted(found.items()))
+    return f"{said} demonstrations" if said else ""
+
+
+def _shares(rows: Sequence[Result], title: str) -> list[float]:
+    return sorted({row["kept_rows"] for row in rows if row["title"] == title and row.get("kept_rows") is not None})
+
+
+def _kept(shares: Sequence[float]) -> str:
+    least, most = f"{100 * shares[0]:.0f}", f"{100 * shares[-1]:.0f}"
+    return f"{least} %" if least == most else f"{least} to {most} %"
+
+
+def _one_each(rows: Sequence[Result], key: str, text: str) -> list[str]:
+    notes = []
+    for title in _titles(rows):
+        values = sorted({row[key] for row in rows if row["title"] == title and row[key] is not None})
+        if values:
+            notes.append(text.format(title=title, value=_list(map(_number, values))))
+    return notes
+
+
+def _times(rows: Sequence[Result], result: Result) -> str:
+    parts = []
+    for title in _titles(rows):
+        unique = {row["name"]: row for row in rows if row["title"] == title}
+        trained = [row["train_seconds"] or 0.0 for row in unique.values()]
+        played = sum(row["evaluation_seconds"] or 0.0 for row in rows if row["title"] == title)
+        mean = sum(trained) / len(trained)
+        parts.append(f"{title} {mean:.0f} s a training, {played / len(unique):.0f} s its evaluation")
+    whole = f"{result['seconds']:.0f} s of wall time for the whole, data and world model included where they were made"
+    return f"Time: {'; '.join([*parts, whole])}."
+
+
+def _reference(value: Result) -> str:
+    if value["success_rate"] is None:
+        return "not run"
+    low, high = value["ci95"]
+    return f"{100 * value['success_rate']:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
+
+
+def _jobs(rows: Sequence[Result]) -> Table:
+    headers = ["job", "protocol", "status", "success", "labels", "environment steps", "training", "evaluation"]
+    body = [
+        [
+            row["name"],
+            row["protocol"],
+            row["status"],
+            "–" if row["success_rate"] is None else f"{row['successes']} of {row['episodes']}",
+            _number(row["labelled_demos"]),
+            _number(row["env_steps"]),
+            "–" if row["train_seconds"] is None else f"{row['train_seconds']:.0f} s",
+            "–" if row["evaluation_seconds"] is None else f"{row['evaluation_seconds']:.0f} s",
+        ]
+        for row in rows
+    ]
+    return Table(headers, body)
+
+
+def _number(value: object) -> str:
+    if value is None:
+        return "–"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def _list(values: Iterable[object]) -> str:
+    return ", ".join(map(str, values))

@@ -1,0 +1,1 @@
+"""Predicted frames, by the number of seed frames."""

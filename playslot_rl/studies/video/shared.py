@@ -1,0 +1,150 @@
+"""What the jobs of a comparison of videos share: clips, the SAVi of methods on slots, and rows without training."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from playslot_rl.collectors import collect
+from playslot_rl.collectors.presets import collect_demos, collect_videos
+from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config.compare_video import ON_SLOTS
+from playslot_rl.config.weights import data_roots
+from playslot_rl.data.windows import Clips
+from playslot_rl.envs import PROCEDURAL
+from playslot_rl.errors import ConfigError
+from playslot_rl.evaluation.lpips import open_lpips
+from playslot_rl.methods.video.load import check_pixel_model
+from playslot_rl.methods.video.scores import as_function, score_clips
+from playslot_rl.methods.video.slots import LastFrame, Reconstruction
+from playslot_rl.runs import Run
+from playslot_rl.runtime.devices import open_device
+from playslot_rl.storage.atomic import json_or_nothing, write_json
+from playslot_rl.storage.checkpoints import require_config
+from playslot_rl.studies.study import Commands
+from playslot_rl.studies.video.clips import open_clips, test_sets, tested_clips
+from playslot_rl.studies.video.jobs import uses_slots
+from playslot_rl.studies.video.page import LAST_FRAME, RECONSTRUCTION
+from playslot_rl.training.record import open_videos
+
+TEST_SEED = 1_000_003
+"""Of a recorded test set: no collection of a preset has it, so that no shipped model has seen its episodes."""
+
+
+def check_models(config: ExperimentConfig) -> None:
+    """Refuse models that do not fit the frames, before anything is computed.
+
+    Raises:
+        ConfigError, CheckpointError: SAVi was trained on frames of another size, SVG-LP or CADDY cannot take these, or
+            the weights of a perceptual loss cannot be read.
+    """
+    for method in config.compare_video.methods:
+        if method not in ON_SLOTS:
+            check_pixel_model(method, config.baselines, config.env.image_size)
+    if config.run and uses_slots(config):
+        require_config(Run.open(config.run).stage("slots"), {"env": {"image_size": config.env.image_size}})
+
+
+def check_clips(config: ExperimentConfig) -> None:
+    """Refuse data without enough clips, and tests on what is trained on, before anything long is computed.
+
+    Raises:
+        ConfigError: a test set is one of the sets that are trained on.
+        DataError: too few episodes, or none as long as a clip of training or test.
+    """
+    own = config.compare_video
+    trained = open_videos(config, config.data.root, "compare-video")
+    folders = {Path(root.path).resolve() for root in data_roots(config.data.root)}
+    for tested in tested_clips(config):
+        test = test_sets(config)[tested.label]
+        if test and (Path(test).resolve() in folders or tested.source.fingerprint == trained.fingerprint):
+            raise ConfigError(
+                f"compare_video.test={test}: got videos of data.root, which models are trained on, expected others: "
+                "leave it out to keep a tenth of data.root's episodes"
+            )
+    Clips(trained, own.trained_seed + own.trained_frames, config.data.validation, config.seed)
+
+
+def prepare_videos(config: ExperimentConfig) -> ExperimentConfig:
+    """The config with the data sets of training and test, which are recorded where none were named.
+
+    Raises:
+        DataError, OutputError: see `playslot_rl.errors`.
+    """
+    own, out = config.compare_video, Path(config.out)
+    if config.data.root:
+        return config
+    data = collect_demos(config, out) if config.collect.learn_from_demos else config.data
+    config = replace(config, data=collect_videos(replace(config, data=data), out))
+    config = replace(config, data=replace(config.data, demos="", held_out=0))
+    if own.test:
+        return config
+    policies = ("random",) if config.env.name in PROCEDURAL else own.tested_on  # there it has no expert
+    tests = {policy: out / "data" / "test" / policy for policy in policies}
+    for policy, test in tests.items():
+        steps = config.collect.expert_steps if policy == "expert" else config.collect.random_steps
+        collect(config, policy, own.episodes, steps, test, TEST_SEED, config.workers)
+    return replace(config, compare_video=replace(own, test=",".join(map(str, tests.values()))))
+
+
+def prepare_slots(config: ExperimentConfig, commands: Commands) -> ExperimentConfig:
+    """The config with the run of the SAVi that methods on slots share, which is trained where none was named.
+
+    Raises:
+        DataError, CheckpointError, OutputError, TrainingError: see `playslot_rl.errors`.
+    """
+    if config.run or not uses_slots(config):
+        return config
+    model = str(Path(config.out) / "world_model")
+    commands["train-slots"](replace(config, out=model, run=""))
+    return replace(config, run=model)
+
+
+def parent_prints(config: ExperimentConfig) -> dict[str, str]:
+    """Fingerprints of the videos, the tests and the SAVi that all trainings have in common."""
+    parents = {"videos": open_videos(config, config.data.root, "compare-video").fingerprint}
+    for label, test in test_sets(config).items():
+        parents[f"test {label}".strip()] = open_clips(config, test, 2, 2)[0].fingerprint
+    if uses_slots(config):
+        parents["slots"] = Run.open(config.run).stage("slots").fingerprint
+    return parents
+
+
+def score_references(config: ExperimentConfig, parents: dict[str, str]) -> list[dict[str, Any]]:
+    """Scores of the rows that need no training; read, where they were scored on the same clips."""
+    own, path = config.compare_video, Path(config.out) / "references.json"
+    network = open_lpips(config.metrics.lpips_weights).network
+    asked = [own.shown, own.predicted, own.clips, own.tested, list(test_sets(config)), network is not None]
+    content = repr([asked, to_dict(config.env), sorted(parents.items())])
+    print_ = hashlib.sha256(content.encode()).hexdigest()[:16]
+    stored = json_or_nothing(path)
+    rows: list[dict[str, Any]] = stored.get("rows", [])
+    if stored.get("fingerprint") == print_:
+        return rows
+    device = open_device(config.device, config.threads)
+    models: dict[str, tuple[str, Any]] = {LAST_FRAME: ("nothing", LastFrame())}
+    if "slots" in parents:
+        models[RECONSTRUCTION] = ("the frames themselves", Reconstruction(Run.open(config.run).load_savi(device)))
+    rows, clips = [], []
+    for tested in tested_clips(config):
+        label, shown, source, at = tested
+        clips.append(tested.fingerprint)
+        for title, (sees, model) in models.items():
+            scores, _ = score_clips(as_function(model, shown), source, at, shown, device, lpips=network)
+            rows.append({"title": title, "row": "", "sees": sees, "clips_of": label, "seed_frames": shown, **scores})
+    write_json(path, {"fingerprint": print_, "clips": clips, "rows": rows})
+    return rows
+
+
+def true_frames(config: ExperimentConfig) -> dict[tuple[str, int], npt.NDArray[np.uint8]]:
+    """Frames of the first clips by test set and number of seed frames, uint8 (clips, P, H, W, 3)."""
+    own = config.compare_video
+    return {
+        (label, shown): source.frames[rows[: own.pictures, shown:]]
+        for label, shown, source, rows in tested_clips(config)
+    }

@@ -1,0 +1,162 @@
+"""A job of a comparison of videos: the learning rate that suits a method, its training, scores on held-out clips."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.errors import TrainingError
+from playslot_rl.evaluation.lpips import open_lpips
+from playslot_rl.methods.video.load import load_video
+from playslot_rl.methods.video.rows import method_rows
+from playslot_rl.methods.video.scores import score_clips
+from playslot_rl.runs import Run
+from playslot_rl.runtime.devices import open_device
+from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing, write_json
+from playslot_rl.storage.checkpoints import StageCheckpoint
+from playslot_rl.storage.locks import locked
+from playslot_rl.studies.several import train_on_several
+from playslot_rl.studies.study import Commands, Record
+from playslot_rl.studies.video.begun import require_same_choice
+from playslot_rl.studies.video.clips import sheet_name, tested_clips
+from playslot_rl.studies.video.jobs import (
+    TRIAL_SEED,
+    VideoJob,
+    asked_of,
+    in_steps,
+    makes_trials,
+    training_of,
+    with_training,
+)
+
+
+class VideoTraining:
+    """A job under way.
+
+    Args:
+        job: which one.
+        record: what its file says.
+        commands: by which it is trained in one process; several are started by torchrun.
+    """
+
+    def __init__(self, job: VideoJob, record: Record, commands: Commands) -> None:
+        self._job, self._record, self._commands = job, record, commands
+        self._asked = asked_of(record)
+
+    def run(self, config: ExperimentConfig) -> None:
+        """Choose, train, score; finished parts are skipped.
+
+        Raises:
+            PlaySlotError: whatever the training or its data refuse.
+        """
+        config = self._chosen(config)
+        self._train(config)
+        self._score(config)
+
+    def _train(self, config: ExperimentConfig) -> None:
+        command = "train-dynamics" if self._job.trained_as == "playslot" else "train-baseline"
+        processes = int(self._record["processes"])
+        if processes > 1:
+            train_on_several(command, config, processes)
+        else:
+            self._commands[command](config)
+
+    def _chosen(self, config: ExperimentConfig) -> ExperimentConfig:
+        """The config with the learning rate that was best after short trials, and the steps that fit the budget.
+
+        The method's job that comes first makes the trials; those of its other seeds wait for them.
+        """
+        job, path = self._job, self._job.choice
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with locked(path.with_suffix(".lock")):
+            stored = json.loads(path.read_text()) if path.is_file() else {}
+            if stored.get("fingerprint") != self._record["choice"]:
+                chosen = self._tried(config)
+                require_same_choice(job, self._asked, chosen, stored)
+                stored = {"fingerprint": self._record["choice"], **chosen}
+                write_json(path, stored)
+        own = training_of(config, job.method)
+        optim = replace(own.optim, lr=own.optim.lr * float(stored["rate"]))
+        return in_steps(with_training(config, job.method, optim=optim), job.method, int(stored["steps"]))
+
+    def _tried(self, config: ExperimentConfig) -> dict[str, Any]:
+        """The factor of the learning rate, the steps, and the trials that led to them."""
+        asked, steps = self._asked, int(training_of(config, self._job.method).steps)
+        if not makes_trials(asked):
+            return {"rate": asked.rates[0], "steps": steps, "tried": []}
+        small = in_steps(replace(config, seed=TRIAL_SEED), self._job.method, asked.trial_steps)
+        tried = [self._trial(small, rate) for rate in asked.rates]
+        ended = [trial for trial in tried if trial["psnr"] is not None]
+        if not ended:
+            raise TrainingError(f"compare_video.rates={','.join(map(str, asked.rates))}: {tried[0]['error']}")
+        best = max(ended, key=lambda trial: float(trial["psnr"]))
+        seconds = min(float(trial["seconds_a_step"]) for trial in ended)
+        if asked.budget_minutes and seconds:
+            steps = max(1, round(60 * asked.budget_minutes / seconds))
+        return {"rate": best["rate"], "steps": steps, "tried": tried}
+
+    def _trial(self, config: ExperimentConfig, rate: float) -> dict[str, Any]:
+        """Validation PSNR after a short training with a factor of the learning rate, and what a step takes; both None
+        with a rate that the training does not survive, and its `error`."""
+        job, own = self._job, training_of(config, self._job.method)
+        out, failed = job.trial(rate), {"rate": rate, "psnr": None, "seconds_a_step": None}
+        try:
+            optim = replace(own.optim, lr=own.optim.lr * rate)
+        except ValueError as error:  # beyond the bounds of a rate
+            return failed | {"error": str(error)}
+        steps = {"checkpoint_every": own.steps, "validate_every": own.steps}
+        try:
+            self._train(replace(with_training(config, job.method, optim=optim, **steps), out=str(out)))
+        except TrainingError as error:
+            return failed | {"error": str(error)}
+        done = Run(out).own(job.stage)
+        return {
+            "rate": rate,
+            "psnr": float(done.meta["metrics"].get("psnr", float("-inf"))),
+            "seconds_a_step": float(done.meta["seconds"]) / own.steps,
+        }
+
+    def _score(self, config: ExperimentConfig) -> None:
+        """Write `RUN/video.json` and the predictions of the first clips."""
+        job, began = self._job, time.monotonic()
+        device = open_device(config.device, config.threads)
+        model = load_video(job.trained_as, job.run, device)
+        done = Run(job.run).own(job.stage)
+        network = open_lpips(config.metrics.lpips_weights).network
+        scores, pictures, clips = list[dict[str, Any]](), dict[str, Any](), list[str]()
+        for tested in tested_clips(config):
+            label, shown, source, rows = tested
+            clips.append(tested.fingerprint)
+            for row in method_rows(model, shown):
+                values, frames = score_clips(
+                    row.predict, source, rows, shown, device,
+                    lpips=network, shuffled=row.shuffled, shown=self._asked.pictures,
+                )  # fmt: skip
+                scores.append({"row": row.name, "clips_of": label, "seed_frames": shown, "sees": row.sees, **values})
+                if not row.name:
+                    pictures[sheet_name(label, shown)] = frames
+        with explain_write_errors(job.pictures):
+            np.savez_compressed(job.pictures, **pictures)
+        facts = {"fingerprint": self._record["fingerprint"], "clips": clips, "scores": scores}
+        write_json(job.scores, facts | _of_training(job, done, time.monotonic() - began))
+
+
+def _of_training(job: VideoJob, done: StageCheckpoint, score_seconds: float) -> dict[str, Any]:
+    """What the result says of the training; `validation` is PSNR on validation clips over its steps."""
+    path = job.run / job.stage / "metrics.jsonl"
+    rows = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+    validated = [row for row in rows if row.get("split") == "validation" and "psnr" in row]
+    return {
+        "metrics": done.meta["metrics"],
+        "validation": [{"step": row["step"], "psnr": row["psnr"]} for row in validated],
+        "steps": done.meta["steps"],
+        "train_seconds": done.meta["seconds"],
+        "score_seconds": round(score_seconds, 1),
+        "choice": json_or_nothing(job.choice),
+        "perceptual": done.meta.get("perceptual"),
+    }
