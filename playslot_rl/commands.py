@@ -5,29 +5,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-TRAINED: Final = ("env", "preset", "seed", "out", "device", "threads", "data.root", "data", "logging")
+TRAINED: Final = "env preset seed out device threads data.root data logging"
 """What every training reads, beside its own groups."""
-MADE: Final = ("env", "render", "collect")
+MADE: Final = "env render collect"
 """What decides which episodes are recorded."""
-TASK: Final = ("env", "render")
-STAGES: Final = ("model", "slots", "dynamics", "behaviour")
+TASK: Final = "env render"
+STAGES: Final = "model slots dynamics behaviour"
 
 
 @dataclass(frozen=True)
 class Command:
-    """One sub-command: what `--help` says about it.
-
-    Attributes:
-        summary: one line.
-        details: a paragraph.
-        examples: command lines.
-        keys: names of the config's keys and groups that it reads; `playslot_rl.config.key_help` explains them.
+    """One sub-command: what `--help` says about it, in a line and in a paragraph, and what it reads: the names of the
+    config's keys and groups, which `playslot_rl.config.key_help` explains.
     """
 
     summary: str
     details: str
     examples: tuple[str, ...]
-    keys: tuple[str, ...]
+    reads: str
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """What it reads, one by one."""
+        return tuple(self.reads.split())
 
 
 COMMANDS: Final[dict[str, Command]] = {
@@ -41,11 +41,8 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot collect policy=random episodes=400 collector.backend=ray workers=2 out=data/random",
             "playslot collect env=grid_shapes episodes=1000 out=data/shapes",
         ),
-        (
-            *("preset", "policy", "episodes", "seed", "workers", "out", "collect.noise", "collect.storage"),
-            *("collect.random_episodes", "collect.random_steps", "collect.expert_episodes", "collect.expert_steps"),
-            *("logging.progress", *TASK, "collector"),
-        ),
+        "preset policy episodes seed workers out collect.noise collect.storage collect.random_episodes "
+        f"collect.random_steps collect.expert_episodes collect.expert_steps logging.progress {TASK} collector",
     ),
     "convert": Command(
         "turn Sketchy, as published, into LeRobot v3.0 data sets",
@@ -55,13 +52,13 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot convert env=sketchy data.root=downloads/sketchy out=data/sketchy",
             "playslot convert env=sketchy data.root=downloads/sketchy data.camera=front_left episodes=10 out=data/few",
         ),
-        ("env", "episodes", "out", "data.root", "data.camera", "env.image_size", "collect.storage"),
+        "env episodes out data.root data.camera env.image_size collect.storage",
     ),
     "train-slots": Command(
         "stage 1: SAVi, object slots from unlabelled videos",
         "Trains SAVi on the frames of any LeRobot v3.0 data set with a camera. The same command resumes after a kill.",
         ("playslot train-slots preset=compact data.root=data/random,data/expert out=runs/mine",),
-        ("env", *TRAINED, "model.savi", "slots", "env.image_size", "render"),
+        f"env {TRAINED} model.savi slots env.image_size render",
     ),
     "train-dynamics": Command(
         "stage 2: latent actions (InvDyn) and the predictor (cOCVP)",
@@ -70,26 +67,17 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot train-dynamics run=runs/mine data.root=data/random,data/expert",
             "playslot train-dynamics run=runs/mine dynamics.steps=5000",
         ),
-        ("run", *TRAINED, "model.inverse_dynamics", "model.predictor", "dynamics"),
+        f"run {TRAINED} model.inverse_dynamics model.predictor dynamics",
     ),
     "train-policy": Command(
         "stage 3: latent policy, action decoder and slot oracle from demonstrations",
         "Clones latent actions from demo videos; only `behaviour.labelled_demos` of them lend their real actions to "
-        "the action decoder. run=pretrained uses the shipped world model.",
+        "the action decoder. run=pretrained uses the pretrained one of the task.",
         (
             "playslot train-policy run=runs/mine data.demos=data/expert",
             "playslot train-policy run=pretrained data.demos=data/expert behaviour.labelled_demos=20 out=runs/few",
         ),
-        (
-            "run",
-            "demos",
-            "data.demos",
-            *TRAINED,
-            "model.policy",
-            "model.action_decoder",
-            "behaviour",
-            "collect.validation_episodes",
-        ),
+        f"run demos data.demos {TRAINED} model.policy model.action_decoder behaviour collect.validation_episodes",
     ),
     "train-baseline": Command(
         "one of the methods PlaySlot is compared with, as a run of its own",
@@ -104,22 +92,8 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot train-baseline method=dreamer env=block_reach out=runs/dreamer",
             "playslot train-baseline method=svg data.root=data/random out=runs/svg",
         ),
-        (
-            "method",
-            "run",
-            "demos",
-            "data.demos",
-            *TRAINED,
-            "model.policy",
-            "model.action_decoder",
-            "behaviour",
-            "baselines",
-            "env.max_steps",
-            "env.frame_skip",
-            "env.blocks",
-            "render",
-            "collect.validation_episodes",
-        ),
+        f"method run demos data.demos {TRAINED} model.policy model.action_decoder behaviour baselines "
+        "env.max_steps env.frame_skip env.blocks render collect.validation_episodes",
     ),
     "evaluate": Command(
         "success rate in simulation (closed loop) or in imagination (open loop)",
@@ -131,7 +105,7 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot evaluate run=runs/mine protocol=imagination episodes=50 seed=3",
             "playslot evaluate run=runs/shapes episodes=100",
         ),
-        ("run", "episodes", "seed", "protocol", "device", "threads", *TASK, "evaluation", "data.root", "data.demos"),
+        f"run episodes seed protocol device threads {TASK} evaluation data.root data.demos",
     ),
     "inspect": Command(
         "report card of a world model: are its slots and latent actions any good?",
@@ -143,7 +117,7 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot inspect run=runs/mine data.root=data/random",
             "playslot inspect run=pretrained/block_push_easy data.root=data/expert out=runs/check",
         ),
-        ("run", "episodes", "seed", "out", "device", "threads", "data"),
+        "run episodes seed out device threads data",
     ),
     "plan": Command(
         "reach goal images by searching over latent actions, beside random actions and the latent policy",
@@ -156,7 +130,7 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot plan run=runs/mine planner=cem proposal=policy episodes=20",
             "playslot plan run=pretrained planner=all proposal=all plan.seconds=1 episodes=20 out=runs/plan",
         ),
-        ("run", "episodes", "seed", "out", "device", "threads", "plan", *TASK, "evaluation"),
+        f"run episodes seed out device threads plan {TASK} evaluation",
     ),
     "export": Command(
         "a trained policy as a folder that LeRobot loads, with a model card; also to the Hub",
@@ -167,21 +141,21 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot export run=runs/demo out=policies/press",
             "playslot export run=runs/demo out=policies/press export.repo=me/press export.private=true",
         ),
-        ("run", "out", "export"),
+        "run out export",
     ),
     "play": Command(
         "steer the imagined future of a scene, in the browser",
         "Opens a page on this machine (127.0.0.1) and prints its address: start from a frame of the run's data, of "
         "data.root, of a fresh simulator episode or from a picture; steer by prototypes and variability, freeze, "
         "remove and swap slots, go back and branch, hand over to the policy, see the decoded actions in the simulator "
-        "beside it, and record it all. Recordings go to RUN/play, to runs/play for a shipped model, or to OUT/play. "
+        "beside it, and record it all. Recordings go to RUN/play, to runs/play for a pretrained model, or to OUT/play. "
         "play.show=true opens the browser. Ctrl-C ends it.",
         (
             "playslot play run=pretrained",
             "playslot play run=pretrained/block_push_easy data.root=data/expert port=8090",
             "playslot play run=runs/mine play.show=true",
         ),
-        ("run", "port", "seed", "out", "device", "threads", "play", "data", *TASK, "evaluation.seed_offset"),
+        f"run port seed out device threads play data {TASK} evaluation.seed_offset",
     ),
     "pipeline": Command(
         "all stages from nothing: data, three trainings, evaluation, report",
@@ -190,7 +164,7 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot pipeline preset=compact env=button_press out=runs/mine",
             "playslot pipeline preset=smoke out=runs/smoke",
         ),
-        ("run", "episodes", "workers", "protocol", *TRAINED, *MADE, "collector", *STAGES, "evaluation"),
+        f"run episodes workers protocol {TRAINED} {MADE} collector {STAGES} evaluation",
     ),
     "adopt": Command(
         "any LeRobot data set with a camera becomes a world model to play with",
@@ -201,7 +175,7 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot adopt data.root=data/mine out=runs/mine",
             "playslot adopt data.root=data/mine data.camera=observation.images.top minutes=30 out=runs/mine",
         ),
-        ("minutes", *TRAINED, "adopt", "model", "slots", "dynamics", "env.image_size"),
+        f"minutes {TRAINED} adopt model slots dynamics env.image_size",
     ),
     "compare": Command(
         "methods side by side: success against demonstrations, table and plot",
@@ -218,19 +192,7 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot compare env=block_push_easy methods=playslot,slot_oracle demos=100,600 seeds=0 out=runs/blocks",
             "playslot compare run=pretrained hydra.launcher=joblib hydra.launcher.n_jobs=2 out=runs/comparison",
         ),
-        (
-            "env",
-            "run",
-            "episodes",
-            "workers",
-            *TRAINED,
-            "compare",
-            *MADE,
-            "collector",
-            *STAGES,
-            "baselines",
-            "evaluation",
-        ),
+        f"env run episodes workers {TRAINED} compare {MADE} collector {STAGES} baselines evaluation",
     ),
     "compare-video": Command(
         "video predictors side by side: PSNR, SSIM and LPIPS on held-out clips, table, curves and pictures",
@@ -247,41 +209,28 @@ COMMANDS: Final[dict[str, Command]] = {
             ),
             "playslot compare-video env=video data.root=data/mine compare_video.budget_minutes=15 out=runs/video",
         ),
-        (
-            "env",
-            "run",
-            "workers",
-            *TRAINED,
-            "compare_video",
-            *MADE,
-            "collector",
-            "model",
-            "slots",
-            "dynamics",
-            "baselines",
-            "metrics",
-        ),
+        f"env run workers {TRAINED} compare_video {MADE} collector model slots dynamics baselines metrics",
     ),
     "demo": Command(
-        "the main job with the shipped world model, in minutes",
+        "the main job with a pretrained world model, in minutes",
         "Collects fresh expert demos, trains the policy on their videos and the action decoder on the labels of a "
         "third of them, evaluates under both protocols and writes a report under runs/demo/ (or out=).",
         ("playslot demo", "playslot demo seed=5 out=runs/demo-1"),
-        ("env", "episodes", "workers", *TRAINED, *MADE, "collector", "behaviour", "evaluation"),
+        f"env episodes workers {TRAINED} {MADE} collector behaviour evaluation",
     ),
     "bench": Command(
         "speed of this machine: training steps, rollout, playing, planning, data sets, rendering",
         "Times the fast paths in one run, medians over repeats, and counts what a training step of the preset costs. "
         "Leave the machine idle.",
         ("playslot bench", "playslot bench --json bench.json"),
-        ("preset", "threads"),
+        "preset threads",
     ),
     "doctor": Command(
         "what works on this machine, and the cure for what does not",
         "Checks Python, torch and device, the GL backend by rendering a frame, PyAV and FFmpeg, disk, cores and cache "
         "folders. Exits with 1 if something essential fails.",
         ("playslot doctor",),
-        ("device", "out", "data.cache"),
+        "device out data.cache",
     ),
 }
 

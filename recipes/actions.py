@@ -17,17 +17,23 @@ Argument = tuple[str, dict[str, Any]]
 """Name and settings of `ArgumentParser.add_argument`."""
 
 
+def argument(name: str, metavar: str, says: str, **settings: Any) -> Argument:
+    """An argument with a value, and what `--help` says of it."""
+    return name, {"metavar": metavar, "help": says, **settings}
+
+
+def flag(name: str, says: str) -> Argument:
+    """An option without a value."""
+    return name, {"action": "store_true", "help": says}
+
+
 @dataclass(frozen=True)
 class Action:
-    """One action: what `--help` says about it, its arguments, and what it does.
+    """One action: what `--help` says about it, in a line and in a paragraph, its arguments, and what it does.
 
     Attributes:
-        summary: one line.
-        details: a paragraph.
-        examples: command lines.
         does: `module:function`, imported when it is run; takes the arguments by name.
-        arguments: in the order of the help.
-        either: of which at most one may be given.
+        either: arguments of which at most one may be given.
         writes: the argument that names what it writes.
     """
 
@@ -43,14 +49,7 @@ class Action:
 def make_parser(
     actions: Mapping[str, Action], command: str, usage: str, description: str, kind: type[argparse.ArgumentParser]
 ) -> argparse.ArgumentParser:
-    """The parser of `playslot COMMAND`.
-
-    Args:
-        actions: by name.
-        usage: what follows the name.
-        description: of all of them.
-        kind: says how bad arguments end.
-    """
+    """The parser of `playslot COMMAND`; `usage` is what follows that, `kind` says how bad arguments end."""
     width = max(map(len, actions))
     lines = "\n".join(f"  {name:<{width}}  {action.summary}" for name, action in actions.items())
     prog = f"playslot {command}"
@@ -70,12 +69,12 @@ def make_parser(
             epilog=f"examples:\n{examples}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        for argument, settings in action.arguments:
-            sub.add_argument(argument, **settings)
+        for key, settings in action.arguments:
+            sub.add_argument(key, **settings)
         if action.either:
             group = sub.add_mutually_exclusive_group()
-            for argument, settings in action.either:
-                group.add_argument(argument, **settings)
+            for key, settings in action.either:
+                group.add_argument(key, **settings)
     return top
 
 
@@ -121,4 +120,4 @@ def whole(smallest: int, largest: int) -> Callable[[str], int]:
     return parse
 
 
-JSON: Final[Argument] = ("--json", {"action": "store_true", "help": "print one JSON object instead of text"})
+JSON: Final = flag("--json", "print one JSON object instead of text")

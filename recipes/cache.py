@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from playslot_rl.recipes.actions import JSON, Action, Argument, make_parser, run_action
+from playslot_rl.recipes.actions import JSON, Action, argument, make_parser, run_action
 
 
 def parser(kind: type[argparse.ArgumentParser] = argparse.ArgumentParser) -> argparse.ArgumentParser:
@@ -20,14 +20,8 @@ def run(options: argparse.Namespace) -> int:
     return run_action(ACTIONS, options)
 
 
-CACHE: Final[Argument] = (
-    "--cache",
-    {"type": Path, "metavar": "DIR", "help": "the cache (default $PLAYSLOT_CACHE or ~/.cache/playslot_rl)"},
-)
-NAMES: Final[Argument] = (
-    "names",
-    {"nargs": "*", "metavar": "NAME", "help": "entries of `playslot cache list`; none means all"},
-)
+CACHE: Final = argument("--cache", "DIR", "the cache (default $PLAYSLOT_CACHE or ~/.cache/playslot_rl)", type=Path)
+NAMES: Final = argument("names", "NAME", "entries of `playslot cache list`; none means all", nargs="*")
 ACTIONS: Final[dict[str, Action]] = {
     "list": Action(
         "what is there: data set, size, last use, and whether a process uses it",

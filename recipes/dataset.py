@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from playslot_rl.recipes.actions import JSON, Action, Argument, make_parser, run_action, whole
+from playslot_rl.recipes.actions import JSON, Action, Argument, argument, flag, make_parser, run_action, whole
 from playslot_rl.seeds.episodes import LARGEST_DRAW
 
 
@@ -42,12 +42,12 @@ def fractions(text: str) -> dict[str, float]:
     return shares
 
 
-ROOT: Final[Argument] = ("root", {"type": Path, "metavar": "DIR", "help": "folder of the data set"})
-REPO_ID: Final[Argument] = ("repo_id", {"metavar": "REPO_ID", "help": "repository on the Hub, as in user/name"})
+ROOT: Final = argument("root", "DIR", "folder of the data set", type=Path)
+REPO_ID: Final = argument("repo_id", "REPO_ID", "repository on the Hub, as in user/name")
 
 
 def _out(what: str, *, required: bool = True) -> Argument:
-    return "--out", {"type": Path, "required": required, "metavar": "DIR", "help": f"{what}; must not exist"}
+    return argument("--out", "DIR", f"{what}; must not exist", type=Path, required=required)
 
 
 ACTIONS: Final[dict[str, Action]] = {
@@ -82,7 +82,7 @@ ACTIONS: Final[dict[str, Action]] = {
         ("playslot dataset merge data/part-1 data/part-2 --out data/all",),
         "playslot_rl.datasets.merge:merge",
         (
-            ("roots", {"type": Path, "nargs": "+", "metavar": "DIR", "help": "folders of the data sets, two or more"}),
+            argument("roots", "DIR", "folders of the data sets, two or more", type=Path, nargs="+"),
             _out("folder of the merged data set"),
         ),
     ),
@@ -94,24 +94,10 @@ ACTIONS: Final[dict[str, Action]] = {
         (
             ROOT,
             _out("folder of the parts, one data set OUT/NAME each"),
-            (
-                "--fractions",
-                {
-                    "type": fractions,
-                    "required": True,
-                    "metavar": "NAME=SHARE,...",
-                    "help": "shares of the episodes, together 1",
-                },
+            argument(
+                "--fractions", "NAME=SHARE,...", "shares of the episodes, together 1", type=fractions, required=True
             ),
-            (
-                "--seed",
-                {
-                    "type": whole(0, LARGEST_DRAW),
-                    "default": 0,
-                    "metavar": "N",
-                    "help": "which episodes go where (default 0)",
-                },
-            ),
+            argument("--seed", "N", "which episodes go where (default 0)", type=whole(0, LARGEST_DRAW), default=0),
         ),
     ),
     "viz": Action(
@@ -125,19 +111,11 @@ ACTIONS: Final[dict[str, Action]] = {
         "playslot_rl.datasets.viz:view",
         (
             ROOT,
-            (
-                "--episodes",
-                {
-                    "type": whole(1, 10**6),
-                    "default": 6,
-                    "metavar": "N",
-                    "help": "episodes to show, evenly spread (default 6)",
-                },
-            ),
+            argument("--episodes", "N", "episodes to show, evenly spread (default 6)", type=whole(1, 10**6), default=6),
         ),
         (
-            ("--out", {"type": Path, "metavar": "FILE.html", "help": "page to write (default DIR.html beside DIR)"}),
-            ("--rerun", {"action": "store_true", "help": "open the rerun viewer instead of writing a page"}),
+            argument("--out", "FILE.html", "page to write (default DIR.html beside DIR)", type=Path),
+            flag("--rerun", "open the rerun viewer instead of writing a page"),
         ),
     ),
     "push": Action(
@@ -149,9 +127,9 @@ ACTIONS: Final[dict[str, Action]] = {
         (
             ROOT,
             REPO_ID,
-            ("--private", {"action": "store_true", "help": "make the repository private if it is made now"}),
-            ("--branch", {"metavar": "B", "help": "push to this branch; the version tag stays where it is"}),
-            ("--tag", {"metavar": "T", "help": "also tag the pushed commit"}),
+            flag("--private", "make the repository private if it is made now"),
+            argument("--branch", "B", "push to this branch; the version tag stays where it is"),
+            argument("--tag", "T", "also tag the pushed commit"),
         ),
     ),
     "pull": Action(
@@ -161,11 +139,8 @@ ACTIONS: Final[dict[str, Action]] = {
         "playslot_rl.hub.pull:pull",
         (
             REPO_ID,
-            (
-                "root",
-                {"type": Path, "metavar": "DIR", "help": "folder to write; must not exist, or be an interrupted pull"},
-            ),
-            ("--revision", {"metavar": "R", "help": "branch, tag or commit (default the format's version tag)"}),
+            argument("root", "DIR", "folder to write; must not exist, or be an interrupted pull", type=Path),
+            argument("--revision", "R", "branch, tag or commit (default the format's version tag)"),
         ),
         writes="root",
     ),

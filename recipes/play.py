@@ -51,7 +51,7 @@ def open_studio(config: ExperimentConfig) -> Studio:
     from playslot_rl.play.studio import Studio
 
     if not config.run:
-        raise ConfigError("run: got nothing, expected a run or a shipped model, such as run=pretrained")
+        raise ConfigError("run: got nothing, expected a run or a pretrained model, such as run=pretrained")
     run = Run.of(config)
     model = load(run, str(open_device(config.device, config.threads)), config.seed)
     world, agent = model.world_model, model.agent

@@ -207,7 +207,7 @@ class ExperimentConfig(Checked):
         seed: seed of data collection, training or evaluation, any 32-bit number.
         workers: collector processes; 0 means one per core.
         out: folder to write.
-        run: run folder to read (and to write where `out` is empty); `pretrained` names the shipped model.
+        run: run folder to read (and to write where `out` is empty); `pretrained` names the task's own model.
         protocol: evaluation protocol: a policy in `simulation` or `imagination`, its decoder in a `replay` of the
             expert's videos, or the `slots` it builds on.
         device: torch device; empty means a GPU if there is one.

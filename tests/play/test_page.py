@@ -196,7 +196,7 @@ def test_data_sets_of_a_run_may_be_gone_and_typed_ones_may_not(
 
 
 def test_play_wants_a_run_and_a_data_set_that_is_there(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="run: got nothing, expected a run or a shipped model"):
+    with pytest.raises(ConfigError, match="run: got nothing, expected a run or a pretrained model"):
         play.open_studio(ExperimentConfig())
     config = ExperimentConfig(run="pretrained", device="cpu")
     config = replace(config, data=replace(config.data, root=str(tmp_path / "no")))
