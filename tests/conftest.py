@@ -6,8 +6,10 @@ import copy
 import os
 import re
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -90,3 +92,18 @@ def _models_compiled_once() -> Iterator[None]:
 def repository() -> Path:
     """Root of the repository."""
     return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def site_module(repository: Path) -> Callable[[str], ModuleType]:
+    """A program of docs/_site by its name, imported."""
+
+    def imported(name: str) -> ModuleType:
+        spec = spec_from_file_location(name, repository / "docs" / "_site" / f"{name}.py")
+        assert spec is not None
+        assert spec.loader is not None
+        module = module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    return imported

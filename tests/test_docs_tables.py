@@ -6,9 +6,9 @@ import io
 import json
 import re
 import shlex
+from collections.abc import Callable
 from copy import deepcopy
 from decimal import Decimal
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -22,23 +22,14 @@ TASKS = {"ButtonPress": 30, "easy BlockPush": 30}
 PROGRAMS = {"playslot", "make", "python", ".venv/bin/python"}
 
 
-def site_module(repository: Path, name: str) -> ModuleType:
-    spec = spec_from_file_location(name, repository / "docs" / "_site" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+@pytest.fixture(scope="module")
+def tables(site_module: Callable[[str], ModuleType]) -> ModuleType:
+    return site_module("tables")
 
 
 @pytest.fixture(scope="module")
-def tables(repository: Path) -> ModuleType:
-    return site_module(repository, "tables")
-
-
-@pytest.fixture(scope="module")
-def pictures(repository: Path) -> ModuleType:
-    return site_module(repository, "pictures")
+def pictures(site_module: Callable[[str], ModuleType]) -> ModuleType:
+    return site_module("pictures")
 
 
 @pytest.fixture(scope="module")

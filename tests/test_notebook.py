@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from importlib.util import module_from_spec, spec_from_file_location
-from pathlib import Path
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -13,13 +12,8 @@ from PIL import Image
 
 
 @pytest.fixture(scope="module")
-def runner(repository: Path) -> ModuleType:
-    spec = spec_from_file_location("notebook", repository / "docs" / "_site" / "notebook.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def runner(site_module: Callable[[str], ModuleType]) -> ModuleType:
+    return site_module("notebook")
 
 
 @pytest.fixture(scope="module")
