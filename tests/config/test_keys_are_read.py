@@ -198,6 +198,7 @@ def library() -> dict[str, str]:
     return {path.relative_to(ROOT).as_posix(): path.read_text() for path in paths if declared not in path.parents}
 
 
+@pytest.mark.integration
 def test_every_key_is_read() -> None:
     assert sorted(Reads(library()).unread()) == sorted(CHECKED)
 

@@ -50,6 +50,7 @@ def other(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return root
 
 
+@pytest.mark.integration
 def test_merged_images_are_the_sources_in_order(images: Path, other: Path, tmp_path: Path) -> None:
     result = merge([images, other], tmp_path / "all")
     made = load(tmp_path / "all")
@@ -101,6 +102,7 @@ def test_small_limits_make_several_files(video: Path, images: Path, tmp_path: Pa
     assert len(list((tmp_path / "video-all").glob("videos/*top/chunk-00[012]/file-00[01].mp4"))) >= 3
 
 
+@pytest.mark.integration
 def test_our_records_are_joined(ours: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(ours, tmp_path / "copy"))
     merge([ours, copy], tmp_path / "all")

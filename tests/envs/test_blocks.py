@@ -39,6 +39,7 @@ def episode(env: BlockEnv, seed: int, steps: int = 4) -> tuple[np.ndarray, np.nd
     return np.stack([o["pixels"] for o in seen]), np.stack([o[keys.STATE] for o in seen])
 
 
+@pytest.mark.integration
 def test_same_seed_repeats_the_same_episode_whatever_came_before(ranged: BlockPushEnv) -> None:
     frames, states = episode(ranged, 5)
     counts = set()
@@ -77,6 +78,7 @@ def test_cubes_that_an_episode_does_not_use_stand_out_of_the_way(ranged: BlockPu
     assert np.abs(others[:, 2] - 0.045).max() < 0.002
 
 
+@pytest.mark.integration
 def test_dense_and_sparse_rewards_are_the_formulas(push: BlockPushEnv) -> None:
     single = BlockPushEnv(replace(push.config, frame_skip=1))
     sparse = BlockPushEnv(replace(push.config, frame_skip=1, blocks=BlocksConfig(reward="sparse")))

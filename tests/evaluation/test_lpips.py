@@ -14,6 +14,8 @@ from playslot_rl.evaluation.lpips import cached_alexnet, open_lpips
 from playslot_rl.evaluation.video import frame_scores
 from playslot_rl.storage.tensors import load_tensors, save_tensors
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
