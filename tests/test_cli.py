@@ -338,6 +338,6 @@ def test_the_installed_command_works_from_another_folder(tmp_path: Path) -> None
 
 
 def test_every_command_stands_in_the_table_of_the_recipes_page(repository: Path) -> None:
-    page = (repository / "docs" / "recipes.md").read_text()
+    page = (repository / "docs" / "reference" / "commands.md").read_text()
     table = page.split("|---|---|---|", 1)[1].split("\n\n", 1)[0]
     assert set(re.findall(r"^\| `([a-z-]+)` \|", table, re.MULTILINE)) == {*cli.COMMANDS, *cli.GROUPS}

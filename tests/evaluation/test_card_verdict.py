@@ -22,7 +22,7 @@ from playslot_rl.evaluation.latent_lines import _probe_lines
 from playslot_rl.runs import Run
 from playslot_rl.world_model import WorldModel
 
-PAGE = Path(__file__).parents[2] / "docs" / "inspect.md"
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "cards.md"
 PROBES = {"linear_probe", "mlp_probe"}
 
 
