@@ -162,7 +162,7 @@ class Controls:
         self.place.set_value(timeline.now.depth)
         self.at.set_text(f"Moment {timeline.now.depth} of {len(branch) - 1}")
         if branches:
-            tips = {tip.number: f"{tip.depth} moments, {tip.label}" for tip in timeline.tips()}
+            tips = {tip.number: f"moment {tip.depth}: {tip.label}" for tip in timeline.tips()}
             self.tips.set_options(tips, value=branch[-1].number)
         self._showing = False
         self._show_slot()

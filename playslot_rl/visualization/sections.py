@@ -276,7 +276,7 @@ def training_section(given: ReportInput, stages: Sequence[str] = STAGES) -> Sect
             [stage, str(meta.get("steps", "–")), took, machine, str(meta.get("commit", ""))[:12] or "–", metrics]
         )
     if rows:
-        blocks.insert(0, Table(["stage", "steps", "time", "machine", "commit", "at the end"], rows))
+        blocks.insert(0, Table(["stage", "steps", "time", "machine", "commit", "measured at the end"], rows))
         blocks[1:1] = _unexplained(given.metas.get("policy", {}).get("metrics", {}))
     paths = {name: given.run / folder / "metrics.jsonl" for name, folder in HISTORIES.items()}
     histories = {name: history for name, path in paths.items() if loss_names(history := read_history(path))}
