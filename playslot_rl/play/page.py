@@ -159,12 +159,12 @@ class PlayPage:
         self.true.set_visibility(picture is not None)
         if picture is not None:
             self.true.set_source(self.gallery.put("beside", picture))
+        title = "the recorded episode has ended"
+        if picture is not None:
+            title = f"recorded at the same step ({now.steps}): it goes on by its own actions"
         if now.true is not None:
-            self.true_title.set_text("the simulator, after the decoded actions")
-        elif picture is not None:
-            self.true_title.set_text(f"recorded at the same step ({now.steps}): it goes on by its own actions")
-        else:
-            self.true_title.set_text("the recorded episode has ended")
+            title = "the simulator, after the decoded actions"
+        self.true_title.set_text(title)
 
     @property
     def target(self) -> int | None:

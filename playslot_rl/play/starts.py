@@ -22,11 +22,10 @@ from playslot_rl.data.windows import spread_evenly
 from playslot_rl.errors import RenderError
 from playslot_rl.frames import to_float
 from playslot_rl.play.picture import read_picture
+from playslot_rl.play.timeline import Frame
 from playslot_rl.play.twin import Twin
 from playslot_rl.seeds.episodes import redraw_stride
 from playslot_rl.world_model import WorldModel, module_device
-
-Frame = npt.NDArray[np.uint8]
 
 SAME: Final = 2.0
 """Mean difference, of 255, up to which a re-run episode shows the recorded frame."""

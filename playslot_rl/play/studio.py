@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -24,10 +25,11 @@ from playslot_rl.play.steering import Driver, variability_directions
 from playslot_rl.world_model import Agent, WorldModel
 
 
+@dataclass(eq=False)
 class Studio:
     """A model to play with.
 
-    Args:
+    Attributes:
         agent: for the policy and the simulator beside.
         out: folder that recordings go to.
         fps: of free play, at first.
@@ -35,8 +37,6 @@ class Studio:
         squeezes: the model's frames were squeezed into squares (`data.resize`), and uploaded pictures are likewise.
         horizon: steps that the model was trained to predict; 0 where that is not known.
         camera: feature that recordings carry.
-
-    Attributes:
         directions: (K, Z), see `variability_directions`.
         donors: (n, N, D), slots of other scenes for swapping; None where there are none.
 
@@ -44,32 +44,29 @@ class Studio:
         CheckpointError: the world model has no prototypes.
     """
 
-    def __init__(
-        self,
-        world_model: WorldModel,
-        agent: Agent | None = None,
-        recorded: RecordedStarts | None = None,
-        simulated: SimulatedStarts | None = None,
-        out: Path = Path("runs/play"),
-        title: str = "world model",
-        fps: float = 8.0,
-        drivers: dict[str, Driver] | None = None,
-        squeezes: bool = False,
-        horizon: int = 0,
-        camera: str = keys.FEATURE_IMAGE,
-    ) -> None:
-        self.squeezes, self.horizon, self.camera = squeezes, horizon, camera
-        self.world_model, self.agent, self.out, self.title, self.fps = world_model.eval(), agent, out, title, fps
-        self.recorded, self.simulated, self.drivers = recorded, simulated, dict(drivers or {})
+    world_model: WorldModel
+    agent: Agent | None = None
+    recorded: RecordedStarts | None = None
+    simulated: SimulatedStarts | None = None
+    out: Path = Path("runs/play")
+    title: str = "world model"
+    fps: float = 8.0
+    drivers: dict[str, Driver] = field(default_factory=dict)
+    squeezes: bool = False
+    horizon: int = 0
+    camera: str = keys.FEATURE_IMAGE
+
+    def __post_init__(self) -> None:
         self._worker = ThreadPoolExecutor(1, "play")
-        clips_of = recorded or simulated
-        clips = None if clips_of is None else self.call(clips_of.clips).result()
-        self.directions = self.call(lambda: variability_directions(world_model, clips)).result()
+        self.call(self._prepare).result()
+
+    def _prepare(self) -> None:
+        model, clips_of = self.world_model.eval(), self.recorded or self.simulated
+        clips = None if clips_of is None else clips_of.clips()
+        self.directions = variability_directions(model, clips)
         self.donors: Tensor | None = None
         if clips is not None:
-            self.donors = self.call(
-                lambda: torch.cat([parse_last(world_model, clip[:1], 0) for clip in clips])
-            ).result()
+            self.donors = torch.cat([parse_last(model, clip[:1], 0) for clip in clips])
 
     def call[Result](self, work: Callable[[], Result]) -> Future[Result]:
         """Hand work to the worker."""

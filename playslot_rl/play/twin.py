@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.acting.episodes import Task, start_episode
+from playslot_rl.play.timeline import Frame
 
-Frame = npt.NDArray[np.uint8]
 Action = npt.NDArray[np.float32]
 
 

@@ -210,7 +210,8 @@ def _html_block(block: Block) -> str:
             sources += f'<source media="(prefers-reduced-motion: reduce)" srcset="{_data_uri(block.still)}">'
         if block.dark is not None:
             sources += f'<source media="(prefers-color-scheme: dark)" srcset="{_data_uri(block.dark)}">'
-        size = f' class="pixels" width="{block.width}"' if block.width else ""
+        size = ' class="moving"' if block.still is not None else ""  # whole on a phone too: columns are compared
+        size = f' class="pixels" width="{block.width}"' if block.width else size
         image = f'<img src="{_data_uri(block.light)}" alt="{escape(block.alt)}"{size}>'
         return (
             f'<figure><div class="scroll" tabindex="0"><picture>{sources}{image}</picture></div>\n'
