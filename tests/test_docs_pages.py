@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 NOTEBOOK = sorted((DOCS / "notebook").glob("*.md"))
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if page not in NOTEBOOK]
-LIMITS = {"docs": 26_000, "notebook": 12_000}
+LIMITS = {"README.md": 1_200, "docs": 26_000, "notebook": 12_000}
 """Words, at most."""
 SOURCES = ("playslot_rl", "recipes", "envs", "collectors", "tests", "lerobot_policy_playslot", "docs", "results")
 SUFFIXES = {".py", ".md", ".yaml", ".toml", ".json"}
@@ -61,7 +61,9 @@ def generator() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize(("name", "pages"), [("docs", PAGES), ("notebook", NOTEBOOK)])
+@pytest.mark.parametrize(
+    ("name", "pages"), [("README.md", [ROOT / "README.md"]), ("docs", PAGES), ("notebook", NOTEBOOK)]
+)
 def test_a_reader_finishes(name: str, pages: list[Path]) -> None:
     assert pages
     assert sum(map(words, pages)) <= LIMITS[name]
@@ -129,3 +131,8 @@ def test_every_mention_of_a_page_is_of_one_that_exists() -> None:
         if not (ROOT / mention).is_file()
     }
     assert gone == set()
+
+
+def test_every_picture_is_shown() -> None:
+    text = "".join(page.read_text() for page in [ROOT / "README.md", *PAGES, *NOTEBOOK])
+    assert [path.name for path in sorted((DOCS / "images").iterdir()) if path.name not in text] == []
