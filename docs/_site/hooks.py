@@ -12,7 +12,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-PAGES: Final = {"README.md": "index.md", "CHANGELOG.md": "changelog.md"}
+PAGES: Final = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "results/README.md": "results/data.md"}
 """Files of the repository that are pages of the site."""
 PACKAGE: Final = "playslot_rl"
 MAPPED: Final = ("envs", "collectors", "recipes")
