@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 MAPPED = ("envs", "collectors", "recipes")
 LIMIT = 60
 """Lines of a function, docstring included."""
+parsed = functools.cache(ast.parse)
 
 
 def layers() -> dict[str, int]:
@@ -50,7 +52,7 @@ def imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
 def upward(text: str, package: str, ranks: dict[str, int]) -> list[str]:
     """The imports of a file's text that do not point downwards; on the lowest line they may point at each other."""
     wrong = []
-    for line, target in imports(ast.parse(text)):
+    for line, target in imports(parsed(text)):
         if target in (package, "__version__"):
             continue
         if ranks[target] >= ranks[package] and not ranks[target] == ranks[package] == 0:
@@ -92,7 +94,7 @@ def test_no_function_is_longer_than_a_screen() -> None:
     long = [
         f"{path.relative_to(ROOT)}:{node.lineno}: {node.name}, {node.end_lineno - node.lineno + 1} lines"
         for path, _ in sources()
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in ast.walk(parsed(path.read_text()))
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         and node.end_lineno is not None
         and node.end_lineno - node.lineno + 1 > LIMIT

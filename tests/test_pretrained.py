@@ -96,6 +96,7 @@ def test_its_policy_solves_the_task_in_simulation(env: str) -> None:
     assert result["success_rate"] >= LEAST[env], f"{result['success_rate']:.0%} of 20 episodes"
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("env", ENVS)
 def test_an_episode_ships_with_each_model_that_it_imagines_from_the_first_frame(env: str) -> None:
     video = episode(env)

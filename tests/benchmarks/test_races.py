@@ -33,6 +33,7 @@ def test_the_savi_rows_are_first_layer_times_precision_times_allocator() -> None
     assert savi_variants()["plain_fp32_glibc"] == Variant("savi_step", False, "fp32", False, False)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("variants", [savi_variants(), dynamics_variants(), rollout_variants()])
 def test_every_variant_of_a_case_computes_the_same_thing(variants: dict[str, Variant]) -> None:
     sizes = quick_sizes()

@@ -14,6 +14,8 @@ from playslot_rl.data.source import open_source, open_sources
 from playslot_rl.datasets.sketchy import convert_sketchy, split_episodes
 from playslot_rl.errors import ConfigError, DataError, OutputError
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.fixture(scope="module")
 def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -48,7 +50,6 @@ def test_the_split_is_the_papers_and_keeps_its_proportion() -> None:
     assert split_episodes(1) == (1, 0)
 
 
-@pytest.mark.integration
 def test_demonstrations_become_episodes_in_the_order_of_their_files(converted: Path, tmp_path: Path) -> None:
     train = open_source(converted / "train", "observation.images.front_left", tmp_path)
     held_out = open_source(converted / "eval", "observation.images.front_left", tmp_path)

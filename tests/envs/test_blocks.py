@@ -225,6 +225,7 @@ def test_passes_gymnasiums_checker(name: str) -> None:
     made.close()
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", NAMES)
 def test_specs_match_what_it_returns(name: str) -> None:
     from torchrl.envs.utils import check_env_specs

@@ -37,6 +37,7 @@ def by_key(lines: list[Line]) -> dict[str, Line]:
     return {one.key: one for one in lines}
 
 
+@pytest.mark.integration
 def test_every_line_says_what_is_good_and_what_is_bad_and_json_holds_it(card: Card) -> None:
     assert [one.key for one in card.lines] == list(MEASURES)
     assert all(one.good and one.bad and one.measure and one.note for one in card.lines)

@@ -51,6 +51,7 @@ def pool(config: ExperimentConfig) -> Iterator[TaskPool]:
         yield pool
 
 
+@pytest.mark.integration
 def test_closed_loop_acts_as_the_torchrl_environment_does(
     config: ExperimentConfig, agent: Agent, pool: TaskPool
 ) -> None:
@@ -101,6 +102,7 @@ def test_result_has_the_agreed_keys(protocol: str, config: ExperimentConfig, age
     assert json.loads(json.dumps(result)) == result
 
 
+@pytest.mark.integration
 def test_references_are_run_once_for_both_protocols(
     config: ExperimentConfig, agent: Agent, pool: TaskPool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -128,6 +130,7 @@ def test_training_seeds_are_never_evaluated(
     assert evaluate(agent, moved, "simulation", 1, 0, run=tmp_path, pool=pool)["seeds"] == [SEED + 5]
 
 
+@pytest.mark.integration
 def test_undrawn_frames_change_no_outcome(config: ExperimentConfig) -> None:
     with TaskPool(replace(config.env, max_steps=20), config.render) as pool:
         blind = run_episodes(pool, ExpertActor(), [SEED, SEED + 1])

@@ -11,8 +11,11 @@ import os
 from pathlib import Path
 from typing import Any
 
+import pytest
 from jobs import job_identities
 from stages import stage_identities
+
+pytestmark = pytest.mark.integration
 
 
 def _compare(name: str, values: dict[str, Any]) -> None:

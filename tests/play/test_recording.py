@@ -81,6 +81,7 @@ def test_nothing_is_recorded_before_a_step_or_without_a_simulator(session: PlayS
     assert not (tmp_path / "play").exists()
 
 
+@pytest.mark.integration
 def test_an_interrupted_recording_leaves_nothing(
     session: PlaySession, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -203,6 +203,7 @@ KINDS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_commands_are_accepted_and_bring_back_the_config(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -21,6 +21,8 @@ from playslot_rl.sharing.folder import read_config
 from playslot_rl.sharing.run import read_results, read_source
 from playslot_rl.storage.atomic import write_json
 
+pytestmark = pytest.mark.integration
+
 
 def evaluated(run: Path, protocol: str, **changes: Any) -> dict[str, Any]:
     """Store a result of this run's policy."""

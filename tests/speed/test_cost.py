@@ -43,6 +43,7 @@ def test_a_product_counts_two_a_multiplication_and_what_it_keeps_for_its_gradien
     assert count.kept == 4 * 3 * 5  # the input; the weight is no activation
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("stage", steps.STAGES)
 def test_every_count_is_a_straight_line_in_the_batch(
     config: ExperimentConfig, costs: dict[str, StageCost], stage: str

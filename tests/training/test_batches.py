@@ -25,6 +25,7 @@ def changed(name: str, steps: int = 20, **optim: float) -> Part:
     return replace(part, config=config)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["slots", "dynamics", "decoder"])
 def test_micro_batches_give_the_curve_of_the_whole_batch(tmp_path: Path, name: str) -> None:
     fit(changed(name), tmp_path / "whole", seed=3)
@@ -36,6 +37,7 @@ def test_micro_batches_give_the_curve_of_the_whole_batch(tmp_path: Path, name: s
             assert parts["grad_norm"] == pytest.approx(whole["grad_norm"], rel=1e-4)
 
 
+@pytest.mark.integration
 def test_a_training_in_micro_batches_is_carried_on_in_one(tmp_path: Path) -> None:
     interrupt(changed("policy", accumulate=2), tmp_path / "parts")
     _, start = fit(changed("policy"), tmp_path / "parts", seed=3)
@@ -86,6 +88,7 @@ def test_the_average_is_validated_and_kept(tmp_path: Path) -> None:
     assert rows[0] != rows[1]
 
 
+@pytest.mark.integration
 def test_an_average_resumes_bit_for_bit(tmp_path: Path) -> None:
     whole, half = changed("policy", ema=0.9), changed("policy", ema=0.9)
     fit(whole, tmp_path / "whole", seed=3)
@@ -112,6 +115,7 @@ def test_the_average_forgets_where_the_weights_began() -> None:
     assert torch.equal(weight, torch.ones(3))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("stage", ["slots", "dynamics", "policy"])
 def test_what_is_compiled_are_the_parts_that_are_called(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each block of a list of them, never the list; and none is left compiled."""

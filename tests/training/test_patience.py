@@ -67,6 +67,7 @@ def test_all_steps_done_the_best_is_kept_too(tmp_path: Path) -> None:
     assert stage.modules["counter"].get_buffer("steps").item() == 16
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("killed", [5, 13, 17, 22, 26])
 def test_killed_it_ends_where_it_would_have(tmp_path: Path, killed: int) -> None:
     whole, state = train(tmp_path / "whole", 3)

@@ -157,6 +157,7 @@ def test_a_single_loss_term_is_drawn_once() -> None:
     assert loss_names([]) == []
 
 
+@pytest.mark.integration
 def test_a_mode_without_prototypes_is_said_so(tmp_path: Path) -> None:
     config = replace(tiny_config(mode="continuous", max_steps=2))
     model = WorldModel(config.model, config.env)

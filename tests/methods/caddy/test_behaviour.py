@@ -24,6 +24,8 @@ from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.checkpoints import StageCheckpoint, save_stage
 
+pytestmark = pytest.mark.integration
+
 SIZE, CPU = 32, torch.device("cpu")
 
 

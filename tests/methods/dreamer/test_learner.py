@@ -42,6 +42,7 @@ def test_reconstruction_and_reward_prediction_learn() -> None:
     assert last["loss"] < first["loss"]
 
 
+@pytest.mark.integration
 def test_modules_and_optimisers_are_all_that_an_update_depends_on() -> None:
     one, other = learner(0), learner(1)
     for number in range(3):

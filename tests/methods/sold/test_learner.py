@@ -118,6 +118,7 @@ def test_the_first_updates_may_leave_actor_and_critic_alone(make_learner: Make, 
     assert {"actor", "critic"} <= _moved(learner, before)
 
 
+@pytest.mark.integration
 def test_equal_seeds_give_equal_updates_bit_for_bit(make_learner: Make, batch: TensorDict) -> None:
     first, second = make_learner(), make_learner()
     for step in range(2):
