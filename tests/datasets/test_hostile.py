@@ -39,6 +39,7 @@ def files(folder: Path) -> dict[str, tuple[int, int]]:
     return {str(p): (p.stat().st_size, p.stat().st_mtime_ns) for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ROWS)
 def test_verify_never_calls_it_sound(name: str, hostile: Path) -> None:
     ROWS[name](hostile)
