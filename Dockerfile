@@ -5,29 +5,27 @@
 #   docker run --rm --gpus all --volume "$PWD:/work" playslot:cuda doctor
 
 FROM python:3.12-slim AS build
-ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
-RUN python -m venv /opt/playslot
-ENV PATH=/opt/playslot/bin:$PATH
+ENV VIRTUAL_ENV=/opt/playslot PATH=/opt/playslot/bin:$PATH UV_NO_CACHE=1
+RUN python -m venv /opt/playslot && pip install --no-cache-dir uv==0.13.8
 WORKDIR /source
 # Packages first: a change of the code does not fetch them again.
 COPY requirements.lock ./
-RUN pip install --require-hashes --requirement requirements.lock
+RUN uv pip install --compile-bytecode --require-hashes --requirement requirements.lock
 COPY pyproject.toml README.md LICENSE ./
 COPY playslot_rl playslot_rl
 COPY envs envs
 COPY collectors collectors
 COPY recipes recipes
 COPY lerobot_policy_playslot lerobot_policy_playslot
-RUN pip install --no-deps --no-build-isolation . ./lerobot_policy_playslot
+RUN uv pip install --compile-bytecode --no-deps --no-build-isolation . ./lerobot_policy_playslot
 
 # The pinned torch has CUDA in it. An index of builds without makes the CPU image some gigabytes smaller:
 #   docker build --target cpu --build-arg TORCH_INDEX=URL --tag playslot .
 FROM build AS build-cpu
 ARG TORCH_INDEX=""
 RUN if [ -n "$TORCH_INDEX" ]; then \
-      pins="$(grep -oE '^(torch|torchvision)==[0-9.]+' requirements.lock | tr '\n' ' ')" \
-      && pip freeze | grep -oE '^(torch|torchvision|triton|nvidia-[^=]*|cuda-[^=]*)(==| )' | tr -d '= ' | xargs pip uninstall --yes \
-      && pip install --no-deps --index-url "$TORCH_INDEX" $pins; \
+      uv pip install --no-deps --reinstall --index-url "$TORCH_INDEX" $(grep -oE '^(torch|torchvision)==[0-9.]+' requirements.lock) \
+      && uv pip uninstall $(uv pip freeze | grep -oE '^(nvidia-[^=]+|cuda-[^=]+|triton)'); \
     fi
 
 # What draws the simulators, and a user who is not root.

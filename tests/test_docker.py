@@ -53,6 +53,12 @@ def test_the_user_is_not_root_and_the_command_is_playslot(dockerfile: str) -> No
     assert re.findall(r"^ENTRYPOINT (.+)", dockerfile, re.MULTILINE) == ['["playslot"]']
 
 
+def test_the_installer_is_that_of_the_makefile(repository: Path, dockerfile: str) -> None:
+    wanted = re.search(r"^UV_VERSION := (\S+)", (repository / "Makefile").read_text(), re.MULTILINE)
+    assert wanted is not None
+    assert re.findall(r"uv==(\S+)", dockerfile) == [wanted[1]]
+
+
 def test_what_draws_is_installed(dockerfile: str) -> None:
     named = re.search(r"apt-get install (lib[a-z0-9 ]+)", CURE)
     assert named is not None

@@ -26,11 +26,15 @@ def run(notebook: dict[str, Any]) -> list[tuple[str, Any]]:
         if cell["cell_type"] != "code":
             continue
         tree = ast.parse("".join(cell["source"]))
-        last = tree.body.pop() if tree.body and isinstance(tree.body[-1], ast.Expr) else None
+        last = tree.body[-1] if tree.body else None
+        if isinstance(last, ast.Expr):
+            tree.body.pop()
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
             exec(compile(tree, str(NOTEBOOK), "exec"), names)
-            value = None if last is None else eval(compile(ast.Expression(last.value), str(NOTEBOOK), "eval"), names)
+            value = None
+            if isinstance(last, ast.Expr):
+                value = eval(compile(ast.Expression(last.value), str(NOTEBOOK), "eval"), names)
         shown.append((printed.getvalue(), value))
     return shown
 
