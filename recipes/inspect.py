@@ -38,7 +38,7 @@ def main(config: ExperimentConfig) -> None:
     """
     from playslot_rl.evaluation.card import DEFAULT_EPISODES, FOLDER, card_json, make_card, write_card
     from playslot_rl.evaluation.card_verdict import concluded
-    from playslot_rl.visualization.card import card_document
+    from playslot_rl.visualization.card_page import card_document
     from playslot_rl.visualization.document import write_document
 
     run, began = opened(config), time.perf_counter()

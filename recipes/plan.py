@@ -48,9 +48,10 @@ def main(config: ExperimentConfig) -> None:
     if run.pretrained:
         run = run_of_pretrained(config, run)
     from playslot_rl.evaluation.goals import GoalPool
-    from playslot_rl.evaluation.planning_table import table
     from playslot_rl.evaluation.success import run_facts
     from playslot_rl.storage.atomic import write_json, write_text
+    from playslot_rl.visualization.document import to_markdown
+    from playslot_rl.visualization.planning_page import planning_page
 
     facts = run_facts(run.folder)
     agent = run.load_agent(open_device(config.device, config.threads))
@@ -70,8 +71,9 @@ def main(config: ExperimentConfig) -> None:
     report = {"run": config.run, "command": "playslot " + " ".join(sys.argv[1:]), "settings": to_dict(config.plan)}
     report |= {"goals": parts, **_facts(config, run.folder)}
     write_json(folder / "planning.json", report)
-    write_text(folder / "planning.md", table(report))
-    print(table(report) + f"\nwritten to {folder / 'planning.md'}", flush=True)
+    page = to_markdown(planning_page(report))
+    write_text(folder / "planning.md", page)
+    print(f"{page}\nwritten to {folder / 'planning.md'}", flush=True)
 
 
 def _facts(config: ExperimentConfig, run: Path) -> dict[str, Any]:
@@ -90,7 +92,7 @@ def _measure(
     from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
     from playslot_rl.storage.atomic import write_bytes, write_json
     from playslot_rl.visualization.charts import LIGHT
-    from playslot_rl.visualization.planning import solution_chart
+    from playslot_rl.visualization.planning_page import solution_chart
 
     plan, first, whole = config.plan, first_seed(config, config.seed), config.env.max_steps
     episodes = make_goals(pool, range(first, first + (config.episodes or EPISODES)), goals, plan, config.seed)
@@ -128,7 +130,7 @@ def _draw(agent: Agent, episodes: list[GoalEpisode], played: Any, folder: Path) 
     from playslot_rl.evaluation.planning import decoded_plan
     from playslot_rl.storage.atomic import write_bytes
     from playslot_rl.visualization.grid import png
-    from playslot_rl.visualization.planning import plan_sheet
+    from playslot_rl.visualization.planning_page import plan_sheet
 
     plans = [decoded_plan(agent, slots) for slots in played.plans[: len(episodes)]]
     executed = [np.stack(trace.frames) for trace in played.traces[: len(episodes)]]

@@ -22,7 +22,7 @@ from playslot_rl.evaluation.card_lines import MEASURES, NO_NUMBERS, Line, line
 from playslot_rl.evaluation.card_verdict import WORDS, conclude, settle, worthless
 from playslot_rl.evaluation.effect_lines import Replayed, effect_lines
 from playslot_rl.evaluation.held_out import HeldOut, hold_out
-from playslot_rl.evaluation.latent_lines import Parsed, action_lines, usage_lines
+from playslot_rl.evaluation.latent_lines import ParsedEpisodes, action_lines, usage_lines
 from playslot_rl.evaluation.probes import infer_latents
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.frames import normalise
@@ -58,7 +58,7 @@ class Card:
     details: dict[str, Any]
     held_out: HeldOut
     replayed: Replayed
-    parsed: Parsed
+    parsed: ParsedEpisodes
 
 
 def make_card(
@@ -118,7 +118,7 @@ def require_motion(source: EpisodeFrames, tested: Any) -> None:
         )
 
 
-def parse(model: WorldModel, source: EpisodeFrames, tested: Any) -> Parsed:
+def parse(model: WorldModel, source: EpisodeFrames, tested: Any) -> ParsedEpisodes:
     """Slots and latents of episodes, parsed from their first frames on."""
     device = module_device(model)
     slots = np.concatenate(list(parse_episodes(source, model.savi, device)))
@@ -129,11 +129,11 @@ def parse(model: WorldModel, source: EpisodeFrames, tested: Any) -> Parsed:
     latents, codes, episodes = infer_latents(model.inverse_dynamics, slots, starts, lengths, real)
     rows = np.concatenate([s + np.arange(n - 1) for s, n in zip(starts, lengths, strict=True)])
     actions = probed_actions(source, frames[rows])
-    return Parsed(source, slots, starts, tested, latents, codes, rows, frames[rows], episodes, actions)
+    return ParsedEpisodes(source, slots, starts, tested, latents, codes, rows, frames[rows], episodes, actions)
 
 
 @torch.no_grad()
-def health_lines(model: WorldModel, parsed: Parsed) -> tuple[list[Line], dict[str, float]]:
+def health_lines(model: WorldModel, parsed: ParsedEpisodes) -> tuple[list[Line], dict[str, float]]:
     """Slots in use, flicker, entropy and motion explained, on clips of the tested episodes."""
     tested = np.flatnonzero(parsed.tested_episodes)
     lengths, device, n = parsed.source.lengths, module_device(model), model.slot_shape[0]

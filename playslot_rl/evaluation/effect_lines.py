@@ -15,8 +15,7 @@ from torch import Tensor
 
 from playslot_rl.data.windows import spread_windows
 from playslot_rl.evaluation.card_lines import EFFECTS, MEASURES, Line, line
-from playslot_rl.evaluation.latent_lines import NO_LATENTS, Parsed
-from playslot_rl.evaluation.replay import (
+from playslot_rl.evaluation.effects import (
     Drawn,
     agreement,
     change_in,
@@ -28,6 +27,7 @@ from playslot_rl.evaluation.replay import (
     same_mover,
     squared_change,
 )
+from playslot_rl.evaluation.latent_lines import NO_LATENTS, ParsedEpisodes
 from playslot_rl.seeds.draws import derived_seed
 from playslot_rl.world_model import WorldModel, module_device
 
@@ -81,7 +81,7 @@ class Replayed:
     codes: tuple[int, ...] = ()
 
 
-def cut_windows(model: WorldModel, parsed: Parsed, seed: int) -> Windows:
+def cut_windows(model: WorldModel, parsed: ParsedEpisodes, seed: int) -> Windows:
     """At most `WINDOWS` windows of the held-out episodes, of `STEPS` steps or as many as the longest has."""
     tested = np.flatnonzero(parsed.tested_episodes)
     lengths = parsed.source.lengths
@@ -111,7 +111,7 @@ def _partners(of: npt.NDArray[np.int64], generator: np.random.Generator) -> npt.
 
 @torch.no_grad()
 def effect_lines(
-    model: WorldModel, parsed: Parsed, seed: int, used: list[int]
+    model: WorldModel, parsed: ParsedEpisodes, seed: int, used: list[int]
 ) -> tuple[list[Line], dict[str, Any], Replayed]:
     """Replay, transfer, constancy and sensitivity.
 

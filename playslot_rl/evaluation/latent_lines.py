@@ -28,7 +28,7 @@ UNTOLD = "no probe recovers the action from the latent"
 
 
 @dataclass(frozen=True)
-class Parsed:
+class ParsedEpisodes:
     """Episodes as a world model sees them, transition by transition; whole episodes are tested.
 
     Attributes:
@@ -61,7 +61,7 @@ class Parsed:
         return self.tested_episodes[self.episodes]
 
 
-def usage_lines(model: WorldModel, parsed: Parsed) -> tuple[list[Line], dict[str, Any]]:
+def usage_lines(model: WorldModel, parsed: ParsedEpisodes) -> tuple[list[Line], dict[str, Any]]:
     """Codes in use, perplexity, directions; and for the page, the counts of the codes."""
     k, tested = model.inverse_dynamics.n_prototypes, parsed.tested
     width = model.inverse_dynamics.latent_dim
@@ -83,7 +83,7 @@ def usage_lines(model: WorldModel, parsed: Parsed) -> tuple[list[Line], dict[str
 NO_LATENTS = "this world model has no latent actions (mode none)"
 
 
-def action_lines(model: WorldModel, parsed: Parsed, seed: int) -> tuple[list[Line], dict[str, Any]]:
+def action_lines(model: WorldModel, parsed: ParsedEpisodes, seed: int) -> tuple[list[Line], dict[str, Any]]:
     """Probes of the real action with their controls; all `not measured` where that cannot be.
 
     Args:
@@ -117,7 +117,7 @@ def action_lines(model: WorldModel, parsed: Parsed, seed: int) -> tuple[list[Lin
     return [lines.get(key) or line(key, None, missing) for key in keys], {"probes": scores}
 
 
-def _scores(parsed: Parsed, noisy: npt.NDArray[np.float32], seed: int) -> dict[str, Any]:
+def _scores(parsed: ParsedEpisodes, noisy: npt.NDArray[np.float32], seed: int) -> dict[str, Any]:
     """What is seen -> result of `probe_actions`."""
     assert parsed.actions is not None
     wrong = repaired(np.arange(len(parsed.rows)), parsed.tested, derived_seed(seed, 0, "wrong pairs"))
@@ -168,7 +168,7 @@ def _noise_size(noisy: npt.NDArray[np.float32], real: npt.NDArray[np.float32]) -
 
 
 @torch.no_grad()
-def noise_latents(model: WorldModel, parsed: Parsed, seed: int) -> npt.NDArray[np.float32]:
+def noise_latents(model: WorldModel, parsed: ParsedEpisodes, seed: int) -> npt.NDArray[np.float32]:
     """The latent (M, Z) between each transition's first frame and the same frame with camera noise, parsed after it."""
     device, savi = module_device(model), model.savi
     found = []

@@ -20,7 +20,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs.grid_shapes import MOVES, Clips, generate
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.probes import probe_moves
-from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
+from playslot_rl.evaluation.seeds import held_out_seeds
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.evaluation.video import video_metrics
 from playslot_rl.frames import to_float
@@ -32,14 +32,14 @@ from playslot_rl.world_model import WorldModel, module_device
 DEFAULT_CLIPS: Final = 100
 CLIPS_AT_ONCE: Final = 10
 SEED_FRAMES: Final = 6
-"""Parsed frames before the predicted ones, as in the paper's table."""
+"""ParsedClips frames before the predicted ones, as in the paper's table."""
 PREDICTED_FRAMES: Final = 15
 RESULT: Final = Path("evaluation") / "objects" / "eval_info.json"
 """The result, relative to the run folder."""
 
 
 @dataclass(frozen=True)
-class Parsed:
+class ParsedClips:
     """What a world model makes of clips.
 
     Attributes:
@@ -66,7 +66,7 @@ def seed_frames(steps: int) -> int:
 
 
 @torch.no_grad()
-def parse_clips(model: WorldModel, frames: npt.NDArray[np.uint8]) -> Parsed:
+def parse_clips(model: WorldModel, frames: npt.NDArray[np.uint8]) -> ParsedClips:
     """Parse clips (C, T + 1, H, W, 3), infer their latent actions and predict the frames after the seed frames."""
     device = module_device(model.savi)
     generator = torch.Generator(device).manual_seed(0)
@@ -84,7 +84,7 @@ def parse_clips(model: WorldModel, frames: npt.NDArray[np.uint8]) -> Parsed:
         array: npt.NDArray[Any] = values.cpu().numpy()
         return array
 
-    return Parsed(
+    return ParsedClips(
         slots=slots,
         labels=owners(decoded.masks).cpu().numpy(),
         reconstructed=decoded.frames,
@@ -175,9 +175,7 @@ def evaluate_run_objects(run: Run, model: WorldModel, config: ExperimentConfig) 
     clips, began = config.episodes or DEFAULT_CLIPS, time.perf_counter()
     if clips < 2:
         raise ConfigError(f"episodes: got {clips}, expected at least 2, since a probe is tested on clips held out")
-    start = first_seed(config, config.seed)
-    seeds = list(range(start, start + clips))
-    check_disjoint(seeds, training_seeds(config, run.folder))
+    seeds = held_out_seeds(config, config.seed, clips, run.folder)
     model.eval()
     result = {
         "protocol": "objects",
@@ -189,9 +187,7 @@ def evaluate_run_objects(run: Run, model: WorldModel, config: ExperimentConfig) 
         "wall_seconds": round(time.perf_counter() - began, 2),
         "hardware": hardware(),
     }
-    path = run.folder / RESULT
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, result)
+    write_json(run.folder / RESULT, result)
     return result
 
 

@@ -18,6 +18,24 @@ def first_seed(config: ExperimentConfig, seed: int) -> int:
     return episode_seed("evaluation", seed, 0, config.evaluation.seed_offset)
 
 
+def held_out_seeds(config: ExperimentConfig, seed: int, episodes: int, run: Path | None = None) -> list[int]:
+    """The first evaluation seeds of `seed`.
+
+    Args:
+        config: names the data sets that were trained on; those in the `data` folder of `run` are others.
+        seed: which block of them.
+        episodes: how many.
+        run: its folder.
+
+    Raises:
+        ConfigError: a training data set holds one of them.
+    """
+    first = first_seed(config, seed)
+    seeds = list(range(first, first + episodes))
+    check_disjoint(seeds, training_seeds(config, run))
+    return seeds
+
+
 def recorded_seeds(root: Path) -> set[int]:
     """Episode seeds that one of our data sets says it was collected with; empty for foreign data sets.
 

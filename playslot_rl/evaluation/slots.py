@@ -20,7 +20,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs import PROCEDURAL, RECORDED, make_env
 from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.evaluation.objects import adjusted_rand_index
-from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
+from playslot_rl.evaluation.seeds import held_out_seeds
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.frames import psnr, to_float
 from playslot_rl.modules.savi import SAVi
@@ -143,9 +143,8 @@ def evaluate_slots(run: Run, out: Path, config: ExperimentConfig, device: torch.
         ConfigError: a training data set holds one of the seeds.
         OutputError: the file cannot be written.
     """
-    began, start = time.perf_counter(), first_seed(config, config.seed)
-    seeds = list(range(start, start + (config.episodes or DEFAULT_EPISODES)))
-    check_disjoint(seeds, training_seeds(config, run.folder))
+    began = time.perf_counter()
+    seeds = held_out_seeds(config, config.seed, config.episodes or DEFAULT_EPISODES, run.folder)
     result = {
         "protocol": "slots",
         "episodes": len(seeds),
@@ -156,6 +155,5 @@ def evaluate_slots(run: Run, out: Path, config: ExperimentConfig, device: torch.
         "wall_seconds": round(time.perf_counter() - began, 2),
         "hardware": hardware(),
     }
-    (out / RESULT).parent.mkdir(parents=True, exist_ok=True)
     write_json(out / RESULT, result)
     return result

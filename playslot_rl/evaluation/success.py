@@ -30,7 +30,7 @@ from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.methods import method_stage
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.intervals import wilson
-from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
+from playslot_rl.evaluation.seeds import check_disjoint, first_seed, held_out_seeds, training_seeds
 from playslot_rl.runtime.threads import available_cores
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.world_model import Agent
@@ -169,17 +169,14 @@ def measure(
     Raises:
         ConfigError: a seed that a training data set holds.
     """
-    start = first_seed(config, seed)
-    seeds = list(range(start, start + episodes))
-    training = training_seeds(config, run)
-    check_disjoint(seeds, training)
+    seeds = held_out_seeds(config, seed, episodes, run)
     begin = time.perf_counter()
     with TaskPool(config.env, config.render) if pool is None else contextlib.nullcontext(pool) as used:
         outcome = run_episodes(used, actor, seeds)
         wall = time.perf_counter() - begin
         references = _references(oracle, config, seeds, used, facts, run)
     played = [e.seed for e in outcome]
-    check_disjoint(played, training)  # a redrawn episode has another seed
+    check_disjoint(played, training_seeds(config, run))  # a redrawn episode has another seed
     return {
         "method": facts.method,
         "protocol": protocol,
@@ -267,9 +264,7 @@ def check_baseline_protocol(config: ExperimentConfig) -> None:
 
 
 def _stored(run: Path, result: dict[str, Any]) -> dict[str, Any]:
-    folder = run / "evaluation" / str(result["protocol"])
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "eval_info.json", result)
+    write_json(run / "evaluation" / str(result["protocol"]) / "eval_info.json", result)
     return result
 
 

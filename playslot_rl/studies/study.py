@@ -74,10 +74,12 @@ class Measure[J: Job](Protocol):
     def result(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """The measure's part of the result."""
 
-    def page(self, result: Result) -> Document:
+    @property
+    def page(self) -> Callable[[Result], Document]:
         """What is read; its last sections, from `FOOTNOTES` on, are not printed."""
 
-    def figure(self, result: Result, theme: Theme) -> Figure:
+    @property
+    def figure(self) -> Callable[[Result, Theme], Figure]:
         """The plot."""
 
     def sheets(self) -> Mapping[str, bytes]:

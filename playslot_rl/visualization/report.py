@@ -23,7 +23,7 @@ from playslot_rl.evaluation.success import hardware
 from playslot_rl.frames import to_uint8
 from playslot_rl.runs import Run
 from playslot_rl.storage.checkpoints import checkpoint_folder
-from playslot_rl.visualization.card import card_section
+from playslot_rl.visualization.card_page import card_section
 from playslot_rl.visualization.document import (
     Block,
     Document,

@@ -15,8 +15,9 @@ from playslot_rl.config.env import EnvConfig
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.goals import GoalPool, make_goals
 from playslot_rl.evaluation.planning import cost_along_solution, play, results, shape
-from playslot_rl.evaluation.planning_table import table
 from playslot_rl.testing import tiny_agent
+from playslot_rl.visualization.document import to_markdown
+from playslot_rl.visualization.planning_page import planning_page
 
 SEEDS = (1_000_000_500, 1_000_000_503)
 ENV = EnvConfig(warmup_steps=2)
@@ -84,7 +85,7 @@ def test_the_cost_along_the_way_and_the_table(pool: GoalPool) -> None:
     settings = {"ahead": 25, "budget": 50}
     part = {"episodes": 2, "max_steps": 10, "size": {"horizon": 5}, "rows": {"random": random, "cem-policy": random}}
     report = {"run": "runs/x", "command": "playslot plan", "settings": settings}
-    page = table({**report, "goals": {"ahead": {**part, "cost_along_solution": found}}})
+    page = to_markdown(planning_page({**report, "goals": {"ahead": {**part, "cost_along_solution": found}}}))
     assert "| random actions | " in page
     assert "| CEM from the policy | " in page
     assert "25 environment steps ahead, budget 50" in page

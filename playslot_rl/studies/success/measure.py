@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
@@ -13,14 +13,14 @@ from playslot_rl.config.compose import is_pretrained
 from playslot_rl.config.methods import METHODS
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
+from playslot_rl.evaluation.seeds import held_out_seeds
 from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_references
 from playslot_rl.methods.online.requirements import require_online
 from playslot_rl.runs import Run
 from playslot_rl.storage.checkpoints import require_config
 from playslot_rl.studies.launch import Status
 from playslot_rl.studies.several import train_on_several
-from playslot_rl.studies.study import Commands, Record, Result
+from playslot_rl.studies.study import Commands, Record
 from playslot_rl.studies.success.figure import success_figure
 from playslot_rl.studies.success.jobs import (
     SuccessJob,
@@ -34,11 +34,6 @@ from playslot_rl.studies.success.jobs import (
 from playslot_rl.studies.success.page import success_page
 from playslot_rl.studies.success.rows import job_rows, summarise
 from playslot_rl.studies.success.shared import Parents, check_data, prepare_shared
-from playslot_rl.visualization.charts import Theme
-from playslot_rl.visualization.document import Document
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 class SuccessMeasure:
@@ -52,6 +47,8 @@ class SuccessMeasure:
     command = "compare"
     name = "comparison"
     unit = "jobs"
+    page = staticmethod(success_page)
+    figure = staticmethod(success_figure)
 
     def __init__(self, config: ExperimentConfig, commands: Commands) -> None:
         self.config = replace(config, episodes=config.episodes or DEFAULT_EPISODES)
@@ -117,12 +114,6 @@ class SuccessMeasure:
             "threads": config.threads,
         }
 
-    def page(self, result: Result) -> Document:
-        return success_page(result)
-
-    def figure(self, result: Result, theme: Theme) -> Figure:
-        return success_figure(result, theme)
-
     def sheets(self) -> Mapping[str, bytes]:
         return {}
 
@@ -163,9 +154,7 @@ def _references(config: ExperimentConfig) -> dict[str, dict[str, Any]]:
     Raises:
         ConfigError: an evaluation seed that a training data set holds.
     """
-    start = first_seed(config, config.compare.evaluation_seed)
-    seeds = list(range(start, start + (config.episodes or 0)))
-    check_disjoint(seeds, training_seeds(config))
+    seeds = held_out_seeds(config, config.compare.evaluation_seed, config.episodes or 0)
     with TaskPool(config.env, config.render) as pool:
         found = run_references(None, config, seeds, pool, cache=Path(config.out) / "references.json")
     return {name: found[name] for name in ("random", "expert")}

@@ -14,7 +14,7 @@ from playslot_rl.config.weights import data_roots
 from playslot_rl.data.agreement import open_files
 from playslot_rl.data.views import first_demonstrations
 from playslot_rl.errors import ConfigError
-from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
+from playslot_rl.evaluation.seeds import held_out_seeds
 from playslot_rl.runs import Run
 from playslot_rl.studies.study import Commands
 from playslot_rl.studies.success.jobs import SuccessJob, latent_models, model_folder, uses_demos, uses_slots
@@ -36,8 +36,7 @@ def check_data(config: ExperimentConfig) -> ExperimentConfig:
         where = config.data.demos or str(out / RECORDED)
         check_demos(config, _episodes(where), f"data.demos={where}")
         open_videos(config, where, "compare").require_actions(config.env.action_dim)
-    start = first_seed(config, config.compare.evaluation_seed)
-    check_disjoint(range(start, start + (config.episodes or 0)), training_seeds(config, out))
+    held_out_seeds(config, config.compare.evaluation_seed, config.episodes or 0, out)
     return config
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from playslot_rl.envs import RECORDED
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.lpips import open_lpips
 from playslot_rl.studies.launch import Status
-from playslot_rl.studies.study import Commands, Record, Result
+from playslot_rl.studies.study import Commands, Record
 from playslot_rl.studies.video.begun import require_begun_alike
 from playslot_rl.studies.video.clips import sheet_name, test_sets
 from playslot_rl.studies.video.figure import video_figure, video_sheet
@@ -32,12 +32,7 @@ from playslot_rl.studies.video.shared import (
     true_frames,
 )
 from playslot_rl.studies.video.training import VideoTraining
-from playslot_rl.visualization.charts import Theme
-from playslot_rl.visualization.document import Document
 from playslot_rl.visualization.grid import png
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 class VideoMeasure:
@@ -51,6 +46,8 @@ class VideoMeasure:
     command = "compare-video"
     name = "video"
     unit = "trainings"
+    page = staticmethod(video_page)
+    figure = staticmethod(video_figure)
 
     def __init__(self, config: ExperimentConfig, commands: Commands) -> None:
         own = config.compare_video
@@ -126,12 +123,6 @@ class VideoMeasure:
             "test_recorded": str(out / "data" / "test") in own.test,
             "perceptual": any(row["perceptual"] for row in rows),
         }
-
-    def page(self, result: Result) -> Document:
-        return video_page(result)
-
-    def figure(self, result: Result, theme: Theme) -> Figure:
-        return video_figure(result, theme)
 
     def sheets(self) -> Mapping[str, bytes]:
         names = {key: sheet_name(*key) for key in self._truth}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from playslot_rl.evaluation.replay import (
+from playslot_rl.evaluation.effects import (
     agreement,
     centroids,
     change_in,
