@@ -44,15 +44,7 @@ CLIPS_AT_ONCE: Final = 8
 
 @dataclass(frozen=True)
 class Card:
-    """What was measured.
-
-    Attributes:
-        lines: in the order of the page.
-        details: plain values behind them.
-        held_out: the episodes.
-        replayed: for the pictures.
-        parsed: for the pictures.
-    """
+    """What was measured: lines in the order of the page, the plain values behind them, and what the pictures show."""
 
     lines: list[Line]
     details: dict[str, Any]
@@ -74,8 +66,7 @@ def make_card(
     Args:
         model: in evaluation mode.
         source: frames of the model's size; actions or none.
-        metas: stage -> `meta.json`, for what was trained on (`hold_out`).
-        data: `validation` and `held_out`.
+        metas, data: see `hold_out`.
         most: episodes that are looked at.
         seed: of wrong pairs, noise and partners.
 
@@ -160,14 +151,7 @@ def health_lines(model: WorldModel, parsed: ParsedEpisodes) -> tuple[list[Line],
 
 
 def card_json(card: Card, source: EpisodeFrames, facts: Mapping[str, Any], began: float) -> dict[str, Any]:
-    """The card as JSON holds it.
-
-    Args:
-        card: what was measured.
-        source: the data set.
-        facts: further plain values: run, data set, seed, fingerprints.
-        began: of `time.perf_counter`.
-    """
+    """The card as JSON holds it, with the `facts` of run, data set and seed; `began` is of `time.perf_counter`."""
     held = card.held_out
     return {
         "format": FORMAT,

@@ -113,11 +113,11 @@ def _partners(of: npt.NDArray[np.int64], generator: np.random.Generator) -> npt.
 def effect_lines(
     model: WorldModel, parsed: ParsedEpisodes, seed: int, used: list[int]
 ) -> tuple[list[Line], dict[str, Any], Replayed]:
-    """Replay, transfer, constancy and sensitivity.
+    """Replay, transfer, constancy and sensitivity, in windows of the tested episodes.
 
     Args:
         model: in evaluation mode.
-        parsed: the episodes; windows are cut from the tested ones.
+        parsed: the episodes.
         seed: of the partners.
         used: codes that the tested episodes use; empty without prototypes.
     """

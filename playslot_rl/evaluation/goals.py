@@ -62,7 +62,6 @@ class GoalTask:
     def step(
         self, action: npt.NDArray[np.float32]
     ) -> tuple[dict[str, npt.NDArray[Any]], Any, bool, bool, dict[str, Any]]:
-        """One agent step."""
         self._task.draw_steps = self.draw_steps
         observation, reward, terminated, truncated, info = self._task.step(action)
         self._note(observation["pixels"])
@@ -73,20 +72,15 @@ class GoalTask:
         self._trace.places.append(np.stack(list(self._task.places().values())))
 
     def expert_action(self) -> npt.NDArray[np.float32]:
-        """The scripted expert's action for the present state."""
         action: npt.NDArray[np.float32] = self._task.expert_action()
         return action
 
     def close(self) -> None:
-        """Free the renderer."""
         self._task.close()
 
 
 class GoalPool(TaskPool):
     """Environments whose episodes begin where the expert was after so many steps.
-
-    Args:
-        env, render: as for `TaskPool`; `env.max_steps` is the budget.
 
     Attributes:
         starts: episode's seed to the expert's steps before its start; others begin at their first frame.
@@ -100,7 +94,6 @@ class GoalPool(TaskPool):
         self._wrapped: list[Task] = []
 
     def take(self, count: int) -> list[Task]:
-        """The first `count` environments."""
         for task in super().take(count)[len(self._wrapped) :]:
             self._wrapped.append(GoalTask(task, self.starts, self.traces))
         return self._wrapped[:count]
@@ -118,7 +111,6 @@ class GoalEpisode:
     """Something to reach.
 
     Attributes:
-        seed: of the episode.
         start: agent steps of the expert before the start.
         frames: the expert's way from start to goal (T + 1, H, W, 3), both included.
         places: of things on that way (T + 1, P, 3), metres.

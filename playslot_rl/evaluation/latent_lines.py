@@ -84,12 +84,8 @@ NO_LATENTS = "this world model has no latent actions (mode none)"
 
 
 def action_lines(model: WorldModel, parsed: ParsedEpisodes, seed: int) -> tuple[list[Line], dict[str, Any]]:
-    """Probes of the real action with their controls; all `not measured` where that cannot be.
-
-    Args:
-        model: in evaluation mode.
-        parsed: the episodes.
-        seed: of the wrong pairs and of the camera noise.
+    """Probes of the real action with their controls; all `not measured` where that cannot be. The `seed` is that of the
+    wrong pairs and of the camera noise.
     """
     fitted = parsed.tested_episodes.size - int(parsed.tested_episodes.sum())
     missing = ""

@@ -119,13 +119,7 @@ def _score(
 
 
 def evaluate_objects(model: WorldModel, config: ExperimentConfig, clips: int, seeds: list[int]) -> dict[str, Any]:
-    """Score a world model.
-
-    Args:
-        model: in evaluation mode.
-        config: its `env` says which clips; `env.max_steps` is T.
-        clips: C, at least 2.
-        seeds: of the clips.
+    """Score a world model, in evaluation mode, on C clips, at least 2, of `env.max_steps` steps.
 
     Returns:
         `ari` and `foreground_ari` (means over clips), `reconstruction` and `prediction` (`psnr` in dB, `ssim`),
@@ -192,10 +186,8 @@ def evaluate_run_objects(run: Run, model: WorldModel, config: ExperimentConfig) 
 
 
 def run_fingerprints(run: Run) -> dict[str, str]:
-    """Weights of the world model's stages.
-
-    Raises:
-        CheckpointError: one is missing or damaged.
+    """Raises:
+    CheckpointError: a stage of the world model is missing or damaged.
     """
     return {name: stage.fingerprint for name, stage in run.world_stages.items()}
 
@@ -209,8 +201,8 @@ def adjusted_rand_index(truth: Labels, predicted: Labels, foreground: bool = Fal
     A clip is scored as a whole, as in SAVi's paper: a slot that changes its object in mid-clip loses.
 
     Args:
-        truth: integers of any shape, 0 the ground.
-        predicted: integers of the same shape; the names of the labels do not matter.
+        truth: of any shape, 0 the ground.
+        predicted: of the same shape; the names of the labels do not matter.
         foreground: leave out the pixels of the ground (FG-ARI).
 
     Raises:
@@ -236,16 +228,9 @@ def overlaps(truth: Labels, predicted: Labels, objects: int, slots: int) -> npt.
 
 
 def match_slots(truth: Labels, predicted: Labels, objects: int, slots: int) -> npt.NDArray[np.int64]:
-    """The slot of each object in a clip: the assignment with the largest overlap in all, ground included.
+    """The slot of each object (O,) in a clip (T, H, W), -1 where there are too few slots.
 
-    Args:
-        truth: (T, H, W) integers, 0 the ground, o + 1 object o.
-        predicted: (T, H, W) integers, the slot that each pixel belongs to.
-        objects: O.
-        slots: N.
-
-    Returns:
-        (O,), -1 for an object that gets no slot because there are too few.
+    It is the assignment with the largest overlap in all, ground included. Label o + 1 of `truth` is object o.
     """
     from scipy.optimize import linear_sum_assignment
 

@@ -105,10 +105,10 @@ def play(
         pool: environments.
         actor: in evaluation mode.
         goals: an episode each.
-        protocol: where the goals are from.
+        protocol: where they are from.
         max_steps: agent steps to act in.
         every: steps from one plan to the next.
-        draw: draw also frames that the actor does not look at.
+        draw: also frames that the actor does not look at.
     """
     pool.begin(goals, max_steps)
     played = Played()
@@ -193,8 +193,7 @@ def cost_along_solution(
     Args:
         agent: in evaluation mode.
         goals: the ways.
-        looks: as when planning.
-        match: as when planning.
+        looks, match: as when planning.
 
     Returns:
         For `slots`, `dynamics` and `image`: `curves` (each T + 1 values, start to goal), `goal_is_minimum` (share of

@@ -30,18 +30,17 @@ def infer_latents(
     lengths: Sequence[int] | Ints,
     actions: npt.NDArray[np.float32] | None = None,
 ) -> tuple[Floats, Ints, Ints]:
-    """Latent actions of whole episodes.
+    """Latent actions of whole episodes: z (M, Z), codes (M, 1), or (M, N) with one latent per slot, -1 without a
+    codebook, and the episode (M,) of each transition.
 
     Args:
-        model: InvDyn, in evaluation mode.
-        slots: (F, N, D) cached slots of all frames.
-        starts: first row of each episode.
-        lengths: frames of each episode.
+        model: in evaluation mode.
+        slots: (F, N, D) of all frames.
+        starts, lengths: first row and number of frames of each episode.
         actions: (F, A) real actions; needed in `ground_truth` mode only.
 
-    Returns:
-        z (M, Z), or (M, N * Z) with one latent per slot; codes (M, 1) or (M, N), -1 without a codebook;
-        episode index (M,). M counts the transitions: lengths minus one, summed.
+    Raises:
+        ValueError: no episode has two frames.
     """
     device = next(iter(model.parameters()), torch.zeros(())).device
     z, codes, episodes = [], [], []
@@ -63,19 +62,11 @@ def infer_latents(
 
 
 def _hold_out(groups: Ints, fraction: float, seed: int, what: str) -> tuple[npt.NDArray[np.bool_], int]:
-    """Choose groups (episodes, clips) at random.
-
-    Args:
-        groups: (M,) group of each row.
-        fraction: of the groups, to hold out; at least one is held out and at least one kept.
-        seed: of the choice.
-        what: who asks and what a group is, for the error: `probe_moves: clip`.
-
-    Returns:
-        (M,) mask of the rows held out, and how many groups they are.
+    """Mask (M,) of the rows of some groups (M,) drawn at random, and how many groups they are: `fraction` of them, at
+    least one, and at least one is left.
 
     Raises:
-        ValueError: there are fewer than two groups.
+        ValueError: there are fewer than two groups; `what` says who asks and what a group is: `probe_moves: clip`.
     """
     names = np.unique(groups)
     if len(names) < 2:
@@ -96,10 +87,10 @@ def probe_actions(
     """How much of the real action can be read from the latent, on episodes the probe has not seen.
 
     Args:
-        z: (M, Z) latents.
-        actions: (M, A) real actions in [-1, 1].
-        episodes: (M,) episode of each transition.
-        codes: (M, C) codes; adds the probe `code`, which sees their one-hot form only.
+        z: (M, Z).
+        actions: (M, A) in [-1, 1].
+        episodes: (M,).
+        codes: (M, C); adds the probe `code`, which sees their one-hot form only.
         tested: (M,) transitions that the probes are tested on, whole episodes of them; None holds out a quarter of the
             episodes, drawn by a fixed seed.
 
@@ -161,7 +152,7 @@ def probe_moves(features: Floats, moves: Ints, clips: Ints, classes: int, seed: 
     Args:
         features: (M, D) what the probe sees, such as the prototype of the object's slot.
         moves: (M,) labels from 0 to `classes` - 1.
-        clips: (M,) clip of each transition; 0.3 of the clips are held out, whole.
+        clips: (M,); 0.3 of the clips are held out, whole.
         classes: number of moves.
         seed: of the split.
 
@@ -196,17 +187,11 @@ def probe_moves(features: Floats, moves: Ints, clips: Ints, classes: int, seed: 
 
 
 def codebook_usage(codes: Ints, n_prototypes: int) -> dict[str, Any]:
-    """How often each prototype is chosen.
-
-    Args:
-        codes: any shape, values from 0 to K - 1.
-        n_prototypes: K.
-
-    Returns:
-        `counts` (K), `used` (codes chosen at least once), `perplexity` (1 to K; K when all are equally frequent).
+    """`counts` (K) of codes of any shape, `used` (codes chosen at least once), and `perplexity` (1 to K; K when all are
+    equally frequent).
 
     Raises:
-        ValueError: a code is outside its range.
+        ValueError: a code is outside 0 to K - 1.
     """
     flat = np.asarray(codes).reshape(-1)
     if flat.size == 0 or flat.min() < 0 or flat.max() >= n_prototypes:
@@ -221,15 +206,8 @@ def codebook_usage(codes: Ints, n_prototypes: int) -> dict[str, Any]:
 
 
 def code_table(codes: Ints, actions: Floats, n_prototypes: int) -> list[dict[str, Any]]:
-    """Mean and standard deviation of the real action for each code.
-
-    Args:
-        codes: (M,) code of each transition.
-        actions: (M, A) real actions in [-1, 1].
-        n_prototypes: K.
-
-    Returns:
-        K rows: `code`, `count`, `mean` (A) and `std` (A); both None for a code that was never chosen.
+    """Of codes (M,) and real actions (M, A), K rows: `code`, `count`, and `mean` (A) and `std` (A) of the action, None
+    for a code that was never chosen.
     """
     rows: list[dict[str, Any]] = []
     for code in range(n_prototypes):
@@ -247,13 +225,8 @@ def code_table(codes: Ints, actions: Floats, n_prototypes: int) -> list[dict[str
 
 
 def participation_ratio(z: Floats) -> float | None:
-    """Effective number of directions in which latents vary: (sum l)^2 / sum l^2 of their covariance's eigenvalues l.
-
-    Args:
-        z: (M, Z).
-
-    Returns:
-        From 1 (a line) to Z (the same variance in every direction); None where nothing varies.
+    """Effective number of directions in which latents (M, Z) vary: (sum l)^2 / sum l^2 of the eigenvalues l of their
+    covariance, from 1 (a line) to Z (the same variance in every direction); None where nothing varies.
     """
     centred = z.astype(np.float64) - z.mean(0, dtype=np.float64)
     # Of the covariance C, without its eigenvalues: (tr C)^2 / tr C^2.

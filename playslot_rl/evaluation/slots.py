@@ -38,13 +38,7 @@ Segmented = tuple[npt.NDArray[np.uint8], npt.NDArray[np.int64]]
 
 
 def segmented_episode(env: Any, seed: int, steps: int) -> Segmented:
-    """Frames uint8 (T + 1, H, W, 3) of the scripted expert's episode, and which object each pixel shows (T + 1, H, W).
-
-    Args:
-        env: a `PixelTask`.
-        seed: of the episode.
-        steps: T.
-    """
+    """The scripted expert's episode of a `PixelTask`, T steps long."""
     frames, labels = [env.reset(seed=seed)[0]["pixels"]], [env.segment()]
     for _ in range(steps):
         frames.append(env.step(env.expert_action())[0]["pixels"])
@@ -53,12 +47,7 @@ def segmented_episode(env: Any, seed: int, steps: int) -> Segmented:
 
 
 def segmented_episodes(config: ExperimentConfig, seeds: Sequence[int]) -> Iterator[Segmented]:
-    """One after the other: the expert's episodes of a simulated task, or GridShapes' clips.
-
-    Args:
-        config: its `env` and `render` say what is seen; `env.max_steps` is T.
-        seeds: of the episodes.
-    """
+    """One after the other: the expert's episodes of a simulated task, or GridShapes' clips; `env.max_steps` is T."""
     if config.env.name in PROCEDURAL:
         for seed in seeds:
             clips = generate([seed], config.env.max_steps, config.env)
@@ -78,7 +67,7 @@ def score_slots(savi: SAVi, episodes: Iterable[Segmented], seeds: Sequence[int])
 
     Args:
         savi: in evaluation mode.
-        episodes: frames and label images.
+        episodes: E of them.
         seeds: one for each, of the initial slots where these are drawn.
 
     Returns:

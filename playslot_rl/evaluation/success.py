@@ -45,11 +45,10 @@ class RunFacts:
     """What the result file says about the run it measures.
 
     Attributes:
-        demos: demonstrations whose videos the policy was trained on; None if the run does not say.
-        labelled_demos: those of them whose real actions were used; None if the run does not say.
-        fingerprints: weights of each stage.
-        commit: commit the policy was trained from.
-        method: a name of `playslot_rl.config.methods`.
+        demos, labelled_demos: demonstrations whose videos, and whose real actions, the policy was trained on; None if
+            the run does not say.
+        fingerprints: weights by stage.
+        commit: that the policy was trained from.
         extra: what the method's checkpoint says of its own (`pretraining`, `env_steps`).
     """
 
@@ -89,10 +88,8 @@ def run_facts(run: Path, method: str = "playslot") -> RunFacts:
 
 
 def check_protocol(protocol: str) -> None:
-    """Refuse an unknown protocol.
-
-    Raises:
-        ConfigError: it is none of `PROTOCOLS`.
+    """Raises:
+    ConfigError: it is none of `PROTOCOLS`.
     """
     if protocol not in PROTOCOLS:
         raise ConfigError(f"protocol: got {protocol!r}, expected one of {', '.join(PROTOCOLS)}")
@@ -112,15 +109,15 @@ def evaluate(
     """Measure an agent.
 
     Args:
-        agent: world model, policy, action decoder and, for the reference, slot oracle.
+        agent: its slot oracle is a reference.
         config: environment, renderer, `evaluation`, and the data sets whose seeds must not come up.
         protocol: `simulation` (closed loop) or `imagination` (open loop: one frame is parsed, policy and cOCVP unfold
             `max_steps` steps in latent space, and the decoded actions are then executed), or `replay` (open loop: the
             latents are those of the expert's video of the same episode; the policy is not asked).
         episodes: number of seeds.
         seed: selects the block of evaluation seeds.
-        facts: what to say about the run.
-        run: run folder; the reference results shared by both protocols are cached under `RUN/evaluation`.
+        facts: of the run.
+        run: its folder; what the references do is kept under `RUN/evaluation`.
         pool: environments to use and leave open; None makes and closes its own.
 
     Returns:
@@ -251,10 +248,8 @@ def evaluate_actor(run: Path, actor: Actor, config: ExperimentConfig, pool: Task
 
 
 def check_baseline_protocol(config: ExperimentConfig) -> None:
-    """Refuse to evaluate a baseline other than in simulation.
-
-    Raises:
-        ConfigError: it was asked for.
+    """Raises:
+    ConfigError: another protocol than simulation was asked for.
     """
     if config.protocol != "simulation":
         raise ConfigError(
@@ -269,7 +264,6 @@ def _stored(run: Path, result: dict[str, Any]) -> dict[str, Any]:
 
 
 def hardware() -> dict[str, Any]:
-    """Processor, cores, threads and GPU."""
     gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
     return {
         "machine": platform.machine(),
@@ -304,8 +298,8 @@ def run_references(
 
     Args:
         oracle: the slot oracle beside the agent; None gives null values.
-        config: environment and renderer.
-        seeds: evaluation seeds.
+        config: of the task.
+        seeds: of the episodes.
         pool: environments.
         oracle_fingerprint: names the weights of oracle and SAVi; empty means that the oracle's result is not cached.
         cache: JSON file that both protocols of a run share; None means no cache.

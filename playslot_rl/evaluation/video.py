@@ -17,12 +17,8 @@ BORDER: Final = 5
 
 
 class FrameScores(NamedTuple):
-    """Scores of single frames.
-
-    Attributes:
-        psnr: dB, (B, T); equal frames have 80.
-        ssim: up to 1, (B, T).
-        lpips: from 0 on, lower is better, (B, T); None without a network.
+    """Scores of single frames, each (B, T): PSNR in dB, 80 for equal frames; SSIM up to 1; LPIPS from 0 on, lower is
+    better, None without a network.
     """
 
     psnr: Tensor
@@ -31,14 +27,7 @@ class FrameScores(NamedTuple):
 
 
 class VideoMetrics(NamedTuple):
-    """Means over the batch.
-
-    Attributes:
-        psnr: dB, mean over all frames.
-        ssim: 0 to 1, mean over all frames.
-        psnr_steps: dB for each predicted step, length T.
-        ssim_steps: SSIM for each predicted step, length T.
-    """
+    """Means over all frames, and over those of each predicted step (T)."""
 
     psnr: float
     ssim: float

@@ -123,14 +123,8 @@ def legend(figure: Figure, theme: Theme, **options: Any) -> None:
 
 
 def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], str]], theme: Theme) -> bytes:
-    """Success rates in per cent with their 95 % intervals.
-
-    Args:
-        rows: label, rate (0 to 1), interval (0 to 1), and the method, in whose colour it is drawn (others are grey).
-        theme: page.
-
-    Returns:
-        PNG.
+    """PNG of success rates: rows of a label, rate and 95 % interval (0 to 1), and the method, in whose colour it is
+    drawn (others are grey).
     """
     figure = new_figure(6.4, 0.6 + 0.42 * len(rows))
     axes = figure.add_subplot()
@@ -160,14 +154,8 @@ def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], str]], t
 
 
 def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Theme) -> bytes:
-    """Loss against the optimiser step, one panel a stage and loss term, logarithmic.
-
-    Args:
-        histories: stage -> rows of its `metrics.jsonl` (`step`, `split`, numbers).
-        theme: page.
-
-    Returns:
-        PNG.
+    """PNG of the loss over the optimiser step, one panel a stage and loss term, logarithmic, from the rows of each
+    stage's `metrics.jsonl`.
 
     Raises:
         ValueError: there is nothing to draw.
@@ -197,16 +185,12 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
 
 
 def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Mapping[str, Any], theme: Theme) -> bytes:
-    """Two panels: mean return with its standard error, and success rate with its 95 % interval.
+    """PNG of two panels: mean return with its standard error, and success rate with its 95 % interval.
 
     Args:
-        curves: method, by its name in `playslot_rl.config.methods` (others in a colour of no method) -> points
-            with `env_steps`, `return_mean`, `return_error`, `success_rate`, `ci95`.
+        curves: points by method.
         random: the random policy's point.
-        theme: page.
-
-    Returns:
-        PNG.
+        theme: of the page.
 
     Raises:
         ValueError: there is no point.
@@ -243,14 +227,7 @@ def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Ma
 
 
 def curve_chart(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[Any, Any]]], theme: Theme) -> bytes:
-    """Numbers over the frames of an episode, one panel a feature and one line a component.
-
-    Args:
-        panels: feature -> component -> one value a frame.
-        theme: page.
-
-    Returns:
-        PNG.
+    """PNG of numbers over the frames of an episode: feature -> component -> one value a frame.
 
     Raises:
         ValueError: there is nothing to draw.
@@ -292,15 +269,7 @@ def loss_names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def usage_chart(counts: Mapping[str, Sequence[int]], theme: Theme) -> bytes:
-    """Share of transitions for each code, in per cent, one series a data set.
-
-    Args:
-        counts: data set -> K counts.
-        theme: page.
-
-    Returns:
-        PNG.
-    """
+    """PNG of the share of transitions for each code, of K counts for each data set."""
     figure = new_figure(6.4, 2.4)
     axes = figure.add_subplot()
     k = max(len(c) for c in counts.values())

@@ -30,13 +30,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Table:
-    """A table; the first column names the row.
-
-    Attributes:
-        headers: column names.
-        rows: cells, already formatted.
-        caption: one line under it.
-    """
+    """A table of formatted cells; the first column names the row, the caption stands under it."""
 
     headers: Sequence[str]
     rows: Sequence[Sequence[str]]

@@ -23,8 +23,7 @@ def image_grid(cells: Frames, rows: Sequence[str] = (), columns: Sequence[str] =
 
     Args:
         cells: (R, C, H, W, 3).
-        rows: R labels, or none.
-        columns: C labels, or none.
+        rows, columns: R and C labels, or none.
         scale: enlargement without interpolation; frames are small, blurring would hide their pixels.
 
     Returns:
@@ -62,7 +61,6 @@ def film_strip(clips: Frames, rows: Sequence[str], columns: int = 8, first: int 
 
 
 def png(picture: Image.Image) -> bytes:
-    """Bytes of a picture."""
     buffer = io.BytesIO()
     picture.save(buffer, format="PNG")
     return buffer.getvalue()
@@ -99,13 +97,7 @@ def animation(pictures: list[Image.Image], fps: float = 6.0, pause: float = 1.2)
 
 
 def side_by_side(clips: Frames, columns: Sequence[str], rows: Sequence[str], scale: int = 2) -> list[Image.Image]:
-    """Pictures of an animation: one row an episode, one column a way of running it.
-
-    Args:
-        clips: (E, C, T, H, W, 3).
-        columns: C labels.
-        rows: E labels.
-        scale: enlargement.
+    """Pictures of an animation of clips (E, C, T, H, W, 3): one row an episode, one column a way of running it.
 
     Raises:
         ValueError: wrong shape or number of labels.

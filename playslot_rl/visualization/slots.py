@@ -20,15 +20,8 @@ Frames = npt.NDArray[np.uint8]
 
 @torch.no_grad()
 def slot_cells(model: WorldModel, frames: Frames) -> Frames:
-    """Rows of pictures for a clip.
-
-    Args:
-        model: world model; its SAVi parses the clip from the first frame on.
-        frames: (T, H, W, 3) uint8.
-
-    Returns:
-        (3 + N, T, H, W, 3) uint8: frame, reconstruction, segmentation, then the frame as each slot sees it
-        (its colours weighted by its mask, on white).
+    """Rows of pictures (3 + N, T, H, W, 3) of a clip (T, H, W, 3): frame, reconstruction, segmentation, then the frame
+    as each slot sees it (its colours weighted by its mask, on white).
     """
     device = next(model.savi.parameters()).device
     slots, _ = model.savi(to_float(frames, device)[None], generator=torch.Generator(device).manual_seed(0))
@@ -48,15 +41,8 @@ def draw_slots(model: WorldModel, frames: Frames, columns: int = 6) -> Image.Ima
 
 @torch.no_grad()
 def prototype_frames(model: WorldModel, frame: Frames, steps: int = 15) -> Frames:
-    """Frames imagined while each prototype is held, with zero variability.
-
-    Args:
-        model: world model with a codebook.
-        frame: (H, W, 3) uint8, the first frame.
-        steps: P.
-
-    Returns:
-        (K, P, H, W, 3) uint8. With one latent per slot every slot gets the prototype.
+    """Frames (K, P, H, W, 3) imagined from a frame (H, W, 3) while each prototype is held for P steps, by every slot,
+    with zero variability.
 
     Raises:
         ValueError: the latent-action mode has no prototypes.
