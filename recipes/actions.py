@@ -79,14 +79,10 @@ def make_parser(
 
 
 def run_action(actions: Mapping[str, Action], options: argparse.Namespace) -> int:
-    """Do what the parsed arguments ask for.
-
-    Returns:
-        The exit code: 0 done, 1 a data set that is not sound.
+    """Do what the parsed arguments ask for; the exit code is 0, or 1 for a data set that is not sound.
 
     Raises:
         OutputError: it would write into the data set that it reads, or into another.
-        PlaySlotError: whatever the action raises.
         KeyboardInterrupt: with a line about what that leaves.
     """
     values = dict(vars(options))

@@ -16,24 +16,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from playslot_rl.config import EnvConfig, ExperimentConfig, SAViConfig, to_dict
+from playslot_rl.config import EnvConfig, ExperimentConfig, to_dict
 from playslot_rl.config.weights import data_roots
-from playslot_rl.data.windows import IntArray, split_episodes
-from playslot_rl.datasets.survey import Choice, Survey, choose_size, choose_stride, survey
-from playslot_rl.errors import ConfigError, DataError
-from playslot_rl.recipes import inspect, train_dynamics, train_slots
-from playslot_rl.recipes.adopt_decisions import Decisions
-from playslot_rl.recipes.adopt_plan import SHARES, Plan
-from playslot_rl.recipes.adopt_trials import (
-    choose_prototypes,
-    choose_slots,
-    paced,
+from playslot_rl.datasets.adoption import (
+    SHARES,
+    Budget,
+    Decisions,
+    clip_room,
+    savi_for,
     scheduled,
-    seconds_a_step,
+    shortest,
     too_short,
     with_prototypes,
     with_slots,
 )
+from playslot_rl.datasets.survey import Choice, Survey, choose_size, choose_stride, survey
+from playslot_rl.errors import ConfigError, DataError
+from playslot_rl.recipes import inspect, train_dynamics, train_slots
+from playslot_rl.recipes.adopt_trials import choose_prototypes, choose_slots, paced, seconds_a_step
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import run_to_write
 
@@ -42,13 +42,7 @@ if TYPE_CHECKING:
 
 
 def main(config: ExperimentConfig) -> None:
-    """Choose, train and report.
-
-    Raises:
-        ConfigError: no data set or several, or a task of the simulator's in `env`.
-        DataError: no camera, several and none named, one-frame episodes, or frames that never change.
-        OutputError, CheckpointError, TrainingError: as the stages.
-    """
+    """Choose, train and report."""
     if config.env.name != "video":
         raise ConfigError(f"env: got {config.env.name}, expected video: adopt reads recorded videos; leave env= out")
     if [root.weight for root in data_roots(config.data.root)] != [None]:
@@ -68,14 +62,14 @@ def main(config: ExperimentConfig) -> None:
     decide = Decisions(run, {"data.root": config.data.root, "camera": seen.camera, **asked}, began)
     config = replace(_for_frames(config, seen, decide), out=str(run), run="")
     kept = -(-seen.lengths // config.data.stride)
-    plan = Plan(decide, 60 * config.minutes, int(kept.sum()), len(kept), seen.action_dim > 0)
+    budget = Budget(decide, 60 * config.minutes, int(kept.sum()), len(kept), seen.action_dim > 0)
 
-    config, milliseconds = _chosen_slots(config, run, plan)
-    _train(train_slots.main, config, "slots", milliseconds, plan)
-    a_frame = plan.parsing(config, milliseconds)
-    config, milliseconds = _chosen_prototypes(config, run, plan, plan.afterwards(a_frame))
-    _train(train_dynamics.main, config, "dynamics", milliseconds, plan)
-    episodes = decide("episodes of the report card", lambda: plan.card_episodes(a_frame))
+    config, milliseconds = _chosen_slots(config, run, budget)
+    _train(train_slots.main, config, "slots", milliseconds, budget)
+    a_frame = budget.parsing(config, milliseconds)
+    config, milliseconds = _chosen_prototypes(config, run, budget, budget.afterwards(a_frame))
+    _train(train_dynamics.main, config, "dynamics", milliseconds, budget)
+    episodes = decide("episodes of the report card", lambda: budget.card_episodes(a_frame))
     print(f"look at it: playslot play run={run} data.root={config.data.root}", flush=True)
     inspect.main_if_needed(replace(config, run=str(run), out="", episodes=episodes))
 
@@ -85,15 +79,15 @@ def _train(
     config: ExperimentConfig,
     stage: str,
     milliseconds: int,
-    plan: Plan,
+    budget: Budget,
 ) -> None:
     """Train a stage in the time that its steps were planned to take."""
     own: Any = getattr(config, stage)
-    before = plan.decide.spent
+    before = budget.decide.spent
     train(config, paced(own.steps, milliseconds, getattr(own, "teacher_steps", 0)))
     meta = Run(Path(config.out)).own(stage).meta
-    if plan.decide.spent > before + 1:  # not one that was finished before
-        plan.decide.note(before + float(meta["seconds"]))
+    if budget.decide.spent > before + 1:  # not one that was finished before
+        budget.decide.note(before + float(meta["seconds"]))
 
 
 def _for_frames(config: ExperimentConfig, seen: Survey, decide: Decisions) -> ExperimentConfig:
@@ -118,32 +112,6 @@ def _for_frames(config: ExperimentConfig, seen: Survey, decide: Decisions) -> Ex
     )
 
 
-def shortest(config: ExperimentConfig) -> int:
-    """Frames that a clip of the dynamics has at least."""
-    return max(3, config.dynamics.seed_frames + 1)
-
-
-def clip_room(lengths: IntArray, least: int, validation: float, seed: int) -> tuple[int, float]:
-    """The longest clip that nine tenths of the episodes which have one at all have room for, and one of those held out.
-
-    Args:
-        lengths: frames of each episode that the stride leaves.
-        least: frames of a clip, at least; half of the episodes have them.
-        validation: fraction of the episodes that is held out.
-        seed: of that split.
-
-    Returns:
-        Frames; and the fraction, which is larger where all that were held out are too short.
-    """
-    room = np.sort(lengths[lengths >= least])
-    longest = int(room[len(room) // 10])
-    for share in (validation, 0.1, 0.2, 0.5):
-        held_out = lengths[split_episodes(len(lengths), share, seed)[1]].max()
-        if share >= validation and held_out >= least:
-            return min(longest, int(held_out)), share
-    return longest, 0.0  # measured on what is trained on
-
-
 def start_for(where: str, size: int) -> str:
     """What SAVi starts from: a model of frames of another size has other weights."""
     if where and Run.open(where).stage("slots").group(EnvConfig, "env").image_size != size:
@@ -152,39 +120,29 @@ def start_for(where: str, size: int) -> str:
     return where
 
 
-def savi_for(savi: SAViConfig, size: int) -> SAViConfig:
-    """The preset's SAVi, which is for 64 pixels, for frames of another size: one doubling more or less in the decoder,
-    and, of the strided encoder, as many tokens."""
-    widths, strides = savi.decoder_channels, savi.encoder_strides
-    if savi.decoder == "pixel_shuffle":
-        doublings = int(math.log2(size // 8))
-        widths = (*widths, *widths[-1:] * doublings)[:doublings]
-    if savi.encoder == "strided" and size > 64:
-        strides = (*strides[:-1], 2)
-    return replace(savi, decoder_channels=widths, encoder_strides=strides)
-
-
-def _chosen_slots(config: ExperimentConfig, run: Path, plan: Plan) -> tuple[ExperimentConfig, int]:
+def _chosen_slots(config: ExperimentConfig, run: Path, budget: Budget) -> tuple[ExperimentConfig, int]:
     """The config with the number of slots and with the steps that fit, and milliseconds of a step."""
-    trials, tried, decide = run / "trials", config.adopt.slots, plan.decide
+    trials, tried, decide = run / "trials", config.adopt.slots, budget.decide
     milliseconds = decide(
         "milliseconds a step of SAVi", lambda: _timed(with_slots(config, max(tried)), "slots", trials)
     )
-    a_frame, all_shares = plan.parsing(config, milliseconds), sum(SHARES.values())
+    a_frame, all_shares = budget.parsing(config, milliseconds), sum(SHARES.values())
     # Afterwards all frames are parsed, steps of the dynamics timed, a report card made.
-    afterwards = plan.afterwards(a_frame) + plan.frames * a_frame + plan.timing(milliseconds)
+    afterwards = budget.afterwards(a_frame) + budget.frames * a_frame + budget.timing(milliseconds)
     if "slots" not in decide.made:
-        plan.warn(milliseconds, afterwards)
-    share = (plan.left() - afterwards) * SHARES["slots_trials"] / all_shares / len(tried)
-    slots = decide("slots", lambda: _try_slots(config, trials, plan.trial("slots", share, milliseconds), milliseconds))
+        budget.warn(milliseconds, afterwards)
+    share = (budget.left() - afterwards) * SHARES["slots_trials"] / all_shares / len(tried)
+    slots = decide(
+        "slots", lambda: _try_slots(config, trials, budget.trial("slots", share, milliseconds), milliseconds)
+    )
     if slots != max(tried):
         milliseconds = decide(
             f"milliseconds a step with {slots} slots", lambda: _timed(with_slots(config, slots), "slots", trials)
         )
     own = SHARES["slots"] + (0.0 if (trials / f"slots_{slots}").is_dir() else SHARES["slots_trials"])
     rest = SHARES["dynamics_trial"] + SHARES["dynamics"]
-    seconds = (plan.left() - afterwards) * own / (own + rest)
-    steps = plan.steps("SAVi", run, "slots", seconds, milliseconds, plan.seconds * own)
+    seconds = (budget.left() - afterwards) * own / (own + rest)
+    steps = budget.steps("SAVi", run, "slots", seconds, milliseconds, budget.seconds * own)
     if steps < config.slots.steps / 2:
         enough = math.ceil(config.slots.steps * milliseconds / 1000 / 60 / SHARES["slots"])
         print(
@@ -209,19 +167,20 @@ def _try_prototypes(config: ExperimentConfig, run: Path, steps: int, millisecond
 
 
 def _chosen_prototypes(
-    config: ExperimentConfig, run: Path, plan: Plan, afterwards: float
+    config: ExperimentConfig, run: Path, budget: Budget, afterwards: float
 ) -> tuple[ExperimentConfig, int]:
     """The config with the number of prototypes and with the steps that fit, and milliseconds of a step."""
-    trials, child, decide = run / "trials", replace(config, run=str(run)), plan.decide
+    trials, child, decide = run / "trials", replace(config, run=str(run)), budget.decide
     milliseconds = decide("milliseconds a step of the dynamics", lambda: _timed(child, "dynamics", trials))
     trial, own = SHARES["dynamics_trial"], SHARES["dynamics"]
-    share = (plan.left() - afterwards) * trial / (trial + own)
+    share = (budget.left() - afterwards) * trial / (trial + own)
     prototypes = decide(
-        "prototypes", lambda: _try_prototypes(config, run, plan.trial("prototypes", share, milliseconds), milliseconds)
+        "prototypes",
+        lambda: _try_prototypes(config, run, budget.trial("prototypes", share, milliseconds), milliseconds),
     )
     few = not (trials / "prototypes").is_dir()
-    seconds, before = plan.left() - afterwards, plan.seconds * (own + (trial if few else 0.0))
-    steps = plan.steps("the dynamics", run, "dynamics", seconds, milliseconds, before)
+    seconds, before = budget.left() - afterwards, budget.seconds * (own + (trial if few else 0.0))
+    steps = budget.steps("the dynamics", run, "dynamics", seconds, milliseconds, before)
     return scheduled(with_prototypes(config, prototypes), "dynamics", steps, config.adopt.patience), milliseconds
 
 

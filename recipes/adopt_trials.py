@@ -12,57 +12,32 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.datasets.adoption import (
+    FEWEST_TIMED,
+    SHORTEST,
+    TIMED_SHARE,
+    TIMED_STEPS,
+    scheduled,
+    with_prototypes,
+    with_slots,
+)
 from playslot_rl.datasets.survey import Choice
 from playslot_rl.runs import Run
 
 if TYPE_CHECKING:
     from playslot_rl.training.pace import Pace
 
-TIMED_STEPS: Final = 24
-FEWEST_TIMED: Final = 2
-TIMED_SHARE: Final = 0.03
-"""Of the time, which they may take: then fewer do."""
-SHORTEST: Final = 20
-"""Steps of a training at least, however little time there is."""
 CARRIED: Final = 0.95
 """Share of the transitions that the prototypes in use have to carry."""
 FEWEST: Final = 4
 """Prototypes at least."""
-TELLING: Final = 150
-"""Steps from which on a trial says something: before that slots are not taken apart and one prototype holds all."""
+CUT_SHORT: Final = 0.8
+"""Share of a trial's planned steps, with fewer of which, for want of time, it cannot be compared with others."""
 
 
 def _quietly() -> contextlib.AbstractContextManager[Any]:
     """What a trial says of its slots, after a few steps, would mislead: its outcome is the reason of a choice."""
     return contextlib.redirect_stdout(io.StringIO())
-
-
-def steps_within(seconds: float, seconds_a_step: float) -> int:
-    """Optimiser steps that fit into some seconds."""
-    return max(SHORTEST, int(seconds / max(seconds_a_step, 1e-6)))
-
-
-def with_slots(config: ExperimentConfig, slots: int) -> ExperimentConfig:
-    """The config with another number of slots."""
-    return replace(config, model=replace(config.model, savi=replace(config.model.savi, n_slots=slots)))
-
-
-def with_prototypes(config: ExperimentConfig, prototypes: int) -> ExperimentConfig:
-    """The config with another number of prototypes."""
-    own = replace(config.model.inverse_dynamics, n_prototypes=prototypes)
-    return replace(config, model=replace(config.model, inverse_dynamics=own))
-
-
-def scheduled(config: ExperimentConfig, stage: str, steps: int, patience: int = 0) -> ExperimentConfig:
-    """The config with so many steps of `slots` or `dynamics`: warm-up and teacher forcing shrink with them."""
-    own: Any = getattr(config, stage)
-    share = min(1.0, steps / own.steps)
-    tenth = max(1, steps // 10)
-    changes: dict[str, Any] = {"steps": steps, "validate_every": tenth, "checkpoint_every": tenth, "patience": patience}
-    changes["optim"] = replace(own.optim, warmup_steps=round(own.optim.warmup_steps * share))
-    if stage == "dynamics":
-        changes["teacher_steps"] = round(own.teacher_steps * share)
-    return replace(config, **{stage: replace(own, **changes)})
 
 
 def seconds_a_step(config: ExperimentConfig, stage: str, out: Path) -> float:
@@ -80,17 +55,6 @@ def seconds_a_step(config: ExperimentConfig, stage: str, out: Path) -> float:
         (train_slots if stage == "slots" else train_dynamics).main(replace(timed, out=str(out)), pace)
     meta = Run(out).own(stage).meta
     return float(meta["seconds"]) / float(meta["steps"])
-
-
-def too_short(steps: int, what: str, preset: int) -> Choice | None:
-    """The preset's number where the time allows no trial that would say anything."""
-    if steps >= TELLING:
-        return None
-    return Choice(preset, f"the preset's: the time is enough for {steps} steps of a trial, and below {TELLING} {what}")
-
-
-CUT_SHORT: Final = 0.8
-"""Share of a trial's planned steps, with fewer of which, for want of time, it cannot be compared with others."""
 
 
 def paced(steps: int, milliseconds: float, settled: int = 0) -> Pace:

@@ -8,14 +8,8 @@ from playslot_rl.config import ExperimentConfig
 
 
 def main(config: ExperimentConfig, json_path: Path | None = None) -> None:
-    """Time the fast paths at the paper's sizes, count the preset's steps, and print both.
-
-    Args:
-        config: `threads` and `preset` are used; `preset=smoke` takes tiny sizes that only show that everything runs.
-        json_path: also write the figures there.
-
-    Raises:
-        RenderError: no GL backend. OutputError: the file cannot be written.
+    """Time the fast paths at the paper's sizes, count the preset's steps, print both, and write the figures to
+    `json_path`; `preset=smoke` takes tiny sizes that only show that everything runs.
     """
     from playslot_rl.speed.cases import Sizes, quick_sizes
     from playslot_rl.speed.report import cost_tables, measure, table

@@ -9,11 +9,7 @@ from playslot_rl.errors import ConfigError
 
 
 def main(config: ExperimentConfig) -> None:
-    """Record `episodes` (or the preset's number) with the policy into `out`; the same command again carries on.
-
-    Raises:
-        ConfigError: no `out`.
-    """
+    """Record `episodes` (or the preset's number) with the policy into `out`; the same command again carries on."""
     from playslot_rl.collectors import collect
 
     if not config.out:

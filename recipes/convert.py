@@ -9,10 +9,6 @@ from playslot_rl.errors import ConfigError
 def main(config: ExperimentConfig) -> None:
     """Convert the data set at `data.root`; `data.camera` (all of the paper's if empty), `env.image_size`,
     `collect.storage` and `episodes` (all if empty) are used, too.
-
-    Raises:
-        ConfigError: another environment, no `data.root` or `out`, or an unknown camera.
-        DataError, OutputError: see `playslot_rl.datasets.sketchy.convert_sketchy`.
     """
     from playslot_rl.data.camera_names import camera_list
     from playslot_rl.datasets.sketchy import PAPER_CAMERAS, convert_sketchy

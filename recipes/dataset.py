@@ -22,11 +22,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def fractions(text: str) -> dict[str, float]:
-    """`train=0.9,val=0.1` as a dict.
-
-    Raises:
-        argparse.ArgumentTypeError: it is not of that form, or a name comes twice.
-    """
+    """`train=0.9,val=0.1` as a dict; an ArgumentTypeError where it is not of that form."""
     shares: dict[str, float] = {}
     for part in text.split(","):
         name, _, share = part.partition("=")

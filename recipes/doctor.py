@@ -11,10 +11,8 @@ from playslot_rl.runtime import checks
 
 
 def main(config: ExperimentConfig) -> int:
-    """Print one finding after the other; `device`, `out` and `data.cache` are looked at.
-
-    Returns:
-        0 if everything essential works, otherwise 1.
+    """Print one finding after the other; `device`, `out` and `data.cache` are looked at. Returns 0 if everything
+    essential works, otherwise 1.
     """
     asked: list[Callable[[], checks.Check]] = [
         checks.check_python,

@@ -14,13 +14,7 @@ def main(config: ExperimentConfig) -> None:
     """Write the policy of `config.run` to the new folder `config.out`, and push it where `config.export.repo` is given.
 
     A folder that holds this very policy already is left as it is, and pushed where a push is asked for: that is how the
-    same command is typed again after a kill or a push that failed.
-
-    Raises:
-        ConfigError: no run or no `out`, or the run is a baseline's.
-        CheckpointError: the run has no trained policy, or its checkpoints are damaged or do not belong together.
-        OutputError: `out` holds something else, or cannot be written.
-        HubError: the push failed; the folder stays.
+    same command is typed again after a kill or a push that failed, a HubError.
     """
     run, folder = evaluate.run_with_policy(replace(config, out="")), check_out(config)
     from playslot_rl.sharing.folder import is_model_folder
@@ -44,7 +38,7 @@ def main(config: ExperimentConfig) -> None:
 
 
 def check_out(config: ExperimentConfig) -> Path:
-    """The folder to write. Raises ConfigError: none was named, or the run is a baseline's."""
+    """The folder to write, if one was named."""
     if not config.out or Path(config.out).resolve() == Path(config.run).resolve():
         raise ConfigError("out: got nothing or the run itself, expected a new folder, such as out=policies/press")
     if config.method != "playslot":

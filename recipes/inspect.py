@@ -26,15 +26,6 @@ def main(config: ExperimentConfig) -> None:
     """Measure the world model of `config.run` on a data set; print a line for each measure, and one for the verdict.
 
     A pretrained model (`run=pretrained/ENV`) is made a run in `out` first, as `evaluate` does.
-
-    Args:
-        config: `run`, `data`, `episodes` (looked at, at most; 200 if None), `seed`, `device`, `out`.
-
-    Raises:
-        ConfigError: no run, no `out` for a pretrained model, or `out` names another folder.
-        CheckpointError: the run does not exist or has no finished world model.
-        DataError: the data set cannot be read, has another frame size, or nothing in it moves.
-        OutputError: the result cannot be written.
     """
     from playslot_rl.evaluation.card import DEFAULT_EPISODES, FOLDER, card_json, make_card, write_card
     from playslot_rl.evaluation.card_verdict import concluded
@@ -53,13 +44,7 @@ def main(config: ExperimentConfig) -> None:
 
 
 def opened(config: ExperimentConfig) -> Run:
-    """The run to inspect.
-
-    Raises:
-        ConfigError: none was named, no `out` for a pretrained model, or `out` names another folder.
-        CheckpointError: there is no such run.
-        OutputError: `out` holds something else.
-    """
+    """The run to inspect."""
     run = run_to_read(config, "inspect", "a run with a world model, such as run=runs/mine or run=pretrained")
     if run.pretrained:
         run_to_write(config)  # refused now, not after minutes
@@ -67,11 +52,7 @@ def opened(config: ExperimentConfig) -> Run:
 
 
 def open_set(config: ExperimentConfig, model: WorldModel) -> EpisodeFrames:
-    """The data set(s) of `data.root`, in frames of the model's size.
-
-    Raises:
-        DataError: none is named, or it cannot be read.
-    """
+    """The data set(s) of `data.root`, in frames of the model's size."""
     from dataclasses import replace
 
     from playslot_rl.training.record import open_videos

@@ -15,12 +15,7 @@ from playslot_rl.runtime.devices import open_device
 
 
 def main(config: ExperimentConfig, run: Run) -> None:
-    """Score the world model of `run` and print the result.
-
-    Raises:
-        CheckpointError: the run has no finished world model, or one for another frame size.
-        ConfigError: fewer than two clips, other frames than the run's, or seeds that it was trained on.
-    """
+    """Score the world model of `run` and print the result."""
     from playslot_rl.evaluation.objects import evaluate_run_objects
     from playslot_rl.visualization.report import write_report
 

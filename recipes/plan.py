@@ -27,13 +27,7 @@ EPISODES = 20
 
 
 def main(config: ExperimentConfig) -> None:
-    """Plan towards both kinds of goals, beside random actions and the latent policy, and print the table.
-
-    Raises:
-        ConfigError: no run, an environment without a simulator, or settings that do not fit together.
-        CheckpointError: the run has no trained policy, whose action decoder executes plans.
-        OutputError: the results cannot be written.
-    """
+    """Plan towards both kinds of goals, beside random actions and the latent policy, and print the table."""
     from playslot_rl.acting.planners.size import search_size
 
     run = run_with_policy(config, "plan")

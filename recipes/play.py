@@ -21,17 +21,7 @@ if TYPE_CHECKING:
 
 
 def main(config: ExperimentConfig) -> None:
-    """Serve the page until Ctrl-C.
-
-    Args:
-        config: `run`, `port`, `out`, `data`, `play`, `env`, `render`, `seed`, `device`.
-
-    Raises:
-        ConfigError: no run, a port that is taken, another frame size than the run's, or NiceGUI is not installed.
-        CheckpointError: there is no such run, or it has no prototypes.
-        DataError: a data set that cannot be read, or whose frames have another size.
-        RenderError: there is no GL backend.
-    """
+    """Serve the page until Ctrl-C."""
     if importlib.util.find_spec("nicegui") is None:
         raise ConfigError("play: got no NiceGUI, expected the extra `play`: make setup, or pip install nicegui==3.18.0")
     from playslot_rl.play.gate import Gate

@@ -15,13 +15,7 @@ from playslot_rl.runtime.devices import open_device
 
 
 def main(config: ExperimentConfig, run: Run) -> None:
-    """Score the slots of `run` on the scripted expert's episodes and print the result.
-
-    Raises:
-        CheckpointError: the run has no finished slots.
-        ConfigError: a training data set holds one of the seeds.
-        OutputError: the result cannot be written.
-    """
+    """Score the slots of `run` on the scripted expert's episodes and print the result."""
     from playslot_rl.evaluation.slots import RESULT, evaluate_slots
 
     device = open_device(config.device, config.threads)

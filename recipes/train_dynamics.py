@@ -18,14 +18,8 @@ if TYPE_CHECKING:
 
 
 def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
-    """Train the dynamics into `RUN/dynamics`; killed, the same command carries on; finished, it says so.
-
-    Args:
-        pace: the time that it has (`adopt`); None trains as many steps as the config says.
-
-    Raises:
-        CheckpointError: no finished slots stage, or the run was begun otherwise.
-        DataError, OutputError, TrainingError: see `playslot_rl.errors`.
+    """Train the dynamics into `RUN/dynamics`; killed, the same command carries on; finished, it says so. `pace` is the
+    time that `adopt` gives it; without one it trains as many steps as the config says.
     """
     from playslot_rl.data.cache import Cache
     from playslot_rl.data.slot_cache import slot_cache

@@ -14,13 +14,8 @@ if TYPE_CHECKING:
 
 
 def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
-    """Train SAVi into `RUN/slots`; killed, the same command carries on; finished, it says so.
-
-    Args:
-        pace: the time that it has (`adopt`); None trains as many steps as the config says.
-
-    Raises:
-        DataError, OutputError, CheckpointError, TrainingError: see `playslot_rl.errors`.
+    """Train SAVi into `RUN/slots`; killed, the same command carries on; finished, it says so. `pace` is as of
+    train-dynamics.
     """
     from playslot_rl.evaluation.slots import validation_scores
     from playslot_rl.methods.playslot.method import SLOTS

@@ -25,7 +25,7 @@ import torch
 from playslot_rl.acting.actor import Actor, ExpertActor, RandomActor
 from playslot_rl.acting.agent import ImaginationActor, oracle_actor, playslot_actor
 from playslot_rl.acting.episodes import Outcome, TaskPool, run_episodes
-from playslot_rl.acting.replay import ReplayActor, perform
+from playslot_rl.acting.expert_videos import ReplayActor, perform
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.methods import method_stage
 from playslot_rl.errors import CheckpointError, ConfigError

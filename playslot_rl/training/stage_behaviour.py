@@ -54,26 +54,19 @@ def cloning_settings(config: BehaviourStageConfig) -> BehaviourStageConfig:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenSlots:
     """What policy and decoder see of demonstrations: parsed slots (`config.parsed`), imagined ones (`config.imagined`).
 
-    Attributes:
-        slots: (I, N, D) in parts, the parsed ones first.
-        rows: the transition of each, int64 (I,).
+    They are (I, N, D) in parts, the parsed ones first; `rows` is the transition of each, int64 (I,).
     """
 
     slots: tuple[Tensor, ...]
     rows: Tensor
 
     @classmethod
-    def of(cls, demos: Demonstrations, config: BehaviourStageConfig, horizon: int | None) -> Seen:
-        """Look at demonstrations.
-
-        Args:
-            demos: labelled by the world model.
-            config: at what of them.
-            horizon: at what the predictor imagines only up to so many steps after the first frame; None for as long as
-                there are.
+    def of(cls, demos: Demonstrations, config: BehaviourStageConfig, horizon: int | None) -> SeenSlots:
+        """Look at what `config` says of demonstrations, and at what the predictor imagines only up to `horizon` steps
+        after the first frame; None for as long as there are.
         """
         rows = torch.arange(len(demos.slots), device=demos.slots.device)
         if not config.imagined:
@@ -114,7 +107,7 @@ class CloneStage:
     ) -> None:
         if policy.whitening is not None:
             policy.whitening.fit(demos.latents)
-        seen = Seen.of(demos, config, horizon)
+        seen = SeenSlots.of(demos, config, horizon)
         self.stages = {
             "policy": RegressionStage(
                 "policy",
@@ -227,7 +220,7 @@ class DecoderStage(RegressionStage):
                 every = torch.arange(len(demos.slots), device=demos.slots.device)
                 latents, slots, rows = [demos.latents], [demos.slots], [every]
             if config.decoder_inputs != "inverse_dynamics":
-                seen = Seen.of(demos, config, horizon)
+                seen = SeenSlots.of(demos, config, horizon)
                 said = apply_rows(
                     policy, TensorInputs(seen.slots), torch.arange(len(seen.rows), device=seen.rows.device)
                 )
@@ -279,7 +272,7 @@ class FinetuneStage:
 
         def examples(demos: Demonstrations, noise: float) -> Examples:
             actions = demos.require_actions()
-            seen = Seen.of(demos, config, horizon)
+            seen = SeenSlots.of(demos, config, horizon)
             return TensorInputs(seen.slots, noise, "finetune_noise"), actions[seen.rows]
 
         acted = _acted(held_out)

@@ -14,10 +14,10 @@ from commands import refused, smoke
 
 from playslot_rl.config.compose import compose
 from playslot_rl.data.windows import split_episodes
+from playslot_rl.datasets import adoption
+from playslot_rl.datasets.adoption import SHORTEST, clip_room, savi_for, scheduled, steps_within, too_short
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.recipes import adopt_trials
-from playslot_rl.recipes.adopt import clip_room, savi_for, start_for
-from playslot_rl.recipes.adopt_trials import SHORTEST, scheduled, steps_within, too_short
+from playslot_rl.recipes.adopt import start_for
 from playslot_rl.recipes.play import open_studio
 from playslot_rl.runs import Run
 from playslot_rl.training.stage_slots import warm_start
@@ -62,7 +62,7 @@ def test_a_set_that_nobody_prepared_becomes_a_world_model(
 ) -> None:
     import playslot_rl
 
-    monkeypatch.setattr(adopt_trials, "TELLING", SHORTEST)  # trials although there is no time
+    monkeypatch.setattr(adoption, "TELLING", SHORTEST)  # trials although there is no time
     run = tmp_path / "run"
     done = smoke("adopt", f"data.root={any_set}", f"out={run}", *QUICK)
     made = json.loads((run / "adopt.json").read_text())["choices"]
@@ -146,7 +146,7 @@ def test_a_trial_that_is_too_short_chooses_nothing() -> None:
     assert few is not None
     assert few.value == 4
     assert "20 steps" in few.reason
-    assert too_short(adopt_trials.TELLING, "nothing is seen", preset=4) is None
+    assert too_short(adoption.TELLING, "nothing is seen", preset=4) is None
 
 
 def test_schedules_shrink_with_the_time_that_there_is() -> None:

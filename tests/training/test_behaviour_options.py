@@ -14,7 +14,7 @@ from playslot_rl.data.demonstrations import Demonstrations
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import StepGenerators
-from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage, Seen, cloning_settings
+from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage, SeenSlots, cloning_settings
 from playslot_rl.training.stage_regression import TensorInputs
 
 STEPS, DEMOS, Z, D, A = 30, 8, 5, 6, 3
@@ -65,17 +65,17 @@ def test_a_policy_needs_slots_to_clone_from() -> None:
 
 def test_imagined_rows_end_at_the_horizon() -> None:
     demos = demonstrations()
-    seen = Seen.of(demos, CONFIG, horizon=2)
+    seen = SeenSlots.of(demos, CONFIG, horizon=2)
     far = demos.step <= 2
     inputs = TensorInputs(seen.slots)
     assert torch.equal(inputs.whole(), torch.cat((demos.slots, demos.imagined[far])))
     some = torch.randperm(len(inputs), generator=torch.Generator().manual_seed(0))[:50]
     assert torch.equal(inputs.plain(some), inputs.whole()[some])
-    assert Seen.of(demos, CONFIG, horizon=None).slots[1] is demos.imagined, "nothing is copied where all are seen"
+    assert SeenSlots.of(demos, CONFIG, horizon=None).slots[1] is demos.imagined, "nothing is copied where all are seen"
     assert torch.equal(seen.rows, torch.cat((torch.arange(len(far)), torch.nonzero(far)[:, 0])))
-    assert len(Seen.of(demos, CONFIG, horizon=None).rows) == 2 * len(far)
-    assert torch.equal(Seen.of(demos, replace(CONFIG, imagined=False), horizon=2).slots[0], demos.slots)
-    alone = Seen.of(demos, replace(CONFIG, parsed=False), horizon=2)
+    assert len(SeenSlots.of(demos, CONFIG, horizon=None).rows) == 2 * len(far)
+    assert torch.equal(SeenSlots.of(demos, replace(CONFIG, imagined=False), horizon=2).slots[0], demos.slots)
+    alone = SeenSlots.of(demos, replace(CONFIG, parsed=False), horizon=2)
     assert torch.equal(alone.slots[0], demos.imagined[far])
     assert torch.equal(demos.latents[alone.rows], demos.latents[far])
 

@@ -11,9 +11,9 @@ import pytest
 from commands import smoke
 from test_adopt import write_set
 
-from playslot_rl.recipes import adopt, adopt_decisions, train_dynamics
-from playslot_rl.recipes.adopt_decisions import Decisions
-from playslot_rl.recipes.adopt_plan import FEWEST, Plan
+from playslot_rl.datasets import adoption
+from playslot_rl.datasets.adoption import FEWEST, Budget, Decisions
+from playslot_rl.recipes import adopt, train_dynamics
 from playslot_rl.training import fit
 from playslot_rl.training.stage_dynamics import DynamicsStage
 from playslot_rl.training.stage_slots import SlotsStage
@@ -34,7 +34,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     made = Clock()
-    for module in (adopt, adopt_decisions, fit):
+    for module in (adopt, adoption, fit):
         monkeypatch.setattr(module, "time", made)
     return made
 
@@ -141,20 +141,20 @@ def test_minutes_that_are_too_few_are_said_to_be_at_the_start(
 
 def test_a_run_that_an_earlier_version_began_keeps_its_steps(tmp_path: Path, clock: Clock) -> None:
     decide = Decisions(tmp_path, {}, clock.now)
-    plan = Plan(decide, 60.0, frames=100, episodes=10, actions=False)
+    budget = Budget(decide, 60.0, frames=100, episodes=10, actions=False)
     (tmp_path / "slots").mkdir()
-    assert plan.steps("SAVi", tmp_path, "slots", 10.0, 100, before=36.0) == 360
-    assert plan.steps("the dynamics", tmp_path, "dynamics", 10.0, 100, before=20.0) == 100
-    assert plan.steps("the dynamics", tmp_path, "dynamics", 5.0, 100, before=20.0) == 100, "decided once"
+    assert budget.steps("SAVi", tmp_path, "slots", 10.0, 100, before=36.0) == 360
+    assert budget.steps("the dynamics", tmp_path, "dynamics", 10.0, 100, before=20.0) == 100
+    assert budget.steps("the dynamics", tmp_path, "dynamics", 5.0, 100, before=20.0) == 100, "decided once"
 
 
 def test_the_report_card_has_the_episodes_that_there_is_time_for(tmp_path: Path, clock: Clock) -> None:
     decide = Decisions(tmp_path, {}, clock.now)
-    plan = Plan(decide, 100.0, frames=20_000, episodes=200, actions=True)
-    assert plan.card_episodes(a_frame=1e-4).value == 200
+    budget = Budget(decide, 100.0, frames=20_000, episodes=200, actions=True)
+    assert budget.card_episodes(a_frame=1e-4).value == 200
     clock.now += 90
-    some = plan.card_episodes(a_frame=1e-3).value
+    some = budget.card_episodes(a_frame=1e-3).value
     assert FEWEST < some < 200
-    assert plan.card(some, 1e-3) <= 10
+    assert budget.card(some, 1e-3) <= 10
     clock.now += 90
-    assert plan.card_episodes(a_frame=1e-3).value == FEWEST
+    assert budget.card_episodes(a_frame=1e-3).value == FEWEST
