@@ -64,23 +64,35 @@ def own(cls: type) -> dict[str, dataclasses.Field[Any]]:
 
 
 def rows(cls: type, groups: list[str], compact: Any) -> Iterator[str]:
-    """The table of a class: a row a key."""
-    shared = len(groups) > 1
-    yield "| key | default | meaning |" if shared else "| key | default | `compact` | meaning |"
-    yield "|---|---|---|" if shared else "|---|---|---|---|"
-    for field in own(cls).values():
-        if groups[0] + field.name in GROUPS:
-            continue
-        hint = key_help.fields_of(cls)[field.name]
-        meaning = key_help.meaning(cls, field.name).replace("|", "\\|")
-        if get_origin(hint) is Literal and not all(f"`{name}`" in meaning for name in get_args(hint)):
-            meaning += " (" + ", ".join(f"`{name}`" for name in get_args(hint)) + ")"
-        default = shown(field.default)
-        cells = [f"`{field.name}`", default]
-        if not shared:
-            here = shown(value(compact, groups[0] + field.name))
-            cells.append("" if here == default else here)
-        yield "| " + " | ".join([*cells, meaning]) + " |"
+    """The table of a class: a row a key; with what `compact` changes, where it is one group's and changes something."""
+    fields = [field for field in own(cls).values() if groups[0] + field.name not in GROUPS]
+    changed = {}
+    if len(groups) == 1:
+        here = {field.name: shown(value(compact, groups[0] + field.name)) for field in fields}
+        changed = {field.name: here[field.name] for field in fields if here[field.name] != shown(field.default)}
+    yield "| key | default | `compact` | meaning |" if changed else "| key | default | meaning |"
+    yield "|---|---|---|---|" if changed else "|---|---|---|"
+    for field in fields:
+        cells = [f"`{field.name}`", shown(field.default), *([changed.get(field.name, "")] if changed else [])]
+        yield "| " + " | ".join([*cells, explained(cls, field.name)]) + " |"
+
+
+def explained(cls: type, name: str) -> str:
+    """The meaning of a key, with the values it takes where the words do not name them."""
+    hint, words = key_help.fields_of(cls)[name], key_help.meaning(cls, name).replace("|", "\\|")
+    if get_origin(hint) is Literal and not all(f"`{choice}`" in words for choice in get_args(hint)):
+        words += " (" + ", ".join(f"`{choice}`" for choice in get_args(hint)) + ")"
+    return words
+
+
+def heading(groups: list[str]) -> str:
+    """Of a section: its groups, or the first of many, with all of them below."""
+    names = [f"`{group.removesuffix('.')}`" for group in groups]
+    if names == ["``"]:
+        return "Without a group"
+    if len(names) < 4:
+        return ", ".join(names)
+    return f"{names[0]} and {len(names) - 1} more\n\nIn {', '.join(names)}."
 
 
 def value(config: Any, key: str) -> Any:
@@ -110,8 +122,7 @@ def page() -> str:
         text = text.replace(word, ", ".join(f"`{name}`" for name in choices(group)))
     for cls, groups in sections().items():
         first = (inspect.getdoc(cls) or "").split("\n\n")[0].replace("\n", " ")
-        title = ", ".join(f"`{group.removesuffix('.')}`" for group in groups) if groups != [""] else "Without a group"
-        text += f"\n## {title}\n\n{first}\n\n" + "\n".join(rows(cls, groups, compact)) + "\n"
+        text += f"\n## {heading(groups)}\n\n{first}\n\n" + "\n".join(rows(cls, groups, compact)) + "\n"
     return text
 
 
