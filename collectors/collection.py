@@ -67,8 +67,6 @@ def collect(
 
     Args:
         config: its `env`, `render`, `collect`, `collector` and `logging` are used.
-        policy: `random` or `expert`.
-        steps: agent steps of each; an episode has one more frame.
         seed: base seed; the data depend on it, not on the number of workers.
         workers: processes; 0 means one per core, 1 records in this process.
 

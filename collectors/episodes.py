@@ -44,7 +44,6 @@ class CollectionPolicy(nn.Module):
     """Uniform actions in [-1, 1], or the expert's with Gaussian noise.
 
     Args:
-        name: `random` or `expert`.
         noise: standard deviation for the expert's actions; the sum is clipped to [-1, 1].
     """
 
@@ -76,9 +75,6 @@ class SeededView(TensorView):
     A reset before the running episode's end starts it again. TorchRL resets more often than there are episodes (when it
     looks at the environment, and after an episode's last step): a reset without a job touches neither the simulator nor
     the renderer, and its observation is all zeros.
-
-    Args:
-        jobs: the first episodes.
 
     Attributes:
         jobs: episodes that have not been started: place in the collection and seed of each.
@@ -146,7 +142,6 @@ class TaskMaker:
         self._view: SeededView | None = None
 
     def __call__(self) -> EnvBase:
-        """The environment."""
         self._view = SeededView(make_env(self.spec.env, self.spec.render))
         return wrap(self._view)
 
@@ -157,13 +152,7 @@ class TaskMaker:
 
 
 class EpisodeCollector(Collector):
-    """TorchRL's collector, whose batch is the one whole episode it is asked for.
-
-    Args:
-        create_env_fn: makes the environment in the process that uses it.
-        policy: writes `keys.ACTION`.
-        **kwargs: TorchRL's.
-    """
+    """TorchRL's collector, whose batch is the one whole episode it is asked for."""
 
     def __init__(self, create_env_fn: TaskMaker, policy: Any = None, **kwargs: Any) -> None:
         self._maker = create_env_fn

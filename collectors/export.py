@@ -37,12 +37,10 @@ FREE_BYTES = 16 * 2**20
 
 
 def repo_id(spec: CollectionSpec) -> str:
-    """Name LeRobot knows the data set by; nothing is looked up on the Hub."""
     return f"playslot_rl/{spec.env.name}_{spec.policy}"
 
 
 def features(spec: CollectionSpec, state_dim: int) -> dict[str, dict[str, Any]]:
-    """LeRobot features of a collection."""
     size = spec.env.image_size
     axes = [f"action_{i}" for i in range(spec.env.action_dim)]
 

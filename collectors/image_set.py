@@ -37,7 +37,6 @@ class ImageSetWriter:
 
     Args:
         meta: LeRobot's metadata of it (`LeRobotDatasetMetadata`); one image feature.
-        task: of every frame.
     """
 
     def __init__(self, meta: Any, root: Path, task: str) -> None:
@@ -56,8 +55,6 @@ class ImageSetWriter:
 
         Args:
             values: (T, ...) of each feature that is neither the image nor LeRobot's own index.
-            frames: uint8 (T, H, W, 3), for the statistics.
-            images: PNGs of the frames.
         """
         size = sum(map(len, images))
         if self._bytes and self._bytes + size > self.meta.data_files_size_in_mb * 2**20:

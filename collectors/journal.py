@@ -39,8 +39,6 @@ class RecordedEpisode:
     """One recorded episode.
 
     Attributes:
-        index: its place in the collection.
-        seed: the seed it ran with.
         redrawn: seeds passed over because the episode started solved.
         frames: uint8 [0, 255] (T + 1, H, W, 3).
         states: float32 (T + 1, S).
@@ -60,7 +58,6 @@ class RecordedEpisode:
 
 
 def png(frame: npt.NDArray[np.uint8]) -> bytes:
-    """PNG of a frame uint8 (H, W, 3)."""
     from PIL import Image
 
     buffer = io.BytesIO()
@@ -69,7 +66,6 @@ def png(frame: npt.NDArray[np.uint8]) -> bytes:
 
 
 def encode(episode: RecordedEpisode) -> bytes:
-    """Content of the episode's file."""
     images = [png(frame) for frame in episode.frames]
     arrays: dict[str, Any] = {name: getattr(episode, name) for name in ARRAYS}
     buffer = io.BytesIO()
@@ -97,9 +93,6 @@ def journal_path(out: Path) -> Path:
 
 class Journal:
     """Finished episodes of one collection.
-
-    Args:
-        folder: made if needed.
 
     Raises:
         OutputError: the folder holds something else, or a collection with other settings, or cannot be written.
@@ -147,7 +140,6 @@ class Journal:
             yield
 
     def path(self, index: int) -> Path:
-        """File of episode `index`."""
         return self.folder / f"episode_{index:06d}.npz"
 
     def add(self, episode: RecordedEpisode) -> None:
@@ -200,7 +192,6 @@ class Journal:
         return RecordedEpisode(index, seed, redrawn, frames, **arrays), images
 
     def missing(self) -> list[int]:
-        """Episodes that are not stored yet."""
         there = {entry.name for entry in os.scandir(self.folder)}
         return [i for i in range(self.spec.episodes) if self.path(i).name not in there]
 

@@ -32,7 +32,6 @@ class RayWorkers:
     """Actors of a Ray cluster, one core each.
 
     Args:
-        journal: where this process stores their episodes.
         address: of the cluster; empty means `$RAY_ADDRESS`, or a cluster of this machine alone.
 
     Raises:
@@ -47,18 +46,15 @@ class RayWorkers:
         self._pool = RayCluster.find(address, count).connect(partial(_collector, journal))
 
     def start(self, slot: int) -> None:
-        """See `playslot_rl.collectors.recording.Workers`."""
         spec = self.journal.spec
         resources = {"num_cpus": 1, "max_restarts": 0}  # we start another one ourselves, and know its episodes
         self._pool.add_collectors([TaskMaker(spec)], 1, make_policy(spec), [collector_settings(spec)], [resources])
         self._actors[slot] = self._pool.remote_collectors[-1]
 
     def submit(self, slot: int, index: int) -> None:
-        """See `playslot_rl.collectors.recording.Workers`."""
         self._tasks[self._actors[slot].record_encoded.remote(index)] = slot
 
     def reports(self, timeout: float) -> list[Report]:
-        """See `playslot_rl.collectors.recording.Workers`."""
         import ray
 
         waiting = list(self._tasks)
@@ -90,7 +86,6 @@ class RayWorkers:
         return Report(slot, index=index)
 
     def kill(self, slot: int) -> None:
-        """See `playslot_rl.collectors.recording.Workers`."""
         import ray
 
         actor, self._actors[slot] = self._actors[slot], None

@@ -21,10 +21,7 @@ class CollectionSpec:
     """A collection.
 
     Attributes:
-        policy: `random` or `expert`.
-        steps: agent steps of each; an episode has one more frame.
         noise: standard deviation of Gaussian noise on the expert's actions.
-        storage: `image` or `video`.
         env: the task; its `max_steps` equals `steps`.
     """
 
@@ -74,7 +71,6 @@ class CollectionSpec:
         return cls(policy, episodes, steps, seed, noise, config.collect.storage, env, config.render)
 
     def episode_seed(self, index: int) -> int:
-        """Seed of episode `index`."""
         return episode_seed("collection", self.seed, OFFSETS[self.policy] + index)
 
     def to_dict(self) -> dict[str, Any]:

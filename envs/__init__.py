@@ -109,10 +109,6 @@ def make_env(env: EnvConfig | str | None = None, render: RenderConfig | None = N
     Observations: `keys.PIXELS` uint8 (H, W, 3), `keys.STATE` float32 (S,); actions float32 (A,) in [-1, 1];
     `info["success"]: bool` from `reset` and `step`.
 
-    Args:
-        env: the task, or its name; None means the defaults.
-        render: how frames are drawn; None means the defaults.
-
     Raises:
         ConfigError: unknown environment name.
         RenderError: there is no working GL backend.
@@ -152,20 +148,12 @@ def task_metadata(env: EnvConfig) -> dict[str, Any]:
 
 
 def make_torchrl_env(env: EnvConfig | str | None = None, render: RenderConfig | None = None) -> EnvBase:
-    """Make a task for TorchRL.
-
-    Args:
-        env: the task, or its name; None means the defaults.
-        render: how frames are drawn; None means the defaults.
+    """Make a task (`make_env`) for TorchRL.
 
     Returns:
         Environment with batch size () that reads `keys.ACTION` float32 (A,) and writes `keys.PIXELS` uint8 (3, H, W),
         `keys.STATE` float32 (S,), `keys.SUCCESS` bool (1,), reward, done, terminated and truncated. `set_seed(s)`
         makes `s` the seed of the next episode; later resets draw theirs from the environment's generator.
-
-    Raises:
-        ConfigError: unknown environment name.
-        RenderError: there is no working GL backend.
     """
     task = make_env(env, render)  # before torchrl, which imports mujoco too
     from playslot_rl.envs.torchrl import TensorView, wrap

@@ -73,11 +73,8 @@ class Scene:
     """What an expert knows.
 
     Attributes:
-        grip: (3,).
-        opening: distance between the fingers beyond closed.
         places: (n, 3) centres of the objects.
         target: index of the object the task is about.
-        goal: (3,).
     """
 
     grip: Vector
@@ -146,30 +143,13 @@ EXPERTS: Final[dict[Variant, Callable[[Scene], Action]]] = {"push": push, "reach
 class BlockEnv(PixelTask):
     """One task of the blocks family; `BlockPushEnv`, `BlockReachEnv` and `BlockPickEnv` say what is to be done.
 
-    Observations are `pixels`, uint8 [0, 255] (H, W, 3), and `state_vector`, float32 (4,): grip xyz and the gripper's
-    opening, in metres. Actions are float32 (4,) in [-1, 1]: grip displacement xyz in units of 0.05 m, and (Pick only)
-    gripper effort, negative closes. One agent step is `frame_skip` environment steps (25 Hz) of the same action; its
-    reward is their mean, and `info["success"]` says whether any of them solved the task. Success does not terminate:
-    clips have a fixed length, `max_steps`.
+    `state_vector` is the grip's xyz and the gripper's opening, metres; an action the grip's displacement xyz in units
+    of 0.05 m, and (Pick only) the gripper's effort, negative closes. The reward of an agent step is the mean of its
+    environment steps' (25 Hz): dense, in (0, 1], with the distance d from the object to its goal and the distance g
+    from the grip to the object, 0.9 exp(-20 d) + 0.1 exp(-10 g); for Reach, where the grip itself is the object,
+    0.9 exp(-20 d) + 0.1 exp(-10 d); sparse, 0 if solved, else -1. All else is as of a `PixelTask`.
 
-    Dense reward of an environment step, in (0, 1], with the distance d from the object to its goal and the distance g
-    from the grip to the object: 0.9 exp(-20 d) + 0.1 exp(-10 g); for Reach, where the grip itself is the object,
-    0.9 exp(-20 d) + 0.1 exp(-10 d). Sparse: 0 if solved, else -1.
-
-    An episode is a function of its seed alone: layout and `warmup_steps` random agent steps before the first
-    observation come from two independent streams of that seed.
-
-    Args:
-        env: the task; None means three distractors, `odd`, 25 agent steps of two environment steps.
-        render: how frames are drawn; None means the defaults.
-        render_mode: `rgb_array` or None.
-
-    Attributes:
-        layout: the present episode's layout.
-
-    Raises:
-        ConfigError: `env.action_dim` is not 4.
-        RenderError: there is no working GL backend.
+    `env` None means three distractors, `odd`, 25 agent steps of two environment steps.
     """
 
     variant: ClassVar[Variant]
@@ -216,13 +196,11 @@ class BlockEnv(PixelTask):
         self._simulation.place(self.layout)
 
     def objects(self) -> tuple[tuple[str, ...], ...]:
-        """The arm, the goal, and each object there may be."""
         kind = "sphere" if self.variant == "reach" else "object"
         things = (f"{kind}{i}" for i in range(self._simulation.count))
         return ("robot0:base_link",), ("target0",), *((name,) for name in things)
 
     def places(self) -> dict[str, npt.NDArray[np.float64]]:
-        """The grip and each object."""
         scene = self.scene
         return {"grip": np.array(scene.grip), **{f"object{i}": np.array(p) for i, p in enumerate(scene.places)}}
 
@@ -244,7 +222,6 @@ class BlockEnv(PixelTask):
 
     @property
     def scene(self) -> Scene:
-        """Where things are now."""
         simulation, layout = self._simulation, self.layout
         places = layout.places if self.variant == "reach" else simulation.cubes(len(layout.places))
         return Scene(simulation.grip, simulation.opening, places, layout.target, layout.goal)
@@ -256,7 +233,6 @@ class BlockEnv(PixelTask):
         return np.array([*self._simulation.grip, self._simulation.opening], np.float32)
 
     def expert_action(self) -> Action:
-        """Action of the scripted expert for the present state: float32 (4,) in [-1, 1]."""
         return EXPERTS[self.variant](self.scene)
 
 

@@ -104,10 +104,6 @@ def lighten(model: mujoco.MjModel) -> None:
 class BlockSimulation(MujocoFetchEnv):
     """Arm, table and objects; `place` starts an episode, `advance` runs one environment step.
 
-    Args:
-        variant: decides objects and gripper.
-        count: most objects that an episode has.
-
     Attributes:
         start_grip: (3,) where the grip is at the start of every episode, metres.
     """

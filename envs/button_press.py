@@ -23,23 +23,10 @@ HAND_STATE = slice(0, STATE_DIM)
 
 
 class ButtonPressEnv(PixelTask):
-    """Press the button.
+    """Press the button; see `PixelTask`.
 
-    Observations are `pixels`, uint8 [0, 255] (H, W, 3), and `state_vector`, float32 (4,): hand xyz in metres and the
-    gripper's opening. Actions are float32 (4,) in [-1, 1]: hand displacement xyz and gripper effort. One agent step is
-    `frame_skip` environment steps of the same action; its reward is their mean (0 to 10), and `info["success"]` says
-    whether any of them solved the task. Success does not terminate: clips have a fixed length, `max_steps`.
-
-    An episode is a function of its seed alone: the button's place and the `warmup_steps` random agent steps before the
-    first observation come from two independent streams of that seed.
-
-    Args:
-        render: how frames are drawn; None means the defaults.
-        render_mode: `rgb_array` or None.
-
-    Raises:
-        ConfigError: `env.action_dim` is not 4.
-        RenderError: there is no working GL backend.
+    `state_vector` is the hand's xyz in metres and the gripper's opening, an action the hand's displacement xyz and the
+    gripper's effort. The reward of an agent step is the mean of its environment steps' (0 to 10).
     """
 
     still = PEDESTAL
@@ -86,11 +73,9 @@ class ButtonPressEnv(PixelTask):
         env._prev_obs = self._full[:18].copy()
 
     def objects(self) -> tuple[tuple[str, ...], ...]:
-        """The arm, and the box with its button."""
         return ("base", "hand"), ("box",)
 
     def places(self) -> dict[str, npt.NDArray[np.float64]]:
-        """The hand and the button."""
         return {"hand": self._full[:3].copy(), "button": self._full[4:7].copy()}
 
     def _advance(self, action: Action) -> tuple[float, bool]:
@@ -105,7 +90,6 @@ class ButtonPressEnv(PixelTask):
         return self._full[HAND_STATE].astype(np.float32)
 
     def expert_action(self) -> Action:
-        """Action of Meta-World's scripted expert for the present state: float32 (4,) in [-1, 1]."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it warns that its gain exceeds the clip, which is how it is meant
             action = self._expert.get_action(self._full)

@@ -70,7 +70,6 @@ class FrustumCuller:
         self._model.geom_group[:] = np.where(self.unseen(data), HIDDEN_GROUP, self._groups)
 
     def show(self) -> None:
-        """Undo `hide`."""
         self._model.geom_group[:] = self._groups
 
 

@@ -23,15 +23,8 @@ class LeRobotTask(gym.Wrapper[Observation, npt.NDArray[np.float32], Any, npt.NDA
 
     Observations are `pixels`, `{"front": uint8 [0, 255] (H, W, 3)}`, and `agent_pos`, float32 (S,); actions float32
     (A,) in [-1, 1]. `info["is_success"]` says whether the agent step solved the task, and then the episode ends, as
-    LeRobot's own environments do. (Ours go on: clips of a data set have a fixed length.)
-
-    Args:
-        env: the task, or its name; its `max_steps` is the longest episode, in agent steps.
-
-    Attributes:
-        task: name of the task in our configuration.
-        task_description: what is to be done, a sentence.
-        metadata: with `render_fps`, agent steps a second (`control_hz / frame_skip`).
+    LeRobot's own environments do. (Ours go on: clips of a data set have a fixed length, `max_steps` agent steps.)
+    `metadata` has `render_fps`, agent steps a second (`control_hz / frame_skip`).
 
     Raises:
         ConfigError: there is no such task.

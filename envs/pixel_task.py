@@ -38,11 +38,7 @@ class Observation(dict[str, npt.NDArray[Any]]):
 
 
 def check_actions(env: EnvConfig) -> None:
-    """Check the width of the action.
-
-    Raises:
-        ConfigError: `env.action_dim` is not 4.
-    """
+    """Refuse an `env.action_dim` other than 4 by a ConfigError."""
     if env.action_dim != ACTION_DIM:
         raise ConfigError(
             f"env.action_dim: got {env.action_dim}, expected {ACTION_DIM} for {env.name}: leave env.action_dim out"
@@ -52,12 +48,11 @@ def check_actions(env: EnvConfig) -> None:
 class PixelTask(gym.Env[Observation, Action]):
     """A task seen by one camera.
 
-    An episode is a function of its seed alone: the task and the `warmup_steps` random agent steps before the first
-    observation come from two independent streams of that seed. One agent step is `frame_skip` environment steps of the
-    same action. Success does not terminate: clips have a fixed length, `max_steps`.
-
-    Args:
-        render_mode: `rgb_array` or None.
+    Observations are `pixels`, uint8 [0, 255] (H, W, 3), and `state_vector`, float32 (4,); actions are float32 (4,) in
+    [-1, 1]. An episode is a function of its seed alone: the task and the `warmup_steps` random agent steps before the
+    first observation come from two independent streams of that seed. One agent step is `frame_skip` environment steps
+    of the same action; `info["success"]` says whether any of them solved the task. Success does not terminate: clips
+    have a fixed length, `max_steps`.
 
     Attributes:
         draw_steps: False makes `step` return the last frame that was drawn instead of a new one, for controllers that
@@ -65,6 +60,7 @@ class PixelTask(gym.Env[Observation, Action]):
 
     Raises:
         ConfigError: `env.action_dim` is not 4.
+        RenderError: there is no working GL backend.
     """
 
     _simulation: Any  # MuJoCo's `model` and `data`, and `close`; made by the subclass, as is the next one
@@ -94,11 +90,7 @@ class PixelTask(gym.Env[Observation, Action]):
         return self._make_renderer()
 
     def open_renderer(self) -> None:
-        """Make the GL context now, not with the first episode.
-
-        Raises:
-            RenderError: there is no working GL backend.
-        """
+        """Make the GL context now, not with the first episode; a RenderError where there is none."""
         assert self._renderer is not None
 
     @abstractmethod
@@ -161,7 +153,6 @@ class PixelTask(gym.Env[Observation, Action]):
         return labels
 
     def close(self) -> None:
-        """Free the GL context."""
         if "_renderer" in self.__dict__:
             self._renderer.close()
         self._simulation.close()

@@ -123,9 +123,7 @@ class FrameRenderer:
     """Draws the scene of one MuJoCo model.
 
     Args:
-        model: the model; its off-screen buffer size and, for `fast`, its samples and shadow map are changed.
         camera: the viewpoint; or the name of a camera of the model that is at rest in the world.
-        config: quality and supersampling.
         still: parts that never move, of which `fast` draws only what a fixed camera can see.
 
     Raises:

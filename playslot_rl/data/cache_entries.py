@@ -30,9 +30,7 @@ class Entry:
     """One entry of a cache.
 
     Attributes:
-        kind: `frames` or `slots`.
         data: folder of the data set it was made from, as it was named then; empty where an older version made it.
-        used: when it was last opened, seconds since 1970.
         in_use: whether a process has it open, or makes it.
         part: whether it is not finished: it is being made, or a kill has left it.
     """
@@ -138,8 +136,6 @@ def make_room(cache: CachePlace, needed: int, key: str) -> None:
     """Remove entries, the least recently used first, until `needed` more bytes fit below the cache's limit.
 
     Args:
-        cache: with its limit; nothing is done without one.
-        needed: bytes of what is to be made.
         key: its name: what a killed process has left of it does not count.
 
     Raises:

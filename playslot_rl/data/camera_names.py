@@ -17,9 +17,6 @@ from playslot_rl.errors import DataError
 def full_name(wanted: str, cameras: Sequence[str], where: str) -> str:
     """The feature that a name means: itself, or the only one that ends with it after a dot.
 
-    Args:
-        where: they are in, for the error.
-
     Raises:
         DataError: none or several are called so.
 

@@ -49,11 +49,7 @@ class Contents:
     """A data set as its files tell it.
 
     Attributes:
-        info: `meta/info.json`.
-        episodes: the readable ones, by index.
         tasks: `task_index` -> words.
-        data_files: readable parquet files of rows, in order.
-        file_rows: rows of each.
         columns: every feature that is no camera, (F, ...), rows in the order of the files; numbers, or objects.
         remote: where the files of rows and videos are, if only the metadata lie in `root`.
     """
@@ -101,7 +97,6 @@ class Contents:
 
     @property
     def videos(self) -> list[str]:
-        """Features whose frames are in mp4 files."""
         return [name for name, feature in self.features.items() if feature["dtype"] == "video"]
 
     @property

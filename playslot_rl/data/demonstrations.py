@@ -32,7 +32,6 @@ class Demonstrations:
     """Transitions of demonstrations.
 
     Attributes:
-        slots: parsed slots (M, N, D).
         imagined: slots cOCVP predicts for the same moments (M, N, D), unfolded from each demonstration's first frame
             under the inferred latents; the first frame's are the parsed ones.
         latents: inferred latent actions (M, Z).
@@ -116,7 +115,6 @@ class DemonstrationSplit:
     """Which demonstrations of a data set are trained on, and which only measure.
 
     Attributes:
-        trained: the first ones.
         parsed: what SAVi parses at once, so that one cache serves every number of them.
         held_out: the last ones; None where nothing is beyond those that are trained on.
     """
@@ -133,7 +131,6 @@ def split_demonstrations(
 
     Args:
         demos: how many are trained on; None for all that are not kept.
-        kept: the last ones, which were recorded to measure (`data.held_out`).
         measured: at most so many of the last ones beyond those that are trained on measure, if more than `kept`.
         draw: seed that decides which are the first ones, the same whatever `demos`; None keeps their order. The last
             ones, which may measure (but half of the set at most, beyond `kept`), are not drawn: they come after the
@@ -262,7 +259,6 @@ def require_finite(demos: DemonstrationSplit, labelled: int | None = None) -> No
     """Refuse demonstrations whose actions are learned or measured, and are no numbers.
 
     Args:
-        demos: those that are trained on, and those that are held out.
         labelled: how many of them show their actions; None: all.
 
     Raises:

@@ -38,11 +38,7 @@ UNIT_FRAMES: Final = 2048
 
 @dataclass(frozen=True)
 class FrameArray:
-    """The array that is being made.
-
-    Attributes:
-        size: side to resize to; None keeps them.
-    """
+    """The array that is being made."""
 
     contents: Contents
     camera: str
@@ -57,7 +53,6 @@ class FrameArray:
 
     @property
     def bytes(self) -> int:
-        """Of its frames."""
         return int(np.prod(self.shape))
 
     def begin(self) -> None:
@@ -109,8 +104,6 @@ def build_frames(contents: Contents, camera: str, size: int | None, folder: Path
     """Decode a data set to `folder/frames.npy`.
 
     Args:
-        size: side to resize to; None keeps them.
-        folder: of the entry that is being made; it may hold some units already.
         workers: processes; 0 means one for each core, 1 decodes in this one.
 
     Raises:

@@ -42,7 +42,6 @@ def decoded_frames(
 
     Args:
         problems: notes what cannot be decoded or has another size than stated; such frames are left out.
-        spans: episodes to read; None means all.
     """
     chosen = contents.spans if spans is None else spans
     read = _video_frames if camera in contents.videos else _image_frames

@@ -37,9 +37,7 @@ def label_demonstrations(
     eight slots are 1.1 GB.
 
     Args:
-        model: frozen world model, on `device`.
         source: the videos; its actions are carried along where it has some.
-        slots: cached slots (F, N, D) of its frames.
         trim: motion of the slots up to which a transition is still; 0 keeps every one.
         margin: still ones kept after each stretch of motion.
 

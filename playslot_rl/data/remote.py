@@ -41,11 +41,9 @@ class Remote:
     """The files of one commit of a data set on the Hub.
 
     Attributes:
-        address: as it was typed.
         place: of the commit, as `huggingface_hub.HfFileSystem` names it.
         root: folder of the metadata on this machine; the paths of all files begin with it.
         hashes: of every file of the data set, by its path below the root.
-        token: sent with every request; None sends none.
     """
 
     address: str
@@ -71,7 +69,6 @@ class Remote:
         return io.BufferedReader(_Ranges(self, file), BUFFER)
 
     def asking(self) -> contextlib.AbstractContextManager[None]:
-        """As `_asking`."""
         return _asking(self.address, self.token, self.root)
 
     def holds(self, path: Path) -> bool:
@@ -131,7 +128,6 @@ def open_remote(address: str, cache: Path) -> Contents:
 
     Args:
         address: `hf://datasets/USER/NAME[@REVISION]`; without a revision the tag that LeRobot loads, else main.
-        cache: folder of the cache, where the metadata are kept.
 
     Raises:
         DataError: no such address, data set or revision; no answer; another format version, damaged metadata.

@@ -57,8 +57,6 @@ def slot_cache(
         source: the frames; the first episodes of a data set will do.
         savi: SAVi with frozen weights; moved to `device` and put in eval mode.
         savi_fingerprint: of its weights (`StageCheckpoint.fingerprint`).
-        cache: the cache; empty means the default one.
-        progress: print a line to standard error before a long computation.
 
     Returns:
         float32 (F, N, D), memory-mapped, by the row of the frame; of sets with weights, the sets' caches in a row.

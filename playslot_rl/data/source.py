@@ -57,7 +57,6 @@ class EpisodeFrames:
         success: bool (F,), or None.
         seeds: int64 (E,), or None.
         fingerprint: content hash, 16 hex digits.
-        camera: feature the frames come from.
         robot: what was recorded, as the data set says; empty where it says nothing.
         name: the folder it was read from, for people.
         shares: of several sets that are drawn from with weights, which rows are whose; None draws all windows alike.
@@ -103,9 +102,6 @@ class EpisodeFrames:
     def require_actions(self, width: int | None = None) -> npt.NDArray[np.float32]:
         """The actions.
 
-        Args:
-            width: A; None takes what there is.
-
         Raises:
             DataError: the data set has none, or of another width.
         """
@@ -141,7 +137,6 @@ def open_sources(
         cache: empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
         image_size: side the model expects; None takes what there is.
         resize: resize frames of another size instead of refusing them.
-        buffer: frames of a shuffle buffer.
 
     Raises:
         DataError: a data set is missing, foreign, truncated or unfinalised; no such camera; wrong or differing frame

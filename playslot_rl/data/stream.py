@@ -45,8 +45,6 @@ class FrameStream:
 
     Args:
         contents: the data set; its columns are not kept.
-        size: side to resize to; None keeps them.
-        buffer: frames of the shuffle buffer.
     """
 
     def __init__(self, contents: Contents, camera: str, size: int | None, buffer: int) -> None:
@@ -69,7 +67,6 @@ class FrameStream:
         return self.shape[0]
 
     def block_of(self, rows: IntArray) -> IntArray:
-        """Number of the block of each row."""
         found: IntArray = np.searchsorted(self._first, rows, side="right").astype(np.int64) - 1
         return found
 
@@ -176,12 +173,10 @@ class ShuffleBuffer:
     """Which episodes a step's windows are drawn from.
 
     Args:
-        frames: streamed.
         starts: first row of each episode that is trained on (E,).
         places: windows of each (E,).
         groups: set of each (E,), of sets with weights; all 0 else.
         shares: how much of the batch comes from each set; they add up to 1.
-        seed: of the order.
     """
 
     def __init__(

@@ -34,7 +34,6 @@ class Episode:
     """One row of `meta/episodes`.
 
     Attributes:
-        index: `episode_index`.
         row: all its values but the statistics.
         stats: feature -> statistic -> array, float64.
     """
@@ -52,7 +51,6 @@ def read_columns(
     """The readable ones of some data files, rows of each, and every feature that is no camera.
 
     Args:
-        info: `meta/info.json`.
         opened: a file as pyarrow takes one.
     """
     features = info["features"]

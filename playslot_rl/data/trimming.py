@@ -26,8 +26,6 @@ def moving_rows(motion: Tensor, step: Tensor, threshold: float, margin: int, key
     Args:
         motion: of each transition (M,), the episodes one after the other.
         step: number of each in its episode, int64 (M,).
-        threshold: motion up to this is none.
-        margin: 0 or more.
         key: of the threshold, for the error.
 
     Raises:

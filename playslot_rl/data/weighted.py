@@ -52,7 +52,6 @@ def weighted(sources: Sequence[EpisodeFrames], weights: Sequence[float | None], 
 
     Args:
         weights: of each; all None draws every window of all sets alike, as `concatenate`.
-        names: what to call each in a message.
 
     Raises:
         DataError: sets with weights differ in frame size, rate or width of their actions.
@@ -93,10 +92,6 @@ def draw_episodes(
     shares: Shares, starts: IntArray, places: IntArray, batch: int, generator: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
     """Draw a set by its weight, then one of the places in its episodes.
-
-    Args:
-        starts: first row of each episode (E,).
-        places: how many there are in each episode (E,), 0 or more.
 
     Returns:
         Episode and place in it, int64 (B,) each.

@@ -28,11 +28,6 @@ def sample_windows(
 ) -> IntArray:
     """Draw windows: every valid first frame is equally likely, so long episodes count for more.
 
-    Args:
-        starts: first row of each episode (E,).
-        lengths: frames of each episode (E,).
-        episodes: episodes to draw from; None means all.
-
     Returns:
         Row indices (B, T), int64.
 
@@ -113,14 +108,6 @@ def split_episodes(episodes: int, validation: float, seed: int) -> tuple[IntArra
 
 class Clips:
     """Clips of unlabelled videos: windows of the training episodes, and spread ones of the episodes held out.
-
-    Args:
-        validation: fraction of episodes held out.
-        shown: windows that a validation looks at, at most.
-
-    Attributes:
-        train_episodes: indices, int64.
-        held_out: row indices (at most `shown`, T), int64.
 
     Raises:
         DataError: no episode has `frames` frames.

@@ -34,12 +34,7 @@ DIGITS = 32
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """Of a data set.
-
-    Attributes:
-        value: of all of it, 32 hex digits.
-        episodes: of each episode, in order.
-    """
+    """Of a data set."""
 
     value: str
     episodes: tuple[str, ...]

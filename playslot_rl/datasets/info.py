@@ -55,7 +55,6 @@ class DatasetSummary:
         return json.dumps(asdict(self), indent=2)
 
     def facts(self) -> list[tuple[str, str]]:
-        """Names and values for people."""
         shortest, mean, longest = self.lengths
         length = f"{shortest}" if shortest == longest else f"{shortest} to {longest}, mean {mean:.1f}"
         seconds = self.frames / self.fps

@@ -20,7 +20,6 @@ class MergeResult:
 
     Attributes:
         sources: those it was made from, with their numbers of episodes.
-        verification: of the new one.
     """
 
     out: Path

@@ -34,7 +34,6 @@ class RepairResult:
     """What `repair` did.
 
     Attributes:
-        verification: of it.
         stated: episodes the damaged one said it had; None where nothing was wrong.
         lost: what is not there any more, a line each.
         damaged: where the damaged one is kept, or None where it was left in its place.

@@ -229,9 +229,7 @@ def convert_sketchy(
 
     Args:
         cameras: names out of `CAMERAS`; each is a feature `observation.images.NAME`.
-        image_size: side of the frames, pixels.
         storage: `image` (PNG in parquet) or `video` (h264 yuv444p, crf 0).
-        tags: which episodes.
         episodes: only so many, for a trial; None takes all.
 
     Returns:

@@ -20,9 +20,7 @@ class SplitResult:
     """What `split` made.
 
     Attributes:
-        out: folder of the parts.
         episodes: part -> episodes of the source, ascending.
-        verifications: part -> its verification.
     """
 
     out: Path
@@ -44,7 +42,6 @@ def split(root: str | Path, out: str | Path, fractions: Mapping[str, float], *, 
 
     Args:
         fractions: name -> share, each more than 0, together 1.
-        seed: of the draw.
 
     Raises:
         ConfigError: a negative or absurd seed.

@@ -117,7 +117,6 @@ class Aggregate:
         self._features: dict[str, dict[str, Array]] = {}
 
     def add(self, episode: Stats) -> None:
-        """Take the statistics of one more episode."""
         for name, given in episode.items():
             values = {key: np.asarray(value, np.float64) for key, value in given.items()}
             count = float(values["count"].reshape(-1)[0])
@@ -126,7 +125,6 @@ class Aggregate:
             self._features[name]["count"] = np.array([(0.0 if there is None else there["count"][0]) + count])
 
     def result(self) -> Stats:
-        """Of all episodes so far."""
         return {name: {**v, "count": v["count"].astype(np.int64)} for name, v in self._features.items()}
 
 
@@ -172,8 +170,6 @@ def differing(
     """Names of the basic statistics that are missing, not finite, or differ.
 
     Args:
-        stored: as the data set has them.
-        actual: recomputed, exact.
         theirs: the same with LeRobot's rounding; a value no further from `actual` than these is not wrong.
         loose: tolerance of mean and standard deviation; with one, count, min and max are not compared.
     """

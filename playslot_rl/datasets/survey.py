@@ -60,7 +60,6 @@ class Survey:
         lengths: int64 (E,) frames of all episodes.
         action_dim: width of its actions; 0 has none.
         episodes: frames of some episodes, uint8 (F, S, S, 3), S at most 128.
-        noise: sigma, grey levels.
     """
 
     root: Path
@@ -74,7 +73,6 @@ class Survey:
 
     @property
     def threshold(self) -> float:
-        """theta, grey levels."""
         return min(40.0, max(10.0, 6.0 * self.noise))  # where everything moves all the time, that is no noise
 
 
@@ -148,7 +146,6 @@ def typical_motion(episodes: Sequence[Frames], stride: int, threshold: float) ->
 
     Args:
         episodes: frames of each, uint8 (F, S, S, 3).
-        threshold: theta, grey levels.
     """
     found = []
     for frames in episodes:

@@ -29,7 +29,6 @@ class Verification:
     """Result of `verify`.
 
     Attributes:
-        episodes, frames: that are there.
         fingerprint: of the content (see `fingerprint.py`); empty where it cannot be read.
     """
 
@@ -194,11 +193,7 @@ def _compare(
 def episode_statistics(
     contents: Contents, scans: Mapping[str, CameraScan], number: int, *, as_lerobot: bool = False
 ) -> Stats:
-    """Statistics of the episode of span `number`; cameras whose frames cannot be decoded are left out.
-
-    Args:
-        as_lerobot: means and standard deviations with LeRobot's rounding, not exact.
-    """
+    """Statistics of the episode of span `number`; cameras whose frames cannot be decoded are left out."""
     span: Span = contents.spans[number]
     stats: Stats = {}
     for name in contents.features:

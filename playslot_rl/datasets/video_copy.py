@@ -69,7 +69,6 @@ class VideoCopier:
             ) from error
 
     def close(self) -> None:
-        """Finish the last file."""
         self._finish()
         if self._source is not None:
             self._source.close()

@@ -19,6 +19,7 @@ from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.frames import rgb_frames
 from playslot_rl.data.metadata import is_depth
 from playslot_rl.data.tables import Array, Episode
+from playslot_rl.data.windows import spread_evenly
 from playslot_rl.datasets.info import info
 from playslot_rl.datasets.verify import require_sound
 from playslot_rl.errors import ConfigError
@@ -129,7 +130,8 @@ def spread(total: int, wanted: int) -> list[int]:
     """
     if wanted < 1:
         raise ConfigError(f"--episodes: got {wanted}, expected at least 1")
-    return sorted({int(i) for i in np.round(np.linspace(0, total - 1, min(wanted, total)))})
+    chosen: list[int] = spread_evenly(np.arange(total), wanted).tolist()
+    return chosen
 
 
 def ordinal(number: int) -> str:

@@ -104,8 +104,6 @@ class HubRecord:
 
     Attributes:
         fingerprint: content hash of the data set, as `playslot dataset verify` prints it.
-        scheme: how the fingerprint is made.
-        playslot_rl: version that pushed.
     """
 
     fingerprint: str

@@ -15,11 +15,7 @@ from playslot_rl.sharing.folder import CONFIG, FILES, RANGE, WEIGHTS, files_of, 
 
 @dataclass(frozen=True)
 class PolicyPushResult(Pushed):
-    """What a push of a policy did.
-
-    Attributes:
-        fingerprint: of the weights.
-    """
+    """What a push of a policy did."""
 
     fingerprint: str
 
@@ -42,9 +38,6 @@ def push_policy(
 
     Args:
         folder: made by `playslot export`; nothing is written into it.
-        private: make it private; refused where it is public.
-        branch: made from main if it is not there; None means main.
-        tag: a name for the commit; never moved.
         token: None takes HF_TOKEN or what `hf auth login` stored.
 
     Raises:
@@ -62,11 +55,6 @@ def push_policy(
 
 def pull_policy(repo_id: str, revision: str = "", cache: str | Path = "", token: str | None = None) -> Path:
     """Download a policy, unless that commit of it is in the cache.
-
-    Args:
-        revision: branch, tag or commit; empty means main.
-        cache: folder of the caches; empty means `$PLAYSLOT_CACHE`, or else `~/.cache/playslot_rl`.
-        token: None takes HF_TOKEN or what `hf auth login` stored; not needed for public models.
 
     Returns:
         The model folder.

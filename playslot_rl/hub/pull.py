@@ -31,9 +31,7 @@ class PullResult:
     """What a pull did.
 
     Attributes:
-        revision: what was fetched: a branch, tag or commit.
         why: how it was chosen; empty if it was asked for.
-        files, size: how many files and bytes.
         compared: whether the Hub named a fingerprint to compare it with.
     """
 
@@ -64,9 +62,7 @@ def pull(repo_id: str, root: Path, *, revision: str | None = None, token: str | 
     """Download a LeRobot data set. After an interruption the same command carries on with the files still missing.
 
     Args:
-        root: a folder that is not there, or empty.
         revision: branch, tag or commit; None means the tag of LeRobot's format version, or main where there is none.
-        token: None takes HF_TOKEN or what `hf auth login` stored; not needed for public data sets.
 
     Raises:
         HubError: no such repository or revision, a bad token, offline, no network, an error of the Hub, or a data set

@@ -36,11 +36,7 @@ dataset = LeRobotDataset("{repo_id}")
 
 
 def make_card(data: DatasetSummary, repo_id: str, fingerprint: str) -> str:
-    """The card as Markdown with a YAML header.
-
-    Args:
-        data: summary of a checked data set.
-    """
+    """The card as Markdown with a YAML header."""
     note = read_record(Path(data.root)) or {}
     made = _made(note)
     header = {
@@ -110,11 +106,7 @@ _VERSION = re.compile(r"v?\d+(\.\d+)*")
 
 @dataclass(frozen=True)
 class PushResult(Pushed):
-    """What a push of a data set did.
-
-    Attributes:
-        left: local files that stayed here.
-    """
+    """What a push of a data set did."""
 
     record: HubRecord
     left: tuple[str, ...]
@@ -138,8 +130,6 @@ def push(
     """Upload a LeRobot data set. An interrupted push changes nothing there; the same command carries on.
 
     Args:
-        root: its folder; nothing is written into it.
-        private: make it private; refused where it is public.
         branch: made from main if it is not there; None means main. The version tag moves with main only.
         tag: one more tag for the commit; never moved.
         token: None takes HF_TOKEN or what `hf auth login` stored.

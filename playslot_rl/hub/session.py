@@ -91,12 +91,10 @@ class Repository(Asked):
                 {ref.name: ref.target_commit for ref in refs.tags})  # fmt: skip
 
     def commit_of(self, revision: str) -> str:
-        """Full commit of a branch, tag or commit."""
         info = self.call(self.api.repo_info, **self.here, revision=revision)
         return str(info.sha)
 
     def tree(self, commit: str) -> dict[str, RepoFile]:
-        """All files of a commit, by path."""
         from huggingface_hub import RepoFile
 
         def listed() -> list[Any]:
@@ -186,11 +184,7 @@ def open_repository(
     """Talk to the Hub about one data set or model.
 
     Args:
-        root: local folder, for messages.
         token: None takes HF_TOKEN or what `hf auth login` stored.
-        writing: needs a token.
-        revision: asked for, for messages.
-        kind: what the repository is.
 
     Raises:
         HubError: a bad name, offline mode, no token, or anything that goes wrong inside, in one line without tokens.
@@ -223,7 +217,6 @@ class Pushed:
     """What every push says.
 
     Attributes:
-        files, size: how many files and bytes were compared.
         stale: files deleted on the Hub because they are no longer part of what is pushed.
         card_kept: whether the card is one that somebody wrote by hand.
     """
@@ -281,7 +274,6 @@ def send(
         root: local folder, which may hold a card written by hand.
         files: what to send, by path, with the card as it is made here.
         mark: line of a card by which those made here are known.
-        private: make it private; refused where it is public.
         branch: made from main if it is not there.
         tag: one more tag for the commit; never moved.
         version: tag that moves to the commit; empty for none.

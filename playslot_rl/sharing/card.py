@@ -52,11 +52,7 @@ def make_card(
     experiment: ExperimentConfig | None = None,
     results: Sequence[Result] = (),
 ) -> str:
-    """The card as Markdown with a YAML header: `card.md`, filled in.
-
-    Args:
-        experiment: config of the run; None where it is not known.
-    """
+    """The card as Markdown with a YAML header: `card.md`, filled in."""
     env = policy.env
     header = {
         "license": LICENCE,

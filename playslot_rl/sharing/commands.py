@@ -45,11 +45,6 @@ class Result:
     """A measured success rate.
 
     Attributes:
-        protocol: `simulation` or `imagination`.
-        episodes: how many, one for each seed.
-        seed: block of evaluation seeds.
-        success_rate: 0 to 1.
-        ci95: Wilson's interval.
         mean_steps: agent steps to the first success, of the episodes that had one; None without any.
         references: success rate and interval of other policies in simulation, on the same seeds, by name.
     """
@@ -64,11 +59,7 @@ class Result:
 
 
 def reproduce(config: ExperimentConfig, source: Mapping[str, Any], results: Sequence[Result]) -> list[str]:
-    """Command lines from nothing (from the data sets, where these were recorded elsewhere) to the evaluated policy.
-
-    Args:
-        source: see `playslot_rl.sharing.run.read_source`.
-    """
+    """Command lines from nothing (from the data sets, where these were recorded elsewhere) to the evaluated policy."""
     evaluate = [
         _line("evaluate", f"run={RUN}", f"protocol={r.protocol}", f"episodes={r.episodes}", f"seed={r.seed}")
         for r in results
@@ -209,11 +200,7 @@ def frames_comment(policy: SharedPolicyConfig) -> str:
 
 
 def use(policy: SharedPolicyConfig, experiment: ExperimentConfig | None = None) -> str:
-    """The paragraph on LeRobot's programs, as Markdown.
-
-    Args:
-        experiment: config of the run; None where it is not known.
-    """
+    """The paragraph on LeRobot's programs, as Markdown."""
     if policy.env.name not in ENVIRONMENTS:
         return REAL.format(camera=policy.camera, rate=rate_words(policy))
     known = experiment or ExperimentConfig()

@@ -221,8 +221,6 @@ def load_weights(agent: nn.Module, path: Path, config: SharedPolicyConfig) -> No
     """Load a weights file into an agent, in place; nothing is changed unless everything fits.
 
     Args:
-        agent: of the sizes of the file's config.
-        path: `model.safetensors`.
         config: what it says of the file: its fingerprint (empty says nothing), and the range of the actions.
 
     Raises:
@@ -264,7 +262,6 @@ def save_pretrained(
 
     Args:
         agent: what to store, without its slot oracle.
-        folder: must not exist, or be empty.
         config: its fingerprint, and the ends of `actions`, are set here.
         card: gives the text of README.md for the config with its fingerprint.
 
@@ -320,9 +317,6 @@ def make_processors(device: str, actions: dict[str, Any] | None = None) -> tuple
 
     Frames go in as LeRobot gives them, floats in [0, 1]. The policy gives actions in [-1, 1], as LeRobot's policies do;
     LeRobot's own normaliser turns them into those of the robot, on the CPU, where they have another range.
-
-    Args:
-        actions: of its config; None or empty for [-1, 1].
     """
     from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
     from lerobot.processor import (

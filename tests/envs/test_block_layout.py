@@ -10,7 +10,7 @@ import pytest
 
 from playslot_rl.config import BlocksConfig
 from playslot_rl.config.env import COLOURS
-from playslot_rl.envs.block_layout import LIFT, REACH_Z, Layout, Variant, draw_layout, redness
+from playslot_rl.envs.block_layout import LIFT, REACH_Z, REDNESS, Layout, Variant, draw_layout
 
 START = np.array([1.3419, 0.7491, 0.5347])
 
@@ -69,7 +69,7 @@ def test_each_task_means_the_object_it_says(distractors: int) -> None:
         assert names(layout).count("red") == 1
         assert names(layout)[layout.target] == "red"
     for layout in layouts("push", BlocksConfig("reddest", distractors), 20):
-        found = [redness(COLOURS[name]) for name in names(layout)]
+        found = [REDNESS.index(name) for name in names(layout)]
         assert layout.target == int(np.argmin(found))
         assert len(set(names(layout))) == distractors + 1
     for layout in layouts("push", BlocksConfig("odd", distractors), 20):

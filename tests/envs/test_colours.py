@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ciede2000 import ciede2000, lab, redness
 
 from playslot_rl.config.env import COLOURS
-from playslot_rl.envs.block_layout import ciede2000, lab, redness
+from playslot_rl.envs.block_layout import REDNESS
 
 PAIRS = [
     ((50.0, 2.6772, -79.7751), (50.0, 0.0, -82.7485), 2.0425),
@@ -40,6 +41,7 @@ def test_lab_of_white_black_and_red() -> None:
 
 def test_red_is_reddest_and_no_two_colours_are_equally_red() -> None:
     order = sorted(COLOURS, key=lambda name: redness(COLOURS[name]))
+    assert tuple(order) == REDNESS
     assert order[0] == "red"
     assert redness(COLOURS["red"]) == 0.0
     assert order.index("mediumvioletred") < order.index("orange") < order.index("lime")
