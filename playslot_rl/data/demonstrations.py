@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,8 @@ from playslot_rl.frames import normalise
 from playslot_rl.modules.action_range import ActionRange
 
 FRAMES_AT_ONCE = 1024
+BY_ROW: Final = ("slots", "imagined", "latents", "actions", "episode", "step")
+"""Parts of `Demonstrations` that have a row a transition."""
 MotionOf = Callable[[npt.NDArray[np.int64]], Tensor]
 """The motion (M,) of the transitions from some rows (M,)."""
 
@@ -51,15 +54,8 @@ class Demonstrations:
 
     def take(self, rows: Tensor) -> Demonstrations:
         """Some transitions: an index int64 (M',) or a mask bool (M,); `lengths` stays."""
-        return replace(
-            self,
-            slots=self.slots[rows],
-            imagined=self.imagined[rows],
-            latents=self.latents[rows],
-            actions=None if self.actions is None else self.actions[rows],
-            episode=self.episode[rows],
-            step=self.step[rows],
-        )
+        there = [name for name in BY_ROW if getattr(self, name) is not None]
+        return replace(self, **{name: getattr(self, name)[rows] for name in there})
 
     def require_actions(self) -> Tensor:
         """The real actions (M, A).

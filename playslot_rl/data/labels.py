@@ -7,6 +7,7 @@ F frames.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from playslot_rl.data.cache import note_read
-from playslot_rl.data.demonstrations import Demonstrations, moving_slots, real_actions, transitions
+from playslot_rl.data.demonstrations import BY_ROW, Demonstrations, moving_slots, real_actions, transitions
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.world_model import WorldModel
 
@@ -101,12 +102,5 @@ def with_copies(demos: Sequence[Demonstrations]) -> Demonstrations:
     first, *copies = demos
     if not copies:
         return first
-    return Demonstrations(
-        slots=torch.cat([copy.slots for copy in demos]),
-        imagined=torch.cat([copy.imagined for copy in demos]),
-        latents=torch.cat([copy.latents for copy in demos]),
-        actions=None if first.actions is None else torch.cat([copy.require_actions() for copy in demos]),
-        episode=torch.cat([copy.episode for copy in demos]),
-        step=torch.cat([copy.step for copy in demos]),
-        lengths=first.lengths,
-    )
+    there = [name for name in BY_ROW if getattr(first, name) is not None]
+    return replace(first, **{name: torch.cat([getattr(copy, name) for copy in demos]) for name in there})

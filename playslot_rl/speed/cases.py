@@ -39,13 +39,11 @@ class Sizes:
     """Sizes and repeats; the defaults are the paper's model, with batches small enough for two CPU cores.
 
     Attributes:
-        config: networks, frames, clips and batches of the training steps.
         decoded_frames: predicted frames that the dynamics step's extra row decodes.
         rollout: B, T, N.
         play_slots, play_steps: what a task has, and what fills the predictor's context.
         plan: candidates, iterations, steps of a plan, elites.
-        episodes, episode_frames, parsed: of the data set, and how many episodes are parsed into slots.
-        window, window_batch: frames a window, windows a batch.
+        parsed: how many episodes are parsed into slots.
         rounds: in which the variants of a case take turns.
     """
 

@@ -32,13 +32,8 @@ STATE: Final = 4
 
 @dataclass(frozen=True)
 class Count:
-    """Of one step, forward and backward, without the optimiser.
-
-    Attributes:
-        flops: of matrix products, convolutions and attention; a multiplication and an addition are two.
-        calls: of kernels, views not counted.
-        kept: bytes of distinct storage kept for the backward pass, weights not counted.
-    """
+    """Of one step, forward and backward, without the optimiser: floating-point operations (a multiplication and an
+    addition are two), calls of kernels (views are none), bytes kept for the backward pass (weights are none)."""
 
     flops: float
     calls: float

@@ -30,14 +30,7 @@ Say = Callable[[str], None]
 
 
 def measure(sizes: Sizes, threads: int, quick: bool, say: Say) -> Figures:
-    """Time everything; `say` is told what is being timed, `quick` is recorded.
-
-    Returns:
-        For each case a dict with `unit` and the median of each variant in it, and `machine`.
-
-    Raises:
-        RenderError: no GL backend.
-    """
+    """For each case `unit` and the median of each variant in it, and `machine`; a RenderError without a GL backend."""
     from playslot_rl.envs import block_config
     from playslot_rl.runtime.allocator import tune_allocator
     from playslot_rl.speed import cases
