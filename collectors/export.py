@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.collectors.image_set import ImageSetWriter, finalising
+from playslot_rl.collectors.image_set import ImageSetWriter, feature, finalising, new_set
 from playslot_rl.collectors.journal import Journal, RecordedEpisode
 from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.envs import PROCEDURAL, task_metadata
@@ -43,23 +43,15 @@ def repo_id(spec: CollectionSpec) -> str:
 def features(spec: CollectionSpec, state_dim: int) -> dict[str, dict[str, Any]]:
     size = spec.env.image_size
     axes = [f"action_{i}" for i in range(spec.env.action_dim)]
-
-    def one(dtype: str) -> dict[str, Any]:
-        return {"dtype": dtype, "shape": (1,), "names": None}
-
     return {
-        keys.FEATURE_IMAGE: {
-            "dtype": spec.storage,
-            "shape": (size, size, 3),
-            "names": ["height", "width", "channels"],
-        },
-        keys.FEATURE_STATE: {"dtype": "float32", "shape": (state_dim,), "names": None},
-        keys.FEATURE_ACTION: {"dtype": "float32", "shape": (spec.env.action_dim,), "names": axes},
-        keys.FEATURE_REWARD: one("float32"),
-        keys.FEATURE_SUCCESS: one("bool"),
-        keys.FEATURE_DONE: one("bool"),
-        keys.FEATURE_SEED: one("int64"),
-        keys.FEATURE_LAST: one("bool"),
+        keys.FEATURE_IMAGE: feature(spec.storage, size, size, 3),
+        keys.FEATURE_STATE: feature("float32", state_dim),
+        keys.FEATURE_ACTION: feature("float32", spec.env.action_dim, names=axes),
+        keys.FEATURE_REWARD: feature("float32", 1),
+        keys.FEATURE_SUCCESS: feature("bool", 1),
+        keys.FEATURE_DONE: feature("bool", 1),
+        keys.FEATURE_SEED: feature("int64", 1),
+        keys.FEATURE_LAST: feature("bool", 1),
     }
 
 
@@ -85,24 +77,12 @@ def columns(episode: RecordedEpisode) -> dict[str, npt.NDArray[Any]]:
 
 def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str, Any]]:
     """Write and finalise the data set at `root`; returns a record of each episode."""
-    from lerobot.configs.video import RGBEncoderConfig
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
     metadata = METADATA if spec.env.name in PROCEDURAL else task_metadata(spec.env)
-    video = spec.storage == "video"
-    dataset = LeRobotDataset.create(
-        repo_id(spec),
-        fps=max(1, round(metadata["control_hz"] / spec.env.frame_skip)),
-        features=features(spec, journal.read(0).states.shape[1]),
-        root=root,
-        robot_type=spec.env.name,
-        use_videos=video,
-        video_backend="pyav",
-        rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=0) if video else None,
-        # LeRobot's 10 makes a row group of some 150 columns every ten episodes, all in memory and in the footer.
-        metadata_buffer_size=METADATA_ROWS,
-    )
-    write = _write_video if video else _write_images
+    fps = max(1, round(metadata["control_hz"] / spec.env.frame_skip))
+    stated = features(spec, journal.read(0).states.shape[1])
+    # LeRobot's 10 makes a row group of some 150 columns every ten episodes, all in memory and in the footer.
+    dataset = new_set(repo_id(spec), root, fps, spec.env.name, stated, metadata_buffer_size=METADATA_ROWS)
+    write = _write_video if spec.storage == "video" else _write_images
     records = []
     with finalising(dataset):
         for episode in write(dataset, journal, metadata["task"]):

@@ -8,15 +8,43 @@ This writer makes the same files with LeRobot's own schema, metadata and statist
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from playslot_rl.data.metadata import CAMERAS
+
 EPISODES_AT_ONCE: Final = 32
 """Episodes in a row group."""
+
+
+def feature(dtype: str, *shape: int, names: Sequence[str] | None = None) -> dict[str, Any]:
+    """A feature as LeRobot states it; pictures have the names of their axes."""
+    if dtype in CAMERAS:
+        names = ("height", "width", "channels")
+    return {"dtype": dtype, "shape": shape, "names": None if names is None else list(names)}
+
+
+def new_set(repo_id: str, root: Path, fps: int, robot: str, features: dict[str, dict[str, Any]], **more: Any) -> Any:
+    """A `LeRobotDataset` to be written; videos, where it has some, in h264 without loss."""
+    from lerobot.configs.video import RGBEncoderConfig
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    video = any(each["dtype"] == "video" for each in features.values())
+    return LeRobotDataset.create(
+        repo_id,
+        fps=fps,
+        features=features,
+        root=root,
+        robot_type=robot,
+        use_videos=video,
+        video_backend="pyav",
+        rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=0) if video else None,
+        **more,
+    )
 
 
 @contextlib.contextmanager

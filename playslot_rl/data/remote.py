@@ -28,6 +28,7 @@ from playslot_rl.data.places import filled, is_plain_path
 from playslot_rl.data.problems import Problems
 from playslot_rl.data.tables import MOST_ROWS, Array, Episode, read_columns
 from playslot_rl.errors import DataError
+from playslot_rl.runtime.processes import here
 from playslot_rl.storage.secrets import checked_token, mask
 
 BUFFER: Final = 1 << 20
@@ -141,7 +142,7 @@ def open_remote(address: str, cache: Path) -> Contents:
     columns: dict[str, Array] = {"episode_index": index}
     if not any(feature["dtype"] == "image" for feature in info["features"].values()):
         columns |= read_columns(list(rows), info, problems, remote.open)[2]
-    elif keys.FEATURE_ACTION in info["features"]:
+    elif keys.FEATURE_ACTION in info["features"] and here().first:
         print(f"note: {address}: its frames lie among its rows, whose actions are therefore not read", flush=True)
     if problems.errors or not episodes or len(columns["episode_index"]) != len(index):
         said = problems.errors[0] if problems.errors else f"{len(episodes)} episodes and other rows"

@@ -28,6 +28,7 @@ from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.frames import rgb_frames, sized
 from playslot_rl.data.metadata import stated_size
 from playslot_rl.data.rows import FrameRows, Frames, IntArray, RowView, row_numbers
+from playslot_rl.runtime import processes
 
 BLOCKS: Final = 16
 """Blocks of a full buffer."""
@@ -203,7 +204,7 @@ class ShuffleBuffer:
         self._orders: dict[tuple[int, int], IntArray] = {}
         self._at: list[list[int]] = []
         for blocks, held in zip(self._blocks, self._held, strict=True):
-            if held < min(FEW, len(blocks)):
+            if held < min(FEW, len(blocks)) and processes.here().first:
                 enough = FEW * round(sizes[blocks].mean())
                 print(
                     f"note: data.shuffle_buffer={buffer} holds {held} of {len(blocks)} blocks of episodes, and batches "

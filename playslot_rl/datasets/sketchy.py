@@ -30,6 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
+from playslot_rl.collectors.image_set import feature, new_set
 from playslot_rl.data.metadata import LARGEST_PICTURE
 from playslot_rl.errors import ConfigError, DataError, OutputError
 from playslot_rl.runtime.progress import quiet_datasets
@@ -175,23 +176,13 @@ def read_steps(episode: SketchyEpisode, cameras: Sequence[str], size: int) -> It
 
 def _write(root: Path, episodes: Sequence[SketchyEpisode], cameras: Sequence[str], size: int, storage: str) -> None:
     """One data set, finalised and counted."""
-    from lerobot.configs.video import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    video = storage == "video"
-    image = {"dtype": storage, "shape": (size, size, 3), "names": ["height", "width", "channels"]}
-    numbers = {keys.FEATURE_STATE: sum(STATE.values()), keys.FEATURE_ACTION: ACTION_DIM}
-    dataset = LeRobotDataset.create(
-        f"playslot_rl/sketchy_{root.name}",
-        fps=FPS,
-        features={f"observation.images.{name}": dict(image) for name in cameras}
-        | {name: {"dtype": "float32", "shape": (width,), "names": None} for name, width in numbers.items()},
-        root=root,
-        robot_type="sawyer",
-        use_videos=video,
-        video_backend="pyav",
-        rgb_encoder=RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=0) if video else None,
-    )
+    name = f"playslot_rl/sketchy_{root.name}"
+    features = {f"observation.images.{camera}": feature(storage, size, size, 3) for camera in cameras}
+    features[keys.FEATURE_STATE] = feature("float32", sum(STATE.values()))
+    features[keys.FEATURE_ACTION] = feature("float32", ACTION_DIM)
+    dataset = new_set(name, root, FPS, "sawyer", features)
     lengths = []
     for episode in episodes:
         lengths.append(0)
@@ -200,7 +191,7 @@ def _write(root: Path, episodes: Sequence[SketchyEpisode], cameras: Sequence[str
             lengths[-1] += 1
         dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
-    again = LeRobotDataset(f"playslot_rl/sketchy_{root.name}", root=root, video_backend="pyav")
+    again = LeRobotDataset(name, root=root, video_backend="pyav")
     if (again.num_episodes, len(again)) != (len(episodes), sum(lengths)):
         raise OutputError(f"{root}: got {len(again)} frames, expected {sum(lengths)}; run the same command again")
     record = {
@@ -355,11 +346,11 @@ def parse_example(record: bytes) -> dict[str, Value]:
             "got a record that is no tf.train.Example, expected one: check that the file is whole"
         ) from error
     found: dict[str, Value] = {}
-    for name, feature in features.items():
-        kind = feature.WhichOneof("kind")
+    for name, held in features.items():
+        kind = held.WhichOneof("kind")
         if kind == "bytes_list":
-            found[name] = list(feature.bytes_list.value)
+            found[name] = list(held.bytes_list.value)
         elif kind is not None:
             dtype: type[Any] = np.float32 if kind == "float_list" else np.int64
-            found[name] = np.array(getattr(feature, kind).value, dtype)
+            found[name] = np.array(getattr(held, kind).value, dtype)
     return found

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.collectors.image_set import ImageSetWriter, finalising
+from playslot_rl.collectors.image_set import ImageSetWriter, feature, finalising, new_set
 from playslot_rl.collectors.journal import png
 from playslot_rl.errors import DataError
 from playslot_rl.play.pictures import session_animation
@@ -115,29 +115,16 @@ def _padded(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _features(values: dict[str, npt.NDArray[Any]], camera: str) -> dict[str, dict[str, Any]]:
-    image = {"dtype": "image", "shape": values[camera].shape[1:], "names": ["height", "width", "channels"]}
-    found: dict[str, dict[str, Any]] = {camera: image}
-    for name, column in values.items():
-        if name != camera:
-            found[name] = {"dtype": str(column.dtype), "shape": column.shape[1:], "names": None}
-    return found
+    kinds = {name: "image" if name == camera else str(column.dtype) for name, column in values.items()}
+    return {name: feature(kinds[name], *column.shape[1:]) for name, column in values.items()}
 
 
 def _write_set(root: Path, session: PlaySession, path: Sequence[SceneMoment], shown: Shown, camera: str) -> None:
     """A data set of one episode at `root`."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
     values = columns(session, path, shown, camera)
     with quiet_datasets():
-        dataset = LeRobotDataset.create(
-            REPO,
-            fps=max(1, round(session.start.fps)),
-            features=_features(values, camera),
-            root=root,
-            robot_type=session.world_model.env.name,
-            use_videos=False,
-            video_backend="pyav",
-        )
+        fps, robot = max(1, round(session.start.fps)), session.world_model.env.name
+        dataset = new_set(REPO, root, fps, robot, _features(values, camera))
         frames = values.pop(camera)
         with (
             finalising(dataset),

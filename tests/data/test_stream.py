@@ -12,6 +12,7 @@ import torch
 from foreign import LENGTHS, foreign_frames
 
 from playslot_rl.config import DataConfig
+from playslot_rl.data import agreement
 from playslot_rl.data.opening import open_configured
 from playslot_rl.data.slot_cache import parse_episodes, slot_cache
 from playslot_rl.data.source import open_source
@@ -20,6 +21,7 @@ from playslot_rl.data.views import concatenate, every, shifted
 from playslot_rl.data.windows import Clips
 from playslot_rl.errors import DataError
 from playslot_rl.modules.savi import SAVi
+from playslot_rl.runtime import processes
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.testing import tiny_config, tiny_savi
 
@@ -151,7 +153,7 @@ def test_a_buffer_as_large_as_the_set_draws_as_the_cache_does(foreign_images: Pa
 
 
 def test_a_buffer_that_has_room_for_all_blocks_holds_all_of_them_at_every_step(
-    foreign_images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    foreign_images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not a stretch of the endless order, in which blocks come twice across an epoch's border."""
     stream = open_source(foreign_images, cache=tmp_path, buffer=20)  # three blocks of five frames, and room for four
@@ -162,6 +164,11 @@ def test_a_buffer_that_has_room_for_all_blocks_holds_all_of_them_at_every_step(
     small = open_source(foreign_images, cache=tmp_path, buffer=5)
     ShuffleBuffer(small.frames, small.starts, small.lengths - 1, np.zeros(3, int), np.ones(1), 0)
     assert "note: data.shuffle_buffer=5 holds 1 of 3 blocks of episodes" in capsys.readouterr().out
+    monkeypatch.setattr(processes, "_here", processes.Processes(1, 2))
+    ShuffleBuffer(small.frames, small.starts, small.lengths - 1, np.zeros(3, int), np.ones(1), 0)
+    agreement._say("note: something")
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("", ""), "one of several processes says it"
 
 
 def test_the_step_of_a_generator_does_not_change_what_it_draws() -> None:
