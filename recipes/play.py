@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -92,12 +91,6 @@ def simulated_starts(config: ExperimentConfig, world: WorldModel) -> SimulatedSt
     return SimulatedStarts(world, maker, fps, metadata["task"], first_seed(config, config.seed))
 
 
-def _stored_root(run: Path) -> str:
-    """The data sets that a run was trained on, as its config names them; nothing where it has none."""
-    stored = run / "config.json"
-    return str(json.loads(stored.read_text())["data"]["root"]) if stored.is_file() else ""
-
-
 def recorded_starts(
     config: ExperimentConfig, run: Run, world: WorldModel, agent: Agent | None
 ) -> RecordedStarts | None:
@@ -112,7 +105,7 @@ def recorded_starts(
     found = [root for root in named if (root / "meta" / "info.json").is_file()]
     missing = [root for root in named if root not in found]
     # A pretrained model names no data set, so the user did; a run names those of its training.
-    typed = known or config.data.root != _stored_root(run.folder)
+    typed = known or config.data.root != run.config.data.root
     if missing and (typed or (not found and config.env.name not in ENVIRONMENTS)):
         raise DataError(f"data.root={missing[0]}: got no data set, expected a LeRobot v3.0 one: check data.root=")
     if named and not found:

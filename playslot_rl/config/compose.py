@@ -296,7 +296,7 @@ def _explained() -> Iterator[None]:
 
 def _from_run(run: Path, pairs: Mapping[str, str]) -> ExperimentConfig:
     """The stored config of a run, changed by what the user typed; `out` is the run where it is not given."""
-    stored = _read_stored(run)
+    stored = stored_config(run)
     for group in GROUPS:
         if group in pairs:
             have = stored.preset if group == "preset" else stored.env.name
@@ -312,7 +312,8 @@ def _from_run(run: Path, pairs: Mapping[str, str]) -> ExperimentConfig:
     return config if config.out else dataclasses.replace(config, out=str(run))
 
 
-def _read_stored(run: Path) -> ExperimentConfig:
+def stored_config(run: Path) -> ExperimentConfig:
+    """`RUN/config.json`; a ConfigError where it is missing or not one of this version."""
     path = run / "config.json"
     if not path.is_file():
         hint = near_run(str(run))

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import DataConfig, EnvConfig, ExperimentConfig, ModelConfig, from_dict, to_dict
-from playslot_rl.config.compose import PRETRAINED, near_run
+from playslot_rl.config.compose import PRETRAINED, near_run, stored_config
 from playslot_rl.data.camera_names import with_full_cameras
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import read_json, write_bytes, write_json
@@ -92,6 +92,11 @@ class Run:
     def name(self) -> str:
         """As `Run.open` takes it."""
         return f"{PRETRAINED}/{self.pretrained}" if self.pretrained else str(self.folder)
+
+    @cached_property
+    def config(self) -> ExperimentConfig:
+        """As stored; a ConfigError where it is missing or not one of this version."""
+        return stored_config(self.folder)
 
     @cached_property
     def view(self) -> DataConfig:

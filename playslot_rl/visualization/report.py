@@ -13,10 +13,10 @@ import numpy as np
 
 from playslot_rl.acting.actor import ExpertActor
 from playslot_rl.acting.episodes import TaskPool, record
-from playslot_rl.config import ExperimentConfig, from_dict
+from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.envs.grid_shapes import generate
-from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.errors import CheckpointError
 from playslot_rl.evaluation.objects import RESULT, parse_clips, seed_frames
 from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.evaluation.success import hardware
@@ -75,7 +75,7 @@ def write_report(
         ConfigError: no config was given and the run has none, or it is not one of this version.
         OutputError: a file cannot be written.
     """
-    config = config or stored_config(run)
+    config = config or Run(run).config
     model = world_model or (agent.world_model if agent is not None else None)
     for module in (model, agent):
         if module is not None:
@@ -86,19 +86,6 @@ def write_report(
         given = ReportInput(run, config, model, agent, used, shown, read_metas(run))
         document = build_objects(given) if config.env.name in PROCEDURAL else build(given)
     return write_document(document, run, "report")
-
-
-def stored_config(run: Path) -> ExperimentConfig:
-    """`RUN/config.json`.
-
-    Raises:
-        ConfigError: it is missing or not one of this version.
-    """
-    path = run / "config.json"
-    try:
-        return from_dict(ExperimentConfig, json.loads(path.read_text()))
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} cannot be used: {error}; expected the config of a run; check run=") from error
 
 
 def read_metas(run: Path) -> dict[str, dict[str, Any]]:

@@ -137,7 +137,7 @@ def test_report_of_an_empty_run_says_what_is_missing_and_how_to_make_it(tmp_path
 
 
 def test_a_run_without_config_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="expected the config of a run"):
+    with pytest.raises(ConfigError, match="expected the folder of a run"):
         write_report(tmp_path)
 
 
