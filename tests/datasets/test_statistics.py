@@ -35,6 +35,8 @@ WRITTEN: dict[str, tuple[str, Draw, tuple[int, ...], tuple[int, int]]] = {
     "a long episode in a video": ("video", BRIGHT, (700,), (16, 16)),
 }
 """Storage, what the frames show, lengths of the episodes, height and width."""
+SOME = ("dark images", "many short episodes", "a long episode", "constant video")
+"""The others are slow."""
 
 
 def write(root: Path, storage: str, draw: Draw, lengths: tuple[int, ...], size: tuple[int, int]) -> Path:
@@ -63,7 +65,9 @@ def write(root: Path, storage: str, draw: Draw, lengths: tuple[int, ...], size: 
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("kind", WRITTEN)
+@pytest.mark.parametrize(
+    "kind", [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in WRITTEN]
+)
 def test_what_lerobot_wrote_is_sound(kind: str, tmp_path: Path) -> None:
     result = verify(write(tmp_path / "set", *WRITTEN[kind]))
     assert (result.errors, result.warnings) == ((), ())

@@ -76,9 +76,11 @@ def fresh(source: str, names: list[str], folder: Path) -> dict[str, Any]:
     return shown
 
 
-def test_gymnasium_makes_every_id(tmp_path: Path) -> None:
-    shown = fresh(PLAY.replace("HOW", MAKE), NAMES, tmp_path)
-    assert len(shown) == 17
+@pytest.mark.parametrize("names", [NAMES[::4], pytest.param(NAMES, marks=pytest.mark.slow)], ids=["some", "all"])
+def test_gymnasium_makes_every_id(names: list[str], tmp_path: Path) -> None:
+    assert len(NAMES) == 17
+    shown = fresh(PLAY.replace("HOW", MAKE), names, tmp_path)
+    assert list(shown) == names
     for name, (shape, total, _) in shown.items():
         env = task_env(make_env(task_config_of(name)))
         assert shape == [64, 64, 3]

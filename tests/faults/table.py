@@ -20,7 +20,6 @@ class Row:
     Attributes:
         argv: what is typed, in the work folder.
         begins: which parts of a finished run `run` are there before.
-        quick: how many kills the quick tests make.
         passing: parts of names whose content depends on the day.
         prepare: puts more into the work folder.
         heavy: it takes long; fewer faults are enough, as its parts have rows of their own.
@@ -30,7 +29,6 @@ class Row:
 
     argv: tuple[str, ...]
     begins: tuple[str, ...] = ("data",)
-    quick: int = 0
     passing: tuple[str, ...] = ()
     prepare: Callable[[Path], object] = lambda root: None
     heavy: bool = False
@@ -133,7 +131,7 @@ TABLE: Final[dict[str, Row]] = {
     ),
     "demo": Row(("demo", "episodes=2", "out=out", *SMOKE), (), heavy=True),
     "dataset merge": Row(
-        ("dataset", "merge", "run/data/random", "run/data/expert", "--out", "out"), quick=2, done=THERE
+        ("dataset", "merge", "run/data/random", "run/data/expert", "--out", "out"), done=THERE
     ),
     "dataset split": Row(
         ("dataset", "split", "run/data/random", "--out", "out", "--fractions", "a=0.5,b=0.5"), done=THERE

@@ -20,12 +20,12 @@ from tiny_disk import tiny_disk
 from playslot_rl import cli
 from playslot_rl.recipes import cache, dataset
 
-pytestmark = pytest.mark.integration
-
 Open = Callable[..., Lab]
-QUICK = [name for name, row in TABLE.items() if row.quick]
-ROWS = [pytest.param(name, marks=pytest.mark.slow) for name in TABLE]
-MIXED = [name if TABLE[name].quick else pytest.param(name, marks=pytest.mark.slow) for name in TABLE]
+
+
+def of_every_row(test: Callable[..., None]) -> Callable[..., None]:
+    """A slow test of each command."""
+    return pytest.mark.slow(pytest.mark.timeout(3000)(pytest.mark.parametrize("name", TABLE)(test)))
 
 
 def test_every_writing_command_is_in_the_table() -> None:
@@ -37,28 +37,16 @@ def test_every_writing_command_is_in_the_table() -> None:
     assert not typed & NOT_HERE.keys()
 
 
-@pytest.mark.timeout(900)
-@pytest.mark.parametrize("name", QUICK)
-def test_killed_at_some_writes_the_same_command_carries_on(lab: Open, name: str) -> None:
-    _kill(made := lab(name), made.points()[: TABLE[name].quick])
-
-
-@pytest.mark.timeout(3000)
-@pytest.mark.parametrize("name", ROWS)
+@of_every_row
 def test_killed_at_each_kind_of_write_the_same_command_carries_on(lab: Open, name: str) -> None:
-    row = TABLE[name]
-    _kill(made := lab(name), made.points()[row.quick : 5 if row.heavy else None])
-
-
-def _kill(made: Lab, points: list[tuple[str, int | str]]) -> None:
-    for said, point in points:
+    made = lab(name)
+    for said, point in made.points()[: 5 if TABLE[name].heavy else None]:
         made.lay()
         assert made.run(kill=point).code == KILLED, said
         made.carries_on(said, may_be_done=point == "end")
 
 
-@pytest.mark.timeout(3000)
-@pytest.mark.parametrize("name", ROWS)
+@of_every_row
 def test_a_disk_that_is_full_from_some_write_on_is_one_line(lab: Open, name: str) -> None:
     made = lab(name)
     places = [number for number, (kind, _) in enumerate(made.writes) if kind == "made"]
@@ -69,8 +57,7 @@ def test_a_disk_that_is_full_from_some_write_on_is_one_line(lab: Open, name: str
         made.refuses_or_ends(said, fail=number, errno=errno.ENOSPC)
 
 
-@pytest.mark.timeout(3000)
-@pytest.mark.parametrize("name", ROWS)
+@of_every_row
 def test_a_disk_that_fills_while_a_command_writes_is_one_line(lab: Open, name: str, tmp_path: Path) -> None:
     """A real one: also what libraries write without Python runs into it."""
     with tiny_disk(tmp_path / "disk", 256 * 1024) as disk:
@@ -87,8 +74,7 @@ def _free(disk: Path) -> int:
     return found.f_bavail * found.f_frsize
 
 
-@pytest.mark.timeout(3000)
-@pytest.mark.parametrize("name", MIXED)
+@of_every_row
 def test_folders_that_may_not_be_written_are_one_line(lab: Open, name: str) -> None:
     made = lab(name)
     made.lay()
@@ -102,8 +88,7 @@ def test_folders_that_may_not_be_written_are_one_line(lab: Open, name: str) -> N
     made.refuses_or_ends("read-only", after=allow, mortal=True)
 
 
-@pytest.mark.timeout(3000)
-@pytest.mark.parametrize("name", ROWS)
+@of_every_row
 def test_few_open_files_are_enough_or_one_line(lab: Open, name: str) -> None:
     made = lab(name)
     for limit in (10,) if TABLE[name].heavy else (7, 16):
@@ -111,8 +96,7 @@ def test_few_open_files_are_enough_or_one_line(lab: Open, name: str) -> None:
         made.refuses_or_ends(f"{limit} files", descriptors=limit)
 
 
-@pytest.mark.timeout(3000)
-@pytest.mark.parametrize("name", MIXED)
+@of_every_row
 def test_typed_twice_at_once_both_end_or_one_is_refused(lab: Open, name: str) -> None:
     made = lab(name)
     made.lay()
