@@ -16,24 +16,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from playslot_rl.config import EnvConfig, ExperimentConfig, to_dict
+from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.weights import data_roots
 from playslot_rl.datasets.adoption import (
     SHARES,
     Budget,
     Decisions,
-    clip_room,
-    savi_for,
+    for_frames,
     scheduled,
     shortest,
-    too_short,
     with_prototypes,
     with_slots,
 )
-from playslot_rl.datasets.survey import Choice, Survey, choose_size, choose_stride, survey
+from playslot_rl.datasets.survey import survey
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.recipes import inspect, train_dynamics, train_slots
-from playslot_rl.recipes.adopt_trials import choose_prototypes, choose_slots, paced, seconds_a_step
+from playslot_rl.recipes.adopt_trials import choose_prototypes, choose_slots, paced, timed
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import run_to_write
 
@@ -60,7 +58,7 @@ def main(config: ExperimentConfig) -> None:
         )
     asked = {"minutes": config.minutes, "seed": config.seed, "preset": config.preset, **to_dict(config.adopt)}
     decide = Decisions(run, {"data.root": config.data.root, "camera": seen.camera, **asked}, began)
-    config = replace(_for_frames(config, seen, decide), out=str(run), run="")
+    config = replace(for_frames(config, seen, decide), out=str(run), run="")
     kept = -(-seen.lengths // config.data.stride)
     budget = Budget(decide, 60 * config.minutes, int(kept.sum()), len(kept), seen.action_dim > 0)
 
@@ -90,42 +88,10 @@ def _train(
         budget.decide.note(before + float(meta["seconds"]))
 
 
-def _for_frames(config: ExperimentConfig, seen: Survey, decide: Decisions) -> ExperimentConfig:
-    """The config with frame size, stride, and clips that the episodes have room for."""
-    size = decide("frame size", lambda: choose_size(seen))
-    stride = decide("stride", lambda: choose_stride(seen, size))
-    kept = -(-seen.lengths // stride)
-    typical, dynamics = int(np.median(kept)), config.dynamics
-    longest, validation = clip_room(kept, shortest(config), config.data.validation, config.seed)
-    predicted = min(dynamics.predicted_frames, longest - dynamics.seed_frames)
-    return replace(
-        config,
-        env=replace(config.env, image_size=size, action_dim=max(1, seen.action_dim), max_steps=max(2, typical - 1)),
-        model=replace(config.model, savi=savi_for(config.model.savi, size)),
-        data=replace(config.data, camera=seen.camera, stride=stride, resize=True, validation=validation),
-        slots=replace(
-            config.slots,
-            clip_frames=min(config.slots.clip_frames, longest),
-            start_from=start_for(config.slots.start_from, size),
-        ),
-        dynamics=replace(dynamics, predicted_frames=predicted),
-    )
-
-
-def start_for(where: str, size: int) -> str:
-    """What SAVi starts from: a model of frames of another size has other weights."""
-    if where and Run.open(where).stage("slots").group(EnvConfig, "env").image_size != size:
-        print(f"note: frames of {size} pixels, other than those of slots.start_from={where}: SAVi starts from scratch")
-        return ""
-    return where
-
-
 def _chosen_slots(config: ExperimentConfig, run: Path, budget: Budget) -> tuple[ExperimentConfig, int]:
     """The config with the number of slots and with the steps that fit, and milliseconds of a step."""
     trials, tried, decide = run / "trials", config.adopt.slots, budget.decide
-    milliseconds = decide(
-        "milliseconds a step of SAVi", lambda: _timed(with_slots(config, max(tried)), "slots", trials)
-    )
+    milliseconds = decide("milliseconds a step of SAVi", lambda: timed(with_slots(config, max(tried)), "slots", trials))
     a_frame, all_shares = budget.parsing(config, milliseconds), sum(SHARES.values())
     # Afterwards all frames are parsed, steps of the dynamics timed, a report card made.
     afterwards = budget.afterwards(a_frame) + budget.frames * a_frame + budget.timing(milliseconds)
@@ -133,11 +99,11 @@ def _chosen_slots(config: ExperimentConfig, run: Path, budget: Budget) -> tuple[
         budget.warn(milliseconds, afterwards)
     share = (budget.left() - afterwards) * SHARES["slots_trials"] / all_shares / len(tried)
     slots = decide(
-        "slots", lambda: _try_slots(config, trials, budget.trial("slots", share, milliseconds), milliseconds)
+        "slots", lambda: choose_slots(config, trials, budget.trial("slots", share, milliseconds), milliseconds)
     )
     if slots != max(tried):
         milliseconds = decide(
-            f"milliseconds a step with {slots} slots", lambda: _timed(with_slots(config, slots), "slots", trials)
+            f"milliseconds a step with {slots} slots", lambda: timed(with_slots(config, slots), "slots", trials)
         )
     own = SHARES["slots"] + (0.0 if (trials / f"slots_{slots}").is_dir() else SHARES["slots_trials"])
     rest = SHARES["dynamics_trial"] + SHARES["dynamics"]
@@ -153,37 +119,19 @@ def _chosen_slots(config: ExperimentConfig, run: Path, budget: Budget) -> tuple[
     return scheduled(with_slots(config, slots), "slots", steps, config.adopt.patience), milliseconds
 
 
-def _try_slots(config: ExperimentConfig, trials: Path, steps: int, milliseconds: int) -> Choice:
-    tried = config.adopt.slots
-    if len(tried) == 1:
-        return Choice(tried[0], "as asked for")
-    few = too_short(steps, "the scene is not taken apart", config.model.savi.n_slots)
-    return few or choose_slots(config, trials, steps, milliseconds)
-
-
-def _try_prototypes(config: ExperimentConfig, run: Path, steps: int, milliseconds: int) -> Choice:
-    few = too_short(steps, "one prototype holds all", config.model.inverse_dynamics.n_prototypes)
-    return few or choose_prototypes(config, run, run / "trials" / "prototypes", steps, milliseconds)
-
-
 def _chosen_prototypes(
     config: ExperimentConfig, run: Path, budget: Budget, afterwards: float
 ) -> tuple[ExperimentConfig, int]:
     """The config with the number of prototypes and with the steps that fit, and milliseconds of a step."""
     trials, child, decide = run / "trials", replace(config, run=str(run)), budget.decide
-    milliseconds = decide("milliseconds a step of the dynamics", lambda: _timed(child, "dynamics", trials))
+    milliseconds = decide("milliseconds a step of the dynamics", lambda: timed(child, "dynamics", trials))
     trial, own = SHARES["dynamics_trial"], SHARES["dynamics"]
     share = (budget.left() - afterwards) * trial / (trial + own)
     prototypes = decide(
         "prototypes",
-        lambda: _try_prototypes(config, run, budget.trial("prototypes", share, milliseconds), milliseconds),
+        lambda: choose_prototypes(config, run, budget.trial("prototypes", share, milliseconds), milliseconds),
     )
     few = not (trials / "prototypes").is_dir()
     seconds, before = budget.left() - afterwards, budget.seconds * (own + (trial if few else 0.0))
     steps = budget.steps("the dynamics", run, "dynamics", seconds, milliseconds, before)
     return scheduled(with_prototypes(config, prototypes), "dynamics", steps, config.adopt.patience), milliseconds
-
-
-def _timed(config: ExperimentConfig, stage: str, trials: Path) -> Choice:
-    seconds = seconds_a_step(config, stage, trials / f"time_{stage}_{config.model.savi.n_slots}")
-    return Choice(max(1, round(1000 * seconds)), "measured here, the first steps included")

@@ -18,6 +18,7 @@ from playslot_rl.datasets.adoption import (
     TIMED_SHARE,
     TIMED_STEPS,
     scheduled,
+    too_short,
     with_prototypes,
     with_slots,
 )
@@ -40,21 +41,22 @@ def _quietly() -> contextlib.AbstractContextManager[Any]:
     return contextlib.redirect_stdout(io.StringIO())
 
 
-def seconds_a_step(config: ExperimentConfig, stage: str, out: Path) -> float:
-    """Seconds that a step takes, measured in a small part of the minutes; nothing else of that training is kept."""
+def timed(config: ExperimentConfig, stage: str, trials: Path) -> Choice:
+    """Milliseconds that a step takes, measured in a small part of the minutes; nothing else of it is kept."""
     from playslot_rl.recipes import train_dynamics, train_slots
     from playslot_rl.training.pace import Pace
 
     pace = Pace(60 * config.minutes * TIMED_SHARE, FEWEST_TIMED)
-    timed = scheduled(config, stage, TIMED_STEPS)
+    short, out = scheduled(config, stage, TIMED_STEPS), trials / f"time_{stage}_{config.model.savi.n_slots}"
     once: dict[str, Any] = {"validate_every": TIMED_STEPS, "checkpoint_every": TIMED_STEPS}
     if stage == "dynamics":  # steps with a teacher are much cheaper than rollouts
         once["teacher_steps"] = 0
-    timed = replace(timed, **{stage: replace(getattr(timed, stage), **once)})
+    short = replace(short, **{stage: replace(getattr(short, stage), **once)})
     with _quietly():
-        (train_slots if stage == "slots" else train_dynamics).main(replace(timed, out=str(out)), pace)
+        (train_slots if stage == "slots" else train_dynamics).main(replace(short, out=str(out)), pace)
     meta = Run(out).own(stage).meta
-    return float(meta["seconds"]) / float(meta["steps"])
+    seconds = float(meta["seconds"]) / float(meta["steps"])
+    return Choice(max(1, round(1000 * seconds)), "measured here, the first steps included")
 
 
 def paced(steps: int, milliseconds: float, settled: int = 0) -> Pace:
@@ -65,18 +67,17 @@ def paced(steps: int, milliseconds: float, settled: int = 0) -> Pace:
 
 
 def choose_slots(config: ExperimentConfig, out: Path, steps: int, milliseconds: float) -> Choice:
-    """The smallest number of slots that reconstructs held-out clips nearly as well as the best of those tried.
-
-    Args:
-        config: with everything else chosen.
-        out: folder of the trials.
-        steps: of each.
-        milliseconds: of a step.
+    """The smallest number of slots that reconstructs held-out clips nearly as well as the best of those tried, by
+    trials of so many steps below `out`.
     """
     from playslot_rl.recipes import train_slots
 
-    errors = {}
-    for slots in sorted(config.adopt.slots):
+    tried, errors = sorted(config.adopt.slots), dict[int, float]()
+    if len(tried) == 1:
+        return Choice(tried[0], "as asked for")
+    if few := too_short(steps, "the scene is not taken apart", config.model.savi.n_slots):
+        return few
+    for slots in tried:
         folder = out / f"slots_{slots}"
         with _quietly():
             trial = scheduled(replace(with_slots(config, slots), out=str(folder)), "slots", steps)
@@ -92,15 +93,9 @@ def choose_slots(config: ExperimentConfig, out: Path, steps: int, milliseconds: 
     return Choice(slots, f"held-out squared error after {steps} steps by number of slots: {listed}")
 
 
-def choose_prototypes(config: ExperimentConfig, run: Path, out: Path, steps: int, milliseconds: float) -> Choice:
-    """As many prototypes as carry nearly all transitions when there are more than enough.
-
-    Args:
-        config: with everything else chosen.
-        run: whose slots the trial builds on.
-        out: folder of the trial.
-        steps: of it.
-        milliseconds: of a step.
+def choose_prototypes(config: ExperimentConfig, run: Path, steps: int, milliseconds: float) -> Choice:
+    """As many prototypes as carry nearly all transitions when there are more than enough, by a trial of so many steps
+    on the slots of `run`.
     """
     import numpy as np
 
@@ -111,7 +106,9 @@ def choose_prototypes(config: ExperimentConfig, run: Path, out: Path, steps: int
     from playslot_rl.training.record import open_videos
     from playslot_rl.world_model import module_device
 
-    many = config.adopt.prototypes
+    many, out = config.adopt.prototypes, run / "trials" / "prototypes"
+    if few := too_short(steps, "one prototype holds all", config.model.inverse_dynamics.n_prototypes):
+        return few
     trial = scheduled(with_prototypes(config, many), "dynamics", steps)
     with _quietly():
         train_dynamics.main(replace(trial, run=str(run), out=str(out)), paced(steps, milliseconds))

@@ -12,11 +12,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from playslot_rl.config import ExperimentConfig, SAViConfig
+from playslot_rl.config import EnvConfig, ExperimentConfig, SAViConfig
 from playslot_rl.data.windows import IntArray, split_episodes
-from playslot_rl.datasets.survey import Choice
+from playslot_rl.datasets.survey import Choice, Survey, choose_size, choose_stride
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.card import DEFAULT_EPISODES
+from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import write_json
 
 SHARES: Final = {"slots_trials": 0.18, "slots": 0.42, "dynamics_trial": 0.06, "dynamics": 0.28}
@@ -222,3 +223,33 @@ def savi_for(savi: SAViConfig, size: int) -> SAViConfig:
     if savi.encoder == "strided" and size > 64:
         strides = (*strides[:-1], 2)
     return replace(savi, decoder_channels=widths, encoder_strides=strides)
+
+
+def for_frames(config: ExperimentConfig, seen: Survey, decide: Decisions) -> ExperimentConfig:
+    """The config with frame size, stride, and clips that the episodes have room for."""
+    size = decide("frame size", lambda: choose_size(seen))
+    stride = decide("stride", lambda: choose_stride(seen, size))
+    kept = -(-seen.lengths // stride)
+    typical, dynamics = int(np.median(kept)), config.dynamics
+    longest, validation = clip_room(kept, shortest(config), config.data.validation, config.seed)
+    predicted = min(dynamics.predicted_frames, longest - dynamics.seed_frames)
+    return replace(
+        config,
+        env=replace(config.env, image_size=size, action_dim=max(1, seen.action_dim), max_steps=max(2, typical - 1)),
+        model=replace(config.model, savi=savi_for(config.model.savi, size)),
+        data=replace(config.data, camera=seen.camera, stride=stride, resize=True, validation=validation),
+        slots=replace(
+            config.slots,
+            clip_frames=min(config.slots.clip_frames, longest),
+            start_from=start_for(config.slots.start_from, size),
+        ),
+        dynamics=replace(dynamics, predicted_frames=predicted),
+    )
+
+
+def start_for(where: str, size: int) -> str:
+    """What SAVi starts from: a model of frames of another size has other weights."""
+    if where and Run.open(where).stage("slots").group(EnvConfig, "env").image_size != size:
+        print(f"note: frames of {size} pixels, other than those of slots.start_from={where}: SAVi starts from scratch")
+        return ""
+    return where

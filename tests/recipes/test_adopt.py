@@ -15,9 +15,8 @@ from commands import refused, smoke
 from playslot_rl.config.compose import compose
 from playslot_rl.data.windows import split_episodes
 from playslot_rl.datasets import adoption
-from playslot_rl.datasets.adoption import SHORTEST, clip_room, savi_for, scheduled, steps_within, too_short
+from playslot_rl.datasets.adoption import SHORTEST, clip_room, savi_for, scheduled, start_for, steps_within, too_short
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.recipes.adopt import start_for
 from playslot_rl.recipes.play import open_studio
 from playslot_rl.runs import Run
 from playslot_rl.training.stage_slots import warm_start
