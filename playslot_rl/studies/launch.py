@@ -28,13 +28,8 @@ SWEEP_MODULE: Final = "playslot_rl.recipes.compare_sweep"
 
 @dataclass(frozen=True)
 class Status:
-    """How a job stands.
-
-    Attributes:
-        status: `waiting`, `running`, `done` or `failed`.
-        fingerprint: of the job as it was when this was written.
-        error: one line, of a failed job.
-        seconds: wall-clock seconds of the process that wrote this.
+    """How a job stands: the fingerprint that it had when this was written, one line of error of a failed job, and
+    wall-clock seconds of the process that wrote this.
     """
 
     status: Literal["waiting", "running", "done", "failed"] = "waiting"
@@ -57,11 +52,6 @@ def read_status(job_file: Path) -> Status:
 
 
 def write_status(job_file: Path, status: Status) -> None:
-    """Store a status.
-
-    Raises:
-        OutputError: full disk.
-    """
     write_json(job_file.with_suffix(".status.json"), asdict(status))
 
 
@@ -99,16 +89,11 @@ def open_comparison(out: Path) -> None:
 
 
 def job_command(job_file: Path) -> list[str]:
-    """The command that runs one job."""
     return [sys.executable, "-m", JOB_MODULE, str(job_file)]
 
 
 def run_process(job_file: Path) -> Status:
-    """Run one job in a process of its own and wait for it; what it prints goes to its log.
-
-    Returns:
-        How it ended; `failed` if the process died.
-    """
+    """Run one job in a process of its own and wait for it; what it prints goes to its log. `failed` if it died."""
     with log_file(job_file).open("a") as log:
         done = subprocess.run(
             job_command(job_file), stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, check=False
@@ -129,13 +114,7 @@ def settle(job_file: Path, code: int) -> Status:
 
 
 def sweep_command(files: Sequence[Path], launcher: str, overrides: Sequence[str]) -> list[str]:
-    """The command that gives jobs to a Hydra launcher: a multirun over the names of their files.
-
-    Args:
-        files: of the jobs, in one folder.
-        launcher: Hydra's name of it.
-        overrides: further overrides for Hydra.
-    """
+    """The command that gives jobs to a Hydra launcher: a multirun over the names of their files, in one folder."""
     folder = files[0].parent.resolve()
     names = ",".join(file.stem for file in files)
     return [

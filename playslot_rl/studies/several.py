@@ -11,7 +11,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import IO, Final
 
@@ -20,18 +20,24 @@ from playslot_rl.config.spelling import spelled
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.runtime.children import end_with_parent
 
+Commands = Mapping[str, Callable[[ExperimentConfig], object]]
+"""The `playslot` commands that a study has run, by name: `train-slots`, `train-dynamics`, `train-baseline`, `evaluate`,
+and `train-videos` for a model of unlabelled videos. They lie above it in the layers."""
 PATIENCE_S: Final = 30.0
 """What torchrun is given to end its processes when the job is interrupted."""
 ERROR: Final = re.compile(r"playslot [a-z-]+(?: \(rank \d+\))?: error: (.*)")
 
 
+def train(command: str, config: ExperimentConfig, processes: int, commands: Commands) -> None:
+    """Run a training command, here or on several processes; raises as it does."""
+    if processes > 1:
+        train_on_several(command, config, processes)
+    else:
+        commands[command](config)
+
+
 def training_command(command: str, config: ExperimentConfig, processes: int) -> list[str]:
     """`torchrun --standalone --nproc-per-node=N -m playslot_rl COMMAND key=value ...`.
-
-    Args:
-        command: such as `train-baseline`.
-        config: of it.
-        processes: N.
 
     Raises:
         ConfigError: no arguments make the config.

@@ -16,6 +16,7 @@ from playslot_rl.storage.atomic import json_or_nothing, write_bytes, write_json,
 from playslot_rl.storage.checkpoints import provenance
 from playslot_rl.studies import launch
 from playslot_rl.studies.job import Job
+from playslot_rl.studies.several import Commands
 from playslot_rl.visualization.charts import LIGHT, Theme, figure_bytes
 from playslot_rl.visualization.document import Document, to_markdown
 
@@ -26,9 +27,6 @@ Record = Mapping[str, Any]
 """What a job's file says; `fingerprint` names it."""
 Result = Mapping[str, Any]
 """What `OUT/NAME.json` holds."""
-Commands = Mapping[str, Callable[[ExperimentConfig], object]]
-"""The `playslot` commands that a study has run, by name: `train-slots`, `train-dynamics`, `train-baseline`, `evaluate`,
-and `train-videos` for a model of unlabelled videos. They lie above it in the layers."""
 FOOTNOTES = "Footnotes"
 
 

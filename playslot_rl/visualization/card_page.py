@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from playslot_rl.evaluation.card import RESULT, Card
 from playslot_rl.evaluation.card_verdict import concluded
 from playslot_rl.evaluation.effect_lines import Replayed
+from playslot_rl.storage.atomic import json_or_nothing
 from playslot_rl.visualization.charts import usage_chart
 from playslot_rl.visualization.document import Block, Document, Missing, Picture, Section, Table, Text
 from playslot_rl.visualization.grid import image_grid, png
@@ -53,13 +53,7 @@ def told_text(result: Mapping[str, Any]) -> str:
 
 
 def card_document(result: Mapping[str, Any], card: Card, model: WorldModel) -> Document:
-    """The page of `inspect`.
-
-    Args:
-        result: as stored (`card_json`).
-        card: what was measured.
-        model: the world model.
-    """
+    """The page of `inspect`: of the card and its stored `result` (`card_json`)."""
     pictures = _pictures(card, model)
     sections = [Section(group, [table, *pictures.get(group, [])]) for group, table in card_tables(result["lines"])]
     lead = (
@@ -77,14 +71,8 @@ def _pictures(card: Card, model: WorldModel) -> dict[str, list[Block]]:
     counts = card.details.get("code_counts")
     if counts:
         alt = f"Share of transitions by code: {', '.join(map(str, counts))}."
-        found[LATENTS].append(
-            chart(
-                "codebook",
-                lambda theme: usage_chart({"held out": counts}, theme),
-                alt,
-                "Codes of the held-out episodes.",
-            )
-        )
+        caption = "Codes of the held-out episodes."
+        found[LATENTS].append(chart("codebook", lambda theme: usage_chart({"held out": counts}, theme), alt, caption))
     if model.inverse_dynamics.latent_dim:
         found[EFFECTS] += _replay_pictures(card.replayed)
         found[EFFECTS] += _prototype_table(card.details.get("prototypes", []))
@@ -117,15 +105,8 @@ def _replay_pictures(shown: Replayed) -> list[Block]:
         )
     if shown.swapped is not None:
         own, swapped = shown.own.frames[rows], shown.swapped.frames[rows]
-        columns, names = (
-            [windows.frames[rows, 0], own, swapped, change_map(own, swapped)],
-            [
-                "frame",
-                "own latents",
-                "others'",
-                "difference",
-            ],
-        )
+        columns = [windows.frames[rows, 0], own, swapped, change_map(own, swapped)]
+        names = ["frame", "own latents", "others'", "difference"]
         if shown.region is not None:
             where = np.where(shown.region[rows][..., None], own, (own * 0.15).astype(np.uint8))
             columns, names = [*columns, where], [*names, "moving slots"]
@@ -181,11 +162,10 @@ def _videos(given: ReportInput) -> str:
 
 def card_section(given: ReportInput) -> Section:
     """The stored card; a note where there is none, or that of another world model."""
-    title, path = "Report card", given.run / RESULT
+    title, result = "Report card", json_or_nothing(given.run / RESULT)
     command = given.command("inspect", f"data.root={_videos(given)}")
-    if not path.is_file():
+    if not result:
         return Section(title, [Missing("There is no report card of the world model yet.", command)])
-    result = json.loads(path.read_text())
     prints = {stage: given.metas.get(stage, {}).get("fingerprint") for stage in ("slots", "dynamics")}
     if result["fingerprints"] != prints:
         return Section(title, [Missing("The report card is that of another world model.", command)])

@@ -22,6 +22,7 @@ from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.frames import to_uint8
 from playslot_rl.runs import Run
+from playslot_rl.storage.atomic import json_or_nothing
 from playslot_rl.storage.checkpoints import checkpoint_folder
 from playslot_rl.visualization.card_page import card_section
 from playslot_rl.visualization.document import (
@@ -62,10 +63,10 @@ def write_report(
     """Write `RUN/report.md`, `RUN/report.html` and `RUN/figures/*.png` from what the run has so far.
 
     Args:
-        run: run folder.
-        config: of the run; None reads `RUN/config.json`.
-        agent: trained agent; None where there is no policy yet.
-        world_model: trained world model; None means the agent's.
+        run: its folder.
+        config: None reads `RUN/config.json`.
+        agent: None where there is no policy yet.
+        world_model: None means the agent's.
         pool: environments to use and leave open; None makes and closes its own.
 
     Returns:
@@ -95,8 +96,8 @@ def read_metas(run: Path) -> dict[str, dict[str, Any]]:
     except CheckpointError:
         model = run  # the report is written from what there is
     homes = {"slots": model, "dynamics": model, "policy": run}
-    paths = {stage: checkpoint_folder(homes[stage], stage) / "meta.json" for stage in STAGES}
-    return {stage: json.loads(path.read_text()) for stage, path in paths.items() if path.is_file()}
+    found = {stage: json_or_nothing(checkpoint_folder(homes[stage], stage) / "meta.json") for stage in STAGES}
+    return {stage: meta for stage, meta in found.items() if meta}
 
 
 def build(given: ReportInput) -> Document:
@@ -211,8 +212,7 @@ PROBES = {"prototype": "from the slot's prototype", "latent": "from the slot's l
 def build_objects(given: ReportInput) -> Document:
     """All sections of the report on known objects; what is missing is named with its command."""
     config, grid = given.config, given.config.env.grid
-    path = given.run / RESULT
-    result = json.loads(path.read_text()) if path.is_file() else None
+    result = json_or_nothing(given.run / RESULT) or None
     seed = first_seed(config, config.seed) if result is None else int(result["seeds"][0])
     clips = generate(range(seed, seed + CLIPS_SHOWN), config.env.max_steps, config.env)
     sections = [

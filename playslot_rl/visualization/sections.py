@@ -13,6 +13,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.evaluation.slots import RESULT as SLOTS_RESULT
 from playslot_rl.evaluation.success import POLICY_PROTOCOLS, PROTOCOLS
+from playslot_rl.storage.atomic import json_or_nothing
 from playslot_rl.visualization.charts import DARK, LIGHT, Theme, loss_chart, loss_names, success_chart
 from playslot_rl.visualization.document import Block, Missing, Picture, Section, Table, Text
 from playslot_rl.visualization.grid import png
@@ -84,12 +85,8 @@ def seconds(value: float | None) -> str:
 
 def read_evaluations(run: Path) -> dict[str, dict[str, Any]]:
     """Protocol -> `eval_info.json`, for those that are there."""
-    found = {}
-    for protocol in PROTOCOLS:
-        path = run / "evaluation" / protocol / "eval_info.json"
-        if path.is_file():
-            found[protocol] = json.loads(path.read_text())
-    return found
+    found = {protocol: json_or_nothing(run / "evaluation" / protocol / "eval_info.json") for protocol in PROTOCOLS}
+    return {protocol: result for protocol, result in found.items() if result}
 
 
 # --- success ------------------------------------------------------------------------------------------------------
@@ -207,8 +204,8 @@ def slots_section(given: ReportInput, clip: Callable[[], Any], what: str = EXPER
         "largest mask. Slot rows: the slot's colours weighted by its mask, on white."
     )
     picture = Picture("slots", png(draw_slots(given.world_model, clip())), alt, caption)
-    path = given.run / SLOTS_RESULT
-    return Section(title, [picture, *([Text(_slots_scored(json.loads(path.read_text())))] if path.is_file() else [])])
+    scored = json_or_nothing(given.run / SLOTS_RESULT)
+    return Section(title, [picture, *([Text(_slots_scored(scored))] if scored else [])])
 
 
 def _slots_scored(result: dict[str, Any]) -> str:

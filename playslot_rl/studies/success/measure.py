@@ -9,7 +9,6 @@ from typing import Any
 
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
-from playslot_rl.config.compose import is_pretrained
 from playslot_rl.config.methods import METHODS
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
@@ -19,13 +18,11 @@ from playslot_rl.methods.online.requirements import require_online
 from playslot_rl.runs import Run
 from playslot_rl.storage.checkpoints import require_config
 from playslot_rl.studies.launch import Status
-from playslot_rl.studies.several import train_on_several
-from playslot_rl.studies.study import Commands, Record
+from playslot_rl.studies.several import Commands, train
+from playslot_rl.studies.study import Record
 from playslot_rl.studies.success.figure import success_figure
 from playslot_rl.studies.success.jobs import (
     SuccessJob,
-    latent_models,
-    model_folder,
     success_config,
     success_jobs,
     success_record,
@@ -33,7 +30,7 @@ from playslot_rl.studies.success.jobs import (
 )
 from playslot_rl.studies.success.page import success_page
 from playslot_rl.studies.success.rows import job_rows, summarise
-from playslot_rl.studies.success.shared import Parents, check_data, prepare_shared
+from playslot_rl.studies.success.shared import Shared, check_data, prepare_shared
 
 
 class SuccessMeasure:
@@ -52,7 +49,7 @@ class SuccessMeasure:
 
     def __init__(self, config: ExperimentConfig, commands: Commands) -> None:
         self.config = replace(config, episodes=config.episodes or DEFAULT_EPISODES)
-        self._commands, self._references = commands, dict[str, dict[str, Any]]()
+        self._commands, self._references, self._shared = commands, dict[str, Any](), dict[str, Any]()
 
     @property
     def launcher(self) -> tuple[str, Sequence[str]]:
@@ -64,24 +61,21 @@ class SuccessMeasure:
 
     def prepare(self) -> Mapping[SuccessJob, Record]:
         self.config = config = prepare_shared(self.config, self._commands)
-        wanted, parents = config.compare, Parents(config)
+        wanted, shared = config.compare, Shared(config)
         plain = replace(
             config, compare=CompareConfig(evaluation_seed=wanted.evaluation_seed, processes=wanted.processes)
         )
         found = {
-            job: success_record(job, success_config(plain, job, config.run), parents.of(job))
+            job: success_record(job, success_config(plain, job, config.run), shared.parents(job))
             for job in success_jobs(config, Path(config.out))
         }
-        self._references = _references(config)
+        self._references, self._shared = _references(config), shared.plain()
         return found
 
     @staticmethod
     def run(record: Record, commands: Commands) -> None:
-        config, processes = from_dict(ExperimentConfig, record["config"]), int(record["processes"])
-        if processes > 1:
-            train_on_several("train-baseline", config, processes)
-        else:
-            commands["train-baseline"](config)
+        config = from_dict(ExperimentConfig, record["config"])
+        train("train-baseline", config, int(record["processes"]), commands)
         own = replace(config, run=config.out, out="", seed=int(record["evaluation_seed"]))
         for protocol in record["protocols"]:
             commands["evaluate"](replace(own, protocol=protocol))
@@ -107,8 +101,7 @@ class SuccessMeasure:
             "summary": summarise(rows),
             "references": self._references,
             "rows": rows,
-            "world_model": _world_model(config),
-            "latent_models": _latent_models(config),
+            **self._shared,
             "learn_from_demos": config.collect.learn_from_demos,
             "frame_skip": config.env.frame_skip,
             "threads": config.threads,
@@ -158,24 +151,3 @@ def _references(config: ExperimentConfig) -> dict[str, dict[str, Any]]:
     with TaskPool(config.env, config.render) as pool:
         found = run_references(None, config, seeds, pool, cache=Path(config.out) / "references.json")
     return {name: found[name] for name in ("random", "expert")}
-
-
-def _world_model(config: ExperimentConfig) -> dict[str, Any] | None:
-    if not uses_slots(config):
-        return None
-    stages = Run.open(config.run).world_stages
-    return {
-        "source": config.run if is_pretrained(config.run) else Path(config.run).name,
-        "fingerprints": {name: stage.fingerprint for name, stage in stages.items()},
-        "seconds": sum(float(stage.meta.get("seconds", 0.0)) for stage in stages.values()),
-        "episodes": stages["slots"].meta.get("episodes"),
-    }
-
-
-def _latent_models(config: ExperimentConfig) -> dict[str, dict[str, Any]]:
-    """What all jobs of LAPO's share, and all of CADDY's, by stage."""
-    found = {}
-    for name in latent_models(config):
-        stage = Run(model_folder(Path(config.out), name)).own(name)
-        found[name] = {key: stage.meta.get(key) for key in ("fingerprint", "seconds", "episodes")}
-    return found

@@ -6,9 +6,11 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from playslot_rl.collectors.presets import collect_demos, collect_videos
 from playslot_rl.config import DataConfig, ExperimentConfig, from_dict
+from playslot_rl.config.compose import is_pretrained
 from playslot_rl.config.methods import METHODS
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.agreement import open_files
@@ -16,7 +18,7 @@ from playslot_rl.data.views import first_demonstrations
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.seeds import held_out_seeds
 from playslot_rl.runs import Run
-from playslot_rl.studies.study import Commands
+from playslot_rl.studies.several import Commands
 from playslot_rl.studies.success.jobs import SuccessJob, latent_models, model_folder, uses_demos, uses_slots
 from playslot_rl.training.record import open_videos
 
@@ -113,27 +115,39 @@ def _demos(config: ExperimentConfig, out: Path) -> DataConfig:
     return collect_demos(replace(config, collect=replace(config.collect, expert_episodes=most)), out)
 
 
-class Parents:
-    """Fingerprints of what jobs build on: weights by stage, and the demonstrations they take.
+class Shared:
+    """What was made or found: what jobs build on, and what the result says of it.
 
     Args:
         config: of the comparison, complete.
     """
 
     def __init__(self, config: ExperimentConfig) -> None:
-        stages = Run.open(config.run).world_stages.items() if uses_slots(config) else ()
-        self._world = {name: stage.fingerprint for name, stage in stages}
-        self._models = {
-            stage: Run(model_folder(Path(config.out), stage)).own(stage).fingerprint for stage in latent_models(config)
-        }
+        self._world = Run.open(config.run).world_stages if uses_slots(config) else {}
+        self._source = config.run if is_pretrained(config.run) else Path(config.run).name
+        self._models = {stage: Run(model_folder(Path(config.out), stage)).own(stage) for stage in latent_models(config)}
         self._demos = open_videos(config, config.data.demos, "compare") if uses_demos(config) else None
 
-    def of(self, job: SuccessJob) -> dict[str, str]:
-        """Of one job."""
+    def parents(self, job: SuccessJob) -> dict[str, str]:
+        """Fingerprints of the weights, by stage, and of the demonstrations that a job builds on."""
         method = METHODS[job.method]
-        prints = dict(self._world) if method.slots else {}
+        prints = {name: stage.fingerprint for name, stage in self._world.items()} if method.slots else {}
         if method.model:
-            prints[method.model] = self._models[method.model]
+            prints[method.model] = self._models[method.model].fingerprint
         if job.demos is not None and self._demos is not None:
             prints["demos"] = first_demonstrations(self._demos, job.demos).fingerprint  # the draw is in its config
         return prints
+
+    def plain(self) -> dict[str, Any]:
+        """`world_model` (null where no method builds on one), and the models of videos by stage, `latent_models`."""
+        world = None
+        if self._world:
+            world = {
+                "source": self._source,
+                "fingerprints": {name: stage.fingerprint for name, stage in self._world.items()},
+                "seconds": sum(float(stage.meta.get("seconds", 0.0)) for stage in self._world.values()),
+                "episodes": self._world["slots"].meta.get("episodes"),
+            }
+        kept = ("fingerprint", "seconds", "episodes")
+        models = {name: {key: stage.meta.get(key) for key in kept} for name, stage in self._models.items()}
+        return {"world_model": world, "latent_models": models}

@@ -12,6 +12,7 @@ from typing import Any
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.compare_video import ON_SLOTS, TITLES, CompareVideoConfig, VideoMethod
 from playslot_rl.config.methods import MethodName
+from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import without
 from playslot_rl.errors import ConfigError
 from playslot_rl.studies.job import Job, absolute, absolute_roots, fingerprint_of
@@ -119,7 +120,8 @@ def check_variants(config: ExperimentConfig) -> None:
     for job in video_jobs(config, Path()):
         if job.variant:
             wanted = _with_setting(config, own.vary, job.value)
-            if _setting(video_config(config, job, ""), own.vary) != _setting(wanted, own.vary):
+            made, meant = (flatten(to_dict(one))[own.vary] for one in (video_config(config, job, ""), wanted))
+            if made != meant:
                 raise ConfigError(
                     f"values: got {job.value} for {own.vary}, expected what a comparison leaves as it is: methods, "
                     "lengths of clips and the context they allow are its own (compare_video.*)"
@@ -133,24 +135,16 @@ def _parsed(text: str) -> Any:
         return text  # a name, such as `hybrid`
 
 
-def _setting(config: ExperimentConfig, key: str) -> Any:
-    at: Any = to_dict(config)
-    for part in key.split("."):
-        at = at[part]
-    return at
-
-
 def _with_setting(config: ExperimentConfig, key: str, text: str) -> ExperimentConfig:
     """The config with one setting of inverse dynamics, predictor or their training changed."""
     values = to_dict(config)
-    group, _, name = key.rpartition(".")
-    at: Any = values
-    for part in group.split("."):
-        at = at.get(part, {}) if isinstance(at, dict) else {}
-    settable = key.startswith(VARIED) and name in at and not isinstance(at[name], dict)
-    if not settable:
+    if not key.startswith(VARIED) or key not in flatten(values):
         known = ", ".join(part.removesuffix(".") for part in VARIED)
         raise ConfigError(f"vary: got {key!r}, expected a setting under {known}")
+    *groups, name = key.split(".")
+    at = values
+    for group in groups:
+        at = at[group]
     at[name] = _parsed(text)
     try:
         return from_dict(ExperimentConfig, values)

@@ -15,7 +15,8 @@ from playslot_rl.envs import RECORDED
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.lpips import open_lpips
 from playslot_rl.studies.launch import Status
-from playslot_rl.studies.study import Commands, Record
+from playslot_rl.studies.several import Commands
+from playslot_rl.studies.study import Record
 from playslot_rl.studies.video.begun import require_begun_alike
 from playslot_rl.studies.video.clips import sheet_name, test_sets
 from playslot_rl.studies.video.figure import video_figure, video_sheet

@@ -26,7 +26,7 @@ from playslot_rl.runs import Run
 from playslot_rl.runtime.devices import open_device
 from playslot_rl.storage.atomic import json_or_nothing, write_json
 from playslot_rl.storage.checkpoints import require_config
-from playslot_rl.studies.study import Commands
+from playslot_rl.studies.several import Commands
 from playslot_rl.studies.video.clips import open_clips, test_sets, tested_clips
 from playslot_rl.studies.video.jobs import uses_slots
 from playslot_rl.studies.video.page import LAST_FRAME, RECONSTRUCTION

@@ -20,8 +20,8 @@ from playslot_rl.runtime.devices import open_device
 from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing, write_json
 from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.storage.locks import locked
-from playslot_rl.studies.several import train_on_several
-from playslot_rl.studies.study import Commands, Record
+from playslot_rl.studies.several import Commands, train
+from playslot_rl.studies.study import Record
 from playslot_rl.studies.video.begun import require_same_choice
 from playslot_rl.studies.video.clips import sheet_name, tested_clips
 from playslot_rl.studies.video.jobs import (
@@ -41,7 +41,7 @@ class VideoTraining:
     Args:
         job: which one.
         record: what its file says.
-        commands: by which it is trained in one process; several are started by torchrun.
+        commands: by which it is trained.
     """
 
     def __init__(self, job: VideoJob, record: Record, commands: Commands) -> None:
@@ -60,11 +60,7 @@ class VideoTraining:
 
     def _train(self, config: ExperimentConfig) -> None:
         command = "train-dynamics" if self._job.trained_as == "playslot" else "train-baseline"
-        processes = int(self._record["processes"])
-        if processes > 1:
-            train_on_several(command, config, processes)
-        else:
-            self._commands[command](config)
+        train(command, config, int(self._record["processes"]), self._commands)
 
     def _chosen(self, config: ExperimentConfig) -> ExperimentConfig:
         """The config with the learning rate that was best after short trials, and the steps that fit the budget.
