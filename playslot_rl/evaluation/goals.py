@@ -144,7 +144,7 @@ def make_goals(pool: GoalPool, seeds: Sequence[int], goals: GoalName, plan: Plan
     out.
 
     Args:
-        pool: environments; the expert runs `pool.env.max_steps`.
+        pool: the expert runs its `env.max_steps`.
         seeds: of the episodes; those that start solved are drawn anew, as in every evaluation.
         goals: which protocol.
         plan: `ahead` and `near`.

@@ -49,11 +49,7 @@ def hold_out(source: EpisodeFrames, metas: Mapping[str, Mapping[str, Any]], conf
     Of the world model's own videos those are tested that its validation held out; of the policy's demonstrations the
     last ones, as many as were held out; of any other set the last `data.held_out`, or else its last quarter.
 
-    Args:
-        source: the data set.
-        metas: stage -> `meta.json` of the checkpoint, for the fingerprints of what was trained on.
-        config: `validation` and `held_out`.
-        most: episodes in all, at least 1.
+    The fingerprints in the checkpoints' `metas`, by stage, tell what was trained on.
 
     Raises:
         DataError: no episode has two frames.

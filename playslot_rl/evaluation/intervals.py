@@ -13,9 +13,6 @@ def wilson(successes: float, trials: int) -> tuple[float, float]:
         successes: number of successes, from 0 to `trials`; a mean over repetitions need not be whole.
         trials: number of episodes, at least 1.
 
-    Returns:
-        Lower and upper end, both in [0, 1].
-
     Raises:
         ValueError: a count is outside its range.
 

@@ -85,13 +85,7 @@ class Measure[J: Job](Protocol):
 
 
 class Study[J: Job]:
-    """Jobs under way, and what there is of their results.
-
-    Args:
-        measure: prepared.
-        jobs: with what their files say.
-        began: `time.monotonic()` at the start of the command.
-    """
+    """Jobs under way, with what their files say, and what there is of their results; `began` is of `time.monotonic`."""
 
     def __init__(self, measure: Measure[J], jobs: Mapping[J, Record], began: float) -> None:
         self._measure, self._jobs, self._began = measure, jobs, began

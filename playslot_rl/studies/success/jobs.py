@@ -117,12 +117,7 @@ def success_config(config: ExperimentConfig, job: SuccessJob, world: str) -> Exp
 
     Labels are the job's, else `behaviour.labelled_demos` or, with fewer demonstrations, all of them. PlaySlot's own
     oracle and the references of each evaluation are left out: the slot oracle is a method, and the references run once.
-    Paths are absolute, so that a job runs from any folder.
-
-    Args:
-        config: of the comparison, with `data` complete.
-        job: which one.
-        world: run folder of the world model, or `pretrained`.
+    Paths are absolute, so that a job runs from any folder; `world` is the run of the world model.
     """
     labelled = job.labels or min(config.behaviour.labelled_demos, job.demos or config.behaviour.labelled_demos)
     policy = "" if job.policy_of is None else absolute(str(replace(job, labels=job.policy_of).run))
@@ -153,13 +148,7 @@ def success_config(config: ExperimentConfig, job: SuccessJob, world: str) -> Exp
 
 
 def success_record(job: SuccessJob, config: ExperimentConfig, parents: Mapping[str, str]) -> dict[str, Any]:
-    """What the job's file says.
-
-    Args:
-        job: which one.
-        config: its own (`success_config`).
-        parents: fingerprints of the weights and demonstrations it builds on.
-    """
+    """What the job's file says: with its own config, and fingerprints of what it builds on, which name it."""
     result = without(config, "machine")  # of data and parents the content counts
     result["baselines"] = result["baselines"].get(job.stage, {})  # another method's settings are none of this job's
     if result["model"]["predictor"]["kind"] == "cocvp":

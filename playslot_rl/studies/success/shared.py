@@ -56,14 +56,7 @@ def check_demos(config: ExperimentConfig, episodes: int, where: str) -> None:
 
 
 def prepare_shared(config: ExperimentConfig, commands: Commands) -> ExperimentConfig:
-    """Record, train or find what the jobs share; finished parts are skipped.
-
-    Args:
-        config: of the comparison, checked.
-        commands: by which it is trained.
-
-    Returns:
-        The config with `data` and `run` complete.
+    """Record, train or find what the jobs share, finished parts excepted; the config with `data` and `run` complete.
 
     Raises:
         DataError, CheckpointError, OutputError, TrainingError: see `playslot_rl.errors`.
@@ -116,11 +109,7 @@ def _demos(config: ExperimentConfig, out: Path) -> DataConfig:
 
 
 class Shared:
-    """What was made or found: what jobs build on, and what the result says of it.
-
-    Args:
-        config: of the comparison, complete.
-    """
+    """What was made or found: what jobs build on, and what the result says of it."""
 
     def __init__(self, config: ExperimentConfig) -> None:
         self._world = Run.open(config.run).world_stages if uses_slots(config) else {}

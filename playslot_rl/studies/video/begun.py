@@ -43,10 +43,9 @@ def require_same_choice(
     """Refuse a learning rate or a number of steps that a job's training was not begun with.
 
     Args:
-        job: which one.
+        job: whose.
         asked: the comparison's settings.
-        choice: what the trials lead to now: `rate` and `steps`.
-        before: what they led to then; empty for nothing.
+        choice, before: `rate` and `steps` that the trials lead to now, and led to then (empty for nothing).
 
     Raises:
         CheckpointError: names the key that was typed.

@@ -75,13 +75,13 @@ def open_clips(config: ExperimentConfig, test: str, frames: int, count: int) -> 
     """Clips of a test set.
 
     Args:
-        config: `data`, `env`.
+        config: names `data.root`.
         test: the data set; empty takes the episodes that are kept of `data.root`.
         frames: T, of a clip.
         count: clips, at most; they do not overlap, and are spread evenly over the episodes.
 
     Returns:
-        The episodes, and row numbers (at most `count`, T), int64.
+        The episodes, and row numbers (at most `count`, T).
 
     Raises:
         DataError: too few episodes, none so long, fewer than two clips, or a data set that cannot be read.

@@ -65,12 +65,8 @@ def _curve(
 def video_sheet(
     truth: npt.NDArray[np.uint8], predictions: Mapping[str, npt.NDArray[np.uint8]], columns: int = 6
 ) -> Image.Image:
-    """True frames and each model's, the first clips of the test, not chosen.
-
-    Args:
-        truth: (clips, P, H, W, 3).
-        predictions: of the same shape, by title.
-        columns: frames of each clip, evenly spread.
+    """True frames (clips, P, H, W, 3) and each model's, by title: the first clips of the test, not chosen; of each so
+    many frames, evenly spread.
     """
     at = np.unique(np.linspace(0, truth.shape[1] - 1, min(columns, truth.shape[1])).round().astype(int))
     strips: list[npt.NDArray[np.uint8]] = []

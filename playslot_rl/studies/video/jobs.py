@@ -197,10 +197,7 @@ def in_steps(config: ExperimentConfig, method: VideoMethod, steps: int) -> Exper
 def video_config(config: ExperimentConfig, job: VideoJob, world: str) -> ExperimentConfig:
     """What a job trains with: the preset's settings, on clips of the same lengths, drawn alike, for every method.
 
-    Args:
-        config: of the comparison, with `data` complete.
-        job: which one.
-        world: run folder of the SAVi, or `pretrained`.
+    `world` is the run of the SAVi.
     """
     own = config.compare_video
     if job.variant:
@@ -249,13 +246,8 @@ def _with_context(config: ExperimentConfig, method: VideoMethod, frames: int) ->
 
 
 def video_record(job: VideoJob, config: ExperimentConfig, parents: Mapping[str, str], lpips: bool) -> dict[str, Any]:
-    """What the job's file says.
-
-    Args:
-        job: which one.
-        config: its own (`video_config`).
-        parents: fingerprints of the slots and the videos it builds on.
-        lpips: whether there are weights for LPIPS: scores without it are not those with it.
+    """What the job's file says: with its own config, and what names it: fingerprints of the slots and the videos that
+    it builds on, and whether there are weights for LPIPS, since scores without it are not those with it.
     """
     own = to_dict(config.compare_video)
     asked = {key: own[key] for key in own if key not in NOT_OF_A_JOB}

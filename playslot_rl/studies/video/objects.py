@@ -19,10 +19,6 @@ def each_number(config: ExperimentConfig, compare: Callable[[ExperimentConfig], 
 
     With N objects a frame has N + 1 slots, and an action two numbers for each object.
 
-    Args:
-        config: with `out`.
-        compare: one study.
-
     Raises:
         ConfigError: another task, or videos that have their number of objects already.
         PlaySlotError: trainings failed; all others have finished, and the tables say so.

@@ -36,13 +36,7 @@ from playslot_rl.studies.video.jobs import (
 
 
 class VideoTraining:
-    """A job under way.
-
-    Args:
-        job: which one.
-        record: what its file says.
-        commands: by which it is trained.
-    """
+    """A job under way: what its file says, and the commands by which it is trained."""
 
     def __init__(self, job: VideoJob, record: Record, commands: Commands) -> None:
         self._job, self._record, self._commands = job, record, commands
