@@ -12,7 +12,7 @@ from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.evaluation.slots import RESULT as SLOTS_RESULT
-from playslot_rl.evaluation.success import POLICY_PROTOCOLS, PROTOCOLS
+from playslot_rl.evaluation.success import POLICY_PROTOCOLS, PROTOCOLS, hardware
 from playslot_rl.storage.atomic import json_or_nothing
 from playslot_rl.visualization.charts import DARK, LIGHT, Theme, loss_chart, loss_names, success_chart
 from playslot_rl.visualization.document import Block, Missing, Picture, Section, Table, Text
@@ -286,3 +286,19 @@ def training_section(given: ReportInput, stages: Sequence[str] = STAGES) -> Sect
     if elsewhere:
         blocks.append(Text(f"No loss curves here for {', '.join(elsewhere)}: trained outside this run folder."))
     return Section("Training", blocks)
+
+
+def settings_table(model: WorldModel | None, task: list[list[str]], measured: list[list[str]]) -> Table:
+    """The rows of the task, of the world model, of what was measured, and of the machine that makes the report."""
+    rows = list(task)
+    if model is not None:
+        savi, inverse = model.config.savi, model.config.inverse_dynamics
+        rows += [
+            ["slots", f"{savi.n_slots} of width {savi.slot_dim}"],
+            ["latent actions", f"{inverse.mode}, {inverse.variant}, width {model.latent_shape[-1]}"],
+            ["prototypes", str(model.inverse_dynamics.n_prototypes)],
+        ]
+    machine = hardware()
+    gpu = f", {machine['gpu']}" if machine["gpu"] else ""
+    here = ["report made on", f"{machine['machine']}, {machine['cores']} cores{gpu}, torch {machine['torch']}"]
+    return Table(["setting", "value"], [*rows, *measured, here])
