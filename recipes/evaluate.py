@@ -5,12 +5,11 @@ Writes `DIR/evaluation/PROTOCOL/eval_info.json` and renews `DIR/report.md` and `
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from playslot_rl.config import EnvConfig, ExperimentConfig
+from playslot_rl.config import EnvConfig, ExperimentConfig, plugins
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError
@@ -79,8 +78,7 @@ def evaluate_baseline(config: ExperimentConfig, run: Run) -> None:
     run_facts(run.folder, config.method)  # a run without a policy is refused before anything is loaded
     require_task(config, run.own(method_stage(config.method)).group(EnvConfig, "env"))
     device = open_device(config.device, config.threads)
-    module, _, function = METHODS[config.method].actor.partition(":")
-    actor = getattr(importlib.import_module(module), function)(run.folder, device)
+    actor = plugins.call(METHODS[config.method].load.actor, run, device)
     actor.eval()
     with TaskPool(config.env, config.render) as pool:
         print(describe(evaluate_actor(run.folder, actor, config, pool), run.folder), flush=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
 
 from playslot_rl.config import ExperimentConfig
@@ -17,7 +16,7 @@ def main(config: ExperimentConfig) -> None:
     Raises:
         ConfigError: no `out`, or the folder of the world model in `run`; a method on slots without `run`; one
             that acts, and an environment without a simulator.
-        PlaySlotError: see the method's recipe.
+        PlaySlotError: see `playslot_rl.methods.training.train`.
     """
     if not config.out:
         raise ConfigError("out: got nothing, expected the folder of the baseline's run, such as out=runs/oracle")
@@ -31,12 +30,17 @@ def main(config: ExperimentConfig) -> None:
             f"run: got nothing with method={config.method}, expected the world model whose slots it builds on: "
             "a run folder, or run=pretrained"
         )
-    if method.actor:
+    if method.acts:
         gym_id(config.env.name)
-    importlib.import_module(f"playslot_rl.recipes.{method.recipe}").main(config)
+    from playslot_rl.methods.training import train
+
+    train(config)
 
 
 def train_videos(config: ExperimentConfig) -> None:
     """Train the model of unlabelled videos that `config.method` builds on into `out`."""
-    recipe = importlib.import_module(f"playslot_rl.recipes.{METHODS[config.method].recipe}")
-    recipe.train_model(config, Path(config.out))
+    from playslot_rl.methods.training import train_model
+
+    model = METHODS[config.method].model
+    assert model is not None
+    train_model(config, model, Path(config.out))

@@ -5,23 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
-from functools import partial
-from typing import TYPE_CHECKING, Any
-
-from playslot_rl.config import BehaviourStageConfig, DynamicsStageConfig, ExperimentConfig
-from playslot_rl.runs import Run
-from playslot_rl.runs.opening import require_parent, run_to_write
-from playslot_rl.runtime.devices import open_device
-
-if TYPE_CHECKING:
-    from playslot_rl.data.demonstrations import Demonstrations
-    from playslot_rl.data.slot_cache import SlotRows
-    from playslot_rl.data.source import EpisodeFrames
-    from playslot_rl.training.fit import Part
-    from playslot_rl.training.record import StageRecord, Training
-    from playslot_rl.training.stage import Stage
+from playslot_rl.config import ExperimentConfig
 
 
 def main(config: ExperimentConfig) -> None:
@@ -33,99 +17,7 @@ def main(config: ExperimentConfig) -> None:
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
     from playslot_rl.methods.playslot.method import POLICY
-    from playslot_rl.training.record import StageRecord, run_stage
+    from playslot_rl.methods.training import train_stage
+    from playslot_rl.runs.opening import run_to_write
 
-    run = run_to_write(config)
-    parent = Run.of(config, run.folder)
-    parents = parent.world_stages
-    for checkpoint in parents.values():
-        require_parent(config, run, checkpoint, "image_size", "action_dim")
-    model, env = parent.world_config
-    record = StageRecord(
-        POLICY,
-        run.folder,
-        config,
-        parents=parents,
-        groups={"env": env, "model": replace(model, **behaviour_networks(config))},
-        ready=partial(run.build_on, parent),
-    )
-
-    run_stage(record, lambda: _training(config, record, parent))
-
-
-def behaviour_networks(config: ExperimentConfig) -> dict[str, Any]:
-    """Configs of the two networks, `policy` and `action_decoder`, of the kinds that `behaviour` names."""
-    own, model = config.behaviour, config.model
-    return {
-        "policy": replace(model.policy, whiten=own.whiten),
-        "action_decoder": replace(model.action_decoder, whiten=own.whiten, reads_slots=own.decoder_state),
-    }
-
-
-def _training(config: ExperimentConfig, record: StageRecord, parent: Run) -> Training:
-    """The frozen world model's view of the demonstrations; fresh policy, oracle and decoder on top of it."""
-    from playslot_rl.data.demonstrations import require_finite, require_labelled
-    from playslot_rl.data.labels import label_demonstrations, with_copies
-    from playslot_rl.seeds.draws import global_seed
-    from playslot_rl.training.demonstrated import cloned, demonstration_views, policy_taken_over
-    from playslot_rl.training.fit import Part
-    from playslot_rl.training.record import Training
-    from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage, cloning_settings
-    from playslot_rl.world_model import Agent
-
-    split, behaviour = record.demos, config.behaviour
-    device = open_device(config.device, config.threads)
-    require_labelled(behaviour.labelled_demos, split.trained.episodes)  # before anything is computed
-    require_finite(split, None if behaviour.oracle else behaviour.labelled_demos)
-    world = parent.load_world_model(device)
-    world.config = replace(world.config, **behaviour_networks(config))
-    with global_seed(config.seed, 0, "policy"):
-        agent = Agent.untrained(world, oracle=behaviour.oracle).to(device)
-    views, others = demonstration_views(config, split, world.savi, record.prints["slots"])
-
-    def label(frames: EpisodeFrames, slots: SlotRows) -> Demonstrations:
-        return label_demonstrations(world, frames, slots, device, behaviour.trim, behaviour.trim_margin)
-
-    demos = with_copies([label(*view) for view in views])
-    held_out = next((label(*view) for view in others), None)
-    dynamics = parent.stage("dynamics").group(DynamicsStageConfig, "dynamics")
-    horizon = dynamics.seed_frames - 1 + dynamics.predicted_frames
-    demos.labelled(behaviour.labelled_demos)  # none that say anything are refused before anything is trained
-
-    def parts() -> Iterator[Part]:
-        cloning = cloning_settings(behaviour)
-        clone = CloneStage(agent.policy, agent.oracle, demos, cloning, held_out, horizon)
-        yield Part("policy", clone, cloning, group="behaviour")
-        agent.eval()
-        if agent.action_decoder.reads_slots:
-            agent.action_decoder.trusts_slots.fill_(False)  # one demonstration cannot tell
-            trial = DecoderStage.trial(agent.action_decoder, agent.policy, demos, behaviour, horizon)
-            if trial is not None:
-                yield _part("decoder_trial", trial, behaviour, -(-behaviour.decoder_steps // 2), behaviour.decoder_lr)
-                agent.action_decoder.trusts_slots.fill_(trial.slots_pay())
-        decoder = DecoderStage(agent.action_decoder, agent.policy, demos, behaviour, held_out, horizon)
-        yield _part("decoder", decoder, behaviour, behaviour.decoder_steps, behaviour.decoder_lr)
-        if behaviour.finetune_steps and behaviour.labelled_demos >= behaviour.finetune_labels:
-            both = FinetuneStage(clone.stages["policy"], agent.action_decoder, demos, behaviour, held_out, horizon)
-            yield _part("finetune", both, behaviour, behaviour.finetune_steps, behaviour.finetune_lr)
-
-    said, extra = cloned("policy", split, len(demos.slots), behaviour.labelled_demos, len(views))
-    return Training(
-        parts(),
-        device,
-        lambda _: f"{said}, {record.folder}",
-        extra={
-            **extra,
-            "held_out_demos": 0 if held_out is None else len(held_out.lengths),
-            "data_root": record.roots,
-        },
-        adopt=policy_taken_over(config, record, behaviour.steps),
-    )
-
-
-def _part(name: str, stage: Stage, behaviour: BehaviourStageConfig, steps: int, lr: float) -> Part:
-    from playslot_rl.training.fit import Part
-
-    own, group = replace(behaviour, steps=steps, optim=replace(behaviour.optim, lr=lr)), name.partition("_")[0]
-    renamed = {"steps": f"behaviour.{group}_steps", "optim.lr": f"behaviour.{group}_lr"}
-    return Part(name, stage, own, folder=name, group="behaviour", renamed=renamed)
+    train_stage(POLICY, config, run_to_write(config))

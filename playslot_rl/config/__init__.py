@@ -4,13 +4,6 @@
 `to_dict` is its inverse; `fingerprint` names a config by its content (all three: `playslot_rl.config.plain`).
 """
 
-from playslot_rl.config.baselines import CADDYOracleConfig as CADDYOracleConfig
-from playslot_rl.config.baselines import CADDYPolicyConfig as CADDYPolicyConfig
-from playslot_rl.config.baselines import DreamerConfig as DreamerConfig
-from playslot_rl.config.baselines import LAPOConfig as LAPOConfig
-from playslot_rl.config.baselines import OnlineConfig as OnlineConfig
-from playslot_rl.config.baselines import ResNetOracleConfig as ResNetOracleConfig
-from playslot_rl.config.baselines import SOLDConfig as SOLDConfig
 from playslot_rl.config.compare import CompareConfig as CompareConfig
 from playslot_rl.config.env import BlocksConfig as BlocksConfig
 from playslot_rl.config.env import EnvConfig as EnvConfig
@@ -21,7 +14,6 @@ from playslot_rl.config.experiment import DataConfig as DataConfig
 from playslot_rl.config.experiment import EvaluationConfig as EvaluationConfig
 from playslot_rl.config.experiment import ExperimentConfig as ExperimentConfig
 from playslot_rl.config.experiment import LoggingConfig as LoggingConfig
-from playslot_rl.config.methods import MethodName as MethodName
 from playslot_rl.config.model import ActionDecoderConfig as ActionDecoderConfig
 from playslot_rl.config.model import InverseDynamicsConfig as InverseDynamicsConfig
 from playslot_rl.config.model import LatentMode as LatentMode
@@ -39,8 +31,3 @@ from playslot_rl.config.stages import OptimConfig as OptimConfig
 from playslot_rl.config.stages import Precision as Precision
 from playslot_rl.config.stages import SlotsStageConfig as SlotsStageConfig
 from playslot_rl.config.stages import StageConfig as StageConfig
-from playslot_rl.config.video import CADDYConfig as CADDYConfig
-from playslot_rl.config.video import OCVPSeqConfig as OCVPSeqConfig
-from playslot_rl.config.video import SlotFormerConfig as SlotFormerConfig
-from playslot_rl.config.video import SVGConfig as SVGConfig
-from playslot_rl.config.video import VideoStageConfig as VideoStageConfig

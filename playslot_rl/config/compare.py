@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from playslot_rl.config.methods import METHODS, MethodName
+from playslot_rl.config.methods import METHODS, require_method
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import SEED, Checked, at_least, between, role
 
@@ -38,7 +38,7 @@ class CompareConfig(Checked):
     """
 
     group = "compare."
-    methods: tuple[MethodName, ...] = ("playslot", "lapo", "slot_oracle", "resnet_oracle", "dreamer", "sold")
+    methods: tuple[str, ...] = ("playslot", "lapo", "slot_oracle", "resnet_oracle", "dreamer", "sold")
     demos: tuple[int, ...] = field(default=(10, 50, 100, 150), metadata=at_least(1, "numbers of at least 1"))
     labels: tuple[int, ...] = field(default=(), metadata=at_least(1, "numbers of at least 1"))
     seeds: tuple[int, ...] = field(default=(0, 1, 2), metadata=SEED)
@@ -54,7 +54,9 @@ class CompareConfig(Checked):
             values = getattr(self, name)
             check(len(values) > 0, name, values, "at least one")
             check(len(set(values)) == len(values), name, values, "each one once")
-        still = [name for name in self.methods if not METHODS[name].actor]
+        for name in self.methods:
+            require_method("methods", name)
+        still = [name for name in self.methods if not METHODS[name].acts]
         check(not still, "methods", ",".join(still), "methods that act; `playslot compare-video` compares predictions")
         check(len(set(self.labels)) == len(self.labels), "labels", self.labels, "each one once")
         most = max(self.labels, default=0)

@@ -18,13 +18,15 @@ from typing import Any, Final, cast
 
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.arguments import require_digits, require_folders, require_once, require_plain
+from playslot_rl.config.baselines import known_methods
 from playslot_rl.config.machine import require_machine
-from playslot_rl.config.methods import MethodName, canonical_method
+from playslot_rl.config.methods import canonical_method
 from playslot_rl.config.plain import flatten, nearest, type_hints
 from playslot_rl.config.planning import GOALS, PLANNERS, PROPOSALS
 from playslot_rl.config.roles import keys_of
 from playslot_rl.errors import ConfigError
 
+METHOD_KEYS: Final = ("method", "compare.methods")
 CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
 CONTINUES: Final = frozenset({"evaluate", "export", "inspect", "plan", "play", "train-dynamics", "train-policy"})
@@ -119,7 +121,7 @@ def _parse(overrides: Sequence[str]) -> dict[str, str]:
         hint = _hint(key)
         if hint is None:
             raise ConfigError(_unknown_key(key))
-        if hint in (MethodName, tuple[MethodName, ...]):
+        if key in METHOD_KEYS:
             value = _method_names(key, value)
         if key == "port" and not value.strip():
             value = "0"  # `port=`: any
@@ -324,7 +326,7 @@ def stored_config(run: Path) -> ExperimentConfig:
         values = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(values, dict):
             raise ValueError(f"got a {type(values).__name__}, expected a group of keys")
-        return from_dict(ExperimentConfig, values)
+        return from_dict(ExperimentConfig, known_methods(values))
     except ValueError as error:
         raise ConfigError(f"{path} cannot be used: {error}; restore it or start a new run") from error
 

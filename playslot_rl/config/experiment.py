@@ -7,10 +7,11 @@ from typing import Literal
 
 from playslot_rl.config.adopt import AdoptConfig
 from playslot_rl.config.baselines import BaselinesConfig
+from playslot_rl.config.baselines import baselines as default_baselines
 from playslot_rl.config.compare import CompareConfig
 from playslot_rl.config.compare_video import CompareVideoConfig
 from playslot_rl.config.env import EnvConfig, RenderConfig
-from playslot_rl.config.methods import MethodName
+from playslot_rl.config.methods import require_method
 from playslot_rl.config.model import ModelConfig
 from playslot_rl.config.planning import PlanConfig
 from playslot_rl.config.roles import (
@@ -231,7 +232,7 @@ class ExperimentConfig(Checked):
     device: str = field(default="", metadata=role("call", "machine"))
     threads: int = field(default=0, metadata=role("machine") | at_least(0, "0 (torch's choice) or more", 1024))
     minutes: float = field(default=60.0, metadata=role("call", "machine", "free") | above_zero(largest=YEAR_MINUTES))
-    method: MethodName = "playslot"
+    method: str = "playslot"
     demos: int | None = field(default=None, metadata=at_least(1))
     port: int = field(default=0, metadata=role("call", "machine") | between(0, 65535, "0 (any) to 65535"))
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -243,7 +244,7 @@ class ExperimentConfig(Checked):
     slots: SlotsStageConfig = field(default_factory=SlotsStageConfig)
     dynamics: DynamicsStageConfig = field(default_factory=DynamicsStageConfig)
     behaviour: BehaviourStageConfig = field(default_factory=BehaviourStageConfig)
-    baselines: BaselinesConfig = field(default_factory=BaselinesConfig)
+    baselines: BaselinesConfig = field(default_factory=default_baselines)
     compare: CompareConfig = field(default_factory=CompareConfig, metadata=role("machine"))
     compare_video: CompareVideoConfig = field(default_factory=CompareVideoConfig, metadata=role("machine"))
     plan: PlanConfig = field(default_factory=PlanConfig, metadata=role("call", "machine"))
@@ -253,3 +254,7 @@ class ExperimentConfig(Checked):
     adopt: AdoptConfig = field(default_factory=AdoptConfig, metadata=role("call", "machine"))
     export: ExportConfig = field(default_factory=ExportConfig, metadata=role("call"))
     play: PlayConfig = field(default_factory=PlayConfig, metadata=role("call", "machine"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_method("method", self.method)

@@ -1,107 +1,178 @@
-"""The methods that can be trained and compared, by name."""
+"""A method, and the methods that there are: ours, and those that other packages bring."""
 
 from __future__ import annotations
 
 import difflib
 import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from functools import cached_property
+from typing import Any, Final
 
+from playslot_rl.config import plugins
+from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.errors import ConfigError
 
-MethodName = Literal[
-    "playslot", "slot_oracle", "resnet_oracle", "slot_bc", "resnet_bc", "lapo", "dreamer", "sold",
-    "caddy_policy", "caddy_oracle", "svg", "caddy", "slotformer", "ocvp_seq",
-]  # fmt: skip
+GROUP: Final = "playslot_rl.methods"
+"""Entry points by which a package brings a method: its name, and a `Method`."""
+
+
+@dataclass(frozen=True)
+class Style:
+    """How a method looks in every plot: index into a theme's series, and a matplotlib marker."""
+
+    colour: int
+    marker: str
+
+
+@dataclass(frozen=True)
+class Load:
+    """How a finished run of a method is loaded; `module:function` each, or empty.
+
+    Attributes:
+        actor: `(run: Run, device) -> Actor`.
+        video: `(run: Run, device) -> VideoPredictor`.
+    """
+
+    actor: str = ""
+    video: str = ""
 
 
 @dataclass(frozen=True)
 class Method:
-    """What a comparison knows of a method before it runs.
+    """A method that is trained and compared.
 
     Attributes:
-        title: as tables and plots name it.
-        recipe: module of `playslot_rl.recipes` whose `main(config)` trains it.
-        actor: `module:function` of `load_actor(run, device) -> Actor`; empty for one that predicts frames and does not
-            act (`playslot_rl.methods.video`).
-        online: it learns by acting (environment steps on the axis, needs a reward) instead of from demonstrations.
-        slots: it builds on a world model's slots.
-        stage: stage of its run whose checkpoint is the method's; empty means its name.
-        labelled_only: it learns from labelled demonstrations alone; what they leave out, it never sees.
-        decodes: its policy clones latent actions and needs no label; a decoder reads those of the labelled
-            demonstrations.
-        model: stage of the model of unlabelled videos that it builds on, see `LATENT_MODELS`; its recipe has a
-            `train_model(config, run)`, and its group of `baselines` a key `world` that takes it from another run.
-        aliases: what people call it besides its name and its title.
+        name: as it is typed and stored.
+        titles: as tables and plots name it, and what people call it besides.
+        style: in plots.
+        config: dataclass of its group of keys, `baselines.NAME`; None if it has none.
+        stages: that are trained one after the other; the last one's checkpoint is the method's.
+        load: as what it is loaded.
     """
 
-    title: str
-    recipe: str
-    actor: str = ""
-    online: bool = False
-    slots: bool = False
-    stage: str = ""
-    labelled_only: bool = False
-    decodes: bool = False
-    model: str = ""
-    aliases: tuple[str, ...] = ()
+    name: str
+    titles: tuple[str, ...]
+    style: Style
+    config: type[Any] | None
+    stages: tuple[StageSpec, ...]
+    load: Load
+
+    @property
+    def title(self) -> str:
+        """As tables and plots name it."""
+        return self.titles[0]
+
+    @property
+    def last(self) -> StageSpec:
+        """The stage whose checkpoint is the method's."""
+        return self.stages[-1]
+
+    @property
+    def acts(self) -> bool:
+        """Whether it gives an actor; one that does not predicts frames only."""
+        return bool(self.load.actor)
+
+    @property
+    def online(self) -> bool:
+        """Whether it learns by acting: environment steps on the axis, a reward needed."""
+        return not self.last.data
+
+    @property
+    def labelled_only(self) -> bool:
+        """Whether it learns from labelled demonstrations alone; what they leave out, it never sees."""
+        return self.last.data == "labelled"
+
+    @property
+    def decodes(self) -> bool:
+        """Whether its policy clones latent actions and needs no label, which only its decoder reads."""
+        return bool({"behaviour", "behaviour.labelled_demos"} & {*self.last.settings})
+
+    @cached_property
+    def slots(self) -> bool:
+        """Whether it builds on a world model's slots."""
+        return any("slots" in (stage.name, *stage.parents) for stage in self.stages)
+
+    @property
+    def model(self) -> StageSpec | None:
+        """The model of unlabelled videos that it trains first, for itself and for any number of demonstrations."""
+        found = [stage for stage in self.stages[:-1] if stage.name in self.last.parents and not stage.parents]
+        return None if self.slots or not found else found[0]
 
 
-METHODS: Final[dict[str, Method]] = {
-    "playslot": Method(
-        "PlaySlot", "train_policy", "playslot_rl.acting.agent:load_actor", slots=True, stage="policy", decodes=True
-    ),
-    "slot_oracle": Method(
-        "Slot Oracle", "baselines.slot_oracle", "playslot_rl.methods.oracles.slot:load_actor", slots=True
-    ),
-    "resnet_oracle": Method(
-        "ResNet Oracle",
-        "baselines.resnet_oracle",
-        "playslot_rl.methods.oracles.resnet:load_actor",
-        aliases=("ResNet",),
-    ),
-    "slot_bc": Method(
-        "Slot BC",
-        "baselines.slot_oracle",
-        "playslot_rl.methods.oracles.slot:load_actor",
-        slots=True,
-        stage="slot_oracle",
-        labelled_only=True,
-    ),
-    "resnet_bc": Method(
-        "ResNet BC",
-        "baselines.resnet_oracle",
-        "playslot_rl.methods.oracles.resnet:load_actor",
-        stage="resnet_oracle",
-        labelled_only=True,
-    ),
-    "lapo": Method(
-        "LAPO", "baselines.lapo", "playslot_rl.methods.lapo.load:load_actor", decodes=True, model="lapo_model"
-    ),
-    "dreamer": Method("DreamerV3", "baselines.online", "playslot_rl.methods.dreamer.actor:load_actor", online=True),
-    "sold": Method("SOLD", "baselines.online", "playslot_rl.methods.sold.actor:load_actor", online=True, slots=True),
-    "caddy_policy": Method(
-        "CADDY", "baselines.caddy", "playslot_rl.methods.caddy.load:load_policy", decodes=True, model="caddy"
-    ),
-    "caddy_oracle": Method(
-        "CADDY Oracle", "baselines.caddy", "playslot_rl.methods.caddy.load:load_oracle", model="caddy"
-    ),
-    "svg": Method("SVG-LP", "baselines.video", aliases=("SVG",)),
-    "caddy": Method("CADDY", "baselines.video"),
-    "slotformer": Method("SlotFormer", "baselines.video", slots=True),
-    "ocvp_seq": Method("OCVP-Seq", "baselines.video", slots=True, aliases=("OCVP",)),
+_OURS: Final[Mapping[str, str]] = {
+    "playslot": "playslot.method:PLAYSLOT",
+    "slot_oracle": "slot_oracle.method:SLOT_ORACLE",
+    "resnet_oracle": "resnet_oracle.method:RESNET_ORACLE",
+    "slot_bc": "slot_oracle.method:SLOT_BC",
+    "resnet_bc": "resnet_oracle.method:RESNET_BC",
+    "lapo": "lapo.method:LAPO",
+    "dreamer": "dreamer.method:DREAMER",
+    "sold": "sold.method:SOLD",
+    "caddy_policy": "caddy.method:CADDY_POLICY",
+    "caddy_oracle": "caddy.method:CADDY_ORACLE",
+    "svg": "svg.method:SVG",
+    "caddy": "caddy.method:CADDY",
+    "slotformer": "slotformer.method:SLOTFORMER",
+    "ocvp_seq": "ocvp_seq.method:OCVP_SEQ",
 }
+"""Below `playslot_rl.methods`."""
 
-LATENT_MODELS: Final = {"lapo_model": "LAPO's inverse and forward model", "caddy": "CADDY's video model"}
-"""Models of unlabelled videos that methods build on, by stage: as pages name them. A comparison trains each once."""
+
+class _Methods(Mapping[str, Method]):
+    """By name, imported when they are asked for; those of packages that cannot be imported are left out of the list."""
+
+    def __getitem__(self, name: str) -> Method:
+        if name in _OURS:
+            found: Method = plugins.load(GROUP, name, Method, f"playslot_rl.methods.{_OURS[name]}")
+            return found
+        if name in plugins.brought(GROUP):
+            brought: Method = plugins.load(GROUP, name, Method)
+            return brought
+        raise KeyError(name)
+
+    def __iter__(self) -> Iterator[str]:
+        yield from _OURS
+        for name in plugins.brought(GROUP).keys() - _OURS.keys():
+            try:
+                yield self[name].name
+            except ConfigError:  # said where it is named
+                continue
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+METHODS: Final[Mapping[str, Method]] = _Methods()
 
 
 def method_stage(method: str) -> str:
     """Stage of a method's run whose checkpoint is the method's."""
-    return METHODS[method].stage or method
+    return METHODS[method].last.name
 
 
-def canonical_method(text: str, acting: bool = False) -> MethodName:
+def stage_title(stage: str) -> str:
+    """What a stage is, in words, where others build on it."""
+    return next(s.title for method in METHODS.values() for s in method.stages if s.name == stage)
+
+
+def known_stages() -> set[str]:
+    """Names of all stages of all methods."""
+    return {stage.name for method in METHODS.values() for stage in method.stages}
+
+
+def require_method(key: str, name: str) -> None:
+    """Refuse a name of no method.
+
+    Raises:
+        ValueError: there is none.
+        ConfigError: the package that brings it fails.
+    """
+    if name not in METHODS:
+        raise ValueError(f"{key}: got {name!r}, expected one of {', '.join(METHODS)}")
+
+
+def canonical_method(text: str, acting: bool = False) -> str:
     """The method that somebody names, by its name, title or alias; case, spaces, `-` and `_` do not matter.
 
     CADDY is two methods: `caddy` predicts videos, and `caddy_policy`, of the title CADDY, acts.
@@ -111,7 +182,7 @@ def canonical_method(text: str, acting: bool = False) -> MethodName:
         acting: a word that names two methods means the one that acts; else a name comes before a title.
 
     Raises:
-        ConfigError: there is no such method.
+        ConfigError: there is no such method, or the package that brings it fails.
 
     Examples:
         >>> canonical_method("DreamerV3"), canonical_method("slot-oracle")
@@ -119,17 +190,18 @@ def canonical_method(text: str, acting: bool = False) -> MethodName:
         >>> canonical_method("CADDY"), canonical_method("CADDY", acting=True)
         ('caddy', 'caddy_policy')
     """
-    names: tuple[MethodName, ...] = get_args(MethodName)
-    words = [(word, name) for name in names for word in (METHODS[name].title, *METHODS[name].aliases)]
-    words += [(name, name) for name in names]  # of equal words the last one counts
+    if text in plugins.brought(GROUP):
+        return METHODS[text].name
+    words = [(word, method) for method in METHODS.values() for word in method.titles]
+    words += [(method.name, method) for method in METHODS.values()]  # of equal words the last one counts
     if acting:
-        words.sort(key=lambda pair: bool(METHODS[pair[1]].actor))
-    known = {_plain(word): name for word, name in words}
+        words.sort(key=lambda pair: pair[1].acts)
+    known = {_plain(word): method.name for word, method in words}
     if _plain(text) in known:
         return known[_plain(text)]
     near = difflib.get_close_matches(_plain(text), known, n=1)
     hint = f"; did you mean {known[near[0]]}?" if near else ""
-    raise ConfigError(f"got {text!r}, expected one of {', '.join(names)}{hint}")
+    raise ConfigError(f"got {text!r}, expected one of {', '.join(METHODS)}{hint}")
 
 
 def _plain(word: str) -> str:

@@ -36,7 +36,10 @@ class StageSpec:
         begun: further ones that only a half-finished one must share.
         parents: stages it is trained on.
         data: what it learns from: `videos`, `demos`, the `labelled` ones of these alone; empty learns by acting.
-        parts: `module:function` that makes what is trained from a `StageRecord`.
+        parts: `module:function` that makes what is trained from a `StageRecord`: a `Training`.
+        sizes: `module:function` that makes the group `model` from the command's config and that of its parents; empty
+            takes the latter.
+        title: in words, where others build on it.
         stores: groups that its checkpoint keeps beside `env` and those of `keys` and `settings`.
         names: what checkpoints call a key or group that has another name there.
         begun_names: what half-finished trainings call it.
@@ -49,6 +52,8 @@ class StageSpec:
     parents: tuple[str, ...] = ()
     data: Literal["videos", "demos", "labelled", ""] = "videos"
     parts: str = ""
+    sizes: str = ""
+    title: str = ""
     stores: tuple[str, ...] = ()
     names: Mapping[str, str] = field(default_factory=dict)
     begun_names: Mapping[str, str] = field(default_factory=dict)

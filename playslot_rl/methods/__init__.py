@@ -1,1 +1,7 @@
-"""Baselines behind the same interfaces."""
+"""Methods: a folder each, with its `Method` in `method.py`. docs/add_a_method.md adds one from another package."""
+
+from playslot_rl.config.methods import METHODS as METHODS
+from playslot_rl.config.methods import Load as Load
+from playslot_rl.config.methods import Method as Method
+from playslot_rl.config.methods import Style as Style
+from playslot_rl.config.stage_spec import StageSpec as StageSpec

@@ -13,6 +13,8 @@ Shapes: M transitions, Z latent-action width, A action dim.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,11 +22,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.config import ExperimentConfig, Precision
+from playslot_rl.config import ExperimentConfig, Precision, StageConfig
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, labelled_rows, moving_frames
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.training.demonstrated import cloned, policy_taken_over
+from playslot_rl.training.fit import Part
+from playslot_rl.training.record import StageRecord, Training
 from playslot_rl.training.stage_regression import (
     FrameInputs,
     Inputs,
@@ -151,3 +156,45 @@ class LatentCloning(ABC):
             self.policy.eval()
             inputs.append(self.chosen(apply_rows(self.policy, seen.inputs, rows)))
         return TensorInputs(torch.cat(inputs)), seen.actions[rows].repeat(len(inputs), 1)
+
+
+def cloning(
+    record: StageRecord,
+    behaviour: LatentCloning,
+    policy: StageConfig,
+    decoder_steps: int,
+    decoder_lr: float,
+) -> Training:
+    """Latent policy, then action decoder; the policy is taken over where another run has trained it.
+
+    Args:
+        record: the method's stage.
+        behaviour: what is trained.
+        policy: its schedule, `baselines.METHOD.policy`.
+        decoder_steps, decoder_lr: the decoder's; the rest is as for the policy.
+    """
+    config, name, split = record.config, record.name, record.demos
+    decoding = replace(policy, steps=decoder_steps, optim=replace(policy.optim, lr=decoder_lr))
+    labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
+
+    def parts() -> Iterator[Part]:
+        group = f"baselines.{name}"
+        yield Part(f"{name}.policy", behaviour.policy_stage(), policy, group=f"{group}.policy")
+        yield Part(
+            f"{name}.action_decoder",
+            behaviour.decoder_stage(),
+            decoding,
+            folder="decoder",
+            group=f"{group}.policy",
+            renamed={"steps": f"{group}.decoder_steps", "optim.lr": f"{group}.decoder_lr"},
+            identity=labelled,
+        )
+
+    said, extra = cloned(name, split, len(behaviour.trained.actions), config.behaviour.labelled_demos)
+    return Training(
+        parts(),
+        behaviour.device,
+        lambda _: f"{said}, {record.folder}",
+        extra={**extra, **labelled},
+        adopt=policy_taken_over(config, record, policy.steps),
+    )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Protocol
 
 import torch
 from torch import nn
@@ -28,6 +28,7 @@ from playslot_rl.errors import CheckpointError, DataError
 from playslot_rl.modules.action_range import range_of
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import STAGE_LOCK
+from playslot_rl.runtime.devices import open_device
 from playslot_rl.runtime.processes import here, wait
 from playslot_rl.storage.atomic import explain_write_errors
 from playslot_rl.storage.checkpoints import (
@@ -159,6 +160,24 @@ class StageRecord:
     def actions(self) -> dict[str, Any] | None:
         """That range, plain values."""
         return None if self.limits is None else self.limits.plain()
+
+    @cached_property
+    def device(self) -> torch.device:
+        """The device that computes, with threads and allocator set.
+
+        Raises:
+            ConfigError: no such device.
+        """
+        return open_device(self.config.device, self.config.threads)
+
+    @cached_property
+    def world(self) -> Run:
+        """The run of the world model that the stage builds on.
+
+        Raises:
+            CheckpointError: there is none.
+        """
+        return Run.of(self.config, self.run)
 
     @cached_property
     def prints(self) -> dict[str, str]:
@@ -330,8 +349,24 @@ class Training:
     identity: Mapping[str, Any] = field(default_factory=dict)
     adopt: Callable[[], None] | None = None
 
+    def carry_out(self, record: StageRecord, begin: Callable[[], None]) -> StageCheckpoint:
+        """See `Prepared`."""
+        return _train(record, self, begin)
 
-def run_stage(record: StageRecord, prepare: Callable[[], Training]) -> StageCheckpoint:
+
+class Prepared(Protocol):
+    """What a stage that is not finished trains."""
+
+    def carry_out(self, record: StageRecord, begin: Callable[[], None]) -> StageCheckpoint:
+        """Train, carrying on where it was left, and save.
+
+        Args:
+            record: what the stage is.
+            begin: called before the first step, when nothing speaks against it.
+        """
+
+
+def run_stage(record: StageRecord, prepare: Callable[[], Prepared]) -> StageCheckpoint:
     """Train a stage, carrying on where it was left, and save it; a finished one is said to be skipped.
 
     Args:
@@ -348,7 +383,7 @@ def run_stage(record: StageRecord, prepare: Callable[[], Training]) -> StageChec
     if done is not None:
         return done
     with record.training() as begin:
-        return _train(record, prepare(), begin)
+        return prepare().carry_out(record, begin)
 
 
 def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -> StageCheckpoint:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from playslot_rl.colours import OKABE_ITO
-from playslot_rl.config.methods import METHODS
+from playslot_rl.config.methods import METHODS, Style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,34 +44,13 @@ DARK: Final = Theme(
 )
 
 
-@dataclass(frozen=True)
-class MethodStyle:
-    """How a method looks in every plot: index into a theme's series, and a matplotlib marker."""
-
-    colour: int
-    marker: str
+_VARIANTS: Final = {"playslot_m": Style(4, "P")}
+"""Of methods that are compared under another name."""
 
 
-METHOD_STYLES: Final = {
-    "playslot": MethodStyle(0, "o"),
-    "lapo": MethodStyle(5, "s"),
-    "slot_oracle": MethodStyle(2, "^"),
-    "resnet_oracle": MethodStyle(1, "v"),
-    "slot_bc": MethodStyle(2, "<"),
-    "resnet_bc": MethodStyle(1, ">"),
-    "caddy_policy": MethodStyle(6, "X"),
-    "caddy_oracle": MethodStyle(7, "p"),
-    "dreamer": MethodStyle(3, "D"),
-    "sold": MethodStyle(4, "P"),
-}
-VIDEO_STYLES: Final = {
-    "playslot": MethodStyle(0, "o"),
-    "playslot_m": MethodStyle(4, "P"),
-    "svg": MethodStyle(1, "v"),
-    "caddy": MethodStyle(5, "s"),
-    "slotformer": MethodStyle(2, "^"),
-    "ocvp_seq": MethodStyle(3, "D"),
-}
+def style_of(method: str) -> Style | None:
+    """How a method looks; None for what is none."""
+    return METHODS[method].style if method in METHODS else _VARIANTS.get(method)
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -129,7 +108,7 @@ def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], str]], t
     figure = new_figure(6.4, 0.6 + 0.42 * len(rows))
     axes = figure.add_subplot()
     for y, (_, rate, (low, high), method) in enumerate(rows):
-        style = METHOD_STYLES.get(method)
+        style = style_of(method)
         colour = theme.series[7 if style is None else style.colour]
         axes.plot([100 * low, 100 * high], [y, y], color=colour, linewidth=3, solid_capstyle="round", alpha=0.6)
         axes.plot(
@@ -200,7 +179,7 @@ def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Ma
     figure = new_figure(6.8, 2.8)
     left, right = figure.subplots(1, 2)
     for method, rows in curves.items():
-        style = METHOD_STYLES.get(method)
+        style = style_of(method)
         colour = theme.series[6] if style is None else theme.series[style.colour]
         name = METHODS[method].title if method in METHODS else method
         steps = np.array([row["env_steps"] for row in rows])

@@ -30,7 +30,7 @@ def agent(initial: str = "learned") -> Agent:
 
 
 def resnet() -> Actor:
-    from playslot_rl.methods.oracles.resnet import ResNetPolicy, resnet_actor
+    from playslot_rl.methods.resnet_oracle.network import ResNetPolicy, resnet_actor
 
     return resnet_actor(ResNetPolicy(compose(["preset=smoke"]).model.policy, 64, 4))
 

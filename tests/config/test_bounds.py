@@ -23,6 +23,7 @@ from playslot_rl import cli
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import compose
 from playslot_rl.config.machine import machine_memory, needs
+from playslot_rl.config.plain import type_hints
 from playslot_rl.config.roles import Bounds, Checked
 from playslot_rl.errors import ConfigError
 
@@ -39,7 +40,7 @@ def number_of(hint: Any) -> type | None:
 
 def fields(cls: type, prefix: str = "") -> Iterator[tuple[str, type, dataclasses.Field[Any], Any]]:
     """Dotted key, class, field and type of every leaf."""
-    hints = typing.get_type_hints(cls)
+    hints = type_hints(cls)
     for field in dataclasses.fields(cls):
         hint = hints[field.name]
         if dataclasses.is_dataclass(hint):

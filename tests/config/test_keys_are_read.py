@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import functools
 import typing
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +19,7 @@ import playslot_rl
 from playslot_rl import config as config_package
 from playslot_rl.cli import COMMANDS
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.plain import type_hints
 
 ROOT = Path(playslot_rl.__file__).parents[1]
 FOLDERS = ("playslot_rl", "recipes", "collectors", "envs")
@@ -28,8 +28,7 @@ LOOPS = (
     "playslot_rl/losses/dynamics.py",
     "playslot_rl/modules/predictors/",
     "playslot_rl/methods/online/",
-    "recipes/baselines/online.py",
-    "recipes/baselines/video.py",
+    "playslot_rl/methods/video/",
 )
 """Where a config known only by its base class is any stage's; elsewhere it is a stage of exactly that class."""
 
@@ -37,7 +36,7 @@ CHECKED: dict[str, str] = {}
 """Keys that say something although no computation reads them."""
 
 
-hints_of = functools.cache(typing.get_type_hints)
+hints_of = type_hints
 
 
 def config_classes(cls: type) -> dict[str, type]:

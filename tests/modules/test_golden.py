@@ -13,13 +13,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.config import (
-    ActionDecoderConfig,
-    InverseDynamicsConfig,
-    PolicyConfig,
-    PredictorConfig,
-    SAViConfig,
-)
+from playslot_rl.config import ActionDecoderConfig, InverseDynamicsConfig, PolicyConfig, PredictorConfig, SAViConfig
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.policy import LatentPolicy

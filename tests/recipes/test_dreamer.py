@@ -13,7 +13,8 @@ from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.methods.dreamer.actor import load_actor
-from playslot_rl.recipes.baselines import online
+from playslot_rl.methods.training import train
+from playslot_rl.runs import Run
 
 pytestmark = pytest.mark.integration
 
@@ -22,7 +23,7 @@ SMOKE = ("preset=smoke", "method=dreamer", "env=block_reach", "threads=1", "devi
 
 def train(out: Path, *overrides: str) -> None:
     """The recipe, as the command line calls it."""
-    online.main(compose([*SMOKE, f"out={out}", *overrides]))
+    train(compose([*SMOKE, f"out={out}", *overrides]))
 
 
 def weights(out: Path) -> bytes:
@@ -51,7 +52,7 @@ def test_a_run_leaves_weights_a_curve_and_its_config(run: Path) -> None:
 
 
 def test_its_actor_plays_and_repeats_itself(run: Path) -> None:
-    actor = load_actor(run)
+    actor = load_actor(Run(run))
     config = compose(list(SMOKE))
     seeds = [1_000_000_000, 1_000_000_001]
     shown: list[list[int]] = [[], []]
@@ -81,7 +82,7 @@ def test_other_values_in_the_same_folder_are_refused(run: Path) -> None:
 
 def test_a_run_without_an_actor_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="no dreamer checkpoint"):
-        load_actor(tmp_path)
+        load_actor(Run(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -99,7 +100,7 @@ def test_what_cannot_be_learned_from_is_refused_before_anything_is_written(
 ) -> None:
     config = compose(list(map(str, instead(SMOKE, f"out={tmp_path / 'run'}", override))))
     with pytest.raises(ConfigError, match=message):
-        online.main(config)
+        train(config)
     assert not (tmp_path / "run").exists()
 
 

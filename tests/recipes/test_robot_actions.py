@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 import shutil
@@ -17,16 +16,18 @@ from robot import CAMERA, CONSTANT, NAMES, OUTLIER, VALUE, edit_stats, robot_act
 
 import playslot_rl
 from playslot_rl.acting.closed_loop import ClosedLoop
+from playslot_rl.config import plugins
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.data.source import open_source
 from playslot_rl.envs.pixel_task import PixelTask
+from playslot_rl.runs import Run
 from playslot_rl.sharing.folder import RANGE
 from playslot_rl.storage.tensors import load_tensors
 
 pytestmark = pytest.mark.integration
 
 TASK = ("env=video", "env.action_dim=6")
-LABELS = [name for name, method in METHODS.items() if method.actor and not method.online]
+LABELS = [name for name, method in METHODS.items() if method.acts and not method.online]
 """Methods that learn real actions from demonstrations."""
 ACTIONS = np.concatenate(robot_actions())
 
@@ -199,8 +200,7 @@ def test_every_method_that_reads_labels_gives_the_robots_units(
     command = (*command, "preset=smoke", f"data.demos={arm}", f"out={run}", own)
     done, stage = smoke(*command), method_stage(method)
     assert f"{stage}: actions: {NAMES[0]} " in done.out
-    module, _, name = METHODS[method].actor.partition(":")
-    actor = getattr(importlib.import_module(module), name)(run)
+    actor = plugins.call(METHODS[method].load.actor, Run.open(run))
     low, high = ends(meta_of(run, stage))
     known = actor.action_range
     assert np.array_equal(known.low, low)

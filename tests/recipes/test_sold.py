@@ -19,8 +19,8 @@ from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError, TrainingError
 from playslot_rl.methods.sold.actor import load_actor, prior_steps
 from playslot_rl.methods.sold.learner import SOLDLearner
+from playslot_rl.methods.training import train
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.recipes.baselines import online
 from playslot_rl.runs import Run
 from playslot_rl.storage.checkpoints import checkpoint_folder, save_stage
 
@@ -60,7 +60,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trained(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished smoke run of SOLD; look, do not touch."""
     run = tmp_path_factory.mktemp("sold") / "run"
-    online.main(_config(world, run))
+    train(_config(world, run))
     return run
 
 
@@ -78,7 +78,7 @@ def test_a_run_leaves_weights_parents_and_a_learning_curve(trained: Path, world:
 
 
 def test_the_actor_that_is_loaded_plays_and_repeats(trained: Path) -> None:
-    actor = load_actor(trained)
+    actor = load_actor(Run(trained))
     config = compose(["preset=smoke"])
     chosen: list[np.ndarray] = []
 
@@ -97,7 +97,7 @@ def test_the_actor_that_is_loaded_plays_and_repeats(trained: Path) -> None:
 
 def test_the_actor_that_is_loaded_has_the_weights_that_were_saved(trained: Path) -> None:
     saved = load_file(trained / "sold" / "checkpoint" / "weights.safetensors")
-    loaded = {f"actor.{name}": value for name, value in load_actor(trained).actor.state_dict().items()}
+    loaded = {f"actor.{name}": value for name, value in load_actor(Run(trained)).actor.state_dict().items()}
     assert loaded.keys() == {name for name in saved if name.startswith("actor.")}
     for name, value in loaded.items():
         assert torch.equal(value, saved[name]), name
@@ -113,7 +113,7 @@ def test_it_is_evaluated_by_the_evaluator_of_all_methods(trained: Path) -> None:
 
 def test_a_finished_run_is_skipped(trained: Path, world: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = _weights(trained)
-    online.main(_config(world, trained))
+    train(_config(world, trained))
     assert "sold: finished before" in capsys.readouterr().out
     assert _weights(trained) == before
 
@@ -131,9 +131,9 @@ def test_an_interrupted_run_ends_with_the_same_weights(
     with monkeypatch.context() as patch:
         patch.setattr(SOLDLearner, "update", stopped)
         with pytest.raises(KeyboardInterrupt, match="sold interrupted; the same command carries on from step 24"):
-            online.main(config)
+            train(config)
     assert not (tmp_path / "run" / "sold" / "checkpoint").exists()
-    online.main(config)
+    train(config)
     assert _weights(tmp_path / "run") == _weights(trained)
 
 
@@ -148,7 +148,7 @@ def test_a_loss_that_is_not_finite_stops_with_the_last_checkpoint(
 
     monkeypatch.setattr(SOLDLearner, "update", broken)
     with pytest.raises(TrainingError, match=r"sold: slot_mse is nan .* the last good checkpoint is .*step_00000024"):
-        online.main(_config(world, tmp_path / "run"))
+        train(_config(world, tmp_path / "run"))
 
 
 def test_another_savi_than_it_was_trained_on_is_refused(trained: Path, tmp_path: Path) -> None:
@@ -156,27 +156,27 @@ def test_another_savi_than_it_was_trained_on_is_refused(trained: Path, tmp_path:
     run = Path(shutil.copytree(trained, tmp_path / "run"))
     (run / "world_model.json").write_text(json.dumps({"source": "../other"}))
     with pytest.raises(CheckpointError, match=r"was trained on slots .* got slots"):
-        load_actor(run)
+        load_actor(Run(run))
     with pytest.raises(CheckpointError, match=r"was trained on slots .* got slots"):
-        online.main(_config(other, run))
+        train(_config(other, run))
 
 
 def test_a_world_without_slots_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(CheckpointError, match="no slots checkpoint"):
-        online.main(_config(tmp_path / "empty", tmp_path / "run"))
+        train(_config(tmp_path / "empty", tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 
 
 def test_a_task_without_a_dense_reward_is_refused_before_anything_is_written(world: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"env\.blocks\.reward: got sparse with method=sold, expected dense"):
-        online.main(_config(world, tmp_path / "run", "env=block_reach", "env.blocks.reward=sparse"))
+        train(_config(world, tmp_path / "run", "env=block_reach", "env.blocks.reward=sparse"))
     assert not (tmp_path / "run").exists()
 
 
 def test_another_frame_size_than_savis_is_refused(world: Path, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"env\.image_size: got 32, expected 64"):
-        online.main(_config(world, tmp_path / "run", "env.image_size=32"))
+        train(_config(world, tmp_path / "run", "env.image_size=32"))
 
 
 def test_savis_data_are_counted_from_the_config_the_checkpoint_or_its_episodes(world: Path) -> None:
@@ -209,5 +209,5 @@ def test_settings_that_cannot_be_are_refused(override: str, message: str) -> Non
 def test_a_killed_run_ends_with_the_same_weights(trained: Path, world: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     killed_at_first_checkpoint(run / "sold", "train-baseline", *FIXED, f"run={world}", f"out={run}")
-    online.main(_config(world, run))
+    train(_config(world, run))
     assert _weights(run) == _weights(trained)

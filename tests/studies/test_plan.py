@@ -10,7 +10,7 @@ import pytest
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import compose
-from playslot_rl.config.methods import METHODS, MethodName
+from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.studies.job import absolute_roots
 from playslot_rl.studies.launch import require_launcher
@@ -75,9 +75,11 @@ def test_only_methods_on_slots_get_the_world_model() -> None:
 @pytest.mark.parametrize(
     ("method", "folder"), [("lapo", "lapo_world"), ("caddy_policy", "caddy_world"), ("caddy_oracle", "caddy_world")]
 )
-def test_a_model_of_videos_is_made_once_for_all_jobs_that_build_on_it(method: MethodName, folder: str) -> None:
+def test_a_model_of_videos_is_made_once_for_all_jobs_that_build_on_it(method: str, folder: str) -> None:
     config = compared(f"methods=slot_oracle,{method}")
-    assert latent_models(config) == {METHODS[method].model: method}
+    model = METHODS[method].model
+    assert model is not None
+    assert latent_models(config) == {model.name: method}
     for demos, seed in ((10, 0), (50, 4)):
         own = success_config(config, SuccessJob(method, demos, seed, OUT), "world").baselines
         assert getattr(own, method).world == str((OUT / folder).resolve())

@@ -18,7 +18,7 @@ from playslot_rl.studies.success.figure import success_figure
 from playslot_rl.studies.success.jobs import SuccessJob
 from playslot_rl.studies.success.page import cell, success_page
 from playslot_rl.studies.success.rows import job_rows, summarise
-from playslot_rl.visualization.charts import LIGHT, METHOD_STYLES, figure_bytes
+from playslot_rl.visualization.charts import LIGHT, figure_bytes
 from playslot_rl.visualization.document import to_markdown
 
 
@@ -98,13 +98,13 @@ def test_the_result_is_json(ended: dict[str, Any]) -> None:
 
 
 def test_every_method_has_a_colour_and_a_marker_of_its_own() -> None:
-    assert set(METHOD_STYLES) == {name for name, method in METHODS.items() if method.actor}
-    colours = {name: style.colour for name, style in METHOD_STYLES.items()}
+    styles = {name: method.style for name, method in METHODS.items() if method.acts}
+    colours = {name: style.colour for name, style in styles.items()}
     assert (colours.pop("slot_bc"), colours.pop("resnet_bc")) == (colours["slot_oracle"], colours["resnet_oracle"])
     assert len(set(colours.values())) == len(colours), (
         "cloning few labels has its oracle's colour, the others their own"
     )
-    assert len({style.marker for style in METHOD_STYLES.values()}) == len(METHOD_STYLES)
+    assert len({style.marker for style in styles.values()}) == len(styles)
 
 
 def test_seeds_of_a_method_that_acts_are_dots_beside_their_mean(ended: dict[str, Any]) -> None:
@@ -130,10 +130,10 @@ def test_the_plot_shows_every_series_in_its_methods_colour(ended: dict[str, Any]
         ("playslot", "PlaySlot"), ("playslot", "PlaySlot, imagination"), ("slot_oracle", "Slot Oracle"),
         ("resnet_oracle", "ResNet Oracle"), ("dreamer", "DreamerV3, 30 s on 2 cores"),
     ):  # fmt: skip
-        assert shown[label] == LIGHT.series[METHOD_STYLES[method].colour]
+        assert shown[label] == LIGHT.series[METHODS[method].style.colour]
     curve = max(right.get_lines(), key=lambda line: len(line.get_xdata()))
     assert list(curve.get_xdata()) == [0, 5000, 10000]
-    assert curve.get_color() == LIGHT.series[METHOD_STYLES["dreamer"].colour]
+    assert curve.get_color() == LIGHT.series[METHODS["dreamer"].style.colour]
 
 
 @pytest.mark.integration

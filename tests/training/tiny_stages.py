@@ -26,17 +26,18 @@ from playslot_rl.config import (
     SlotsStageConfig,
     StageConfig,
 )
-from playslot_rl.config.baselines import LAPOConfig
-from playslot_rl.config.video import CADDYConfig, SVGConfig
 from playslot_rl.data.demonstrations import Demonstrations
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips
 from playslot_rl.losses.behaviour import BehaviourLoss
+from playslot_rl.methods.caddy.config import CADDYConfig
 from playslot_rl.methods.caddy.model import CADDY
 from playslot_rl.methods.caddy.stage import CADDYStage
+from playslot_rl.methods.lapo.config import LAPOConfig
 from playslot_rl.methods.lapo.model import ForwardModel, InverseModel
 from playslot_rl.methods.lapo.stage import LAPOModelStage
-from playslot_rl.methods.oracles.resnet import ResNetPolicy
+from playslot_rl.methods.resnet_oracle.network import ResNetPolicy
+from playslot_rl.methods.svg.config import SVGConfig
 from playslot_rl.methods.svg.model import SVG
 from playslot_rl.methods.svg.stage import SVGStage
 from playslot_rl.modules.action_decoder import ActionDecoder

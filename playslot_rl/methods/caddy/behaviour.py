@@ -29,6 +29,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, moving_frames
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
+from playslot_rl.methods.caddy.config import CADDYOracleConfig, CADDYPolicyConfig
 from playslot_rl.methods.caddy.encoder import Encoder
 from playslot_rl.methods.caddy.heads import MovesHead, StateHead, as_moves, states_of
 from playslot_rl.methods.caddy.load import ORACLE, POLICY, load_model
@@ -129,7 +130,8 @@ class CADDYBehaviour(LatentCloning):
     def __init__(
         self, config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
     ) -> None:
-        self.own, self.model = config.baselines.caddy_policy, load_model(model, device)
+        self.own: CADDYPolicyConfig = config.baselines.caddy_policy
+        self.model = load_model(model, device)
         super().__init__(config, demos, device, self.own.shift)
         sizes = self.model.config
         width = sizes.actions + sizes.latent_dim
@@ -176,7 +178,8 @@ def oracle_stage(
         CheckpointError: a damaged model.
         DataError: demonstrations without actions, or in which nothing moves.
     """
-    own, behaviour, width = config.baselines.caddy_oracle, config.behaviour, config.env.action_dim
+    own: CADDYOracleConfig = config.baselines.caddy_oracle
+    behaviour, width = config.behaviour, config.env.action_dim
     caddy = load_model(model, device)
 
     def examples(source: EpisodeFrames, shift: int = 0) -> tuple[StateInputs, Tensor]:

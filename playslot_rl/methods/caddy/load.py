@@ -7,25 +7,20 @@ RUN/caddy_oracle/checkpoint    module `oracle`
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Final
 
 import torch
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor, ReactiveActor, latent_actor
-from playslot_rl.config import CADDYConfig, EnvConfig
+from playslot_rl.config import EnvConfig
+from playslot_rl.methods.caddy.config import CADDYConfig
 from playslot_rl.methods.caddy.heads import MovesHead, OnFrames, StateHead
 from playslot_rl.methods.caddy.model import CADDY
+from playslot_rl.methods.decoded_policy import DecodedPolicy
 from playslot_rl.modules.action_decoder import ActionDecoder
-from playslot_rl.storage.checkpoints import (
-    StageCheckpoint,
-    checkpoint_folder,
-    load_weights,
-    read_stage,
-    require_parents,
-)
-from playslot_rl.training.runs import freeze_on, stage_config, stage_model
+from playslot_rl.runs import Run
+from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.world_model import oracle_module
 
 MODEL: Final = "caddy"
@@ -39,48 +34,44 @@ def load_model(done: StageCheckpoint, device: torch.device | str = "cpu") -> CAD
     Raises:
         CheckpointError: it is damaged.
     """
-    with torch.random.fork_rng(devices=[]):
-        model = CADDY(stage_config(done, CADDYConfig, MODEL), stage_config(done, EnvConfig, "env").image_size)
-    load_weights(done, {MODEL: model})
-    freeze_on(model, device)
-    return model
+    own, size = done.group(CADDYConfig, MODEL), done.group(EnvConfig, "env").image_size
+    return done.restore(lambda: CADDY(own, size), MODEL, device)
 
 
-def load_policy(run: Path, device: torch.device | str = "cpu") -> Actor:
+def load_video(run: Run, device: torch.device | str = "cpu") -> CADDY:
+    """The CADDY of a finished run.
+
+    Raises:
+        CheckpointError: it is missing or damaged.
+    """
+    return load_model(run.stage(MODEL), device)
+
+
+def load_policy(run: Run, device: torch.device | str = "cpu") -> Actor:
     """CADDY's actor of a finished run.
 
     Raises:
         CheckpointError: it is missing or damaged, or was trained on another model.
     """
-    done, caddy = _finished(run, POLICY, device)
-    sizes, env = stage_model(done)
-    own = caddy.config
-    with torch.random.fork_rng(devices=[]):
+    done, caddy = run.stage(POLICY, MODEL), load_video(run, device)
+    (sizes, env), own = done.sizes, caddy.config
+
+    def build() -> DecodedPolicy[MovesHead]:
         head = MovesHead(own.encoder[-1], own.actions, own.latent_dim)
         decoder = ActionDecoder(sizes.action_decoder, own.actions + own.latent_dim, env.action_dim)
-    load_weights(done, {"policy": head, "action_decoder": decoder})
-    freeze_on(head, device)
-    freeze_on(decoder, device)
-    return latent_actor(OnFrames(caddy.encoder, head), decoder)
+        return DecodedPolicy(head, decoder)
+
+    parts = done.restore(build, DecodedPolicy.PARTS, device)
+    return latent_actor(OnFrames(caddy.encoder, parts.policy), parts.action_decoder)
 
 
-def load_oracle(run: Path, device: torch.device | str = "cpu") -> Actor:
+def load_oracle(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The CADDY Oracle's actor of a finished run; actions clamped to [-1, 1].
 
     Raises:
         CheckpointError: it is missing or damaged, or was trained on another model.
     """
-    done, caddy = _finished(run, ORACLE, device)
-    with torch.random.fork_rng(devices=[]):
-        head = StateHead(caddy.config.encoder[-1], stage_config(done, EnvConfig, "env").action_dim, acts=True)
-    load_weights(done, {"oracle": head})
-    freeze_on(head, device)
+    done, caddy = run.stage(ORACLE, MODEL), load_video(run, device)
+    width = done.group(EnvConfig, "env").action_dim
+    head = done.restore(lambda: StateHead(caddy.config.encoder[-1], width, acts=True), "oracle", device)
     return ReactiveActor(oracle_module(OnFrames(caddy.encoder, head), keys.PIXELS))
-
-
-def _finished(run: Path, stage: str, device: torch.device | str) -> tuple[StageCheckpoint, CADDY]:
-    """A finished stage of a run, and the model that it was trained on."""
-    done = read_stage(checkpoint_folder(run, stage), stage)
-    model = read_stage(checkpoint_folder(run, MODEL), MODEL)
-    require_parents(done, {MODEL: model})
-    return done, load_model(model, device)

@@ -25,8 +25,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.config.video import CADDYConfig
 from playslot_rl.methods.caddy.action import ActionNetwork, Gaussian, Latents, Moves, chosen, gumbel_softmax
+from playslot_rl.methods.caddy.config import CADDYConfig
 from playslot_rl.methods.caddy.dynamics import Dynamics
 from playslot_rl.methods.caddy.encoder import Encoder, inside
 from playslot_rl.methods.caddy.generator import Generator, Pyramid

@@ -19,9 +19,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.config.video import CADDYConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise, psnr
+from playslot_rl.methods.caddy.config import CADDYConfig
 from playslot_rl.methods.caddy.information import joint_distribution, mutual_information
 from playslot_rl.methods.caddy.loss import CADDYLoss
 from playslot_rl.methods.caddy.model import CADDY

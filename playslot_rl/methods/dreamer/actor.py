@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Final
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -12,12 +10,10 @@ from tensordict import TensorDict, TensorDictBase
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
 from playslot_rl.config import EnvConfig
-from playslot_rl.config.baselines import DreamerConfig
+from playslot_rl.methods.dreamer.config import DreamerConfig
+from playslot_rl.methods.dreamer.method import NAME
 from playslot_rl.methods.dreamer.networks import DreamerNetworks
-from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
-from playslot_rl.training.runs import freeze_on, stage_config
-
-NAME: Final = "dreamer"
+from playslot_rl.runs import Run
 
 
 def act(networks: DreamerNetworks, memory: TensorDictBase, generator: torch.Generator | None) -> TensorDict:
@@ -66,16 +62,12 @@ class DreamerActor(Actor):
         return tensordict.update(out.select(*self.out_keys))
 
 
-def load_actor(run: Path, device: torch.device | str = "cpu") -> DreamerActor:
+def load_actor(run: Run, device: torch.device | str = "cpu") -> DreamerActor:
     """The trained actor of `RUN/dreamer/checkpoint`, in eval mode.
 
     Raises:
         CheckpointError: no finished training there, or a damaged one.
     """
-    checkpoint = read_stage(checkpoint_folder(run, NAME), NAME)
-    config, env = stage_config(checkpoint, DreamerConfig, NAME), stage_config(checkpoint, EnvConfig, "env")
-    with torch.random.fork_rng(devices=[]):
-        networks = DreamerNetworks(config, env)
-    load_weights(checkpoint, {"networks": networks})
-    freeze_on(networks, device)
-    return DreamerActor(networks)
+    done = run.stage(NAME)
+    own, env = done.group(DreamerConfig, NAME), done.group(EnvConfig, "env")
+    return DreamerActor(done.restore(lambda: DreamerNetworks(own, env), "networks", device))

@@ -22,9 +22,9 @@ from torchrl.objectives.utils import ValueEstimators
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper, DreamerV3Optimizer
 
 from playslot_rl import keys
-from playslot_rl.config.baselines import DreamerConfig
 from playslot_rl.losses.common import total_loss
 from playslot_rl.methods.dreamer.actor import act
+from playslot_rl.methods.dreamer.config import DreamerConfig
 from playslot_rl.methods.dreamer.networks import BINS, UNIMIX, DreamerNetworks, actor_module
 from playslot_rl.seeds.draws import StepGenerators
 

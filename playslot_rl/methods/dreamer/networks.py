@@ -32,8 +32,8 @@ from torchrl.modules import (
 
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig
-from playslot_rl.config.baselines import DreamerConfig
 from playslot_rl.errors import ConfigError
+from playslot_rl.methods.dreamer.config import DreamerConfig
 
 UNIMIX = 0.01
 """Uniform share of every categorical, so that none becomes certain."""

@@ -13,18 +13,19 @@ import torch
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.config import ExperimentConfig, LAPOConfig
+from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.cloning import LatentCloning
-from playslot_rl.methods.lapo.load import NAME, LAPOPolicy
-from playslot_rl.methods.lapo.model import InverseModel
+from playslot_rl.methods.lapo.config import LAPOConfig
+from playslot_rl.methods.lapo.load import LAPOPolicy
+from playslot_rl.methods.lapo.method import NAME
+from playslot_rl.methods.lapo.model import ForwardModel, InverseModel
 from playslot_rl.methods.lapo.stage import infer_latents
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
-from playslot_rl.training.runs import freeze_on, stage_config, stage_model
 from playslot_rl.training.stage_regression import RegressionStage
 
 
@@ -45,7 +46,8 @@ class LAPOBehaviour(LatentCloning):
     def __init__(
         self, config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
     ) -> None:
-        self.own, self.inverse = config.baselines.lapo, load_inverse(model, device)
+        self.own: LAPOConfig = config.baselines.lapo
+        self.inverse = load_inverse(model, device)
         super().__init__(config, demos, device, self.own.shift)
         with global_seed(config.seed, 0, NAME):
             self.policy = LAPOPolicy(self.own, config.env.image_size).to(device)
@@ -73,11 +75,9 @@ def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseM
     Raises:
         CheckpointError: it is damaged.
     """
-    from playslot_rl.methods.lapo.model import ForwardModel
+    own, (_, env) = model.group(LAPOConfig, NAME), model.sizes
 
-    config, (_, env) = stage_config(model, LAPOConfig, NAME), stage_model(model)
     with torch.random.fork_rng(devices=[]):
-        inverse, forward = InverseModel(config, env.image_size), ForwardModel(config)
+        inverse, forward = InverseModel(own, env.image_size), ForwardModel(own)
     load_weights(model, {"inverse": inverse, "forward": forward})
-    freeze_on(inverse, device)
-    return inverse
+    return inverse.to(device).eval().requires_grad_(False)

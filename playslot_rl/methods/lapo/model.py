@@ -22,8 +22,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from playslot_rl.config.baselines import LAPOConfig
 from playslot_rl.frames import normalise
+from playslot_rl.methods.lapo.config import LAPOConfig
 from playslot_rl.modules.quantizer import ActionQuantizer
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -20,11 +20,11 @@ import torch
 from tensordict import TensorDictBase
 
 from playslot_rl.acting.episodes import LOCKSTEP, TaskPool
-from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.config.roles import without
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.methods.online.acting import PlayedEpisodes, play
 from playslot_rl.methods.online.checkpoints import OnlineCheckpoints, OnlineState
+from playslot_rl.methods.online.config import OnlineConfig
 from playslot_rl.methods.online.learner import Learner
 from playslot_rl.methods.online.players import Players, Round, play_round
 from playslot_rl.methods.online.replay import Replay
@@ -43,6 +43,7 @@ def train_online(
     learner: Learner,
     online: OnlineConfig,
     record: StageRecord,
+    begin: Callable[[], None],
     *,
     title: str,
     device: torch.device,
@@ -56,6 +57,7 @@ def train_online(
         learner: its modules already on `device`.
         online: the method's config.
         record: the method, which is the prefix of its config keys, its run, task, renderer, seed, logging.
+        begin: called before the first step, when nothing speaks against it.
         title: as the curve names it.
         device: the learner's.
         prior_steps: agent steps behind what the learner was given (a world model's data), added to the curve's.
@@ -69,10 +71,9 @@ def train_online(
         OutputError: another command trains it, or a full disk; the last good checkpoint stays.
         KeyboardInterrupt: Ctrl-C; its message says where the same command carries on.
     """
-    with record.training() as begin:
-        run = _Run(learner, online, record, title, device, prior_steps)
-        begin()
-        return _train(run, record)
+    run = _Run(learner, online, record, title, device, prior_steps)
+    begin()
+    return _train(run, record)
 
 
 def _train(run: _Run, record: StageRecord) -> tuple[OnlineState, int]:

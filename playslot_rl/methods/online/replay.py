@@ -14,8 +14,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from playslot_rl import keys
-from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.errors import ConfigError
+from playslot_rl.methods.online.config import OnlineConfig
 
 STREAM: Final = "stream"
 """Zero everywhere: to the sampler all episodes are one trajectory, and sequences run across them."""

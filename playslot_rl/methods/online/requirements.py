@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import ConfigError
+from playslot_rl.methods.online.config import OnlineConfig
 from playslot_rl.runtime.processes import here
 from playslot_rl.seeds.episodes import EPISODES
 

@@ -1,9 +1,10 @@
-"""PlaySlot's three stages."""
+"""PlaySlot: SAVi, the dynamics in its slots, and the policy in their latent actions."""
 
 from __future__ import annotations
 
 from typing import Final
 
+from playslot_rl.config.methods import Load, Method, Style
 from playslot_rl.config.stage_spec import StageSpec
 
 SLOTS: Final = StageSpec("slots", keys=("env.image_size", "model.savi"), settings=("slots",))
@@ -20,5 +21,15 @@ POLICY: Final = StageSpec(
     begun=("model",),
     parents=("slots", "dynamics"),
     data="demos",
+    parts="playslot_rl.methods.playslot.policy:training",
+    sizes="playslot_rl.methods.playslot.policy:sizes",
     names={"behaviour": "policy"},
+)
+PLAYSLOT: Final = Method(
+    "playslot",
+    ("PlaySlot",),
+    Style(0, "o"),
+    None,
+    (SLOTS, DYNAMICS, POLICY),
+    Load(actor="playslot_rl.methods.playslot.load:load_actor", video="playslot_rl.methods.playslot.load:load_video"),
 )

@@ -1,11 +1,12 @@
-"""The slot oracle: the policy's network on the real actions of all demonstrations."""
+"""The policy's network on the real actions of all demonstrations, or of the labelled ones alone (BC)."""
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Final
 
 from playslot_rl.config import BehaviourStageConfig
+from playslot_rl.config.methods import Load, Method, Style
 from playslot_rl.config.roles import keys_of
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.config.stages import AFTER_CLONING
@@ -18,5 +19,9 @@ STAGE: Final = StageSpec(
     settings=tuple(f"behaviour.{f.name}" for f in fields(BehaviourStageConfig) if f.name not in _NOT_ITS),
     parents=("slots",),
     data="demos",
+    parts="playslot_rl.methods.slot_oracle.training:training",
     names={"behaviour": NAME},
 )
+_LOAD: Final = Load(actor="playslot_rl.methods.slot_oracle.load:load_actor")
+SLOT_ORACLE: Final = Method(NAME, ("Slot Oracle",), Style(2, "^"), None, (STAGE,), _LOAD)
+SLOT_BC: Final = Method("slot_bc", ("Slot BC",), Style(2, "<"), None, (replace(STAGE, data="labelled"),), _LOAD)

@@ -7,7 +7,6 @@ Shapes: n episodes, W frames of memory, N slots, D slot width, A action width.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -17,18 +16,13 @@ from torchrl.modules import TruncatedNormal
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
 from playslot_rl.config import EnvConfig
-from playslot_rl.config.baselines import SOLDConfig
 from playslot_rl.errors import ConfigError
+from playslot_rl.methods.sold.config import SOLDConfig
+from playslot_rl.methods.sold.method import NAME
 from playslot_rl.methods.sold.networks import ActorHead, SOLDNetworks, sample_action
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.storage.checkpoints import (
-    StageCheckpoint,
-    checkpoint_folder,
-    load_weights,
-    read_stage,
-    require_parents,
-)
-from playslot_rl.training.runs import freeze_on, load_savi, run_folder, slots_checkpoint, stage_config, stage_model
+from playslot_rl.runs import Run
+from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.world_model import frame_parser_module, module_device
 
 
@@ -96,9 +90,6 @@ class SOLDActor(Actor):
         return location[rows, length - 1], std[rows, length - 1]
 
 
-NAME = "sold"
-
-
 def build_networks(config: SOLDConfig, slots: StageCheckpoint, action_dim: int, max_steps: int) -> SOLDNetworks:
     """Fresh networks for the slots of a finished SAVi.
 
@@ -108,7 +99,7 @@ def build_networks(config: SOLDConfig, slots: StageCheckpoint, action_dim: int, 
         action_dim: A.
         max_steps: agent steps in an episode, which a `sequence` of 0 takes whole.
     """
-    slot_dim = stage_model(slots)[0].savi.slot_dim
+    slot_dim = slots.sizes[0].savi.slot_dim
     return SOLDNetworks(config, slot_dim, action_dim, config.sequence or max_steps + 1)
 
 
@@ -131,23 +122,22 @@ def prior_steps(config: SOLDConfig, slots: StageCheckpoint) -> int:
             f"baselines.sold.savi_steps: got nothing, and {slots.path}/meta.json names neither agent_steps nor "
             "episodes: say how many agent steps SAVi's data hold"
         )
-    return int(episodes) * stage_model(slots)[1].max_steps
+    return int(episodes) * slots.sizes[1].max_steps
 
 
-def load_actor(run: Path | str, device: torch.device | str = "cpu") -> SOLDActor:
+def load_actor(run: Run, device: torch.device | str = "cpu") -> SOLDActor:
     """SOLD's policy of a run, in evaluation mode.
 
     Raises:
         CheckpointError: the run has no finished SOLD, a damaged one, or another SAVi than it was trained on.
     """
-    checkpoint = read_stage(checkpoint_folder(run_folder(run), NAME), NAME)
-    slots = slots_checkpoint(run)
-    require_parents(checkpoint, {"slots": slots})
-    config, env = stage_config(checkpoint, SOLDConfig, NAME), stage_config(checkpoint, EnvConfig, "env")
-    with torch.random.fork_rng(devices=[]):
-        networks = build_networks(config, slots, env.action_dim, env.max_steps)
-    load_weights(checkpoint, networks.parts)
-    freeze_on(networks, device)
-    actor = SOLDActor(load_savi(run, device), networks.actor, config.context, env.action_dim)
+    done, slots = run.stage(NAME, "slots"), run.stage("slots")
+    own, env = done.group(SOLDConfig, NAME), done.group(EnvConfig, "env")
+    networks = done.restore(
+        lambda: build_networks(own, slots, env.action_dim, env.max_steps),
+        ("dynamics", "reward", "critic", "actor"),
+        device,
+    )
+    actor = SOLDActor(run.load_savi(device), networks.actor, own.context, env.action_dim)
     actor.eval()
     return actor

@@ -18,10 +18,10 @@ from torch import Tensor, nn
 from torchrl.modules import PercentileValueNorm
 
 from playslot_rl import keys
-from playslot_rl.config.baselines import SOLDConfig
 from playslot_rl.frames import normalise
 from playslot_rl.methods.sold import losses
 from playslot_rl.methods.sold.actor import SOLDActor
+from playslot_rl.methods.sold.config import SOLDConfig
 from playslot_rl.methods.sold.networks import SOLDNetworks
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.seeds.draws import StepGenerators

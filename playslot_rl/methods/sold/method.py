@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
+from playslot_rl.config.methods import Load, Method, Style
 from playslot_rl.config.stage_spec import StageSpec
+from playslot_rl.methods.sold.config import SOLDConfig
 
 NAME: Final = "sold"
 STAGE: Final = StageSpec(
@@ -14,4 +16,13 @@ STAGE: Final = StageSpec(
     begun=("render",),
     parents=("slots",),
     data="",
+    parts="playslot_rl.methods.sold.training:training",
+)
+SOLD: Final = Method(
+    NAME,
+    ("SOLD",),
+    Style(4, "P"),
+    SOLDConfig,
+    (STAGE,),
+    Load(actor="playslot_rl.methods.sold.actor:load_actor"),
 )

@@ -24,9 +24,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.config.video import SVGConfig
 from playslot_rl.frames import normalise
 from playslot_rl.methods.svg.backbone import Decoder, Encoded, Encoder, check_image_size
+from playslot_rl.methods.svg.config import SVGConfig
 from playslot_rl.methods.svg.recurrent import FramePredictor, Gaussian, GaussianLSTM, State
 from playslot_rl.methods.video.predictor import check_clip
 
@@ -64,7 +64,7 @@ class SVG(nn.Module):
 
     Examples:
         >>> import torch
-        >>> from playslot_rl.config.video import SVGConfig
+        >>> from playslot_rl.methods.svg.config import SVGConfig
         >>> config = SVGConfig(channels=(4, 8), convs=(1, 1), features=8, latent_dim=2, hidden=8)
         >>> model = SVG(config, 16).eval()
         >>> model.predict(torch.rand(2, 5, 3, 16, 16), seed=3).shape

@@ -10,10 +10,10 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.config.video import SVGConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise, psnr
 from playslot_rl.losses.common import draw_frames
+from playslot_rl.methods.svg.config import SVGConfig
 from playslot_rl.methods.svg.loss import gaussian_kl, svg_objective
 from playslot_rl.methods.svg.model import SVG
 from playslot_rl.runtime.precision import autocast

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from playslot_rl.config.methods import METHODS
 from playslot_rl.studies.study import Result
 from playslot_rl.studies.success.page import budgeted
-from playslot_rl.visualization.charts import METHOD_STYLES, Theme, legend, new_figure, step_axis, style_axes
+from playslot_rl.visualization.charts import Theme, legend, new_figure, step_axis, style_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,14 +57,14 @@ def _panels(result: Result, offline: Sequence[Result]) -> list[tuple[str, Sequen
 def _against(axes: Axes, summary: Sequence[Result], rows: Sequence[Result], theme: Theme, key: str) -> None:
     """Success over `demos` or `labels`; what has no such number, oracles among labels, is a line across."""
     for row in (row for row in summary if row[key] is None):
-        colour = theme.series[METHOD_STYLES[row["method"]].colour]
+        colour = theme.series[METHODS[row["method"]].style.colour]
         axes.axhline(100 * row["success_rate"], color=colour, linestyle="-.", linewidth=1.2, label=row["title"])
     summary = [row for row in summary if row[key] is not None]
     shown = {(row["method"], row["protocol"], row["demos"]) for row in summary}
     series = list(dict.fromkeys((row["method"], row["protocol"], row["title"]) for row in summary))
     numbers = sorted({row[key] for row in summary})
     for index, (method, protocol, title) in enumerate(series):
-        style, own = METHOD_STYLES[method], [r for r in summary if (r["method"], r["protocol"]) == (method, protocol)]
+        style, own = METHODS[method].style, [r for r in summary if (r["method"], r["protocol"]) == (method, protocol)]
         own.sort(key=lambda row: row[key])
         # Side by side, so that equal rates do not hide each other; by a factor, since the axis is logarithmic.
         aside = 1.035 ** (index - (len(series) - 1) / 2)
@@ -96,7 +96,7 @@ def _against(axes: Axes, summary: Sequence[Result], rows: Sequence[Result], them
 
 def _steps(axes: Axes, curves: Sequence[Result], final: Sequence[Result], theme: Theme) -> None:
     for method in dict.fromkeys(row["method"] for row in [*curves, *final]):
-        style = METHOD_STYLES[method]
+        style = METHODS[method].style
         colour = theme.series[style.colour]
         own = [row for row in curves if row["method"] == method]
         for row in own:

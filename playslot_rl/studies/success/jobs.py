@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.config.methods import METHODS, MethodName, method_stage
+from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.config.roles import without
 from playslot_rl.studies.job import Job, absolute, absolute_roots, fingerprint_of
 
@@ -25,7 +25,7 @@ class SuccessJob(Job):
             one that trains its own.
     """
 
-    method: MethodName
+    method: str
     demos: int | None
     seed: int
     out: Path
@@ -56,7 +56,7 @@ class SuccessJob(Job):
     def model(self) -> Path | None:
         """Run folder of the model of unlabelled videos that it takes, made once for all; None where it takes none."""
         stage = METHODS[self.method].model
-        return model_folder(self.out, stage) if stage else None
+        return model_folder(self.out, stage.name) if stage else None
 
     @property
     def wave(self) -> int:
@@ -85,7 +85,7 @@ def success_jobs(config: ExperimentConfig, out: Path) -> list[SuccessJob]:
     return [*found, *(SuccessJob(name, None, seed, out) for seed in seeds for name in online)]
 
 
-def _of_demonstrations(method: MethodName, demos: int, seed: int, out: Path, labels: Sequence[int]) -> list[SuccessJob]:
+def _of_demonstrations(method: str, demos: int, seed: int, out: Path, labels: Sequence[int]) -> list[SuccessJob]:
     """One job, or one for each number of labels where the method's policy needs none and serves them all."""
     if not labels or not METHODS[method].decodes:
         return [SuccessJob(method, demos, seed, out)]
@@ -102,9 +102,9 @@ def uses_slots(config: ExperimentConfig) -> bool:
     return any(METHODS[name].slots for name in config.compare.methods)
 
 
-def latent_models(config: ExperimentConfig) -> dict[str, MethodName]:
+def latent_models(config: ExperimentConfig) -> dict[str, str]:
     """Stages of the models of unlabelled videos that methods build on, and for each of them a method that does."""
-    return {METHODS[name].model: name for name in config.compare.methods if METHODS[name].model}
+    return {model.name: name for name in config.compare.methods if (model := METHODS[name].model)}
 
 
 def model_folder(out: Path, stage: str) -> Path:

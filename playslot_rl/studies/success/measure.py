@@ -11,10 +11,10 @@ from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
 from playslot_rl.config.methods import METHODS
 from playslot_rl.envs import gym_id
-from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.errors import CheckpointError
 from playslot_rl.evaluation.seeds import held_out_seeds
 from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_references
-from playslot_rl.methods.online.requirements import require_online
+from playslot_rl.methods.training import check_method
 from playslot_rl.runs import Run
 from playslot_rl.storage.checkpoints import require_config
 from playslot_rl.studies.launch import Status
@@ -119,16 +119,10 @@ def check_success(config: ExperimentConfig) -> None:
             are not there.
         CheckpointError: `run` is no finished world model, or one of another task.
     """
-    env, methods = config.env, config.compare.methods
+    env = config.env
     gym_id(env.name)
-    for method in (name for name in methods if METHODS[name].online):
-        require_online(config, getattr(config.baselines, method), method)
-    weights = config.baselines.resnet_oracle.weights
-    named = weights in ("auto", "download", "scratch")
-    if {"resnet_oracle", "resnet_bc"} & {*methods} and not named and not Path(weights).is_file():
-        raise ConfigError(
-            f"baselines.resnet_oracle.weights: got {weights}, expected a file, auto, download or scratch: check it"
-        )
+    for method in config.compare.methods:
+        check_method(config, method)
     if not uses_slots(config) or not config.run:
         return
     for checkpoint in Run.open(config.run).world_stages.values():

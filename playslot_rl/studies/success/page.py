@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from playslot_rl.config.methods import LATENT_MODELS, METHODS
+from playslot_rl.config.methods import METHODS, stage_title
 from playslot_rl.runtime.progress import format_seconds
 from playslot_rl.studies.study import FOOTNOTES, Result, machine_note, open_jobs_notes
 from playslot_rl.visualization.document import Block, Document, Linked, Notes, Section, Table, Text
@@ -136,7 +136,7 @@ def _shared(result: Result) -> list[str]:
         )
     for stage, model in result["latent_models"].items():
         notes.append(
-            f"{LATENT_MODELS[stage]}: {model['seconds']:.0f} s of training on {model['episodes']} videos without "
+            f"{stage_title(stage)}: {model['seconds']:.0f} s of training on {model['episodes']} videos without "
             f"actions, {rest}."
         )
     return notes

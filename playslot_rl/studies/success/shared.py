@@ -122,7 +122,7 @@ class Shared:
         method = METHODS[job.method]
         prints = {name: stage.fingerprint for name, stage in self._world.items()} if method.slots else {}
         if method.model:
-            prints[method.model] = self._models[method.model].fingerprint
+            prints[method.model.name] = self._models[method.model.name].fingerprint
         if job.demos is not None and self._demos is not None:
             prints["demos"] = first_demonstrations(self._demos, job.demos).fingerprint  # the draw is in its config
         return prints

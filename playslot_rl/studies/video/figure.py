@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from playslot_rl.studies.study import Result
 from playslot_rl.studies.video.page import RECONSTRUCTION, heading
-from playslot_rl.visualization.charts import VIDEO_STYLES, Theme, legend, new_figure, style_axes
+from playslot_rl.visualization.charts import Theme, legend, new_figure, style_axes, style_of
 from playslot_rl.visualization.grid import image_grid
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def video_figure(result: Result, theme: Theme) -> Figure:
 def _curve(
     axes: Any, steps: npt.NDArray[np.int64], row: Result, name: str, theme: Theme, variants: Sequence[str]
 ) -> None:
-    style = VIDEO_STYLES.get(row["method"] or "")
+    style = style_of(row["method"] or "")
     number = 7 if style is None else style.colour
     if row["variant"]:  # of one method: each has a colour of its own
         number = variants.index(row["title"]) % 7

@@ -11,7 +11,6 @@ from typing import Any
 
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.compare_video import ON_SLOTS, TITLES, CompareVideoConfig, VideoMethod
-from playslot_rl.config.methods import MethodName
 from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import without
 from playslot_rl.errors import ConfigError
@@ -55,7 +54,7 @@ class VideoJob(Job):
         return f"{TITLES[self.method]}, {self.variant}" if self.variant else TITLES[self.method]
 
     @property
-    def trained_as(self) -> MethodName:
+    def trained_as(self) -> str:
         """Its name among `playslot_rl.config.methods`."""
         return "playslot" if self.method == "playslot_m" else self.method
 

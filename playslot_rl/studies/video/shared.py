@@ -19,7 +19,7 @@ from playslot_rl.data.windows import Clips
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.lpips import open_lpips
-from playslot_rl.methods.video.load import check_pixel_model
+from playslot_rl.methods.training import check_method
 from playslot_rl.methods.video.scores import as_function, score_clips
 from playslot_rl.methods.video.slots import LastFrame, Reconstruction
 from playslot_rl.runs import Run
@@ -45,7 +45,7 @@ def check_models(config: ExperimentConfig) -> None:
     """
     for method in config.compare_video.methods:
         if method not in ON_SLOTS:
-            check_pixel_model(method, config.baselines, config.env.image_size)
+            check_method(config, method)
     if config.run and uses_slots(config):
         require_config(Run.open(config.run).stage("slots"), {"env": {"image_size": config.env.image_size}})
 

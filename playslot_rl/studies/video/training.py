@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.config import ExperimentConfig, plugins
+from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import TrainingError
 from playslot_rl.evaluation.lpips import open_lpips
-from playslot_rl.methods.video.load import load_video
 from playslot_rl.methods.video.rows import method_rows
 from playslot_rl.methods.video.scores import score_clips
 from playslot_rl.runs import Run
@@ -115,8 +115,8 @@ class VideoTraining:
         """Write `RUN/video.json` and the predictions of the first clips."""
         job, began = self._job, time.monotonic()
         device = open_device(config.device, config.threads)
-        model = load_video(job.trained_as, job.run, device)
-        done = Run(job.run).own(job.stage)
+        run = Run(job.run)
+        model, done = plugins.call(METHODS[job.trained_as].load.video, run, device), run.own(job.stage)
         network = open_lpips(config.metrics.lpips_weights).network
         scores, pictures, clips = list[dict[str, Any]](), dict[str, Any](), list[str]()
         for tested in tested_clips(config):

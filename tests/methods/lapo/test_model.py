@@ -11,9 +11,9 @@ from clips import moving_square
 
 from playslot_rl.acting.actor import latent_actor
 from playslot_rl.config import ActionDecoderConfig, OptimConfig, StageConfig
-from playslot_rl.config.baselines import LAPOConfig
 from playslot_rl.data.demonstrations import transitions
 from playslot_rl.data.windows import Clips
+from playslot_rl.methods.lapo.config import LAPOConfig
 from playslot_rl.methods.lapo.load import LAPOPolicy
 from playslot_rl.methods.lapo.model import ForwardModel, InverseModel
 from playslot_rl.methods.lapo.stage import LAPOModelStage, infer_latents

@@ -7,8 +7,8 @@ import torch
 from tensordict import TensorDict
 
 from playslot_rl import keys
-from playslot_rl.config.baselines import OnlineConfig
 from playslot_rl.errors import ConfigError
+from playslot_rl.methods.online.config import OnlineConfig
 from playslot_rl.methods.online.replay import Replay
 
 FRAMES = 4

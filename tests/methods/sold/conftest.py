@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 from playslot_rl import keys
-from playslot_rl.config.baselines import SOLDConfig
+from playslot_rl.methods.sold.config import SOLDConfig
 from playslot_rl.methods.sold.learner import SOLDLearner
 from playslot_rl.methods.sold.networks import SOLDNetworks
 from playslot_rl.modules.savi import SAVi

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import nn
 
-from playslot_rl.config.video import SVGConfig
 from playslot_rl.methods.svg.backbone import Decoder, Encoder
+from playslot_rl.methods.svg.config import SVGConfig
 from playslot_rl.methods.svg.model import SVG
 
 COMPACT = SVGConfig(channels=(16, 32, 64, 128), convs=(1, 1, 1, 1), features=64, latent_dim=16, hidden=128)

@@ -9,9 +9,9 @@ import pytest
 import torch
 from clips import moving_square
 
-from playslot_rl.config.video import SVGConfig
 from playslot_rl.data.windows import Clips
 from playslot_rl.frames import normalise
+from playslot_rl.methods.svg.config import SVGConfig
 from playslot_rl.methods.svg.model import SVG
 from playslot_rl.methods.svg.stage import SVGStage
 from playslot_rl.seeds.draws import StepGenerators

@@ -11,7 +11,7 @@ from torchvision.models import resnet18
 from playslot_rl import keys
 from playslot_rl.config import PolicyConfig
 from playslot_rl.errors import CheckpointError
-from playslot_rl.methods.oracles.resnet import ResNetPolicy, cached_weights, load_pretrained, resnet_actor
+from playslot_rl.methods.resnet_oracle.network import ResNetPolicy, cached_weights, load_pretrained, resnet_actor
 from playslot_rl.storage.tensors import save_tensors
 
 HEAD = PolicyConfig(dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16)

@@ -24,13 +24,12 @@ from playslot_rl.acting.actor import Actor, ReactiveActor
 from playslot_rl.config import PolicyConfig
 from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import normalise
+from playslot_rl.methods.resnet_oracle.method import NAME
 from playslot_rl.modules.policy import LatentPolicy
-from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage
+from playslot_rl.runs import Run
 from playslot_rl.storage.published import pick_published, read_published
-from playslot_rl.training.runs import freeze_on, stage_model
 from playslot_rl.world_model import oracle_module
 
-NAME = "resnet_oracle"
 WIDTH = 512
 Pretraining = Literal["imagenet", "scratch"]
 
@@ -126,16 +125,13 @@ def resnet_actor(policy: ResNetPolicy) -> Actor:
     return ReactiveActor(oracle_module(policy, keys.PIXELS))
 
 
-def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
+def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a finished run.
 
     Raises:
         CheckpointError: it is missing or damaged.
     """
-    done = read_stage(checkpoint_folder(run, NAME), NAME)
-    model, env = stage_model(done)
-    with torch.random.fork_rng(devices=[]):
-        policy = ResNetPolicy(model.policy, env.image_size, env.action_dim)
-    load_weights(done, {"policy": policy})
-    freeze_on(policy, device)
+    done = run.stage(NAME)
+    model, env = done.sizes
+    policy = done.restore(lambda: ResNetPolicy(model.policy, env.image_size, env.action_dim), "policy", device)
     return resnet_actor(policy)

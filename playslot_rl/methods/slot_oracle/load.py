@@ -8,32 +8,24 @@ of its own: all its demonstrations lend their real actions.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import torch
 
 from playslot_rl.acting.actor import Actor, SlotActor
+from playslot_rl.methods.slot_oracle.method import NAME
 from playslot_rl.modules.policy import LatentPolicy
-from playslot_rl.storage.checkpoints import checkpoint_folder, load_weights, read_stage, require_parents
-from playslot_rl.training.runs import freeze_on, load_savi, stage_model, world_model_folder
+from playslot_rl.runs import Run
 from playslot_rl.world_model import oracle_module
 
-NAME = "slot_oracle"
 
-
-def load_actor(run: Path, device: torch.device | str = "cpu") -> Actor:
+def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a finished run.
 
     Raises:
         CheckpointError: the run or its SAVi is missing or damaged, or it was trained on other slots.
     """
-    done = read_stage(checkpoint_folder(run, NAME), NAME)
-    slots = read_stage(checkpoint_folder(world_model_folder(run), "slots"), "slots")
-    require_parents(done, {"slots": slots})
-    savi = load_savi(run, device)
-    model, env = stage_model(done)
-    with torch.random.fork_rng(devices=[]):
-        oracle = LatentPolicy(model.policy, savi.config.slot_dim, env.action_dim, acts=True)
-    load_weights(done, {"oracle": oracle})
-    freeze_on(oracle, device)
+    done, savi = run.stage(NAME, "slots"), run.load_savi(device)
+    model, env = done.sizes
+    oracle = done.restore(
+        lambda: LatentPolicy(model.policy, savi.config.slot_dim, env.action_dim, acts=True), "oracle", device
+    )
     return SlotActor(savi, oracle_module(oracle))

@@ -1,1 +1,0 @@
-"""Slot oracle and ResNet oracle: real actions cloned from slots and from ResNet-18 features."""

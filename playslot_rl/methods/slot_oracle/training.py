@@ -1,0 +1,45 @@
+"""Training of the slot oracle: sizes are `model.policy`, the schedule is `behaviour`, as for PlaySlot's policy."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from playslot_rl.data.demonstrations import moving_slots, real_actions, require_finite, transitions
+from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.seeds.draws import global_seed
+from playslot_rl.training.demonstrated import ParsedVideos, cloned, demonstration_views
+from playslot_rl.training.fit import Part
+from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.stage_behaviour import oracle_stage
+
+
+def training(record: StageRecord) -> Training:
+    """A new policy on the slots of the demonstrations."""
+    config = record.config
+    device, split, width = record.device, record.demos, config.env.action_dim
+    split.trained.require_actions(width)  # before anything is computed
+    require_finite(split)
+    savi = record.world.load_savi(device)
+    with global_seed(config.seed, 0, record.name):
+        oracle = LatentPolicy(config.model.policy, savi.config.slot_dim, width, acts=True).to(device)
+
+    behaviour = config.behaviour
+
+    def examples(views: list[ParsedVideos]) -> tuple[Tensor, Tensor]:
+        trim, margin = behaviour.trim, behaviour.trim_margin
+        rows = [moving_slots(transitions(frames), cached, trim, margin).rows for frames, cached in views]
+        slots = [torch.from_numpy(cached[at]) for (_, cached), at in zip(views, rows, strict=True)]
+        actions = [real_actions(frames, at, width) for (frames, _), at in zip(views, rows, strict=True)]
+        return torch.cat(slots).to(device), torch.cat(actions).to(device)
+
+    views, others = demonstration_views(config, split, savi, record.prints["slots"])
+    slots, actions = examples(views)
+    stage = oracle_stage(oracle, slots, actions, behaviour, examples(others) if others else None)
+    said, extra = cloned(record.name, split, len(slots), views=len(views))
+    return Training(
+        [Part(record.name, stage, config.behaviour, group="behaviour")],
+        device,
+        lambda _: f"{said}, {record.folder}",
+        extra=extra,
+    )

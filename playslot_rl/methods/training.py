@@ -1,0 +1,148 @@
+"""Training a method: its stages one after the other, each of them from what its `StageSpec` says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from playslot_rl.config import ExperimentConfig, plugins
+from playslot_rl.config.methods import METHODS
+from playslot_rl.config.stage_spec import StageSpec
+from playslot_rl.data.demonstrations import (
+    labelled_rows,
+    moving_frames,
+    require_finite,
+    require_labelled,
+)
+from playslot_rl.errors import CheckpointError
+from playslot_rl.methods.online.requirements import require_online
+from playslot_rl.runs import Run
+from playslot_rl.runs.opening import require_parent, run_to_write
+from playslot_rl.storage.checkpoints import StageCheckpoint, require_config, require_whole
+from playslot_rl.training.record import StageRecord, run_stage
+
+
+@runtime_checkable
+class Checking(Protocol):
+    """Settings of a method that refuse what does not fit, before anything is computed."""
+
+    def check(self, name: str, config: ExperimentConfig) -> None:
+        """Look, by the dotted name of these settings.
+
+        Raises:
+            ConfigError, CheckpointError: something does not fit.
+        """
+
+
+def check_method(config: ExperimentConfig, name: str) -> None:
+    """Refuse what a method cannot be trained with, before anything is computed.
+
+    Raises:
+        ConfigError, CheckpointError: settings, task or frames that do not fit.
+    """
+    method = METHODS[name]
+    if method.online:
+        require_online(config, getattr(config.baselines, name), name)
+    for group in dict.fromkeys(group for stage in method.stages for group in stage.groups):
+        own = attrgetter(group)(config)
+        if isinstance(own, Checking):
+            own.check(group, config)
+
+
+def train(config: ExperimentConfig) -> StageCheckpoint:
+    """Train `config.method` into `OUT/STAGE`; killed, the same command carries on; finished, it says so.
+
+    Raises:
+        ConfigError: a method that acts, and a task without simulator or dense reward.
+        CheckpointError: no finished parent, or `out` was begun otherwise.
+        DataError: no videos, too few demonstrations, or none with actions.
+        OutputError, TrainingError: see `playslot_rl.errors`.
+    """
+    method = METHODS[config.method]
+    check_method(config, method.name)
+    run = run_to_write(config)
+    if method.model is None:
+        return train_stage(method.last, config, run)
+    parents = dict[str, StageCheckpoint]()
+    record = StageRecord(
+        method.last, run.folder, config, parents, ready=lambda: run.take(parents[record.spec.parents[0]])
+    )
+    parents[method.model.name] = _model(method.model, record, run)
+    return run_stage(record, partial(plugins.call, record.spec.parts, record))
+
+
+def train_stage(spec: StageSpec, config: ExperimentConfig, run: Run) -> StageCheckpoint:
+    """Train one stage into a run, on `data.root` or the demonstrations, and on the world model of `config.run`.
+
+    Raises:
+        CheckpointError, DataError, OutputError, TrainingError: as `train`.
+    """
+    if not spec.parents:
+        record = StageRecord(spec, run.folder, config)
+        return run_stage(record, partial(plugins.call, spec.parts, record))
+    world = Run.of(config, run.folder)
+    parents = world.world_stages if "dynamics" in spec.parents else {"slots": world.stage("slots")}
+    for checkpoint in parents.values():
+        require_parent(config, run, checkpoint, "image_size", *(["action_dim"] if "dynamics" in parents else []))
+    groups: dict[str, Any] = {}
+    if "dynamics" in parents:
+        groups["model"], groups["env"] = world.world_config
+    else:
+        groups["model"] = replace(config.model, savi=parents["slots"].sizes[0].savi)
+    if spec.sizes:
+        groups["model"] = plugins.call(spec.sizes, config, groups["model"])
+    record = StageRecord(spec, run.folder, config, parents, groups, ready=partial(run.build_on, world))
+    return run_stage(record, partial(plugins.call, spec.parts, record))
+
+
+def train_model(config: ExperimentConfig, spec: StageSpec, folder: Path) -> StageCheckpoint:
+    """Train the model of unlabelled videos that methods build on into a run, or find it there.
+
+    Raises:
+        CheckpointError, DataError, OutputError, TrainingError: as `train`.
+    """
+    method = spec.name if spec.name in METHODS else config.method
+    return train_stage(spec, replace(config, method=method, out=str(folder), run=""), Run(folder))
+
+
+def _model(spec: StageSpec, record: StageRecord, run: Run) -> StageCheckpoint:
+    """The model that a method builds on: of the run that `baselines.METHOD.world` names, or trained into its own.
+
+    What the method will clone is looked at before a model is trained for it.
+    """
+    config, labelled = record.config, record.spec.data == "demos" and METHODS[record.config.method].decodes
+    count = config.behaviour.labelled_demos if labelled else None
+    record.data.require_actions(config.env.action_dim)
+    if count is not None:
+        require_labelled(count, record.demos.trained.episodes)
+    require_finite(record.demos, count)
+    world = getattr(getattr(config.baselines, config.method), "world", "")
+    if not world:
+        if not run.has(spec.name):
+            _require_moving(record, count)
+        return train_model(config, spec, run.folder)
+    other = Run(Path(world))
+    if not other.has(spec.name):
+        raise CheckpointError(
+            f"baselines.{config.method}.world={world}: got no {other.place(spec.name)}, expected a run with "
+            f"{spec.title}: name another, or leave it out to train one"
+        )
+    model = other.own(spec.name)
+    require_whole(model)
+    require_parent(config, run, model, "image_size")
+    shared = [key for key in record.spec.keys if key in spec.keys]
+    wanted = StageRecord(replace(spec, keys=tuple(shared), settings=()), run.folder, config).finishes()
+    require_config(model, wanted, record.spec.typed)
+    return model
+
+
+def _require_moving(record: StageRecord, labelled: int | None) -> None:
+    threshold, margin = record.config.behaviour.trim_pixels, record.config.behaviour.trim_margin
+    moves = moving_frames(record.demos.trained, threshold, margin)
+    if labelled is not None:
+        labelled_rows(moves.episode, labelled)
+    if record.demos.held_out is not None:
+        moving_frames(record.demos.held_out, threshold, margin)

@@ -1,0 +1,70 @@
+"""What the trainings of models that predict frames share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import nn
+
+from playslot_rl.config import ExperimentConfig, StageConfig
+from playslot_rl.errors import ConfigError
+from playslot_rl.seeds.draws import global_seed
+from playslot_rl.training.fit import Part
+from playslot_rl.training.patience import Patience
+from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.stage import Stage
+
+
+def pixel_model[Model: nn.Module](build: Callable[[Any, int], Model], own: Any, record: StageRecord) -> Model:
+    """A new model of frames, from its settings and the frames' size.
+
+    Raises:
+        ConfigError: frames of a size that its convolutions do not fit.
+    """
+    with global_seed(record.config.seed, 0, record.name):
+        return _fitting(build, own, record.config, record.name).to(record.device)
+
+
+def check_pixel_model(build: Callable[[Any, int], nn.Module], config: ExperimentConfig, name: str) -> None:
+    """Refuse frames that a model of frames cannot take, before anything is computed.
+
+    Raises:
+        ConfigError: as `pixel_model`.
+    """
+    with torch.device("meta"):
+        _fitting(build, getattr(config.baselines, name), config, name)
+
+
+def on_clips(
+    record: StageRecord,
+    stage: Stage,
+    own: StageConfig,
+    patience: Patience | None = None,
+    extra: Mapping[str, Any] | None = None,
+) -> Training:
+    """The one part of a model that is trained on clips.
+
+    Args:
+        record: of the stage.
+        stage: what is trained.
+        own: its settings, `baselines.NAME`.
+        patience: with it; None trains all steps.
+        extra: more for `meta.json`.
+    """
+    return Training(
+        [Part(f"baselines.{record.name}", stage, own, patience=patience)],
+        record.device,
+        lambda metrics: f"{record.name}: {metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {record.folder}",
+        extra={"episodes": record.data.episodes, **(extra or {})},
+    )
+
+
+def _fitting[Model: nn.Module](
+    build: Callable[[Any, int], Model], own: Any, config: ExperimentConfig, name: str
+) -> Model:
+    try:
+        return build(own, config.env.image_size)
+    except ValueError as error:
+        raise ConfigError(f"env.{error}: change it, or leave out method {name}") from None

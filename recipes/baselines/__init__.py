@@ -1,1 +1,0 @@
-"""Recipes of the baselines, one module a method: `main(config)` trains it."""
