@@ -12,8 +12,8 @@ from commands import instead, killed_at_first_checkpoint
 from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.methods import training
 from playslot_rl.methods.dreamer.actor import load_actor
-from playslot_rl.methods.training import train
 from playslot_rl.runs import Run
 
 pytestmark = pytest.mark.integration
@@ -23,7 +23,7 @@ SMOKE = ("preset=smoke", "method=dreamer", "env=block_reach", "threads=1", "devi
 
 def train(out: Path, *overrides: str) -> None:
     """The recipe, as the command line calls it."""
-    train(compose([*SMOKE, f"out={out}", *overrides]))
+    training.train(compose([*SMOKE, f"out={out}", *overrides]))
 
 
 def weights(out: Path) -> bytes:
@@ -100,7 +100,7 @@ def test_what_cannot_be_learned_from_is_refused_before_anything_is_written(
 ) -> None:
     config = compose(list(map(str, instead(SMOKE, f"out={tmp_path / 'run'}", override))))
     with pytest.raises(ConfigError, match=message):
-        train(config)
+        training.train(config)
     assert not (tmp_path / "run").exists()
 
 

@@ -169,5 +169,6 @@ def train(run: Path, learner: ToyLearner | None = None, **changes: Any) -> tuple
         env=EnvConfig(max_steps=STEPS), seed=3, logging=LoggingConfig(backend="none", progress=False)
     )
     record = StageRecord(SPEC, run, config)
-    done = train_online(learner, toy_online(**changes), record, title="Toy", device=torch.device("cpu"))
+    with record.training() as begin:
+        done = train_online(learner, toy_online(**changes), record, begin, title="Toy", device=torch.device("cpu"))
     return learner, Trained(*done)
