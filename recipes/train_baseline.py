@@ -8,6 +8,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.methods import METHODS
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import ConfigError
+from playslot_rl.runtime.processes import here
 
 
 def main(config: ExperimentConfig) -> None:
@@ -34,7 +35,18 @@ def main(config: ExperimentConfig) -> None:
         gym_id(config.env.name)
     from playslot_rl.methods.training import train
 
-    train(config)
+    done = train(config)
+    if method.online and here().first:
+        _draw_curve(done.path.parent, method.name)
+
+
+def _draw_curve(folder: Path, name: str) -> None:
+    from playslot_rl.storage.atomic import read_json, write_bytes
+    from playslot_rl.visualization.charts import DARK, LIGHT, learning_chart
+
+    curve = read_json(folder / "curve.json")
+    for theme in (LIGHT, DARK):
+        write_bytes(folder / f"curve_{theme.name}.png", learning_chart({name: curve["rows"]}, curve["random"], theme))
 
 
 def train_videos(config: ExperimentConfig) -> None:

@@ -62,7 +62,8 @@ def train(config: ExperimentConfig) -> StageCheckpoint:
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
     method = METHODS[config.method]
-    check_method(config, method.name)
+    if method.online:
+        require_online(config, getattr(config.baselines, method.name), method.name)
     run = run_to_write(config)
     if method.model is None:
         return train_stage(method.last, config, run)

@@ -14,6 +14,7 @@ from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.methods import training
 from playslot_rl.methods.dreamer.actor import load_actor
+from playslot_rl.recipes import train_baseline
 from playslot_rl.runs import Run
 
 pytestmark = pytest.mark.integration
@@ -23,7 +24,7 @@ SMOKE = ("preset=smoke", "method=dreamer", "env=block_reach", "threads=1", "devi
 
 def train(out: Path, *overrides: str) -> None:
     """The recipe, as the command line calls it."""
-    training.train(compose([*SMOKE, f"out={out}", *overrides]))
+    train_baseline.main(compose([*SMOKE, f"out={out}", *overrides]))
 
 
 def weights(out: Path) -> bytes:
