@@ -36,17 +36,19 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.methods.training import train
 
     done = train(config)
-    if method.online and here().first:
-        _draw_curve(done.path.parent, method.name)
+    curve = done.path.parent / "curve.json"
+    if curve.is_file() and here().first:
+        _draw_curve(curve, method.name)
 
 
-def _draw_curve(folder: Path, name: str) -> None:
+def _draw_curve(path: Path, name: str) -> None:
     from playslot_rl.storage.atomic import read_json, write_bytes
     from playslot_rl.visualization.charts import DARK, LIGHT, learning_chart
 
-    curve = read_json(folder / "curve.json")
+    curve = read_json(path)
     for theme in (LIGHT, DARK):
-        write_bytes(folder / f"curve_{theme.name}.png", learning_chart({name: curve["rows"]}, curve["random"], theme))
+        chart = learning_chart({name: curve["rows"]}, curve["random"], theme)
+        write_bytes(path.with_name(f"curve_{theme.name}.png"), chart)
 
 
 def train_videos(config: ExperimentConfig) -> None:
