@@ -9,7 +9,6 @@ from typing import Any
 
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
-from playslot_rl.config.methods import METHODS
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError
 from playslot_rl.evaluation.seeds import held_out_seeds
