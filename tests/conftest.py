@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 import os
 import re
 import signal
@@ -46,6 +47,15 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
         if (f"not {tier}" in wanted and whole) or (wanted.startswith(tier) and not part):
             return True
     return None
+
+
+gc.disable()  # while a million objects are imported; they stay, and are not looked through again afterwards
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage from here on."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

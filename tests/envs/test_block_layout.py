@@ -63,6 +63,7 @@ def names(layout: Layout) -> list[str]:
     return [known[tuple(int(v) for v in colour)] for colour in layout.colours]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("distractors", [0, 1, 2, 3, 4])
 def test_each_task_means_the_object_it_says(distractors: int) -> None:
     for layout in layouts("push", BlocksConfig("red", distractors), 20):

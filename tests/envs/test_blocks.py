@@ -168,6 +168,7 @@ def test_the_goal_moves_with_the_episode_and_not_only_when_drawn(push: BlockPush
     assert np.ptp(places, axis=0)[:2].min() > 0.01
 
 
+@pytest.mark.integration
 def test_frames_are_the_same_without_what_the_camera_never_sees(
     push: BlockPushEnv, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,6 +207,7 @@ def test_drawing_leaves_the_model_as_it_was(push: BlockPushEnv) -> None:
     np.testing.assert_array_equal(push._simulation.model.mesh_facenum, fresh.mesh_facenum)
 
 
+@pytest.mark.integration
 def test_fast_rendering_looks_like_full_quality(push: BlockPushEnv) -> None:
     full = BlockPushEnv(push.config, RenderConfig(quality="full"))
     a, b = (env.reset(seed=2)[0]["pixels"].astype(float) for env in (push, full))
@@ -238,6 +240,7 @@ def test_specs_match_what_it_returns(name: str) -> None:
     env.close()
 
 
+@pytest.mark.integration
 def test_every_id_starts_from_the_task_it_names() -> None:
     import gymnasium
 

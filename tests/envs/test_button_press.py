@@ -83,6 +83,7 @@ def test_passes_gymnasiums_checker() -> None:
     made.close()
 
 
+@pytest.mark.integration
 def test_registered_id_makes_the_same_environment(env: ButtonPressEnv) -> None:
     import gymnasium
 
@@ -109,6 +110,7 @@ def test_wrong_action_width_is_refused() -> None:
         make_env(EnvConfig(action_dim=7))
 
 
+@pytest.mark.integration
 def test_fast_rendering_looks_like_full_quality(env: ButtonPressEnv) -> None:
     full = make_env(EnvConfig(), RenderConfig(quality="full"))
     a = env.reset(seed=2)[0]["pixels"].astype(float)
@@ -156,6 +158,7 @@ def test_renders_although_mujoco_was_imported_without_a_backend() -> None:
     assert "(64, 64, 3)" in done.stdout, done.stderr
 
 
+@pytest.mark.integration
 def test_missing_gl_backend_is_one_line() -> None:
     code = (
         "from playslot_rl.envs.rendering import check_rendering\n"

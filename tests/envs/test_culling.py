@@ -9,6 +9,8 @@ from playslot_rl.envs.button_press import ButtonPressEnv
 from playslot_rl.envs.culling import FrustumCuller
 from playslot_rl.envs.rendering import Camera, FrameRenderer
 
+pytestmark = pytest.mark.integration
+
 SCENE = """
 <mujoco>
   <worldbody>

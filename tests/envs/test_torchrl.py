@@ -41,6 +41,7 @@ def test_set_seed_starts_that_episode() -> None:
     gym_env.close()
 
 
+@pytest.mark.integration
 def test_proprioception_has_one_name() -> None:
     """In Gymnasium's observations, in TorchRL's own wrapper and in ours; LeRobot's programs have LeRobot's."""
     from torchrl.envs import GymEnv

@@ -68,6 +68,7 @@ def test_latents_that_are_the_action_are_recovered_and_wrong_pairs_are_not(model
     assert lines["above_frame"].verdict == "good"
 
 
+@pytest.mark.integration
 def test_a_robot_that_follows_late_shows_its_action_in_the_next_latent(model: WorldModel, card: Card) -> None:
     parsed = card.parsed
     assert parsed.actions is not None

@@ -182,6 +182,7 @@ def test_a_task_looks_as_lerobot_expects(task: LeRobotTask) -> None:
     assert np.array_equal(task.render(), observation["pixels"]["front"])
 
 
+@pytest.mark.integration
 def test_an_episode_ends_at_its_success_and_not_before(task: LeRobotTask) -> None:
     task.reset(seed=SEED)
     steps = 0
@@ -198,6 +199,7 @@ def test_an_episode_ends_at_its_success_and_not_before(task: LeRobotTask) -> Non
     assert ends == [(False, False)] * 19 + [(False, True)]
 
 
+@pytest.mark.integration
 def test_environments_side_by_side_wait_for_each_other() -> None:
     from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 

@@ -108,6 +108,7 @@ def test_the_page_has_a_table_for_each_number_of_videos_with_bc_in_each(by_label
     assert "PlaySlot saw the real actions of 5, 25 of 100, 5, 25 of 300 demonstrations" in page
 
 
+@pytest.mark.integration
 def test_the_plot_has_a_panel_for_each_number_of_videos(by_labels: dict[str, Any]) -> None:
     panels = success_figure(by_labels, LIGHT).axes
     assert [axes.get_title() for axes in panels] == ["100 videos", "300 videos"]
