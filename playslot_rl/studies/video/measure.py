@@ -75,11 +75,10 @@ class VideoMeasure:
             )
 
     def prepare(self) -> Mapping[VideoJob, Record]:
-        recorded = bool(self.config.data.root)
         config = prepare_videos(self.config)
-        self.config = config = prepare_slots(config, self._commands)
-        if not recorded:
+        if config is not self.config:  # those just recorded are looked at before SAVi is trained
             check_clips(config)
+        self.config = config = prepare_slots(config, self._commands)
         parents, found = parent_prints(config), dict[VideoJob, Record]()
         for job in video_jobs(config, Path(config.out)):
             found[job] = video_record(job, video_config(config, job, config.run), parents, not self._lpips_reason)
