@@ -67,7 +67,7 @@ class Controls:
             for number in range(len(self.session.prototypes)):
                 button = ui.button(color=None).props("flat no-caps padding=0").mark(f"prototype-{number}")
                 with button, ui.element("div").classes("proto"):
-                    self._previews.append(ui.image())
+                    self._previews.append(ui.image().props("no-spinner no-transition"))
                     ui.label(str(number))
                 button.tooltip(f"prototype {number}: key {number}")
                 button.on("pointerdown", lambda _, k=number: page.down(k))

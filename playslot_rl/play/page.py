@@ -218,7 +218,8 @@ class PlayPage:
 
         async def animate(number: int) -> tuple[Frame, bytes] | None:
             async with self._lock:
-                if self.closed or self.controls.stale:
+                if self.closed or self.controls.stale or self.ticker.active:  # playing comes first
+                    self.controls.outdate()
                     return None
                 made = await self.studio.do(lambda: preview(number))
             return None if self.closed else made
