@@ -218,8 +218,9 @@ class PlayPage:
 
         async def animate(number: int) -> tuple[Frame, bytes] | None:
             async with self._lock:
-                if self.closed or self.controls.stale or self.ticker.active:  # playing comes first
+                if self.ticker.active:  # playing comes first
                     self.controls.outdate()
+                if self.closed or self.controls.stale:
                     return None
                 made = await self.studio.do(lambda: preview(number))
             return None if self.closed else made
