@@ -44,11 +44,7 @@ def block_config(name: str, blocks: BlocksConfig) -> EnvConfig:
 
 
 def block_ids() -> dict[str, tuple[str, EnvConfig]]:
-    """Ids of the blocks family, every variant with every task and the easy setting, by Gymnasium id.
-
-    Returns:
-        Entry point and the configuration it starts from (three distractors, dense reward).
-    """
+    """Entry point and config of the blocks family's ids: every variant with every task, and the easy setting."""
     found = {}
     for variant in ("Push", "Reach", "Pick"):
         entry = f"playslot_rl.envs.block_push:Block{variant}Env"
@@ -73,11 +69,7 @@ def register() -> None:
 
 
 def gym_id(name: str) -> str:
-    """Gymnasium id of a configured environment name.
-
-    Raises:
-        ConfigError: there is no such environment.
-    """
+    """Gymnasium id of a configured environment name; a ConfigError where there is no such simulator."""
     if name in (*PROCEDURAL, *RECORDED):
         known = ", ".join(sorted(ENVIRONMENTS))
         raise ConfigError(f"env={name}: got an environment without a simulator, expected one of {known}")
@@ -89,10 +81,7 @@ def gym_id(name: str) -> str:
 
 def task_config(env: EnvConfig | str | None = None) -> EnvConfig:
     """A task's config, given itself or by its name, with the settings that `env=NAME` has; None means ButtonPress.
-
-    Raises:
-        ConfigError: unknown name, or something else.
-    """
+    A ConfigError for an unknown name, or something else."""
     if isinstance(env, str):
         default = "", EnvConfig(env)
         return block_ids().get(gym_id(env), default)[1]
@@ -131,11 +120,7 @@ def task_env(env: gym.Env[Any, Any]) -> PixelTask:
 
 
 def task_metadata(env: EnvConfig) -> dict[str, Any]:
-    """Gymnasium's metadata of a task, without making it: `control_hz`, `task` (a sentence), `action` (its numbers).
-
-    Raises:
-        ConfigError: there is no such environment, or it has no simulator.
-    """
+    """Gymnasium's metadata of a task, without making it: `control_hz`, `task` (a sentence), `action` (its numbers)."""
     name = gym_id(env.name)
     import gymnasium
     from gymnasium.envs.registration import load_env_creator

@@ -46,14 +46,7 @@ Vector = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Layout:
-    """The start of an episode.
-
-    Attributes:
-        places: (n, 3) centres of the objects.
-        colours: uint8 (n, 3) sRGB.
-        target: index of the object the task is about.
-        goal: (3,) where it belongs; for Reach, its own place.
-    """
+    """The start of an episode: centres (n, 3), colours uint8 (n, 3), the task's object, where that belongs (3,)."""
 
     places: Vector
     colours: npt.NDArray[np.uint8]

@@ -70,12 +70,8 @@ FALLEN_Z: Final = 0.38
 
 @dataclass(frozen=True)
 class Scene:
-    """What an expert knows.
-
-    Attributes:
-        places: (n, 3) centres of the objects.
-        target: index of the object the task is about.
-    """
+    """What an expert knows: grip, opening of the fingers beyond closed, centres (n, 3), the task's object, goal
+    (3,)."""
 
     grip: Vector
     opening: float

@@ -46,14 +46,9 @@ ROBOT_START: Final = {"robot0:slide0": 0.405, "robot0:slide1": 0.48, "robot0:sli
 
 
 def build_spec(cubes: int = 0, spheres: int = 0, pick: bool = False) -> mujoco.MjSpec:
-    """The scene.
-
-    Args:
-        cubes: cubes `object0`, `object1`, ... with joints `object0:joint`, ..., all parked.
-        spheres: sites `sphere0`, ... without collision, invisible until they are coloured.
-        pick: smaller cubes, and a gripper that opens and closes; otherwise its fingers are enlarged and are meant to be
-            locked.
-    """
+    """The scene: cubes `object0`, ... with joints `object0:joint`, ..., all parked, and sites `sphere0`, ... without
+    collision, invisible until they are coloured. To pick, the cubes are smaller and the gripper opens and closes;
+    otherwise its fingers are enlarged and are meant to be locked."""
     spec = mujoco.MjSpec.from_file(str(SCENES / f"{'pick_and_place' if pick else 'push'}.xml"))
     spec.detach_body(spec.body("object0"))
     spec.detach_body(spec.body("floor0"))  # its site moves only when gymnasium-robotics renders; ours is the world's
@@ -102,11 +97,8 @@ def lighten(model: mujoco.MjModel) -> None:
 
 
 class BlockSimulation(MujocoFetchEnv):
-    """Arm, table and objects; `place` starts an episode, `advance` runs one environment step.
-
-    Attributes:
-        start_grip: (3,) where the grip is at the start of every episode, metres.
-    """
+    """Arm, table and objects; `place` starts an episode, `advance` runs one environment step. Every episode begins with
+    the grip at `start_grip`, (3,) metres."""
 
     def __init__(self, variant: Variant, count: int) -> None:
         self.variant, self.count = variant, count

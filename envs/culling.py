@@ -35,11 +35,7 @@ Vector = npt.NDArray[np.float64]
 
 
 class FrustumCuller:
-    """Hides the geoms of a model that a camera fixed in the world cannot see.
-
-    Args:
-        scene: a scene updated with the camera to be used; frames are square.
-    """
+    """Hides the geoms of a model that a camera fixed in the world (the scene's; frames are square) cannot see."""
 
     def __init__(self, model: mujoco.MjModel, scene: mujoco.MjvScene) -> None:
         self._model = model
@@ -75,13 +71,8 @@ class FrustumCuller:
 
 @dataclass(frozen=True)
 class Still:
-    """Parts at rest.
-
-    Attributes:
-        data: a state in which they stand where they always stand.
-        geoms: names of mesh geoms, each the only user of its mesh.
-        screen: name of a box geom at rest that may hide them.
-    """
+    """Parts at rest, as `data` has them: mesh geoms, each the only user of its mesh, and a box geom that may hide
+    them."""
 
     data: mujoco.MjData
     geoms: tuple[str, ...]

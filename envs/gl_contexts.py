@@ -32,14 +32,8 @@ FORKED: Final = (
 
 
 class KeptContext:
-    """An EGL context as MuJoCo's renderers use it; freed, it waits for the next one.
-
-    Args:
-        width, height: not used, as by MuJoCo's own: what is drawn into lies in the context.
-
-    Raises:
-        RenderError: the process was forked from one that draws.
-    """
+    """An EGL context as MuJoCo's renderers use it; freed, it waits for the next one. What is drawn into lies in the
+    context, whatever its size. A RenderError in a process that was forked from one that draws."""
 
     def __init__(self, width: int, height: int) -> None:
         self._context: Any = _take()
@@ -53,11 +47,7 @@ class KeptContext:
             _end_at_exit()
 
     def make_current(self) -> None:
-        """Draw in it from now on, in this thread.
-
-        Raises:
-            RuntimeError: another thread does.
-        """
+        """Draw in it from now on, in this thread; a RuntimeError where another thread does."""
         _enter(self._context)
 
     def free(self) -> None:

@@ -86,16 +86,11 @@ def moves_of(actions: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
 
 
 def generate(seeds: Iterable[int], steps: int, env: EnvConfig) -> Clips:
-    """Draw the clips of some seeds.
+    """Draw the clips of some seeds, of T steps each.
 
     Each object starts at a place drawn uniformly from those where it lies inside the frame, and with a random move. At
     each step it draws a new move with probability `env.grid.change` (uniformly from all five), else it keeps the last
     one. A move that would leave the frame is reversed. Later objects occlude earlier ones.
-
-    Args:
-        seeds: one for each clip; the other clips do not matter.
-        steps: T, at least 1.
-        env: `image_size` and `grid` are used.
 
     Raises:
         ConfigError: a shape is larger than the frame.
@@ -120,11 +115,7 @@ def generate(seeds: Iterable[int], steps: int, env: EnvConfig) -> Clips:
 
 
 def check_actions(env: EnvConfig) -> None:
-    """Check that the width of the action is two for each object, and that an object fits into a frame.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """Refuse actions that are not two for each object, and objects that do not fit into a frame (ConfigError)."""
     if env.grid.size > env.image_size:
         raise ConfigError(
             f"env.grid.size: got {env.grid.size}, expected at most the {env.image_size} pixels of env.image_size"

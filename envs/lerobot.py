@@ -25,10 +25,6 @@ class LeRobotTask(gym.Wrapper[Observation, npt.NDArray[np.float32], Any, npt.NDA
     (A,) in [-1, 1]. `info["is_success"]` says whether the agent step solved the task, and then the episode ends, as
     LeRobot's own environments do. (Ours go on: clips of a data set have a fixed length, `max_steps` agent steps.)
     `metadata` has `render_fps`, agent steps a second (`control_hz / frame_skip`).
-
-    Raises:
-        ConfigError: there is no such task.
-        RenderError: there is no working GL backend.
     """
 
     def __init__(self, env: EnvConfig | str | None = None, render: RenderConfig | None = None) -> None:
@@ -51,11 +47,7 @@ class LeRobotTask(gym.Wrapper[Observation, npt.NDArray[np.float32], Any, npt.NDA
         return _named(observation), {"is_success": bool(info["success"])}
 
     def step(self, action: npt.NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One agent step; the reward is the task's own.
-
-        Raises:
-            ValueError: an action of another shape, or not finite.
-        """
+        """One agent step; the reward is the task's own."""
         observation, reward, _, truncated, info = self.env.step(action)
         success = bool(info["success"])
         return _named(observation), float(reward), success, truncated, {"is_success": success}

@@ -160,17 +160,11 @@ class PixelTask(gym.Env[Observation, Action]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode.
-
-        Args:
-            seed: the episode's seed; None draws the next one from the environment's generator.
+        """Start the episode of a seed; None draws one from the environment's generator.
 
         Returns:
             The first observation and `{"success": bool}`: True for an episode that starts solved, which only random
             warm-up steps can make.
-
-        Raises:
-            RenderError: there is no working GL backend.
         """
         del options
         self.open_renderer()
@@ -184,10 +178,7 @@ class PixelTask(gym.Env[Observation, Action]):
         return self._observe(self.draw_resets), {"success": self._solved()}
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One agent step.
-
-        Args:
-            action: float (4,), clipped to [-1, 1].
+        """One agent step of an action (4,), clipped to [-1, 1].
 
         Raises:
             ValueError: an action of another shape, or not finite.

@@ -32,14 +32,8 @@ CURE = "set MUJOCO_GL to egl, osmesa or glfw and install that library (Debian/Ub
 
 @dataclass(frozen=True)
 class Camera:
-    """A free camera.
-
-    Attributes:
-        distance: metres from the point looked at.
-        azimuth: degrees about the vertical.
-        elevation: degrees over the horizon; negative looks down.
-        lookat: the point looked at, metres.
-    """
+    """A free camera: metres from the point looked at, degrees about the vertical and over the horizon (under it:
+    negative)."""
 
     distance: float
     azimuth: float
@@ -208,11 +202,7 @@ class FrameRenderer:
 
 
 def check_rendering() -> npt.NDArray[np.uint8]:
-    """Draw one frame of an empty scene: uint8 (64, 64, 3).
-
-    Raises:
-        RenderError: there is no working GL backend.
-    """
+    """Draw one frame of an empty scene, uint8 (64, 64, 3); a RenderError where there is no working GL backend."""
     mj = import_mujoco()
     model = mj.MjModel.from_xml_string("<mujoco/>")
     data = mj.MjData(model)

@@ -17,13 +17,10 @@ View = dict[str, npt.NDArray[Any]]
 
 
 class TensorView(gym.Wrapper[View, npt.NDArray[np.float32], dict[str, npt.NDArray[Any]], npt.NDArray[np.float32]]):
-    """Observations as TorchRL wants them, under the names of `keys.py`.
+    """Observations as TorchRL wants them, under the names of `keys.py`, and `more` that a subclass's `view` adds.
 
     `keys.PIXELS` uint8 [0, 255] (3, H, W), `keys.STATE` float32 (S,), `keys.SUCCESS` bool (1,): whether the last agent
     step solved the task (after a reset: whether the episode starts solved).
-
-    Args:
-        more: spaces of what a subclass's `view` adds.
     """
 
     def __init__(self, env: gym.Env[Any, Any], more: Mapping[str, gym.Space[Any]] | None = None) -> None:

@@ -215,8 +215,7 @@ def open_files(root: str | Path) -> Contents:
     What is wrong with it and no frame depends on is said in a line, once.
 
     Raises:
-        DataError: it is missing, foreign, of another format version, unfinalised, truncated or empty; or its rows are
-            not in the order of their episodes.
+        DataError: no such set, none of this version, unfinalised, truncated or empty; or its rows are out of order.
     """
     folder, expected = Path(root).expanduser(), "expected a LeRobot"
     if not str(root):

@@ -36,13 +36,8 @@ RELEASE_EVERY: Final = 2**28
 
 @dataclass(frozen=True)
 class Cache:
-    """Where caches are, how large they may be, and who makes them.
-
-    Attributes:
-        folder: empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
-        limit: bytes of all entries together; None has none.
-        workers: processes that decode; 0 means one for each core, 1 none but this one.
-    """
+    """Where caches are (empty: `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`), how many bytes they may have together, and
+    how many processes decode (0: one for each core, 1: none but this one)."""
 
     folder: str | Path = ""
     limit: int | None = None

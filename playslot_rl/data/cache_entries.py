@@ -135,8 +135,7 @@ def room(cache: CachePlace, needed: int, key: str) -> Iterator[None]:
 def make_room(cache: CachePlace, needed: int, key: str) -> None:
     """Remove entries, the least recently used first, until `needed` more bytes fit below the cache's limit.
 
-    Args:
-        key: its name: what a killed process has left of it does not count.
+    What a killed process has left of the entry `key`, which is to be made, does not count.
 
     Raises:
         DataError: it does not fit beside what is in use; then nothing is removed.

@@ -166,10 +166,8 @@ def episode_files(root: Path) -> list[Path]:
 
 
 def read_contents(root: str | Path, problems: Problems, *, statistics: bool = True) -> Contents:
-    """Read all but the frames. What cannot be read is left out and noted in `problems`.
-
-    Args:
-        statistics: read those of each episode.
+    """Read all but the frames, and statistics if they are wanted. What cannot be read is left out and noted in
+    `problems`.
 
     Raises:
         DataError: as `read_info`; without it nothing else can be understood.

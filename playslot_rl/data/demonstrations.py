@@ -58,11 +58,7 @@ class Demonstrations:
         return replace(self, **{name: getattr(self, name)[rows] for name in there})
 
     def require_actions(self) -> Tensor:
-        """The real actions (M, A).
-
-        Raises:
-            DataError: there are none.
-        """
+        """The real actions (M, A); a DataError where there are none."""
         if self.actions is None:
             raise DataError("action decoder: got demonstrations without actions, expected the feature `action`")
         return self.actions
@@ -94,11 +90,7 @@ def labelled_rows(episode: Tensor | npt.NDArray[np.int64], demos: int) -> Tensor
 
 
 def require_labelled(labelled: int, demos: int) -> None:
-    """Refuse more labelled demonstrations than there are.
-
-    Raises:
-        DataError: there are fewer.
-    """
+    """Refuse more labelled demonstrations than there are by a DataError."""
     if labelled > demos:
         raise DataError(
             f"behaviour.labelled_demos: got {labelled}, expected at most the {demos} demonstrations "
@@ -153,14 +145,9 @@ def split_demonstrations(
 
 @dataclass(frozen=True)
 class Transitions:
-    """Row numbers of the transitions of some episodes, in order.
-
-    Attributes:
-        rows: frame a transition starts from, int64 (M,); row + 1 is the frame after it.
-        episode: number of its episode among those with a transition, int64 (M,).
-        step: its number in that episode, int64 (M,).
-        lengths: transitions of each of those episodes as they were recorded, int64 (E,).
-    """
+    """Transitions of some episodes, in order: the row they start from (row + 1 is the frame after it), the number of
+    their episode among those with one, and theirs in it, int64 (M,) each; and how many each episode had as it was
+    recorded, int64 (E,)."""
 
     rows: npt.NDArray[np.int64]
     episode: npt.NDArray[np.int64]
@@ -252,14 +239,8 @@ def _unit_actions(source: EpisodeFrames, actions: npt.NDArray[np.float32]) -> Te
 
 
 def require_finite(demos: DemonstrationSplit, labelled: int | None = None) -> None:
-    """Refuse demonstrations whose actions are learned or measured, and are no numbers.
-
-    Args:
-        labelled: how many of them show their actions; None: all.
-
-    Raises:
-        DataError: NaN or infinite actions.
-    """
+    """Refuse demonstrations whose actions are learned (of the first `labelled`; None: all) or measured, and are no
+    numbers."""
     for source, shown in ((demos.trained, labelled), (demos.held_out, None)):
         if source is None or source.actions is None:
             continue

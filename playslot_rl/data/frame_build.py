@@ -101,10 +101,7 @@ def _digest(row: int, pixels: npt.NDArray[np.uint8]) -> int:
 
 
 def build_frames(contents: Contents, camera: str, size: int | None, folder: Path, workers: int = 1) -> None:
-    """Decode a data set to `folder/frames.npy`.
-
-    Args:
-        workers: processes; 0 means one for each core, 1 decodes in this one.
+    """Decode a data set to `folder/frames.npy`, by several processes (0: one for each core, 1: this one).
 
     Raises:
         DataError: a frame cannot be decoded.

@@ -20,15 +20,9 @@ AGAIN = "run the same command again"
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked of the Hub, as messages speak of it.
-
-    Attributes:
-        name: `user/name`, or the address as it was typed.
-        what: `data set` or `model`.
-        revision: the one asked for; empty if none was.
-        writing: a push.
-        has_token: whether a token is sent.
-    """
+    """What is asked of the Hub, as messages speak of it: `user/name`, or an address as it was typed; `data set` or
+    `model`; the Hub's address; a local folder; the revision, if one was given; whether it is a push; whether a token is
+    sent."""
 
     name: str
     what: str

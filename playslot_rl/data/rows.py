@@ -35,14 +35,9 @@ class FrameRows(Protocol):
 
 
 def row_numbers(rows: Any, count: int) -> tuple[IntArray, tuple[int, ...]]:
-    """The rows that an index means, from 0 on, int64 (n,), and the shape of the index.
-
-    Args:
-        rows: an integer, a slice or an integer array of any shape; negative numbers count from the end.
-
-    Raises:
-        IndexError: there is no such row.
-    """
+    """The rows that an index means, from 0 on, int64 (n,), and the shape of the index: of an integer, a slice or an
+    integer array of any shape, in which negative numbers count from the end. An IndexError where there is no such
+    row."""
     if isinstance(rows, slice):
         rows = np.arange(*rows.indices(count))
     index = np.asarray(rows, np.int64)
