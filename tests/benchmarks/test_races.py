@@ -63,7 +63,7 @@ def won(what: str, took: dict[str, float], slow: str, fast: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize(
     ("what", "variants", "slow", "fast"),
     [
@@ -78,6 +78,7 @@ def test_the_fast_path_is_quicker(what: str, variants: dict[str, Variant], slow:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_two_processes_take_no_more_than_half_as_long_again() -> None:
     shared = Variant("ddp_2")
     took = race({"one_process_two_threads": [shared], "two_processes": [shared] * 2}, Sizes(), 2)
@@ -86,12 +87,14 @@ def test_two_processes_take_no_more_than_half_as_long_again() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_our_search_is_quicker_than_that_of_torchrl() -> None:
     sizes = Sizes()
     won("plan_step", {"torchrl": seconds(torchrl_search(sizes)), **plan_step(sizes)}, "torchrl", "own")
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_windows_come_quicker_from_the_cache_than_from_the_loader(tmp_path: Path) -> None:
     from playslot_rl.collectors.export import export
 
