@@ -15,6 +15,7 @@ from typing import Any, Final, Literal, get_args, get_origin
 
 from playslot_rl.config import ExperimentConfig, key_help
 from playslot_rl.config.compose import GROUPS, choices, compose
+from playslot_rl.config.methods import METHODS
 
 PAGE: Final = Path(__file__).resolve().parents[1] / "reference" / "keys.md"
 INTRODUCTION: Final = """\
@@ -30,6 +31,7 @@ preset of a command that names none, changes. A task's own values are in `recipe
 |---|---|---|
 | `env` | the task | ENVS |
 | `preset` | sizes and schedule | PRESETS |
+| `method` | what is trained and compared | NAMES |
 """
 
 
@@ -116,10 +118,10 @@ def shown(default: Any) -> str:
 def page() -> str:
     """The whole page."""
     compact = compose(["preset=compact"])
-    names = {"ENVS": "env", "PRESETS": "preset"}
+    names = {"ENVS": choices("env"), "PRESETS": choices("preset"), "NAMES": METHODS}
     text = INTRODUCTION
-    for word, group in names.items():
-        text = text.replace(word, ", ".join(f"`{name}`" for name in choices(group)))
+    for word, known in names.items():
+        text = text.replace(word, ", ".join(f"`{name}`" for name in known))
     for cls, groups in sections().items():
         first = (inspect.getdoc(cls) or "").split("\n\n")[0].replace("\n", " ")
         text += f"\n## {heading(groups)}\n\n{first}\n\n" + "\n".join(rows(cls, groups, compact)) + "\n"
