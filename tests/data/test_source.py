@@ -6,10 +6,14 @@ import errno
 import json
 import multiprocessing
 import shutil
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from foreign import LENGTHS, foreign_frames, write_foreign
@@ -122,44 +126,76 @@ def test_an_unknown_camera_lists_the_cameras(foreign_images: Path, foreign_video
         open_source(foreign_video, "", tmp_path)
 
 
-@pytest.mark.parametrize("root", ["", "nowhere", "empty"])
-def test_a_missing_data_set_is_refused(tmp_path: Path, root: str) -> None:
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match=r"data\.root") as caught:
-        open_source(str(tmp_path / root) if root else "", cache=tmp_path / "cache")
-    assert one_line(caught)
+def edited_info(root: Path, text: str = "") -> None:
+    path = root / "meta" / "info.json"
+    path.write_text(text or json.dumps(json.loads(path.read_text()) | {"codebase_version": "v2.1"}))
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{", "damaged"),
-        ("[]", "damaged"),
-        ('{"codebase_version": "v3.0"}', "damaged"),
-        (None, "got LeRobot format v2.1"),
-    ],
-)
-def test_a_foreign_info_file_is_refused(damaged: Path, tmp_path: Path, text: str | None, message: str) -> None:
-    path = damaged / "meta" / "info.json"
-    changed = json.dumps(json.loads(path.read_text()) | {"codebase_version": "v2.1"})
-    path.write_text(changed if text is None else text)
+def cut(root: Path, folder: str) -> None:
+    path = next((root / folder).rglob("*.parquet"))
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def another_file_of_rows(root: Path) -> None:
+    path = next((root / "data").rglob("*.parquet"))
+    shutil.copy(path, path.with_name("file-001.parquet"))
+
+
+def frame_that_is_none(root: Path) -> None:
+    path = next((root / "data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    rows = table.to_pylist()
+    rows[7]["observation.images.top"]["bytes"] = b"no picture"
+    pq.write_table(type(table).from_pylist(rows, schema=table.schema), path)
+
+
+def cut_videos(root: Path) -> None:
+    for path in root.rglob("*.mp4"):
+        path.write_bytes(path.read_bytes()[:200])
+
+
+def later_episode(root: Path) -> None:
+    path = next((root / "meta" / "episodes").rglob("*.parquet"))
+    table = pq.read_table(path)
+    name = "videos/observation.images.top/from_timestamp"
+    later = pa.array([0.0, 0.5, 3.0], table.schema.field(name).type)
+    pq.write_table(table.set_column(table.column_names.index(name), name, later), path)
+
+
+FAULTS: dict[str, tuple[str, Callable[[Path], None], str]] = {
+    "gone": ("images", shutil.rmtree, r"data\.root"),
+    "an empty folder": ("images", lambda root: (shutil.rmtree(root), root.mkdir()), r"data\.root"),  # type: ignore[dict-item]
+    "half an info file": ("images", partial(edited_info, text="{"), "damaged"),
+    "a list for info": ("images", partial(edited_info, text="[]"), "damaged"),
+    "hardly any info": ("images", partial(edited_info, text='{"codebase_version": "v3.0"}'), "damaged"),
+    "an older format": ("images", edited_info, "got LeRobot format v2.1"),
+    "no rows": ("images", lambda root: shutil.rmtree(root / "data"), "never finalised, or is truncated"),
+    "half its rows": ("images", partial(cut, folder="data"), "never finalised, or is truncated"),
+    "no episodes": ("images", lambda root: shutil.rmtree(root / "meta/episodes"), "never finalised, or is truncated"),
+    "half its episodes": ("images", partial(cut, folder="meta/episodes"), "never finalised, or is truncated"),
+    "rows of nobody": ("images", another_file_of_rows, "got 30 rows and 3 episodes of 15 frames, expected 15"),
+    "no picture": ("images", frame_that_is_none, r"a frame of observation\.images\.top cannot be decoded"),
+    "half a video": ("video", cut_videos, r"cannot decode the frame at 0\.000 s"),
+    "a video too short": ("video", later_episode, r"at 3\.000 s \(it ends too early\)"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_damaged_data_set_is_refused_and_leaves_no_cache(
+    fault: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    kind, damage, message = FAULTS[fault]
+    root = Path(shutil.copytree(request.getfixturevalue(f"foreign_{kind}"), tmp_path / "set"))
+    damage(root)
     with pytest.raises(DataError, match=message) as caught:
-        open_source(damaged, cache=tmp_path / "cache")
-    assert one_line(caught)
-
-
-@pytest.mark.parametrize("folder", ["data", "meta/episodes"])
-@pytest.mark.parametrize("fault", ["missing", "truncated"])
-def test_a_truncated_data_set_is_refused(damaged: Path, tmp_path: Path, folder: str, fault: str) -> None:
-    path = next((damaged / folder).rglob("*.parquet"))
-    if fault == "missing":
-        path.unlink()
-    else:
-        path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(DataError, match="never finalised, or is truncated") as caught:
-        open_source(damaged, cache=tmp_path / "cache")
+        open_source(root, "observation.images.top", tmp_path / "cache")
     assert one_line(caught)
     assert not list((tmp_path / "cache").rglob("*.npy"))
+
+
+def test_no_name_of_a_data_set_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"data\.root"):
+        open_source("", cache=tmp_path / "cache")
 
 
 def test_an_unfinalised_data_set_is_refused(tmp_path: Path) -> None:
@@ -172,50 +208,6 @@ def test_an_unfinalised_data_set_is_refused(tmp_path: Path) -> None:
 
 def write_unfinalised(root: Path) -> None:
     write_foreign(root, "image", die=True)
-
-
-def test_more_rows_than_the_metadata_say_are_refused(damaged: Path, tmp_path: Path) -> None:
-    path = next((damaged / "data").rglob("*.parquet"))
-    shutil.copy(path, path.with_name("file-001.parquet"))
-    with pytest.raises(DataError, match="got 30 rows and 3 episodes of 15 frames, expected 15"):
-        open_source(damaged, cache=tmp_path / "cache")
-
-
-def test_an_undecodable_frame_is_refused(damaged: Path, tmp_path: Path) -> None:
-    import pyarrow.parquet as pq
-
-    path = next((damaged / "data").rglob("*.parquet"))
-    table = pq.read_table(path)
-    rows = table.to_pylist()
-    rows[7]["observation.images.top"]["bytes"] = b"no picture"
-    pq.write_table(type(table).from_pylist(rows, schema=table.schema), path)
-    with pytest.raises(DataError, match=r"a frame of observation\.images\.top cannot be decoded") as caught:
-        open_source(damaged, cache=tmp_path / "cache")
-    assert one_line(caught)
-    assert not list((tmp_path / "cache").rglob("*.npy"))
-
-
-def test_a_damaged_video_is_refused(foreign_video: Path, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(foreign_video, tmp_path / "video"))
-    for path in root.rglob("*.mp4"):
-        path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(DataError, match=r"cannot decode the frame at 0\.000 s") as caught:
-        open_source(root, "observation.images.top", tmp_path / "cache")
-    assert one_line(caught)
-
-
-def test_a_video_that_ends_too_early_is_refused(foreign_video: Path, tmp_path: Path) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    root = Path(shutil.copytree(foreign_video, tmp_path / "video"))
-    path = next((root / "meta" / "episodes").rglob("*.parquet"))
-    table = pq.read_table(path)
-    name = "videos/observation.images.top/from_timestamp"
-    later = pa.array([0.0, 0.5, 3.0], table.schema.field(name).type)
-    pq.write_table(table.set_column(table.column_names.index(name), name, later), path)
-    with pytest.raises(DataError, match=r"at 3\.000 s \(it ends too early\)"):
-        open_source(root, "observation.images.top", tmp_path / "cache")
 
 
 def test_a_full_disk_leaves_no_cache(foreign_images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
