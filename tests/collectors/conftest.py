@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from small_sets import spec_of
 
 from playslot_rl.collectors.episodes import record
 from playslot_rl.collectors.journal import Journal
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-from small_sets import spec_of
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,6 @@ from playslot_rl import keys
 from playslot_rl.data.source import open_source
 
 pytestmark = pytest.mark.integration
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 
 
 @pytest.mark.parametrize("made", ["as collected", "merged"])

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fake_hub import FakeHub, Repository
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "datasets"))
-
 from hostile import METADATA, linked, nested
 
 pytestmark = pytest.mark.slow  # together they take a minute; make test-all runs them

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from scene import DotTask, make_source
 
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.play.session import PlaySession
@@ -15,9 +15,6 @@ from playslot_rl.play.starts import RecordedStarts, SimulatedStarts
 from playslot_rl.play.studio import Studio
 from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.world_model import Agent, WorldModel
-
-sys.path.insert(0, str(Path(__file__).parent))
-from scene import DotTask, make_source
 
 
 @pytest.fixture(scope="session")

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
-sys.path.insert(0, str(Path(__file__).parent))
 
 from playslot_rl.sharing.folder import SharedPolicyConfig, save_pretrained
 from playslot_rl.storage.atomic import write_json

@@ -1,14 +1,9 @@
-"""A tiny CADDY, and its helper module made importable."""
+"""A tiny CADDY."""
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture
