@@ -1,8 +1,4 @@
-"""The configuration: frozen dataclasses are the truth, YAML and command-line overrides only change their values.
-
-`from_dict` builds a config from nested plain dicts (what Hydra composes) and refuses unknown keys;
-`to_dict` is its inverse; `fingerprint` names a config by its content (all three: `playslot_rl.config.plain`).
-"""
+"""The configuration: frozen dataclasses are the truth, YAML and command-line overrides only change their values."""
 
 from playslot_rl.config.compare import CompareConfig as CompareConfig
 from playslot_rl.config.env import BlocksConfig as BlocksConfig

@@ -14,7 +14,7 @@ class AdoptConfig(Checked):
     Attributes:
         slots: numbers of slots that are tried; one of them is taken as it is.
         prototypes: size of the codebook in the trial that decides how many prototypes there are.
-        tolerance: a smaller number of slots is taken where its error is at most so much above the least, a fraction.
+        tolerance: a smaller number of slots is taken where its error is at most this fraction above the least.
         patience: validations without a lower error after which a training ends.
     """
 

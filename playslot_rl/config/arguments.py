@@ -23,11 +23,8 @@ _HIDDEN: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def require_plain(key: str, argument: str) -> None:
-    """Refuse interpolation, which could bring the value of an environment variable into a message or a file, and
-    characters that nobody sees. Neither the argument nor what it names is repeated.
-
-    Raises:
-        ConfigError: with the key, as far as that is plain.
+    """Refuse interpolation, which could bring an environment variable into a message or a file, and characters that
+    nobody sees. Neither the argument nor what it names is repeated.
 
     Examples:
         >>> require_plain("out", "out=runs/$HOME")
@@ -50,11 +47,7 @@ def require_plain(key: str, argument: str) -> None:
 
 
 def require_once(keys: Sequence[str]) -> None:
-    """Refuse a key that was typed twice.
-
-    Raises:
-        ConfigError: one was.
-    """
+    """Refuse a key that was typed twice."""
     for key in keys:
         if keys.count(key) > 1:
             raise ConfigError(f"{key}: got it {keys.count(key)} times, expected it once: leave the others out")
@@ -63,9 +56,6 @@ def require_once(keys: Sequence[str]) -> None:
 def require_digits(key: str, value: str, hint: Any) -> None:
     """Refuse `1_000` for a number, which is read as 1000 in one place and as text in another, and what Python reads as
     no number for its length.
-
-    Raises:
-        ConfigError: the key takes numbers, and its value holds such a one.
     """
     for part in re.split(r"[\[\]{}():,\s]+", value) if _numeric(hint) else ():
         if _GROUPED.fullmatch(part):
@@ -75,15 +65,7 @@ def require_digits(key: str, value: str, hint: Any) -> None:
 
 
 def require_folders(key: str, value: str) -> None:
-    """Refuse paths that no file system takes, and a list where one folder is meant.
-
-    Args:
-        key: with the role `folder`.
-        value: one path, or several separated by commas.
-
-    Raises:
-        ConfigError: a name in one, or all of it, is too long, or the value is a list.
-    """
+    """Refuse paths, one or several with commas, that no file system takes, and a list where one folder is meant."""
     if key in ("out", "run") and value.startswith("[") and value.endswith("]"):
         raise ConfigError(f"{key}: got the list {value}, expected one folder, such as {key}=runs/first")
     for folder in value.split(","):
@@ -96,7 +78,6 @@ def require_folders(key: str, value: str) -> None:
 
 
 def _numeric(hint: Any) -> bool:
-    """Whether a field of this type takes numbers, or keys with numbers."""
     if get_origin(hint) in (Union, types.UnionType, tuple):
         return any(map(_numeric, get_args(hint)))
     return hint in (int, float) or dataclasses.is_dataclass(hint)

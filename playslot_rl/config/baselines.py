@@ -25,7 +25,6 @@ class BaselinesConfig:
 
     @classmethod
     def whole(cls) -> type[BaselinesConfig]:
-        """The class with a field for each method."""
         return _whole()
 
 

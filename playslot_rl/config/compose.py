@@ -63,14 +63,7 @@ def choices(group: str) -> list[str]:
 
 
 def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfig:
-    """Build the config of one command.
-
-    Args:
-        overrides: `key=value` strings, such as `preset=smoke` or `slots.optim.lr=1e-3`, each key once.
-        command: name of the command, which decides whether `run=DIR` brings its stored config.
-
-    Returns:
-        The validated config.
+    """Build the validated config of one command, which decides whether `run=DIR` brings its stored config.
 
     Raises:
         ConfigError: an argument that is not `key=value`, or that interpolates; an unknown environment, preset or key, a
@@ -110,7 +103,6 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
 
 
 def _parse(overrides: Sequence[str]) -> dict[str, str]:
-    """Split `key=value` arguments."""
     pairs: dict[str, str] = {}
     typed: list[str] = []
     for argument in overrides:

@@ -40,12 +40,11 @@ class DataConfig(Checked):
     """Where data come from.
 
     Attributes:
-        root: LeRobot v3.0 data set(s) of unlabelled videos; several are separated by commas. With `stream` also
+        root: LeRobot v3.0 data set(s) of unlabelled videos, separated by commas. With `stream` also
             `hf://datasets/USER/NAME[@REVISION]`, read where it lies (`playslot_rl.data.remote`).
         demos: data set of demonstrations; empty means `root`.
         held_out: how many of its last episodes are neither trained on nor shown to the world model: they measure.
-        draw: seed of the draw that decides which demonstrations are the first ones, of those that are not held out;
-            None takes them in the order in which they were recorded.
+        draw: seed that draws which of the other demonstrations are the first ones; None takes them as recorded.
         camera: image feature(s) to read, separated by commas; empty means the only one.
         stride: of each episode every `stride`-th frame is read (`playslot_rl.data.views.every`).
         resize: resize frames of another size than `env.image_size` (area averaging) instead of refusing them.
@@ -132,7 +131,7 @@ class EvaluationConfig(Checked):
     Attributes:
         references: also run the random, expert and slot-oracle references.
         seed_offset: first number of the episodes of small seeds (`playslot_rl.seeds.episodes`), above all collections'.
-            Below that only the records of the training data sets, which are looked at, keep episodes apart.
+            Below that only the records of the training data sets keep episodes apart.
     """
 
     group = "evaluation."

@@ -24,9 +24,7 @@ _CHOSEN: Final = {"env": "the task", "preset": "sizes and schedule"}
 def explained(command: str, keys: Sequence[str]) -> str:
     """The keys of a command as text.
 
-    Args:
-        command: its name, which decides which keys go without their group's name.
-        keys: names of single keys, `seed` or `data.root`, and of groups, `slots`; of `env` both are meant.
+    `keys` are single ones, `seed` or `data.root`, and groups, `slots`; `env` means both.
 
     Examples:
         >>> print(explained("bench", ["threads"]))
@@ -105,7 +103,6 @@ def _shown(key: str) -> str:
 
 
 def _words(key: str) -> str:
-    """What a key says, from its class's docstring."""
     if key in GROUPS:
         return f"{_CHOSEN[key]}: {', '.join(choices(key))}"
     return meaning(*_owner(key))

@@ -32,13 +32,8 @@ _DRIVERS: Final = ("/dev/nvidiactl", "/dev/kfd", "/dev/dxg", "/System/Library/Fr
 
 
 class Need(NamedTuple):
-    """Memory that is needed at once.
-
-    Attributes:
-        keys: keys or groups whose numbers it is made of.
-        what: in words.
-        size: bytes, at least.
-        host: of the machine itself, not of an accelerator.
+    """Memory in bytes, at least, that is needed at once, and the keys or groups whose numbers it is made of; `host` is
+    the machine itself, not an accelerator.
     """
 
     keys: tuple[str, ...]
@@ -71,12 +66,9 @@ def machine_memory() -> int:
 def require_machine(config: ExperimentConfig, typed: Mapping[str, str]) -> None:
     """Refuse typed sizes that cannot fit, and typed threads that would only wait for one another.
 
-    Args:
-        config: of the command. A comparison that a launcher runs on other machines is left to them.
-        typed: dotted keys and values that were typed; what none of them changes was accepted when it was made.
-
-    Raises:
-        ConfigError: with the estimate and what there is.
+    What none of the typed keys changes was accepted when it was made. A comparison that a launcher runs on other
+    machines
+    is left to them.
     """
     if {config.compare.launcher, config.compare_video.launcher} & ELSEWHERE:
         return

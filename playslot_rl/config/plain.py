@@ -15,11 +15,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 
 def check(ok: bool, what: str, got: object, expected: str) -> None:
-    """Refuse a value out of range.
-
-    Raises:
-        ValueError: not `ok`; one line that says what was got and what was expected.
-    """
+    """Refuse a value out of range by a ValueError: one line that says what was got and what was expected."""
     if not ok:
         raise ValueError(f"{what}: got {shortened(got)}, expected {expected}")
 
@@ -85,12 +81,7 @@ def _type_hints(cls: Any) -> dict[str, Any]:
 
 
 def from_dict[T](cls: type[T], values: dict[str, Any], where: str = "") -> T:
-    """Build a config from nested dicts.
-
-    Args:
-        cls: the dataclass.
-        values: nested plain values; missing keys keep their defaults.
-        where: dotted prefix for error messages.
+    """Build a config from nested plain values; missing keys keep their defaults. `where` is the prefix of messages.
 
     Raises:
         ValueError: unknown key, wrong type, or a value outside its range.

@@ -22,13 +22,7 @@ def brought(group: str) -> dict[str, EntryPoint]:
 
 @functools.cache
 def load(group: str, name: str, kind: type, built_in: str = "") -> Any:
-    """The object that a name stands for.
-
-    Args:
-        group: of entry points.
-        name: of a built-in, or of one of them.
-        kind: what it has to be; its `name` has to be that name.
-        built_in: `module:object` of one that is ours; empty for one that a package brings.
+    """The object, of a `kind`, that a name stands for: `module:object` of a built-in, or an entry point of a package.
 
     Raises:
         ConfigError: it cannot be loaded, or is something else; names the package.
@@ -54,6 +48,5 @@ def load(group: str, name: str, kind: type, built_in: str = "") -> Any:
 
 
 def call(reference: str, *arguments: Any, **named: Any) -> Any:
-    """Call `module:function`, which is imported now."""
     module, _, function = reference.partition(":")
     return getattr(importlib.import_module(module), function)(*arguments, **named)

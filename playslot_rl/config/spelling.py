@@ -11,11 +11,7 @@ from playslot_rl.errors import ConfigError
 
 
 def spelled(config: ExperimentConfig, command: str) -> list[str]:
-    """Arguments with which `playslot COMMAND` gets exactly this config.
-
-    Args:
-        config: of a command that is no comparison.
-        command: its name, which decides whether `run` brings its stored config.
+    """Arguments with which `playslot COMMAND`, no comparison, gets exactly this config.
 
     Raises:
         ConfigError: no arguments make it: `run` is of another preset or task, and the command takes its config.
@@ -35,7 +31,6 @@ def spelled(config: ExperimentConfig, command: str) -> list[str]:
 
 
 def _text(value: Any) -> str:
-    """A value as `compose` reads it."""
     if value is None:
         return "null"
     if isinstance(value, bool):

@@ -148,10 +148,11 @@ class BehaviourStageConfig(StageConfig):
         trim: slot motion, the RMS change of the slots to the next frame, up to which a transition counts as still and
             is left out by all that clone from slots; read off the videos alone. 0 keeps every row (paper).
         trim_pixels: the same for those that clone from frames: the RMS change of the pixels, in [0, 1].
-        trim_margin: still transitions that are kept after each stretch of motion, so that stopping is learned. A policy
-            that has learned to stop may stop too early, too; 0 keeps none.
-        whiten: clone the latents in whitened coordinates (`playslot_rl.modules.whitening`), where each of the handful
-            of directions that they vary in weighs the same; false clones them as they are (paper).
+        trim_margin: still transitions kept after each stretch of motion, so that stopping is learned, which may also
+            come
+            too early; 0 keeps none.
+        whiten: clone the latents in whitened coordinates (`playslot_rl.modules.whitening`), where each direction that
+            they vary in weighs the same; false clones them as they are (paper).
         decoder_inputs: `inverse_dynamics` (InvDyn's latents; paper), `policy` (the policy's outputs) or `both`.
         decoder_state: the decoder also reads the slots, a_t = D_a(z_t, S_t): the same change of the image asks for
             different actions in different places. From very few labels that is not learned, so a decoder of the first

@@ -22,11 +22,8 @@ def is_remote(root: str | Path) -> bool:
 
 
 class DataRoot(NamedTuple):
-    """One data set of `data.root`.
-
-    Attributes:
-        path: its folder, as it was written.
-        weight: how often windows are drawn from it, relative to the others; None where none is given.
+    """One data set of `data.root`: its folder, as it was written, and how often windows are drawn from it, relative to
+    the others.
     """
 
     path: str
@@ -39,14 +36,11 @@ class DataRoot(NamedTuple):
 
 
 def data_roots(text: str, key: str = "data.root") -> list[DataRoot]:
-    """The data sets that a text with commas names; empty parts are left out.
+    """The data sets that a text such as `a`, `a,b` or `a:2,b:1` names; where only some have a weight, the others have
+    1.
 
     What follows a part's last colon is its weight if it is a number, unless a folder has the whole part as its name:
     `sets/a:2` is the folder of that name where there is one. Windows' `C:/sets/a` has no weight.
-
-    Args:
-        text: `a`, `a,b` or `a:2,b:1`; where only some have a weight, the others have 1.
-        key: config key, for the message.
 
     Raises:
         ConfigError: a weight that is not above 0.

@@ -4,8 +4,7 @@
     pi(o_t) ~ z_t                       on the videos of all demonstrations, no action read
     L_a = mean (D(z_t) - a_t)^2         on the labelled ones
 
-The decoder is PlaySlot's, on the same labels, and is fed alike (`behaviour.decoder_inputs`). Policies clone what moves:
-still transitions are left out (`behaviour.trim_pixels`).
+Policies clone what moves: still transitions are left out (`behaviour.trim_pixels`).
 
 Shapes: M transitions, Z latent-action width, A action dim.
 """
@@ -41,13 +40,8 @@ from playslot_rl.training.stage_regression import (
 
 
 class Seen(NamedTuple):
-    """Transitions of demonstrations.
-
-    Attributes:
-        inputs: what the policy reads of the frame before each, M of them.
-        latents: what the model infers (M, Z).
-        actions: real ones (M, A) in [-1, 1].
-        episode: whose they are (M,).
+    """Transitions: what the policy reads of the frame before each, the latents (M, Z) that the model infers, the real
+    actions (M, A) in [-1, 1], and whose they are (M,).
     """
 
     inputs: Inputs
@@ -60,12 +54,6 @@ class LatentCloning(ABC):
     """Policy and decoder, untrained, with the stages that train them one after the other.
 
     A method makes `policy` and `decoder` after this, which asks it for `infer` and `observe`.
-
-    Args:
-        config: labels, trimming, what the decoder is fed.
-        demos: demonstrations, and those that are held out.
-        device: where to compute.
-        shift: of frames in the policy's training, pixels.
 
     Raises:
         DataError: demonstrations without actions, or in which nothing moves, or nothing in the labelled ones.
@@ -103,13 +91,7 @@ class LatentCloning(ABC):
     def cloning[S: RegressionStage](
         self, kind: type[S], criterion: BehaviourLoss, batch_size: int, precision: Precision
     ) -> S:
-        """The policy's stage.
-
-        Args:
-            kind: of it.
-            criterion: what the policy's outputs and the inferred latents are compared by.
-            batch_size, precision: of its training.
-        """
+        """The policy's stage; `criterion` compares the policy's outputs and the inferred latents."""
         return kind(
             "policy",
             criterion,
@@ -122,12 +104,7 @@ class LatentCloning(ABC):
         )
 
     def decoding(self, loss: str, batch_size: int, precision: Precision) -> RegressionStage:
-        """The decoder's stage, once the policy is trained.
-
-        Args:
-            loss: `l2` or `l1`.
-            batch_size, precision: of its training.
-        """
+        """The decoder's stage, once the policy is trained."""
         inputs, actions = self._decoded(self.trained, self.labelled.to(self.device))
         held_out = None
         if self.held_out is not None:
@@ -149,7 +126,7 @@ class LatentCloning(ABC):
         return Seen(self.observe(frames), self.infer(source, moves), actions, moves.episode)
 
     def _decoded(self, seen: Seen, rows: Tensor) -> tuple[TensorInputs, Tensor]:
-        """What the decoder regresses from, and what it should give, on rows of demonstrations."""
+        """What the decoder regresses from, and what it should give."""
         kind = self.config.behaviour.decoder_inputs
         inputs: list[Tensor] = [] if kind == "policy" else [seen.latents[rows]]
         if kind != "inverse_dynamics":
@@ -167,11 +144,8 @@ def cloning(
 ) -> Training:
     """Latent policy, then action decoder; the policy is taken over where another run has trained it.
 
-    Args:
-        record: the method's stage.
-        behaviour: what is trained.
-        policy: its schedule, `baselines.METHOD.policy`.
-        decoder_steps, decoder_lr: the decoder's; the rest is as for the policy.
+    `policy` is its schedule, `baselines.METHOD.policy`; the decoder has its own steps and rate, the rest is the
+    policy's.
     """
     config, name, split = record.config, record.name, record.demos
     decoding = replace(policy, steps=decoder_steps, optim=replace(policy.optim, lr=decoder_lr))

@@ -8,8 +8,6 @@ from playslot_rl.modules.action_decoder import ActionDecoder
 
 
 class DecodedPolicy[Policy: nn.Module](nn.Module):
-    """Both as one module, for `StageCheckpoint.restore`."""
-
     PARTS = ("policy", "action_decoder")
 
     def __init__(self, policy: Policy, action_decoder: ActionDecoder) -> None:

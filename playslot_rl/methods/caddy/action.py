@@ -33,24 +33,15 @@ VARIANCE = 1e-6
 
 
 class Gaussian(NamedTuple):
-    """Diagonal normal distributions.
-
-    Attributes:
-        mean: (..., Z).
-        var: variances (..., Z), not negative.
-    """
+    """Diagonal normal distributions: mean (..., Z), variances (..., Z), not negative."""
 
     mean: Tensor
     var: Tensor
 
 
 class Moves(NamedTuple):
-    """What happened between consecutive frames.
-
-    Attributes:
-        direction: distribution of d (B, T-1, Z).
-        d: drawn from it, or its mean (B, T-1, Z).
-        logits: of p (B, T-1, K).
+    """What happened between consecutive frames: the direction's distribution and d, drawn from it or its mean, each
+    (B, T-1, Z), and logits (B, T-1, K) of p.
     """
 
     direction: Gaussian
@@ -59,17 +50,12 @@ class Moves(NamedTuple):
 
     @property
     def p(self) -> Tensor:
-        """Probabilities of the actions (B, T-1, K)."""
         return self.logits.softmax(dim=-1)
 
 
 class Latents(NamedTuple):
-    """What steers a prediction, one for each pair of consecutive frames.
-
-    Attributes:
-        a: actions (B, T-1, K), each a distribution over the K: one-hot at test.
-        v: variabilities (B, T-1, Z).
-        p: probabilities that a was taken from (B, T-1, K).
+    """What steers a prediction, one for each pair of consecutive frames: actions a (B, T-1, K), each a distribution
+    (one-hot at test), variabilities v (B, T-1, Z), and the probabilities p that a was taken from (B, T-1, K).
     """
 
     a: Tensor
@@ -78,12 +64,7 @@ class Latents(NamedTuple):
 
 
 class Trunk(nn.Sequential):
-    """Two residual blocks, the first of which halves, and the mean over the map that is left.
-
-    Args:
-        in_channels: C.
-        channels: of the blocks, the width of what is left.
-    """
+    """Two residual blocks, the first of which halves, and the mean over the map that is left."""
 
     def __init__(self, in_channels: int, channels: int) -> None:
         super().__init__(Res(in_channels, channels, 2), Res(channels, channels))
@@ -96,15 +77,7 @@ class Trunk(nn.Sequential):
 
 
 class ActionNetwork(nn.Module):
-    """A.
-
-    Args:
-        in_channels: C.
-        channels: of its two residual blocks.
-        latent_dim: Z.
-        actions: K.
-        decay: of the centroids' moving average.
-    """
+    """A, with the `decay` of the centroids' moving average."""
 
     centroids: Tensor
 
@@ -125,12 +98,7 @@ class ActionNetwork(nn.Module):
         return Gaussian(mean.float().unflatten(0, leading), var.float().unflatten(0, leading))
 
     def moves(self, first: Gaussian, second: Gaussian, noise: torch.Generator | None = None) -> Moves:
-        """From where frames are and where those after them are, each (B, n, Z), to the n moves between them.
-
-        Args:
-            first, second: before and after.
-            noise: d is drawn with it; None takes the mean.
-        """
+        """The n moves between frames and those after them, each (B, n, Z); d is drawn with `noise`, or is the mean."""
         direction = difference(first, second)
         d = direction.mean
         if noise is not None:
@@ -145,9 +113,8 @@ class ActionNetwork(nn.Module):
 
     @torch.no_grad()
     def update_centroids(self, p: Tensor, d: Tensor) -> None:
-        """Move the centroids towards the p-weighted means of directions (..., Z); p is (..., K). Training mode only.
-
-        The means are those of the global batch.
+        """Move the centroids towards the p-weighted means of d over the global batch, (..., K) and (..., Z); in
+        training mode only.
         """
         if not self.training:
             return
@@ -168,12 +135,8 @@ def divergence(direction: Gaussian) -> Tensor:
 
 
 def gumbel_softmax(logits: Tensor, temperature: float, noise: torch.Generator) -> Tensor:
-    """Soft samples (..., K), each summing to 1, of the distributions with these logits (..., K).
-
-    Args:
-        logits: unnormalised log probabilities.
-        temperature: tau, positive; towards 0 the samples are one-hot.
-        noise: source of the Gumbel noise.
+    """Soft samples (..., K), each summing to 1, of unnormalised log probabilities; towards temperature 0 they are
+    one-hot.
     """
     drawn = own_noise(logits.shape, lambda shape: torch.rand(shape, generator=noise, device=noise.device))
     uniform = drawn.clamp(min=1e-20)

@@ -51,12 +51,7 @@ BATCH = 64
 
 
 class StateInputs:
-    """States by row (b, C, H/8, W/8): `Inputs` of a regression, encoded as they are drawn.
-
-    Args:
-        encoder: E, frozen and in evaluation mode.
-        frames: what it reads.
-    """
+    """States by row (b, C, H/8, W/8): `Inputs` of a regression, encoded by a frozen E as they are drawn."""
 
     def __init__(self, encoder: Encoder, frames: FrameInputs) -> None:
         self.encoder, self.frames = encoder, frames
@@ -65,11 +60,9 @@ class StateInputs:
         return len(self.frames)
 
     def draw(self, rows: Tensor, generators: StepGenerators) -> Tensor:
-        """States of rows, of their frames shifted as drawn."""
         return states_of(self.encoder, self.frames.draw(rows, generators))
 
     def plain(self, rows: Tensor) -> Tensor:
-        """States of rows."""
         return states_of(self.encoder, self.frames.plain(rows))
 
 
@@ -77,9 +70,6 @@ class MovesLoss(BehaviourLoss):
     """Cross-entropy of the action and squared error of the variability, over its variance.
 
     Reads STATE_MAPS (b, C, H/8, W/8) and LATENT_ACTION (b, K + Z), moves; writes `loss_policy`.
-
-    Args:
-        network: states to logits and variability (b, K + Z), standardised.
     """
 
     network: MovesHead
@@ -114,12 +104,6 @@ class MovesStage(RegressionStage):
 class CADDYBehaviour(LatentCloning):
     """Policy and decoder, untrained, with the stages that train them one after the other.
 
-    Args:
-        config: schedules, labels.
-        model: finished CADDY.
-        demos: demonstrations, and those that are held out.
-        device: where to compute.
-
     Raises:
         CheckpointError: a damaged model.
         DataError: demonstrations without actions.
@@ -141,24 +125,19 @@ class CADDYBehaviour(LatentCloning):
         self.policy.standardise(self.trained.latents[:, sizes.actions :])
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
-        """Moves (M, K + Z) by the model."""
         return infer_moves(self.model, source, moves)
 
     def observe(self, frames: FrameInputs) -> Inputs:
-        """Their states."""
         return StateInputs(self.model.encoder, frames)
 
     def chosen(self, outputs: Tensor) -> Tensor:
-        """The most probable action, and v."""
         return as_moves(outputs, self.policy.actions)
 
     def policy_stage(self) -> RegressionStage:
-        """See `LatentCloning`."""
         own = self.own.policy
         return self.cloning(MovesStage, MovesLoss(self.policy), own.batch_size, own.precision)
 
     def decoder_stage(self) -> RegressionStage:
-        """See `LatentCloning`."""
         own = self.own.policy
         return self.decoding(self.config.behaviour.loss, own.batch_size, own.precision)
 
@@ -166,13 +145,7 @@ class CADDYBehaviour(LatentCloning):
 def oracle_stage(
     config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
 ) -> RegressionStage:
-    """Training of the CADDY Oracle, a new head that clones the real actions of all demonstrations.
-
-    Args:
-        config: schedule, trimming, loss.
-        model: finished CADDY.
-        demos: demonstrations, and those that are held out.
-        device: where to compute.
+    """The CADDY Oracle's training: a new head clones the real actions of all demonstrations.
 
     Raises:
         CheckpointError: a damaged model.

@@ -38,12 +38,7 @@ def double() -> nn.Upsample:
 
 
 class Res(nn.Module):
-    """Residual block that may widen and pool.
-
-    Args:
-        in_channels, out_channels: C before and after.
-        pool: k, 1 keeps the resolution.
-    """
+    """Residual block that may widen and pool; a factor of 1 keeps the resolution."""
 
     def __init__(self, in_channels: int, out_channels: int, pool: int = 1) -> None:
         super().__init__()
@@ -66,13 +61,7 @@ class Res(nn.Module):
 
 
 class ConvLSTM(nn.Module):
-    """A convolutional LSTM cell whose memory starts from learned maps.
-
-    Args:
-        in_channels: of the input.
-        channels: of hidden state and cell.
-        side: H = W of the maps.
-    """
+    """A convolutional LSTM cell whose memory starts from learned maps of H = W = `side`."""
 
     def __init__(self, in_channels: int, channels: int, side: int) -> None:
         super().__init__()
@@ -81,11 +70,10 @@ class ConvLSTM(nn.Module):
         self.first_cell = nn.Parameter(torch.zeros(channels, side, side))
 
     def begin(self, batch: int) -> Memory:
-        """The memory before the first input, for B clips."""
         return self.first_hidden.expand(batch, -1, -1, -1), self.first_cell.expand(batch, -1, -1, -1)
 
     def forward(self, x: Tensor, memory: Memory) -> Memory:
-        """One step: the input (B, in, H, W) and the memory to the next memory."""
+        """The input (B, in, H, W) and the memory to the next memory."""
         hidden, cell = memory
         i, f, o, g = self.gates(torch.cat((x, hidden), dim=1)).chunk(4, dim=1)
         cell = f.sigmoid() * cell + i.sigmoid() * g.tanh()

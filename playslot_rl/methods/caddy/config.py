@@ -80,14 +80,12 @@ class CADDYConfig(VideoStageConfig):
         check(len(self.temperature) == 2, "baselines.caddy.temperature", self.temperature, "two numbers above 0")
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        """See `playslot_rl.config.machine.Needy`."""
         yield windows(name, self, self.frames * frame_numbers(config))
         weights = 9 * (chain(3, *self.encoder) + chain(self.dynamics, *self.generator)) + 9 * self.dynamics**2
         weights += self.actions * (self.latent_dim + self.dynamics)
         yield Need((name,), "CADDY's weights", weights * WEIGHT)
 
     def check(self, name: str, config: ExperimentConfig) -> None:
-        """See `playslot_rl.methods.training.Checking`."""
         from playslot_rl.methods.caddy.model import CADDY
         from playslot_rl.methods.caddy.perceptual import load_perceptual
         from playslot_rl.methods.video.training import check_pixel_model
@@ -117,7 +115,6 @@ class CADDYPolicyConfig(Checked):
     world: str = field(default="", metadata=role("machine", "folder"))
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        """See `playslot_rl.config.machine.Needy`."""
         yield windows(f"{name}.policy", self.policy, frame_numbers(config))
 
 
@@ -137,5 +134,4 @@ class CADDYOracleConfig(Checked):
     world: str = field(default="", metadata=role("machine", "folder"))
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        """See `playslot_rl.config.machine.Needy`."""
         yield windows(f"{name}.policy", self.policy, frame_numbers(config))

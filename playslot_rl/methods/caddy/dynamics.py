@@ -21,14 +21,7 @@ Memories = tuple[Memory, ...]
 
 
 class Dynamics(nn.Module):
-    """R.
-
-    Args:
-        in_channels: C.
-        condition: K + Z, widths of a and v together.
-        channels: of the cells at the state's resolution; the one at half of it has twice as many.
-        side: h = w, even.
-    """
+    """R, with `condition` = K + Z; the cell at half the state's resolution has twice the channels."""
 
     def __init__(self, in_channels: int, condition: int, channels: int, side: int) -> None:
         super().__init__()
@@ -50,20 +43,11 @@ class Dynamics(nn.Module):
         )
 
     def begin(self, batch: int) -> Memories:
-        """What it remembers before the first frame of B clips."""
         return tuple(cell.begin(batch) for cell in self.cells)  # type: ignore[operator]
 
     def forward(self, s: Tensor, a: Tensor, v: Tensor, memories: Memories) -> tuple[Tensor, Memories]:
-        """One step.
-
-        Args:
-            s: states (B, C, h, w).
-            a: actions (B, K), each a distribution over the K.
-            v: variabilities (B, Z).
-            memories: of the step before, or `begin`.
-
-        Returns:
-            y (B, channels, h, w), and the memories for the next step.
+        """One step: states (B, C, h, w), actions (B, K), each a distribution, variabilities (B, Z) and the memories of
+        the step before, or `begin`, to y (B, channels, h, w) and the next memories.
         """
         condition = torch.cat((a, v), dim=-1)
         kept = []

@@ -15,11 +15,7 @@ from playslot_rl.methods.caddy.blocks import Res, convolution
 
 
 class Encoder(nn.Module):
-    """E.
-
-    Args:
-        channels: of the stem and of the three widths.
-    """
+    """E; `channels` are those of the stem and of the three widths."""
 
     def __init__(self, channels: tuple[int, ...]) -> None:
         super().__init__()

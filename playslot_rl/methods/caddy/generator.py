@@ -19,12 +19,7 @@ KERNELS = (3, 3, 7)
 
 
 class Generator(nn.Module):
-    """G.
-
-    Args:
-        in_channels: of y.
-        channels: at a quarter, a half and the full resolution.
-    """
+    """G; `channels` are those at a quarter, a half and the full resolution."""
 
     def __init__(self, in_channels: int, channels: tuple[int, ...]) -> None:
         super().__init__()

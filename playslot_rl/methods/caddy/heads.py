@@ -25,13 +25,7 @@ from playslot_rl.modules.action_range import ActionRange
 
 
 class StateHead(nn.Module):
-    """A trunk of A's form and a linear layer.
-
-    Args:
-        in_channels: C; the trunk has twice as many, as A's.
-        out_dim: K + Z, or A.
-        acts: it gives real actions, and has their `action_range`.
-    """
+    """A trunk of A's form and a linear layer to K + Z numbers, or to A real actions with their `action_range`."""
 
     def __init__(self, in_channels: int, out_dim: int, acts: bool = False) -> None:
         super().__init__()
@@ -41,19 +35,12 @@ class StateHead(nn.Module):
             self.action_range = ActionRange(out_dim)
 
     def forward(self, states: Tensor) -> Tensor:
-        """States (B, C, H/8, W/8) to (B, out_dim)."""
         out: Tensor = self.to_out(self.trunk(states))
         return out
 
 
 class MovesHead(StateHead):
-    """A head whose outputs are moves: logits of the action, and the variability.
-
-    Args:
-        in_channels: C.
-        actions: K.
-        latent_dim: Z.
-    """
+    """A head whose outputs are moves: logits of the action, and the variability."""
 
     mean: Tensor
     scale: Tensor
@@ -77,12 +64,7 @@ class MovesHead(StateHead):
 
 
 class OnFrames(nn.Module):
-    """A head on the states of a frozen encoder.
-
-    Args:
-        encoder: E, in evaluation mode.
-        head: reads its states.
-    """
+    """A head on the states of a frozen encoder."""
 
     def __init__(self, encoder: Encoder, head: StateHead) -> None:
         super().__init__()
@@ -103,7 +85,7 @@ def states_of(encoder: Encoder, pixels: Tensor) -> Tensor:
 
 
 def as_moves(outputs: Tensor, actions: int) -> Tensor:
-    """Logits and variability (..., K + Z) to moves (..., K + Z): the most probable action as one-hot, and v.
+    """Logits and variability (..., K + Z) to the most probable action as one-hot, and v.
 
     Example:
         >>> as_moves(torch.tensor([0.1, 0.9, 0.5, -3.0]), actions=3).tolist()

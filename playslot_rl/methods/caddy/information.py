@@ -20,11 +20,7 @@ TINY = 1e-12
 
 
 def joint_distribution(real: Tensor, generated: Tensor) -> Tensor:
-    """Symmetric joint distribution (K, K) of the actions in real and generated frames of the global batch.
-
-    Args:
-        real, generated: probabilities (..., K), at least one row.
-    """
+    """Symmetric joint distribution (K, K) of probabilities (..., K), of the global batch; at least one row."""
     real, generated = all_rows(real.float().flatten(0, -2)), all_rows(generated.float().flatten(0, -2))
     joint = real.T @ generated / len(real)
     return (joint + joint.T) / 2
@@ -37,13 +33,8 @@ def mutual_information(joint: Tensor) -> Tensor:
 
 
 class ActionInformation(nn.Module):
-    """The information of a moving average of the joint distribution; gradients go through the newest part of it.
-
-    The first batch is the average; before it there is none.
-
-    Args:
-        actions: K.
-        decay: of the average.
+    """The information of a moving average of the joint distribution, which starts with the first batch; gradients go
+    through the newest part of it.
     """
 
     joint: Tensor
@@ -56,9 +47,8 @@ class ActionInformation(nn.Module):
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
 
     def forward(self, real: Tensor, generated: Tensor) -> Tensor:
-        """Information (scalar, nats) of probabilities (..., K); the average moves in training mode.
-
-        With no rows it is 0 and nothing moves.
+        """Information (scalar, nats) of probabilities (..., K); the average moves in training mode. With no rows it is
+        0.
         """
         if real.numel() == 0:
             return real.new_zeros((), dtype=torch.float32)

@@ -39,19 +39,14 @@ def load_model(done: StageCheckpoint, device: torch.device | str = "cpu") -> CAD
 
 
 def load_video(run: Run, device: torch.device | str = "cpu") -> CADDY:
-    """The CADDY of a finished run.
-
-    Raises:
-        CheckpointError: it is missing or damaged.
-    """
     return load_model(run.stage(MODEL), device)
 
 
 def load_policy(run: Run, device: torch.device | str = "cpu") -> Actor:
-    """CADDY's actor of a finished run.
+    """CADDY's actor.
 
     Raises:
-        CheckpointError: it is missing or damaged, or was trained on another model.
+        CheckpointError: a stage is missing or damaged, or was trained on another model.
     """
     done, caddy = run.stage(POLICY, MODEL), load_video(run, device)
     (sizes, env), own = done.sizes, caddy.config
@@ -66,10 +61,10 @@ def load_policy(run: Run, device: torch.device | str = "cpu") -> Actor:
 
 
 def load_oracle(run: Run, device: torch.device | str = "cpu") -> Actor:
-    """The CADDY Oracle's actor of a finished run; actions clamped to [-1, 1].
+    """The CADDY Oracle's actor; actions clamped to [-1, 1].
 
     Raises:
-        CheckpointError: it is missing or damaged, or was trained on another model.
+        CheckpointError: as `load_policy`.
     """
     done, caddy = run.stage(ORACLE, MODEL), load_video(run, device)
     width = done.group(EnvConfig, "env").action_dim

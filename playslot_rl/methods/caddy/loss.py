@@ -30,19 +30,13 @@ from playslot_rl.methods.caddy.perceptual import VGGFeatures
 
 
 class CADDYLoss:
-    """All terms, with their weights.
-
-    Args:
-        config: weights.
-        perceptual: on the frames' device; None leaves L_perc out.
-    """
+    """All terms, with their weights; without `perceptual` images are compared by L1 only."""
 
     def __init__(self, config: CADDYConfig, perceptual: VGGFeatures | None = None) -> None:
         self.config, self.perceptual = config, perceptual
 
     @property
     def perceptual_on(self) -> bool:
-        """Whether there is a perceptual term; else images are compared by L1 only."""
         return self.perceptual is not None
 
     def __call__(
@@ -54,8 +48,7 @@ class CADDYLoss:
             rollout: of the clips.
             frames: the clips (B, T, 3, H, W), float [0, 1].
             information: its moving average moves in training mode.
-            wanted: times of the frames that image and state are compared at, all of them generated; None: all
-                generated ones.
+            wanted: times of generated frames that image and state are compared at; None: all.
         """
         config, generated = self.config, rollout.generated
         places = [i for i, time in enumerate(generated.times) if wanted is None or time in wanted]

@@ -35,13 +35,12 @@ from playslot_rl.methods.video.predictor import check_clip
 
 
 class Generated(NamedTuple):
-    """Frames that were generated and what E makes of them, n of the T-1 after a clip's first.
+    """n of the T-1 frames after a clip's first, generated, and what E makes of them.
 
     Attributes:
         times: of the n frames, 1 to T-1, rising.
         frames: at a quarter, a half and the full resolution, each (B, n, 3, h, w) in (-1, 1).
-        s: states (B, n, C, H/8, W/8).
-        attended: s m, of the same shape.
+        s, attended: states s and s m, each (B, n, C, H/8, W/8).
         y: what R gave for all frames after the first (B, T-1, C', H/8, W/8).
     """
 
@@ -75,16 +74,11 @@ class Rollout(NamedTuple):
 class CADDY(nn.Module):
     """All of CADDY; a `VideoPredictor`.
 
-    Args:
-        config: sizes.
-        image_size: H = W, a multiple of 16.
-
     Attributes:
-        infers: it reads actions off the true future.
         variability: v in `predict`, see the config; may be set.
 
     Raises:
-        ValueError: a size that is no multiple of 16.
+        ValueError: an image size that is no multiple of 16.
     """
 
     infers = True
@@ -146,13 +140,9 @@ class CADDY(nn.Module):
 
     @torch.no_grad()
     def predict(self, frames: Tensor, seed: int, donors: Tensor | None = None) -> Tensor:
-        """See `VideoPredictor`: frames (B, T, 3, H, W) to (B, T - S, 3, H, W) in (0, 1), in evaluation mode whatever
-        the mode is.
+        """See `VideoPredictor`; in evaluation mode whatever the mode is.
 
         Moves within the seed are read off the seed, those from its last frame on off `donors`, from their frame S on.
-
-        Raises:
-            ValueError: no frame past the seed, frames of another size, or donors of another shape.
         """
         self._check(frames)
         check_clip(frames, seed)
@@ -174,9 +164,6 @@ class CADDY(nn.Module):
         """Latents between consecutive frames (B, T, 3, H, W), float [0, 1] or uint8; nothing is drawn.
 
         a is the one-hot argmax and v belongs to the mean direction. For evaluation mode: else BatchNorm sees the batch.
-
-        Raises:
-            ValueError: frames of another size.
         """
         self._check(frames)
         pose = self.action.pose(self._encode(inside(frames))[1])
@@ -185,14 +172,9 @@ class CADDY(nn.Module):
         return Latents(a, self.action.variability(a, moves.d), moves.p)
 
     def rollout(self, seed: Tensor, latents: Latents) -> Tensor:
-        """Frames after the seed's, each from its own predictions. For evaluation mode.
+        """Frames (B, n + 1 - S, 3, H, W) in (0, 1) after the seed's (B, S, 3, H, W), each from its own predictions.
 
-        Args:
-            seed: frames (B, S, 3, H, W), float [0, 1] or uint8.
-            latents: for each move from the first frame on, at least S of them.
-
-        Returns:
-            Frames (B, n + 1 - S, 3, H, W) in (0, 1), for n moves.
+        `latents` are those of all n moves from the first frame on, at least S. For evaluation mode.
 
         Raises:
             ValueError: frames of another size, or moves that do not lead past the seed.

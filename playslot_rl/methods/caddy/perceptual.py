@@ -74,13 +74,8 @@ class VGGFeatures(nn.Module):
 
 
 def load_perceptual(weights: str) -> VGGFeatures | None:
-    """VGG19's features.
-
-    Args:
-        weights: `CADDYConfig.perceptual`: empty, `auto` or a path.
-
-    Returns:
-        The frozen network on the CPU; None where it is empty, or `auto` and torch's cache does not have the weights.
+    """VGG19's features on the CPU, frozen, for `CADDYConfig.perceptual`; None where it is empty, or `auto` and torch's
+    cache does not have the weights.
 
     Raises:
         CheckpointError: the file is missing, damaged or not VGG19's.

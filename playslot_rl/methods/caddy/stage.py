@@ -35,12 +35,7 @@ from playslot_rl.world_model import module_device
 
 
 class CADDYStage:
-    """CADDY.
-
-    Args:
-        model: trained in place, on its device.
-        clips: of S + predicted frames.
-        config: schedules, weights, batch, precision.
+    """CADDY, trained in place on clips of S + predicted frames.
 
     Raises:
         CheckpointError: weights of VGG19 that are asked for cannot be read.
@@ -53,16 +48,13 @@ class CADDYStage:
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """The model; VGG19 is not stored."""
         return {"caddy": self.model}
 
     @property
     def perceptual_on(self) -> bool:
-        """Whether there is a perceptual term; else images are compared by L1 only."""
         return self.objective.perceptual_on
 
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
-        """Terms of one batch; `usage` and `perplexity` (1 to K) of its actions."""
         config = self.config
         rows = own_rows(self.clips.sample(config.batch_size, generators.numpy("clips")))
         frames = self._frames(rows[:, : clip_length(config, step)])
@@ -104,9 +96,7 @@ class CADDYStage:
         }
 
     def _look(self, rows: IntArray) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Of held-out clips: errors of the frames, probabilities of actions in real and predicted ones, squares of v
-        and d.
-        """
+        """Errors of the frames, probabilities of actions in real and predicted ones, and squares of v and d."""
         frames, seed = self._frames(rows), self.config.seed_frames
         predicted = self.model.predict(frames, seed)
         error = (predicted.clamp(0, 1) - frames[:, seed:]).square().mean(dim=(2, 3, 4)).flatten()
@@ -129,13 +119,12 @@ class CADDYStage:
 
 
 def temperature(config: CADDYConfig, step: int) -> float:
-    """Temperature of the Gumbel-softmax at a step, from 0."""
     first, last = config.temperature
     return first + (last - first) * min(1.0, step / config.anneal_steps)
 
 
 def clip_length(config: CADDYConfig, step: int) -> int:
-    """Frames of a clip at a step, from 0; never more than seed and predicted frames."""
+    """Frames of a clip at a step, from 0."""
     last = config.seed_frames + config.predicted_frames
     first = min(config.first_frames, last)
     if step >= config.growth_steps:

@@ -17,10 +17,9 @@ from playslot_rl.runs import Run
 
 
 def act(networks: DreamerNetworks, memory: TensorDictBase, generator: torch.Generator | None) -> TensorDict:
-    """See a frame and choose an action.
+    """See a frame and choose an action; networks in eval mode.
 
     Args:
-        networks: in eval mode.
         memory: `state` (n, S), `belief` (n, H), `keys.ACTION` (n, A) and `keys.PIXELS` uint8 (n, 3, H, W).
         generator: of state and action; None takes the most likely state and the mean action.
 
@@ -40,18 +39,13 @@ def act(networks: DreamerNetworks, memory: TensorDictBase, generator: torch.Gene
 
 
 class DreamerActor(Actor):
-    """DreamerV3 without exploring. The memory: `state`, `belief` and the last ACTION.
-
-    Args:
-        networks: trained, in eval mode.
-    """
+    """DreamerV3 without exploring. The memory: `state`, `belief` and the last ACTION."""
 
     def __init__(self, networks: DreamerNetworks) -> None:
         super().__init__(("state", "belief", keys.ACTION))
         self.networks = networks
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
-        """Zero states; nothing is drawn."""
         return self.networks.blank(len(seeds)).to(self.device)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -71,7 +71,6 @@ class DreamerConfig(OnlineConfig):
         check(self.belief % self.blocks == 0, "belief", self.belief, f"a multiple of blocks ({self.blocks})")
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        """See `playslot_rl.config.machine.Needy`."""
         state, depths = self.categoricals * self.classes, [self.depth * mult for mult in self.mults]
         weights = self.kernel**2 * chain(3, *depths) + self.belief**2 / self.blocks
         weights += (self.hidden + self.units) * (self.belief + state) + 2 * self.layers * self.units**2

@@ -141,14 +141,9 @@ def records(batch: TensorDictBase, networks: DreamerNetworks) -> TensorDict:
 
 
 class DreamerLearner:
-    """Acts from pixels and learns world model, actor and critic in one update.
-
-    Args:
-        networks: on the device it computes on.
-        config: objective and optimiser.
+    """Acts from pixels and learns world model, actor and critic in one update; see `Learner`.
 
     Attributes:
-        stored: frames, reduced to the size it sees.
         loss: the objective; holds the slow critic and the scale of the returns.
     """
 
@@ -170,20 +165,17 @@ class DreamerLearner:
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """The networks, and what the objective holds beside them."""
         return {"networks": self.networks, "slow": self._slow}
 
     @property
     def optimizers(self) -> Mapping[str, torch.optim.Optimizer]:
-        """The one optimiser of everything (LaProp with adaptive gradient clipping)."""
+        """The one optimiser of everything: LaProp with adaptive gradient clipping."""
         return {"all": self._optimizer}
 
     def initial(self, n: int) -> TensorDict:
-        """Zero states."""
         return self.networks.blank(n)
 
     def act(self, memory: TensorDictBase, generator: torch.Generator, explore: bool) -> TensorDictBase:
-        """See `playslot_rl.methods.online.learner.Learner.act`."""
         return act(self.networks, memory, generator if explore else None)
 
     def update(self, batch: TensorDict, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002

@@ -42,13 +42,7 @@ MIN_STD, MAX_STD = 0.1, 1.0
 
 
 class ActorNetwork(nn.Module):
-    """(z, h) to mean and standard deviation of a Gaussian action: tanh mean, deviation in [0.1, 1].
-
-    Args:
-        features: S + H.
-        action_dim: A.
-        config: sizes.
-    """
+    """(z, h) to mean and standard deviation of a Gaussian action: tanh mean, deviation in [0.1, 1]."""
 
     def __init__(self, features: int, action_dim: int, config: DreamerConfig) -> None:
         super().__init__()
@@ -61,12 +55,7 @@ class ActorNetwork(nn.Module):
 
 
 class TwoHotHead(nn.Module):
-    """(z, h) to the logits of a scalar and the scalar they mean; zero at the start.
-
-    Args:
-        features: S + H.
-        layers, units: hidden layers and their width.
-    """
+    """(z, h) to the logits of a scalar and the scalar they mean; zero at the start."""
 
     def __init__(self, features: int, layers: int, units: int) -> None:
         super().__init__()
@@ -81,14 +70,6 @@ class TwoHotHead(nn.Module):
 
 class DreamerNetworks(nn.Module):
     """All networks.
-
-    Args:
-        config: sizes.
-        env: the task, for frame size and action width.
-
-    Attributes:
-        frame_size: F.
-        state_dim, belief_dim, action_dim: S, H, A.
 
     Raises:
         ConfigError: the frame size does not divide, or does not fit the encoder's stages.
@@ -144,15 +125,11 @@ class DreamerNetworks(nn.Module):
     def filter(
         self, state: Tensor, belief: Tensor, action: Tensor, frames: Tensor, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """The posterior state after a frame: z_t, h_t.
+        """The posterior state z_t, h_t after a frame o_t, uint8 (n, 3, F, F), from z_{t-1}, h_{t-1} and a_{t-1}.
 
         Note: TorchRL's `RSSMStateEstimatorV3` draws z from the global generator; here it is drawn from `generator`, or
-        is the most likely one where that is None.
-
-        Args:
-            state, belief, action: z_{t-1} (n, S), h_{t-1} (n, H), a_{t-1} (n, A).
-            frames: o_t, uint8 (n, 3, F, F).
-            generator: None for the most likely z.
+        is the
+        most likely one where that is None.
         """
         _, _, belief = self.prior(state, belief, action)
         logits, _ = self.posterior(belief, self.encoder(frames))

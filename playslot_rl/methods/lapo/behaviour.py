@@ -30,17 +30,10 @@ from playslot_rl.training.stage_regression import RegressionStage
 
 
 class LAPOBehaviour(LatentCloning):
-    """Policy and decoder, untrained, with the stages that train them one after the other.
-
-    Args:
-        config: sizes, schedules, labels.
-        model: finished inverse and forward model.
-        demos: demonstrations, and those that are held out.
-        device: where to compute.
+    """See `LatentCloning`.
 
     Raises:
         CheckpointError: a damaged model.
-        DataError: demonstrations without actions.
     """
 
     def __init__(
@@ -55,26 +48,19 @@ class LAPOBehaviour(LatentCloning):
             self.decoder = ActionDecoder(config.model.action_decoder, width, config.env.action_dim).to(device)
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
-        """Latent actions (M, Z) by the inverse model."""
         return infer_latents(self.inverse, source, moves, self.device, self.own.targets == "quantised")
 
     def policy_stage(self) -> RegressionStage:
-        """See `LatentCloning`."""
         own, criterion = self.own.policy, BehaviourLoss(self.policy, self.own.loss)
         criterion.set_keys(observation=keys.PIXELS)
         return self.cloning(RegressionStage, criterion, own.batch_size, own.precision)
 
     def decoder_stage(self) -> RegressionStage:
-        """See `LatentCloning`."""
         return self.decoding(self.own.loss, self.own.policy.batch_size, self.own.policy.precision)
 
 
 def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseModel:
-    """The inverse model of a finished stage, frozen.
-
-    Raises:
-        CheckpointError: it is damaged.
-    """
+    """The inverse model of a finished stage, frozen."""
     own, (_, env) = model.group(LAPOConfig, NAME), model.sizes
 
     with torch.random.fork_rng(devices=[]):

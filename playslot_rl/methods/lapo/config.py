@@ -66,7 +66,6 @@ class LAPOConfig(Checked):
         return self.groups * self.code_dim
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        """See `playslot_rl.config.machine.Needy`."""
         for part, stage in (("model", self.model), ("policy", self.policy)):
             yield windows(f"{name}.{part}", stage, frame_numbers(config))
         weights = 9 * chain(3, *self.channels) + self.hidden * (self.channels[-1] + self.latent_dim)

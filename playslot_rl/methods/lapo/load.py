@@ -1,7 +1,4 @@
-"""A trained LAPO run as an actor: frame to latent action by the latent policy, to a real action by the decoder.
-
-Shapes: B batch, H W image height and width, Z latent-action width, A action dim.
-"""
+"""A trained LAPO run as an actor: frame to latent action by the latent policy, to a real action by the decoder."""
 
 from __future__ import annotations
 
@@ -19,19 +16,13 @@ from playslot_rl.runs import Run
 
 
 class LAPOPolicy(nn.Module):
-    """LAPO's latent policy: one frame to a latent action.
-
-    Args:
-        config: sizes.
-        image_size: H = W.
-    """
+    """LAPO's latent policy: frames (B, 3, H, W), uint8 or float [0, 1], to latent actions (B, Z)."""
 
     def __init__(self, config: LAPOConfig, image_size: int) -> None:
         super().__init__()
         self.network = EncoderMLP(3, config.channels, image_size, config.hidden, config.latent_dim)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Frames (B, 3, H, W), uint8 or float [0, 1], to latent actions (B, Z)."""
         z: Tensor = self.network(normalise(pixels))
         return z
 

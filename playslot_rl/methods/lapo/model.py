@@ -28,11 +28,7 @@ from playslot_rl.modules.quantizer import ActionQuantizer
 
 
 class ResidualBlock(nn.Module):
-    """x + conv(relu(conv(relu(x)))), 3x3, same channels.
-
-    Args:
-        channels: of input and output.
-    """
+    """x + conv(relu(conv(relu(x)))), 3x3, same channels."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -40,18 +36,12 @@ class ResidualBlock(nn.Module):
         self.second = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) to the same shape."""
         out: Tensor = x + self.second(F.relu(self.first(F.relu(x))))
         return out
 
 
 class ConvEncoder(nn.Module):
-    """Levels of halved resolution, each a strided 3x3 conv and a residual block (after IMPALA, Espeholt et al., 2018).
-
-    Args:
-        in_channels: C.
-        channels: of each level.
-    """
+    """Levels of halved resolution: a strided 3x3 conv and a residual block (after IMPALA, Espeholt et al., 2018)."""
 
     def __init__(self, in_channels: int, channels: tuple[int, ...]) -> None:
         super().__init__()
@@ -71,15 +61,7 @@ class ConvEncoder(nn.Module):
 
 
 class EncoderMLP(nn.Module):
-    """A ConvEncoder's last level, flattened, through one hidden layer to a vector.
-
-    Args:
-        in_channels: C.
-        channels: of the encoder's levels.
-        image_size: H = W.
-        hidden: width of the hidden layer.
-        out_dim: width of the output.
-    """
+    """A ConvEncoder's last level, flattened, through one hidden layer: (B, C, H, W) to (B, out_dim)."""
 
     def __init__(self, in_channels: int, channels: tuple[int, ...], image_size: int, hidden: int, out_dim: int) -> None:
         super().__init__()
@@ -88,19 +70,13 @@ class EncoderMLP(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(channels[-1] * side * side, hidden), nn.ReLU(), nn.Linear(hidden, out_dim))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) to (B, out_dim)."""
         out: Tensor = self.mlp(self.encoder(x)[-1].flatten(1))
         return out
 
 
 class Inferred(NamedTuple):
-    """Latent actions.
-
-    Attributes:
-        z: quantised, straight-through (B, Z).
-        before: what was quantised (B, Z).
-        code: int64 (B, G).
-        vq_loss: commitment term, weight included (scalar).
+    """Latent actions z, quantised straight-through, and as they were `before` (B, Z), their codes int64 (B, G), and the
+    commitment term, weight included (scalar).
     """
 
     z: Tensor
@@ -110,12 +86,7 @@ class Inferred(NamedTuple):
 
 
 class InverseModel(nn.Module):
-    """IDM: two frames to a quantised latent action.
-
-    Args:
-        config: sizes.
-        image_size: H = W.
-    """
+    """IDM: two frames to a quantised latent action."""
 
     def __init__(self, config: LAPOConfig, image_size: int) -> None:
         super().__init__()
@@ -135,11 +106,7 @@ class InverseModel(nn.Module):
 
 
 class ForwardModel(nn.Module):
-    """FDM: a frame and a latent action to the next frame, by a U-Net; the latent enters at its lowest resolution.
-
-    Args:
-        config: sizes.
-    """
+    """FDM: a frame and a latent action to the next frame, by a U-Net; the latent enters at its lowest resolution."""
 
     def __init__(self, config: LAPOConfig) -> None:
         super().__init__()

@@ -34,13 +34,7 @@ BATCH = 64
 
 
 class LAPOModelStage:
-    """Inverse and forward model together.
-
-    Args:
-        inverse, forward: trained in place.
-        clips: pairs of frames of unlabelled videos.
-        config: batch, precision.
-    """
+    """Inverse and forward model together, trained in place on pairs of frames of unlabelled videos."""
 
     def __init__(self, inverse: InverseModel, forward: ForwardModel, clips: Clips, config: StageConfig) -> None:
         self.inverse, self.forward, self.clips, self.config = inverse, forward, clips, config
@@ -49,11 +43,9 @@ class LAPOModelStage:
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """Both models."""
         return {"inverse": self.inverse, "forward": self.forward}
 
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """Error of one batch of pairs."""
         first, second = self._frames(own_rows(self.clips.sample(self.config.batch_size, generators.numpy("pairs"))))
         with autocast(first.device.type, self.config.precision):
             inferred = self.inverse(first, second)
@@ -95,7 +87,7 @@ def infer_latents(
     device: torch.device | str = "cpu",
     quantised: bool = True,
 ) -> Tensor:
-    """Latent actions (M, Z) of transitions, quantised or as they were before; the model in evaluation mode."""
+    """Latent actions (M, Z) of transitions; the model in evaluation mode."""
     parts = []
     for rows in np.array_split(moves.rows, -(-len(moves.rows) // BATCH)):
         pixels = source.pixels(np.stack((rows, rows + 1), axis=1)).to(device)

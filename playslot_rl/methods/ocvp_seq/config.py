@@ -15,8 +15,9 @@ from playslot_rl.config.stages import DynamicsStageConfig
 
 @dataclass(frozen=True)
 class OCVPSeqSizes(PredictorConfig):
-    """OCVP-Seq at the paper's size, queries, keys and values without bias,
-    heads without an output projection: two blocks a layer, each with an MLP of 512."""
+    """OCVP-Seq at the paper's size, queries, keys and values without bias, heads without an output projection: two
+    blocks a layer, each with an MLP of 512.
+    """
 
     group = "baselines.ocvp_seq.predictor."
     kind: Literal["cocvp", "ocvp_seq", "slotformer"] = "ocvp_seq"
@@ -38,6 +39,5 @@ class OCVPSeqConfig(DynamicsStageConfig):
     predictor: OCVPSeqSizes = field(default_factory=OCVPSeqSizes)
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        """See `playslot_rl.config.machine.Needy`."""
         yield rollouts(name, self, config)
         yield predictor_weights(f"{name}.predictor", self.predictor, config)

@@ -27,8 +27,7 @@ class PlayedEpisodes:
     """Whole episodes.
 
     Attributes:
-        frames: batch size [n, L], on the CPU: the learner's stored keys, `keys.ACTION`, `keys.REWARD`,
-            `keys.IS_FIRST`, `keys.IS_LAST`.
+        frames: batch size [n, L], on the CPU: the learner's stored keys, ACTION, REWARD, IS_FIRST, IS_LAST.
         returns: undiscounted sums of rewards, (n,).
         successes: whether a step solved the task.
     """
@@ -39,13 +38,8 @@ class PlayedEpisodes:
 
 
 class LearnerActor(Actor):
-    """A learner as it acts now.
-
-    Args:
-        learner: its modules in evaluation mode.
-        device, generator: the learner's, and of what it draws.
-        explore: it samples its actions.
-        start: replaces the actions it chose; it still sees every frame.
+    """A learner as it acts now, its modules in evaluation mode; `start` replaces the actions it chose, while it still
+    sees every frame.
     """
 
     def __init__(
@@ -63,16 +57,13 @@ class LearnerActor(Actor):
 
     @property
     def device(self) -> torch.device:
-        """The learner's."""
         return self._device
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
-        """The learner's memory, and the random actions if there are any."""
         memory = self.initial(len(seeds)).to(self._device)
         return memory if self.start is None else memory.update(self.start.reset(seeds).to(self._device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Look, and choose."""
         seen = self.act(tensordict, self.generator, self.explore)
         if self.start is None:
             return seen
@@ -89,13 +80,10 @@ def play(
     explore: bool = False,
     random: bool = False,
 ) -> PlayedEpisodes:
-    """Play one episode for each seed, all side by side.
+    """Play one episode for each seed, all side by side; one that starts solved is drawn anew.
 
     Args:
-        pool: environments.
-        seeds: episode seeds; an episode that starts solved is drawn anew.
         learner: sees every frame; None looks at none (`random` only) and stores none.
-        device, generator: the learner's, and of what it draws.
         explore: it samples its actions.
         random: uniform actions in [-1, 1] instead, a function of the episode's seed.
     """

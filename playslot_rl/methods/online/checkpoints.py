@@ -60,11 +60,7 @@ def whole_episodes(tensors: Mapping[str, Tensor]) -> TensorDict:
 
 
 class ReplayJournal:
-    """The episodes of a run on disk.
-
-    Args:
-        folder: where its files live.
-    """
+    """The episodes of a run on disk."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -74,11 +70,7 @@ class ReplayJournal:
         return sorted((int(path.stem), path) for path in self.folder.glob("[0-9]*.safetensors"))
 
     def append(self, first: int, episodes: TensorDictBase) -> None:
-        """Write episodes `first`, `first` + 1, ...; batch size [n, L].
-
-        Raises:
-            OutputError: full disk.
-        """
+        """Write episodes `first`, `first` + 1, ...; batch size [n, L]."""
         tensors = {str(key): value for key, value in episodes.items()}
         save_tensors(self.folder / f"{first:08d}.safetensors", tensors)
 
@@ -116,12 +108,7 @@ class ReplayJournal:
 
 
 class OnlineCheckpoints(TrainingCheckpoints):
-    """The checkpoints of a run.
-
-    Args:
-        folder: `RUN/METHOD`.
-        identity, typed: see `TrainingCheckpoints`.
-    """
+    """The checkpoints of a run in `RUN/METHOD`."""
 
     def __init__(self, folder: Path, identity: Mapping[str, Any], typed: Callable[[str], str] = str) -> None:
         super().__init__(folder / "checkpoints", identity, typed)
@@ -140,8 +127,6 @@ class OnlineCheckpoints(TrainingCheckpoints):
         """Write a checkpoint, and the episodes that came since the last one.
 
         Args:
-            state: where the run stands.
-            modules, optimizers: of the learner.
             new: episodes since the last checkpoint, batch size [n, L], the last of them number `state.episodes` - 1.
             capacity: episodes that the replay holds.
             ahead: the episodes of `state.ahead`, batch size [m, L].
@@ -166,11 +151,7 @@ class OnlineCheckpoints(TrainingCheckpoints):
         return final
 
     def ahead(self) -> TensorDict:
-        """The frames of `OnlineState.ahead`, of the newest checkpoint, batch size [m, L].
-
-        Raises:
-            CheckpointError: the file is missing or damaged.
-        """
+        """The frames of `OnlineState.ahead`, of the newest checkpoint, batch size [m, L]."""
         last = self.last()
         assert last is not None
         return whole_episodes(load_tensors(last / "ahead.safetensors"))

@@ -54,12 +54,8 @@ def train_online(
     Writes `checkpoints`, `replay`, `logs`, `metrics.jsonl` and `curve.json` in `RUN/METHOD`, nothing else.
 
     Args:
-        learner: its modules already on `device`.
-        online: the method's config.
-        record: the method, which is the prefix of its config keys, its run, task, renderer, seed, logging.
         begin: called before the first step, when nothing speaks against it.
         title: as the curve names it.
-        device: the learner's.
         prior_steps: agent steps behind what the learner was given (a world model's data), added to the curve's.
 
     Returns:
@@ -136,7 +132,6 @@ class _Run:
 
     @property
     def finished(self) -> bool:
-        """Whether the steps, or the minutes, are used up."""
         late = 0 < self.online.minutes * 60 <= self.state.seconds
         return self.state.step >= self.online.steps or late
 
@@ -179,13 +174,11 @@ class _Run:
             self.players.begin(self._round())  # with the weights from before the updates that come now
 
     def _round(self) -> Round:
-        """The episodes that are to be played next."""
         state, seed = self.state, self.config.seed
         seeds = tuple(episode_seed("training", seed, state.episodes + i) for i in range(self.online.envs))
         return Round(seed, state.rounds, seeds, random=state.step < self.online.prefill)
 
     def _next(self) -> PlayedEpisodes:
-        """Those of `_round`, played."""
         if self.players is None:
             return play_round(self.pool, self.learner, self.device, self._round())
         if self.ahead is None and not self.players.playing:
@@ -250,7 +243,6 @@ class _Run:
         self.write_curve()
 
     def write_curve(self) -> None:
-        """Renew `curve.json`."""
         seeds = self._development_seeds()
         values = {
             "method": self.title,

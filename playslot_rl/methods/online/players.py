@@ -42,13 +42,8 @@ START_S = 300.0
 
 @dataclass(frozen=True)
 class Round:
-    """Episodes that are played with the same weights.
-
-    Attributes:
-        seed: of the run.
-        number: of the round, from 0.
-        seeds: of the episodes.
-        random: played with uniform actions.
+    """Episodes, by their seeds, that are played with the same weights; the round's number counts from 0, and `random`
+    takes uniform actions.
     """
 
     seed: int
@@ -73,11 +68,7 @@ def play_round(pool: TaskPool, learner: Learner, device: torch.device, wanted: R
 
 
 class Player:
-    """A worker's body: an own learner, which acts with the weights it is sent, and own environments.
-
-    Args:
-        setup: what `Players` packed.
-    """
+    """A worker's body: an own learner, which acts with the weights it is sent, and own environments."""
 
     def __init__(self, setup: bytes) -> None:
         torch.set_num_threads(1)
@@ -111,15 +102,13 @@ class _Worker(Protocol):
     """A place where parts of rounds are played."""
 
     def submit(self, weights: bytes, wanted: Round, part: int) -> Future[Any]:
-        """Begin."""
+        """Begin to play."""
 
     def close(self) -> None:
         """End it at once, also while it plays or hangs."""
 
 
 class _LocalWorker:
-    """A process of this machine."""
-
     def __init__(self, setup: bytes) -> None:
         self._pool = ProcessPoolExecutor(1, worker_context(), _begin, (setup,))
 
@@ -133,8 +122,6 @@ class _LocalWorker:
 
 
 class _RayWorker:
-    """An actor of a Ray cluster."""
-
     def __init__(self, setup: bytes) -> None:
         import ray
 
@@ -151,13 +138,11 @@ class _RayWorker:
 
 
 class Players:
-    """Workers that play one round ahead of the learner.
+    """Workers that play one round ahead of the learner, of which each has a copy.
 
     Args:
-        learner: copied to each of them.
         make_pool: gives a worker its environments; it is pickled.
         count: W; divides the episodes of a round.
-        settings: backend, patience and replacements, as for `playslot collect`.
 
     Raises:
         ConfigError: Ray is asked for and not installed.
@@ -190,7 +175,6 @@ class Players:
 
     @property
     def playing(self) -> bool:
-        """Whether a round is under way."""
         return bool(self._futures)
 
     def finish(self) -> PlayedEpisodes:

@@ -28,12 +28,7 @@ class Replay:
     `sample` multiplies it by `reward_scale`), and `keys.IS_FIRST` and `keys.IS_LAST`. A sequence no longer than an
     episode lies within one; a longer one runs on into the next episode, with its `IS_FIRST`.
 
-    Args:
-        config: batch, sequence length, capacity.
-        episode_frames: L.
-
     Attributes:
-        sequence: T.
         capacity: episodes it holds.
 
     Raises:
@@ -71,7 +66,6 @@ class Replay:
 
     @property
     def ready(self) -> bool:
-        """Whether it holds a whole sequence."""
         return len(self) >= self.sequence
 
     def add(self, episodes: TensorDictBase) -> None:
@@ -88,11 +82,8 @@ class Replay:
         self.episodes += n
 
     def restore(self, episodes: TensorDictBase, total: int) -> None:
-        """Fill an empty replay as it was after `total` episodes, bit for bit, from the latest of them.
-
-        Args:
-            episodes: at least the last min(`total`, `capacity`) ones, in order, batch size [m, L].
-            total: episodes ever added.
+        """Fill an empty replay as it was after `total` episodes, bit for bit, from at least the last
+        min(`total`, `capacity`) of them, in order, batch size [m, L].
         """
         kept = episodes[-min(total, self.capacity) :]
         first = total - len(kept)
@@ -115,7 +106,6 @@ class Replay:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without TorchRL's line on standard error that a storage was made."""
     logger = logging.getLogger("torchrl")
     level = logger.level
     logger.setLevel(logging.WARNING)

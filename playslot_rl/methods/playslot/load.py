@@ -20,9 +20,5 @@ def load_actor(run: Run, device: torch.device | str = "cpu") -> SlotActor:
 
 
 def load_video(run: Run, device: torch.device | str = "cpu") -> SlotVideo:
-    """The world model of a finished run.
-
-    Raises:
-        CheckpointError: as `load_actor`.
-    """
+    """The world model of a finished run; raises as `load_actor`."""
     return SlotVideo(run.load_world_model(device))

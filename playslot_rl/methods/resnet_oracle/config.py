@@ -37,11 +37,9 @@ class ResNetOracleConfig(StageConfig):
     patience: int = field(default=0, metadata=was(0) | at_least(0))
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        """See `playslot_rl.config.machine.Needy`."""
         yield windows(name, self, frame_numbers(config))
 
     def check(self, name: str, config: ExperimentConfig) -> None:  # noqa: ARG002
-        """See `playslot_rl.methods.training.Checking`."""
         if self.weights not in ("auto", "download", "scratch") and not Path(self.weights).is_file():
             raise ConfigError(
                 f"{name}.weights: got {self.weights}, expected a file, auto, download or scratch: check it"

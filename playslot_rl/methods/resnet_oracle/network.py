@@ -38,13 +38,7 @@ _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class ResNetPolicy(nn.Module):
-    """Real action from one frame.
-
-    Args:
-        config: sizes of the head.
-        image_size: H = W, a multiple of 32.
-        out_dim: A.
-    """
+    """Real actions from frames H = W = `image_size`, a multiple of 32."""
 
     mean: Tensor
     std: Tensor
@@ -73,14 +67,8 @@ class ResNetPolicy(nn.Module):
 
 
 def load_pretrained(policy: ResNetPolicy, weights: str) -> Pretraining:
-    """Give the trunk its starting weights.
-
-    Args:
-        policy: changed in place.
-        weights: `auto`, `scratch`, `download` or a path, see `ResNetOracleConfig`.
-
-    Returns:
-        Which they are.
+    """Give the trunk its starting weights, and say which: `auto`, `scratch`, `download` or a path
+    (`ResNetOracleConfig`).
 
     Raises:
         CheckpointError: the file is missing, damaged or not ResNet-18's, or cannot be fetched.

@@ -2,8 +2,8 @@
 
     a_t = clamp(f(S_t), -1, 1),   L = mean |f(S_t) - a_t|  (or squared, `behaviour.loss`)
 
-It is the same network and training as the reference inside stage 3 (`playslot_rl.training.stage_behaviour`), but a run
-of its own: all its demonstrations lend their real actions.
+The same network and training as the reference inside stage 3, but a run of its own: all its demonstrations lend their
+real actions.
 """
 
 from __future__ import annotations

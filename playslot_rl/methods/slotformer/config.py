@@ -37,6 +37,5 @@ class SlotFormerConfig(DynamicsStageConfig):
     predictor: SlotFormerSizes = field(default_factory=SlotFormerSizes)
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        """See `playslot_rl.config.machine.Needy`."""
         yield rollouts(name, self, config)
         yield predictor_weights(f"{name}.predictor", self.predictor, config)

@@ -32,13 +32,8 @@ class SOLDActor(Actor):
     Reads PIXELS (n, 3, H, W) uint8, SLOT_STATE, SLOT_AGE, SLOT_HISTORY (n, W, N, D), right-aligned, and
     HISTORY_LENGTH (n, 1); writes these anew but for the frame, SLOTS (n, N, D) and ACTION (n, A) in [-1, 1].
 
-    Note: W is C, in imagination as here: each decision follows the last 1 to C frames, there predicted ones too.
-
-    Args:
-        savi: frozen.
-        actor: the policy.
-        window: W, the last frames the actor sees; ALiBi lets it slide.
-        action_dim: A.
+    Note: the window W is C, in imagination as here: each decision follows the last 1 to C frames, there predicted ones
+    too. ALiBi lets it slide.
     """
 
     def __init__(self, savi: SAVi, actor: ActorHead, window: int, action_dim: int) -> None:
@@ -46,7 +41,6 @@ class SOLDActor(Actor):
         self.savi, self.actor, self.window, self.action_dim = savi, actor, window, action_dim
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
-        """The memory of new episodes; nothing is drawn."""
         return self.initial(len(seeds))
 
     def initial(self, n: int) -> TensorDict:
@@ -91,14 +85,7 @@ class SOLDActor(Actor):
 
 
 def build_networks(config: SOLDConfig, slots: StageCheckpoint, action_dim: int, max_steps: int) -> SOLDNetworks:
-    """Fresh networks for the slots of a finished SAVi.
-
-    Args:
-        config: sizes.
-        slots: SAVi's checkpoint.
-        action_dim: A.
-        max_steps: agent steps in an episode, which a `sequence` of 0 takes whole.
-    """
+    """Fresh networks for the slots of a finished SAVi; a `sequence` of 0 takes an episode of `max_steps` whole."""
     slot_dim = slots.sizes[0].savi.slot_dim
     return SOLDNetworks(config, slot_dim, action_dim, config.sequence or max_steps + 1)
 
@@ -129,7 +116,7 @@ def load_actor(run: Run, device: torch.device | str = "cpu") -> SOLDActor:
     """SOLD's policy of a run, in evaluation mode.
 
     Raises:
-        CheckpointError: the run has no finished SOLD, a damaged one, or another SAVi than it was trained on.
+        CheckpointError: a stage is missing or damaged, or it was trained on another SAVi.
     """
     done, slots = run.stage(NAME, "slots"), run.stage("slots")
     own, env = done.group(SOLDConfig, NAME), done.group(EnvConfig, "env")

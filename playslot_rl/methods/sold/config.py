@@ -86,7 +86,6 @@ class SOLDConfig(OnlineConfig):
         check(learns, f"{group}slot_weight", self.slot_weight, "slot_weight or image_weight above 0, none below")
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        """See `playslot_rl.config.machine.Needy`."""
         slots = config.model.savi.n_slots * config.model.savi.slot_dim
         layers = self.dynamics_layers + 3 * self.head_layers
         weights = layers * (4 * self.dim**2 + 2 * self.dim * self.mlp_dim)

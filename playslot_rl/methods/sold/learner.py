@@ -28,14 +28,7 @@ from playslot_rl.seeds.draws import StepGenerators
 
 
 class SOLDLearner:
-    """SOLD as `playslot_rl.methods.online.learner.Learner`.
-
-    Args:
-        savi: of a finished run, frozen: evaluation mode, no weight that asks for a gradient.
-        networks: on SAVi's device.
-        config: sizes, weights and rates.
-        action_dim: A.
-    """
+    """SOLD as `playslot_rl.methods.online.learner.Learner`; SAVi is frozen, in evaluation mode."""
 
     def __init__(self, savi: SAVi, networks: SOLDNetworks, config: SOLDConfig, action_dim: int) -> None:
         self.savi, self.networks, self.config = savi, networks, config
@@ -54,7 +47,6 @@ class SOLDLearner:
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """The four networks, the slow copies of critic and actor, and the scale of the returns."""
         slow = {"slow_critic": self.slow_critic, "mean_actor": self.mean_actor}
         return {**self.networks.parts, **slow, "returns": self.returns}
 
@@ -65,11 +57,9 @@ class SOLDLearner:
 
     @property
     def optimizers(self) -> Mapping[str, torch.optim.Optimizer]:
-        """One Adam a network."""
         return self._adam
 
     def initial(self, n: int) -> TensorDict:
-        """The memory of n new episodes."""
         return self.acting.initial(n)
 
     def act(self, memory: TensorDictBase, generator: torch.Generator, explore: bool) -> TensorDictBase:
@@ -80,7 +70,6 @@ class SOLDLearner:
         return self.exploring.act(memory, generator, explore) if explore else self.acting(memory)
 
     def update(self, batch: TensorDict, generators: StepGenerators) -> Mapping[str, Tensor]:
-        """See `Learner.update`."""
         metrics = self._model(batch, generators)
         if generators.step >= self.config.world_model_updates:
             metrics |= self._behaviour(batch, generators)

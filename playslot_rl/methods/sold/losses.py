@@ -26,8 +26,7 @@ class Imagined(NamedTuple):
     Attributes:
         slots: (B, C + H, N, D); the context, then what follows from the actions. Differentiable in the actions.
         actions: (B, H, A) in [-1, 1], reparameterised.
-        log_probs: (B, H) of the actions, as constants, summed over A.
-        entropies: (B, H), summed over A.
+        log_probs, entropies: (B, H), summed over A; those of the actions as constants.
         locations: (B, H, A), the modes of the actions' distributions, as constants.
     """
 
@@ -47,19 +46,11 @@ def imagine(
     window: int,
     generator: torch.Generator | None = None,
 ) -> Imagined:
-    """Unfold H steps from the context's last frame.
+    """Unfold H steps from the last frame of parsed slots (B, C, N, D), between which `actions` (B, C - 1, A) were
+    taken.
 
     The actor reads slots without their gradient (as in Dreamer): an action is judged by what the dynamics make of it.
     It sees as many frames as it does when it acts, the last `window`, not all that were imagined so far.
-
-    Args:
-        dynamics: predicts the next frame's slots.
-        actor: chooses the actions.
-        context: parsed slots (B, C, N, D).
-        actions: (B, C - 1, A) taken between them.
-        horizon: H.
-        window: frames the actor sees, at most.
-        generator: of the sampled actions.
     """
     memory = None
     if context.shape[1] > 1:
@@ -122,13 +113,10 @@ def actor_loss(
     """-E[w_t (R_t / S)] - entropy E[w_t H_t], or with `reinforce` -E[w_t log pi(a_t) sg((R_t - v_t) / S)] - ...
 
     Args:
-        imagined: the rollout.
         returns: R_0 ... R_{H-1} (B, H), differentiable in the actions for `dynamics`.
         baselines: v_0 ... v_{H-1} (B, H).
         scale: S, a number of at least 1.
         weights: w (H,), gamma^0 ... gamma^(H-1): how much an imagined step weighs.
-        entropy: weight of the entropy.
-        gradient: which estimator.
     """
     if gradient == "dynamics":
         objective = returns / scale
@@ -138,12 +126,7 @@ def actor_loss(
 
 
 def value_loss(head: ScalarHead, logits: Tensor, returns: Tensor, slow: Tensor, weights: Tensor) -> Tensor:
-    """Cross entropy of the returns and of what the slow critic says (DreamerV3): two targets of equal weight.
-
-    Args:
-        head: the critic, for its grid.
-        logits: its logits (B, H, K).
-        returns, slow: targets (B, H); no gradient runs into them.
-        weights: w (H,).
+    """Cross entropy of the critic's logits (B, H, K) and its two targets of equal weight (DreamerV3), the returns and
+    what the slow critic says, each (B, H) and without gradient, weighed by w (H,).
     """
     return (weights * (head.cross_entropy(logits, returns) + head.cross_entropy(logits, slow))).mean()

@@ -41,13 +41,7 @@ def alibi_slopes(heads: int) -> Tensor:
 
 
 def alibi_bias(slopes: Tensor, new: int, past: int, tokens: int) -> Tensor:
-    """Bias of the attention logits, causal over steps.
-
-    Args:
-        slopes: (heads,).
-        new: steps of the queries, the last ones of the sequence.
-        past: steps before them.
-        tokens: M, tokens a step.
+    """Bias of the attention logits, causal over steps, of queries of `new` steps after `past` ones.
 
     Returns:
         (heads, new * M, (past + new) * M): -m_h times the steps between, minus infinity for later steps.
@@ -61,10 +55,6 @@ def alibi_bias(slopes: Tensor, new: int, past: int, tokens: int) -> Tensor:
 
 class SlotAggregation(nn.Module):
     """Summarise the slots of all steps so far, at every step.
-
-    Args:
-        slot_dim: D.
-        dim, layers, heads, mlp_dim: the transformer.
 
     Raises:
         ValueError: `dim` is no multiple of `heads`.
@@ -89,15 +79,7 @@ class SlotAggregation(nn.Module):
         self.register_buffer("slopes", alibi_slopes(heads), persistent=False)
 
     def forward(self, slots: Tensor, past: list[KeysValues] | None = None) -> tuple[Tensor, list[KeysValues]]:
-        """Summaries of S new steps.
-
-        Args:
-            slots: (B, S, N, D).
-            past: what the call on the earlier steps returned.
-
-        Returns:
-            (B, S, dim), and the past of the next call.
-        """
+        """Summaries (B, S, dim) of S new steps' slots (B, S, N, D), and the past for the next call."""
         b, s, n = slots.shape[:3]
         first = 0 if past is None else past[0][0].shape[2] // (n + 1)
         output = self.output_token.expand(b, s, 1, -1)
@@ -124,12 +106,7 @@ def _backbone(config: SOLDConfig, slot_dim: int) -> SlotAggregation:
 
 
 class ScalarHead(nn.Module):
-    """Reward or value of every step, as logits over a symlog grid; what lies beyond its ends is encoded as the end.
-
-    Args:
-        config: sizes, grid and mean.
-        slot_dim: D.
-    """
+    """Reward or value of every step, as logits over a symlog grid; what lies beyond its ends is encoded as the end."""
 
     grid: Tensor
 
@@ -163,13 +140,7 @@ class ScalarHead(nn.Module):
 
 
 class ActorHead(nn.Module):
-    """Distribution of the action of every step.
-
-    Args:
-        config: sizes.
-        slot_dim: D.
-        action_dim: A.
-    """
+    """Distribution of the action of every step."""
 
     def __init__(self, config: SOLDConfig, slot_dim: int, action_dim: int) -> None:
         super().__init__()
@@ -199,14 +170,7 @@ def sample_action(distribution: TruncatedNormal, generator: torch.Generator | No
 
 
 class SOLDNetworks(nn.Module):
-    """Dynamics, reward, critic and actor.
-
-    Args:
-        config: sizes.
-        slot_dim: D.
-        action_dim: A.
-        frames: frames of the longest sequence that the dynamics learn from.
-    """
+    """Dynamics, reward, critic and actor; `frames` are those of the longest sequence the dynamics learn from."""
 
     def __init__(self, config: SOLDConfig, slot_dim: int, action_dim: int, frames: int) -> None:
         super().__init__()
@@ -228,5 +192,4 @@ class SOLDNetworks(nn.Module):
 
     @property
     def parts(self) -> Mapping[str, nn.Module]:
-        """By name, as checkpoints store them."""
         return {"dynamics": self.dynamics, "reward": self.reward, "critic": self.critic, "actor": self.actor}

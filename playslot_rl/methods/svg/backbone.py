@@ -28,12 +28,7 @@ SLOPE = 0.2
 
 
 class Encoded(NamedTuple):
-    """A frame as the encoder sees it.
-
-    Attributes:
-        code: h (B, F), in (-1, 1).
-        skips: k, a map of each level (B, C_i, H / 2^i, W / 2^i).
-    """
+    """A frame's code h (B, F) in (-1, 1), and its skip maps k, one of each level (B, C_i, H / 2^i, W / 2^i)."""
 
     code: Tensor
     skips: list[Tensor]
@@ -44,23 +39,13 @@ class Encoded(NamedTuple):
 
 
 def check_image_size(image_size: int, levels: int) -> None:
-    """Refuse a resolution that does not end in 4x4 pixels.
-
-    Raises:
-        ValueError: `image_size` is not 4 * 2^levels.
-    """
+    """Refuse a resolution that does not end in 4x4 pixels."""
     fitting = BOTTOM * 2**levels
     check(image_size == fitting, "image_size", image_size, f"{fitting}, for {levels} widths in baselines.svg.channels")
 
 
 class Encoder(nn.Module):
-    """Enc: levels of convolutions with max-pooling between them, then one 4x4 convolution to a vector.
-
-    Args:
-        channels: C_i.
-        convs: convolutions of each level.
-        features: F.
-    """
+    """Enc: levels of convolutions with max-pooling between them, then one 4x4 convolution to a vector."""
 
     def __init__(self, channels: Sequence[int], convs: Sequence[int], features: int) -> None:
         super().__init__()
@@ -90,11 +75,6 @@ class Decoder(nn.Module):
     """Dec: the encoder's mirror image, with twice the channels where a skip map joins.
 
     The highest level's last convolution is the one to colours, which does not take its only one from it.
-
-    Args:
-        channels: C_i.
-        convs: convolutions of each level.
-        features: F.
     """
 
     def __init__(self, channels: Sequence[int], convs: Sequence[int], features: int) -> None:

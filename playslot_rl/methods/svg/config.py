@@ -49,14 +49,12 @@ class SVGConfig(VideoStageConfig):
         check(min(self.convs) >= 1, "baselines.svg.convs", self.convs, "numbers of at least 1")
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        """See `playslot_rl.config.machine.Needy`."""
         yield windows(name, self, self.frames * frame_numbers(config))
         weights = 9 * chain(3, *self.channels) + self.features * self.channels[-1]
         weights += self.hidden * (self.features + self.latent_dim) + 8 * self.layers * self.hidden**2
         yield Need((name,), "SVG's weights", weights * WEIGHT)
 
     def check(self, name: str, config: ExperimentConfig) -> None:
-        """See `playslot_rl.methods.training.Checking`."""
         from playslot_rl.methods.svg.model import SVG
         from playslot_rl.methods.video.training import check_pixel_model
 

@@ -26,16 +26,11 @@ def gaussian_kl(posterior: Gaussian, prior: Gaussian) -> Tensor:
 
 
 def svg_objective(out: TeacherForced, frames: Tensor, kl_weight: float) -> dict[str, Tensor]:
-    """Loss of a pass over true clips.
+    """Loss of a pass over true clips (B, T, 3, H, W), uint8 or float [0, 1].
 
     With k of T - 1 predictions decoded, the image term is (T - 1) / k times their sum: an unbiased estimate, as far as
     the prediction of a frame does not depend on which others are decoded (in training mode it does, through
     BatchNorm).
-
-    Args:
-        out: the pass.
-        frames: its clips (B, T, 3, H, W), uint8 or float [0, 1].
-        kl_weight: beta.
 
     Returns:
         Scalars: `loss`, the sum of `loss_image` and `loss_kl` (beta included), which are sums over steps; to be logged,

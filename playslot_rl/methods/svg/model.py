@@ -50,14 +50,7 @@ class TeacherForced(NamedTuple):
 
 
 class SVG(nn.Module):
-    """SVG-LP, a `VideoPredictor`.
-
-    Args:
-        config: sizes.
-        image_size: H = W, 4 * 2^levels.
-
-    Attributes:
-        infers: the latents are read off the true future.
+    """SVG-LP, a `VideoPredictor` of frames H = W = 4 * 2^levels.
 
     Raises:
         ValueError: the levels do not fit the image size.
@@ -120,22 +113,7 @@ class SVG(nn.Module):
         return torch.stack([self.encoder(normalise(frame)).code for frame in frames.unbind(dim=1)], dim=1)
 
     def predict(self, frames: Tensor, seed: int, donors: Tensor | None = None) -> Tensor:
-        """Predict the frames after the seed, each from its own predictions (`VideoPredictor.predict`).
-
-        z_t is the posterior's mean. Past the seed it is inferred from the true frames, or with `donors` from theirs:
-        the latents that those clips themselves would be predicted with. Within the seed it is always the clip's own.
-
-        Args:
-            frames: clips (B, T, 3, H, W), uint8 or float [0, 1].
-            seed: S, at least 1 and less than T.
-            donors: clips of the same shape, or None.
-
-        Returns:
-            Frames (B, T - S, 3, H, W), float in (0, 1).
-
-        Raises:
-            ValueError: no frame past the seed, or frames or donors of another size.
-        """
+        """See `VideoPredictor`; z_t is the posterior's mean, within the seed always of the clip's own."""
         check_clip(frames, seed)
         shown = self._see(frames[:, :seed])
         if donors is None:
@@ -148,19 +126,7 @@ class SVG(nn.Module):
         return self._unroll(shown, latents, frames.shape[1], None)
 
     def sample(self, frames: Tensor, seed: int, generator: torch.Generator) -> Tensor:
-        """Predict the frames after the seed with latents drawn from the learned prior, which sees no true frame there.
-
-        Args:
-            frames: clips (B, T, 3, H, W), uint8 or float [0, 1]; of those past the seed only the number counts.
-            seed: S, at least 1 and less than T; its latents are the posterior's means, as in `predict`.
-            generator: draws z.
-
-        Returns:
-            Frames (B, T - S, 3, H, W), float in (0, 1).
-
-        Raises:
-            ValueError: no frame past the seed, or frames of another size.
-        """
+        """As `predict`, but z past the seed is drawn from the learned prior, which sees no true frame there."""
         check_clip(frames, seed)
         shown = self._see(frames[:, :seed])
         return self._unroll(shown, shown.latents, frames.shape[1], generator)

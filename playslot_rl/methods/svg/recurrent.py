@@ -21,12 +21,7 @@ State = tuple[Tensor, Tensor]
 
 
 class Gaussian(NamedTuple):
-    """Diagonal Gaussians.
-
-    Attributes:
-        mean: (..., Z).
-        log_variance: (..., Z), log sigma^2.
-    """
+    """Diagonal Gaussians: mean and log sigma^2, each (..., Z)."""
 
     mean: Tensor
     log_variance: Tensor
@@ -41,13 +36,7 @@ class Gaussian(NamedTuple):
 
 
 class Recurrent(nn.Module):
-    """A linear layer and an LSTM after it.
-
-    Args:
-        in_dim: width of the input.
-        hidden: width of both.
-        layers: cells above each other.
-    """
+    """A linear layer and an LSTM of `layers` cells after it."""
 
     def __init__(self, in_dim: int, hidden: int, layers: int) -> None:
         super().__init__()
@@ -61,14 +50,7 @@ class Recurrent(nn.Module):
 
 
 class FramePredictor(nn.Module):
-    """LSTM_f: the last frame's code and the latent of the change, to the code that is decoded.
-
-    Args:
-        features: F.
-        latent_dim: Z.
-        hidden: width of the LSTM.
-        layers: cells above each other.
-    """
+    """LSTM_f: the last frame's code and the latent of the change, to the code that is decoded."""
 
     def __init__(self, features: int, latent_dim: int, hidden: int, layers: int) -> None:
         super().__init__()
@@ -83,13 +65,7 @@ class FramePredictor(nn.Module):
 
 
 class GaussianLSTM(nn.Module):
-    """LSTM_q or LSTM_p: frames' codes to a Gaussian over z after each.
-
-    Args:
-        features: F.
-        latent_dim: Z.
-        hidden: width of the LSTM, one cell.
-    """
+    """LSTM_q or LSTM_p: frames' codes to a Gaussian over z after each."""
 
     def __init__(self, features: int, latent_dim: int, hidden: int) -> None:
         super().__init__()

@@ -24,24 +24,16 @@ from playslot_rl.world_model import module_device
 
 
 class SVGStage:
-    """All of SVG-LP at once.
-
-    Args:
-        model: trained in place.
-        clips: clips of T frames.
-        config: batch, seed frames, decoded frames, weight of the divergence, precision.
-    """
+    """All of SVG-LP at once, on clips of T frames."""
 
     def __init__(self, model: SVG, clips: Clips, config: SVGConfig) -> None:
         self.model, self.clips, self.config = model, clips, config
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """The model."""
         return {"svg": self.model}
 
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """Loss of one batch of clips (`svg_objective`); draws clips, latents and decoded steps."""
         config = self.config
         frames = self._frames(own_rows(self.clips.sample(config.batch_size, generators.numpy("clips"))))
         device = frames.device

@@ -40,10 +40,6 @@ class VideoPredictor(Protocol):
 
 
 def check_clip(frames: Tensor, seed: int) -> None:
-    """Refuse clips that have no frame past the seed.
-
-    Raises:
-        ValueError: there is none, or no seed.
-    """
+    """Refuse clips that have no frame past the seed."""
     if not 1 <= seed < frames.shape[1]:
         raise ValueError(f"clip: got {frames.shape[1]} frames with {seed} seed frames, expected more, and a seed")

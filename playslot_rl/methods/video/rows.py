@@ -16,13 +16,8 @@ from playslot_rl.world_model import module_device
 
 
 class Row(NamedTuple):
-    """One row of a model.
-
-    Attributes:
-        name: empty for the model as it is.
-        sees: what it is told of the true future.
-        predict: see `Predict`.
-        shuffled: latents come from another clip.
+    """One row of a model; `name` is empty for the model as it is, `sees` is what it is told of the true future, and
+    `shuffled` takes the latents from another clip.
     """
 
     name: str
@@ -32,12 +27,7 @@ class Row(NamedTuple):
 
 
 def method_rows(model: VideoPredictor, seed: int) -> list[Row]:
-    """All rows of a trained model.
-
-    Args:
-        model: in evaluation mode.
-        seed: S.
-    """
+    """All rows of a trained model in evaluation mode."""
     plain = as_function(model, seed)
     if not model.infers:
         return [Row("", "nothing", plain)]

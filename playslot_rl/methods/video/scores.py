@@ -51,12 +51,7 @@ def score_clips(
     """Predict the frames past the seed of each clip, and compare.
 
     Args:
-        predict: the model.
-        source: the videos.
         rows: row numbers of the clips' frames, int64 (C, T).
-        seed: S.
-        device: where the model computes.
-        lpips: network, or None.
         shuffled: latents, or real actions, past the seed come from the next clip, so that none keeps its own.
         shown: of so many first clips the predictions are kept.
 
@@ -93,12 +88,7 @@ def score_clips(
 
 
 def bootstrap(values: npt.ArrayLike, seed: int = 0, draws: int = 2000) -> tuple[float, float]:
-    """95 % percentile interval of the mean over clips, which are drawn with replacement.
-
-    Args:
-        values: one number a clip (C,).
-        seed: of the draws.
-        draws: how many.
+    """95 % percentile interval of the mean over clips, one number each, drawn with replacement.
 
     Example:
         >>> bootstrap([1.0, 1.0, 1.0])

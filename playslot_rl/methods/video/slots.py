@@ -22,11 +22,7 @@ def parse(savi: SAVi, frames: Tensor) -> Tensor:
 
 
 class SlotVideo:
-    """A world model as a `VideoPredictor`.
-
-    Args:
-        model: in evaluation mode.
-    """
+    """A world model in evaluation mode as a `VideoPredictor`."""
 
     def __init__(self, model: WorldModel) -> None:
         self.model = model
@@ -35,17 +31,7 @@ class SlotVideo:
 
     @torch.no_grad()
     def predict(self, frames: Tensor, seed: int, donors: Tensor | None = None, actions: Tensor | None = None) -> Tensor:
-        """See `VideoPredictor.predict`.
-
-        Args:
-            frames: clips (B, T, 3, H, W), float [0, 1].
-            seed: S.
-            donors: clips whose latents are taken instead.
-            actions: real actions (B, T - 1, A), needed in mode `ground_truth` only.
-
-        Raises:
-            ValueError: no frame past the seed, or no actions in mode `ground_truth`.
-        """
+        """See `VideoPredictor`; mode `ground_truth` needs the real actions (B, T - 1, A), else a ValueError."""
         check_clip(frames, seed)
         model = self.model
         slots = parse(model.savi, frames)
@@ -64,11 +50,7 @@ class SlotVideo:
 
 
 class Reconstruction:
-    """SAVi's reconstruction of the true frames: what no model on its slots can exceed.
-
-    Args:
-        savi: in evaluation mode.
-    """
+    """SAVi's reconstruction of the true frames: what no model on its slots can exceed."""
 
     infers = True
 
@@ -77,7 +59,6 @@ class Reconstruction:
 
     @torch.no_grad()
     def predict(self, frames: Tensor, seed: int, donors: Tensor | None = None) -> Tensor:  # noqa: ARG002
-        """The frames past the seed, each seen."""
         check_clip(frames, seed)
         decoded: Tensor = self.savi.decode(parse(self.savi, frames)[:, seed:]).frames
         return decoded
@@ -89,6 +70,5 @@ class LastFrame:
     infers = False
 
     def predict(self, frames: Tensor, seed: int, donors: Tensor | None = None) -> Tensor:  # noqa: ARG002
-        """The last seed frame, T - S times."""
         check_clip(frames, seed)
         return frames[:, seed - 1 : seed].expand_as(frames[:, seed:])
