@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from playslot_rl import collectors
+from playslot_rl.collectors import presets
+from playslot_rl.collectors.presets import collect_demos
 from playslot_rl.config.compose import compose
-from playslot_rl.recipes.pipeline import collect_demos
 
 pytestmark = pytest.mark.integration
 
@@ -33,7 +33,7 @@ def test_a_set_begun_without_held_out_demonstrations_stays_as_it_is(
     def collect(_config: Any, _policy: str, episodes: int, *_rest: Any) -> None:
         asked.append(episodes)
 
-    monkeypatch.setattr(collectors, "collect", collect)
+    monkeypatch.setattr(presets, "collect", collect)
     if begun is not None:
         path = tmp_path / "data" / record
         path.parent.mkdir(parents=True)
