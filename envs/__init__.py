@@ -6,10 +6,12 @@ loaded when first used.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
 from playslot_rl.config.plain import nearest
+from playslot_rl.config.tasks import TASKS
 from playslot_rl.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -18,14 +20,29 @@ if TYPE_CHECKING:
 
     from playslot_rl.envs.pixel_task import PixelTask
 
-ENVIRONMENTS: dict[str, tuple[str, str]] = {
+_OURS: Final = {
     "button_press": ("PlaySlot/ButtonPress-v0", "playslot_rl.envs.button_press:ButtonPressEnv"),
     "block_push": ("PlaySlot/BlockPush-v0", "playslot_rl.envs.block_push:BlockPushEnv"),
     "block_push_easy": ("PlaySlot/BlockPushEasy-v0", "playslot_rl.envs.block_push:BlockPushEnv"),
     "block_reach": ("PlaySlot/BlockReach-v0", "playslot_rl.envs.block_push:BlockReachEnv"),
     "block_pick": ("PlaySlot/BlockPick-v0", "playslot_rl.envs.block_push:BlockPickEnv"),
 }
-"""Name in the configuration -> Gymnasium id and entry point; `block_ids` has more ids of the blocks family."""
+
+
+class _Environments(Mapping[str, tuple[str, str]]):
+    def __getitem__(self, name: str) -> tuple[str, str]:
+        return _OURS[name] if name in _OURS else (TASKS[name].gym_id, TASKS[name].entry_point)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter((*_OURS, *TASKS))
+
+    def __len__(self) -> int:
+        return len(_OURS) + len(TASKS)
+
+
+ENVIRONMENTS: Final[Mapping[str, tuple[str, str]]] = _Environments()
+"""Name in the configuration -> Gymnasium id and entry point, those of other packages last; `block_ids` has more ids of
+the blocks family."""
 
 PROCEDURAL = ("grid_shapes",)
 """Environments that are drawn, not simulated: they give videos, there is nothing to act on and no success."""
@@ -56,16 +73,19 @@ def block_ids() -> dict[str, tuple[str, EnvConfig]]:
     return {**found, "PlaySlot/BlockPushEasy-v0": ("playslot_rl.envs.block_push:BlockPushEnv", easy)}
 
 
+_PLAIN: Final[dict[str, Any]] = {"order_enforce": False, "disable_env_checker": True}
+
+
 def register() -> None:
     """Register the Gymnasium ids; calling it again does nothing."""
     from gymnasium.envs.registration import register as gym_register
     from gymnasium.envs.registration import registry
 
-    wanted: dict[str, tuple[str, dict[str, Any]]] = {name: (entry, {}) for name, entry in ENVIRONMENTS.values()}
+    wanted: dict[str, tuple[str, dict[str, Any]]] = {name: (entry, {}) for name, entry in _OURS.values()}
     wanted.update({name: (entry, {"env": config}) for name, (entry, config) in block_ids().items()})
     for name, (entry, kwargs) in wanted.items():
         if name not in registry:
-            gym_register(id=name, entry_point=entry, order_enforce=False, disable_env_checker=True, kwargs=kwargs)
+            gym_register(id=name, entry_point=entry, kwargs=kwargs, **_PLAIN)
 
 
 def gym_id(name: str) -> str:
@@ -76,7 +96,14 @@ def gym_id(name: str) -> str:
     if name not in ENVIRONMENTS:
         hint = nearest(name, ENVIRONMENTS, "env=") or "; choose one of these"
         raise ConfigError(f"unknown environment: got {name!r}, expected one of {', '.join(sorted(ENVIRONMENTS))}{hint}")
-    return ENVIRONMENTS[name][0]
+    found, entry = ENVIRONMENTS[name]
+    if name not in _OURS:
+        from gymnasium.envs.registration import register as gym_register
+        from gymnasium.envs.registration import registry
+
+        if found not in registry:
+            gym_register(id=found, entry_point=entry, **_PLAIN)
+    return found
 
 
 def task_config(env: EnvConfig | str | None = None) -> EnvConfig:
@@ -84,7 +111,8 @@ def task_config(env: EnvConfig | str | None = None) -> EnvConfig:
     A ConfigError for an unknown name, or something else."""
     if isinstance(env, str):
         default = "", EnvConfig(env)
-        return block_ids().get(gym_id(env), default)[1]
+        name = gym_id(env)
+        return TASKS[env].env if env in TASKS else block_ids().get(name, default)[1]
     given: Any = EnvConfig() if env is None else env
     if not isinstance(given, EnvConfig):
         known = ", ".join(sorted(ENVIRONMENTS))

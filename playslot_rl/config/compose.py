@@ -13,10 +13,11 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, Final, cast
 
-from playslot_rl.config import ExperimentConfig, from_dict, to_dict
+from playslot_rl.config import ExperimentConfig, from_dict, plugins, to_dict
 from playslot_rl.config.arguments import require_digits, require_folders, require_once, require_plain
 from playslot_rl.config.baselines import known_methods
 from playslot_rl.config.machine import require_machine
@@ -24,8 +25,12 @@ from playslot_rl.config.methods import canonical_method
 from playslot_rl.config.plain import flatten, nearest, type_hints
 from playslot_rl.config.planning import GOALS, PLANNERS, PROPOSALS
 from playslot_rl.config.roles import keys_of
+from playslot_rl.config.tasks import GROUP as TASKS_GROUP
+from playslot_rl.config.tasks import TASKS
 from playslot_rl.errors import ConfigError
 
+PLAIN_ENV: Final = "button_press"
+"""The task whose values one that another package brings starts from: it asks nothing of the model."""
 METHOD_KEYS: Final = ("method", "compare.methods")
 CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
@@ -57,8 +62,13 @@ def near_run(run: str) -> str:
 
 
 def choices(group: str) -> list[str]:
-    """Names of the YAML files of a group (`env` or `preset`), sorted."""
+    """Names of the YAML files of a group (`env` or `preset`), sorted; then the tasks that other packages bring."""
     folder = resources.files(f"{CONF_MODULE}.{group}")
+    brought = sorted(plugins.brought(TASKS_GROUP)) if group == "env" else []
+    return [*_files(folder), *brought]
+
+
+def _files(folder: Traversable) -> list[str]:
     return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
 
 
@@ -250,9 +260,14 @@ def _presets(groups: tuple[str, ...]) -> dict[str, Any]:
     from hydra import initialize_config_module
     from omegaconf import OmegaConf
 
+    chosen = dict(group.split("=", 1) for group in groups)
+    task = TASKS[chosen["env"]] if chosen.get("env", "") in plugins.brought(TASKS_GROUP) else None
+    if task is not None:
+        groups = tuple(f"{group}={name}" for group, name in {**chosen, "env": PLAIN_ENV}.items())
     with _explained(), initialize_config_module(CONF_MODULE, version_base="1.3"):
         composed = OmegaConf.to_container(hydra_compose("config", list(groups)), resolve=True)
-    return cast("dict[str, Any]", composed)
+    values = cast("dict[str, Any]", composed)
+    return values if task is None else _merge(values, {"env": to_dict(task.env), "model": dict(task.model)})
 
 
 def _typed(pairs: Mapping[str, str]) -> dict[str, Any]:

@@ -1,0 +1,113 @@
+"""Packages bring methods and tasks: those of the tutorials work, and one that fails is one line where it is named."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.integration
+
+TUTORIALS = Path(__file__).parents[2] / "docs" / "tutorials"
+SCRIPT = """
+import contextlib, sys
+from playslot_rl.cli import main
+for line in sys.stdin.read().splitlines():
+    print(f"{line}: {main(line.split())}")
+"""
+
+
+def module_of(page: str) -> str:
+    """The Python of a tutorial."""
+    [block] = re.findall(r"^```python\n(.*?)^```", (TUTORIALS / page).read_text(), re.DOTALL | re.MULTILINE)
+    return block
+
+
+def install(site: Path, name: str, group: str, points: str, module: str) -> None:
+    """What pip leaves of a package of one module."""
+    info = site / f"{name}-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[{group}]\n{points}\n")
+    (site / f"{name}.py").write_text(module)
+
+
+def play(site: Path, *commands: str) -> str:
+    """What commands say, one after the other in one process that finds the packages of a folder."""
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT],
+        input="\n".join(commands),
+        env={**os.environ, "PYTHONPATH": str(site)},
+        capture_output=True,
+        text=True,
+        timeout=280,
+        cwd=site,
+    )
+    return done.stdout + done.stderr
+
+
+def test_a_method_of_a_package_is_trained_evaluated_and_compared(tmp_path: Path) -> None:
+    site, smoke = tmp_path / "site", "preset=smoke env=button_press logging.progress=false"
+    assert len(module_of("add-a-method.md").splitlines()) < 80
+    install(site, "mine", "playslot_rl.methods", "mine = mine:MINE", module_of("add-a-method.md"))
+    trained = f"train-baseline {smoke} method=Mine baselines.mine.width=3 baselines.mine.steps=2 data.demos=demos"
+    said = play(
+        site,
+        f"collect {smoke} policy=expert episodes=4 out=demos",
+        f"{trained} out=run",
+        f"{trained} behaviour.loss=l2 out=run",
+        "evaluate run=run episodes=2",
+        f"train-baseline {smoke} method=resnet_oracle data.demos=demos out=other",
+        f"compare {smoke} methods=resnet_oracle,mine baselines.mine.steps=2 data.demos=demos demos=2 seeds=0 "
+        "episodes=2 out=compared",
+    )
+    assert "out=run: 0" in said, said
+    assert "behaviour.loss: got l2, expected l1" in said, said
+    stored = json.loads((site / "run" / "mine" / "checkpoint" / "config.json").read_text())
+    assert stored["mine"]["width"] == 3
+    assert (site / "run" / "evaluation" / "simulation" / "eval_info.json").is_file(), said
+    assert "| mine-d2-s0 | simulation | done |" in (site / "compared" / "comparison.md").read_text()
+    for left in (site / "mine-1.0.dist-info").iterdir():
+        left.unlink()
+    said = play(site, "evaluate run=other episodes=2", "evaluate run=run episodes=2")
+    assert (site / "other" / "evaluation" / "simulation" / "eval_info.json").is_file(), said
+    assert "got 'mine', expected one of playslot" in said, said
+
+
+def test_a_task_of_a_package_is_recorded_and_learned(tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    assert len(module_of("add-a-task.md").splitlines()) < 80
+    install(site, "reach_dot", "playslot_rl.envs", "reach_dot = reach_dot:TASK", module_of("add-a-task.md"))
+    smoke = "preset=smoke env=reach_dot logging.progress=false env.max_steps=20"
+    said = play(
+        site,
+        f"collect {smoke} policy=expert episodes=4 out=demos",
+        f"train-slots {smoke} data.root=demos out=world",
+        f"train-baseline {smoke} method=resnet_oracle data.demos=demos out=run",
+        "evaluate run=run episodes=4",
+    )
+    result = json.loads((site / "run" / "evaluation" / "simulation" / "eval_info.json").read_text())
+    assert result["expert"]["success_rate"] == 1.0, said
+    stored = json.loads((site / "world" / "slots" / "checkpoint" / "config.json").read_text())
+    assert (stored["env"]["name"], stored["env"]["frame_skip"]) == ("reach_dot", 1)
+
+
+def test_a_package_that_fails_is_one_line_where_it_is_named(tmp_path: Path) -> None:
+    site, broken = tmp_path / "site", "raise RuntimeError('no such chip')\n"
+    install(site, "broken", "playslot_rl.methods", "broken = broken:METHOD", broken)
+    install(site, "odd", "playslot_rl.envs", "odd = odd:TASK", "TASK = 3\n")
+    said = play(
+        site,
+        "train-baseline method=broken out=run",
+        "collect env=odd out=data",
+        "train-baseline method=nothing out=run",
+    )
+    assert "broken: got broken:METHOD of the package broken, which fails (RuntimeError: no such chip): repair" in said
+    assert "odd: got odd:TASK of the package odd, expected a Task of the name odd" in said, said
+    assert "got 'nothing', expected one of playslot, " in said
+    assert "Traceback" not in said
