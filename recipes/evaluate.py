@@ -39,7 +39,7 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
     if run.pretrained:
         run = run_of_pretrained(config, run)
         config = replace(config, run=str(run.folder), out="")
-    if config.method != "playslot":
+    if not METHODS[config.method].imagines:
         evaluate_baseline(config, run)
         return
     if config.env.name in PROCEDURAL:

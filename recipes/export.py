@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import ConfigError, OutputError
 from playslot_rl.recipes import evaluate
 
@@ -41,6 +42,6 @@ def check_out(config: ExperimentConfig) -> Path:
     """The folder to write, if one was named."""
     if not config.out or Path(config.out).resolve() == Path(config.run).resolve():
         raise ConfigError("out: got nothing or the run itself, expected a new folder, such as out=policies/press")
-    if config.method != "playslot":
+    if not METHODS[config.method].imagines:
         raise ConfigError(f"run={config.run}: got a run of method={config.method}, expected one of PlaySlot")
     return Path(config.out)

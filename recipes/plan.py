@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config.methods import METHODS
 from playslot_rl.config.planning import GoalName
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError, ConfigError
@@ -37,7 +38,7 @@ def main(config: ExperimentConfig) -> None:
         sizes = {goals: search_size(config.plan, goals, frame_skip) for goals in config.plan.goals}
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    if config.method != "playslot":
+    if not METHODS[config.method].imagines:
         raise CheckpointError(f"run={config.run}: got a run of method={config.method}, expected one of playslot's own")
     if run.pretrained:
         run = run_of_pretrained(config, run)

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final, Literal, get_args
+from typing import Final, Literal
 
 from playslot_rl.config.compare import LAUNCHERS
+from playslot_rl.config.methods import METHODS, Method
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import OPEN_FRACTION, SEED, YEAR_MINUTES, Checked, above_zero, at_least, between, role
 from playslot_rl.seeds.episodes import EPISODES
 
-VideoMethod = Literal["svg", "caddy", "slotformer", "ocvp_seq", "playslot", "playslot_m"]
-VIDEO_METHODS: Final[tuple[VideoMethod, ...]] = get_args(VideoMethod)
-"""`playslot` is the world model with InvDyn_S, `playslot_m` the one with InvDyn_M."""
+VARIANTS: Final[Mapping[str, tuple[str, str]]] = {"playslot_m": ("playslot", "PlaySlot (InvDyn_M)")}
+"""Rows that are a method with other settings, by name: the method, and a title. `playslot` itself has InvDyn_S."""
 
-TITLES: Final[dict[VideoMethod, str]] = {
-    "svg": "SVG-LP",
-    "caddy": "CADDY",
-    "slotformer": "SlotFormer",
-    "ocvp_seq": "OCVP-Seq",
-    "playslot": "PlaySlot",
-    "playslot_m": "PlaySlot (InvDyn_M)",
-}
-ON_SLOTS: Final = ("slotformer", "ocvp_seq", "playslot", "playslot_m")
+
+def video_methods() -> tuple[str, ...]:
+    """What can be compared: methods that predict frames, and variants of them."""
+    return (*(name for name, method in METHODS.items() if method.load.video), *VARIANTS)
+
+
+def method_of(name: str) -> Method:
+    """The method that a row is of."""
+    return METHODS[VARIANTS[name][0] if name in VARIANTS else name]
+
+
+def title_of(name: str) -> str:
+    """As tables name a row."""
+    return VARIANTS[name][1] if name in VARIANTS else METHODS[name].title
 
 
 @dataclass(frozen=True)
@@ -31,7 +37,7 @@ class CompareVideoConfig(Checked):
     `processes=` and `hydra.launcher=`, without the group's name.
 
     Attributes:
-        methods: names of `VIDEO_METHODS`.
+        methods: names of methods that predict frames; `playslot_m` is PlaySlot with InvDyn_M.
         seeds: training seeds.
         trained_seed, trained_frames: seed frames and predicted frames of a training clip, the same for all methods.
         shown: numbers of seed frames that are tested, each with `predicted` frames after them.
@@ -57,7 +63,7 @@ class CompareVideoConfig(Checked):
     """
 
     group = "compare_video."
-    methods: tuple[VideoMethod, ...] = ("svg", "caddy", "slotformer", "ocvp_seq", "playslot")
+    methods: tuple[str, ...] = ("svg", "caddy", "slotformer", "ocvp_seq", "playslot")
     seeds: tuple[int, ...] = field(default=(0, 1, 2), metadata=SEED)
     trained_seed: int = field(default=6, metadata=at_least(1))
     trained_frames: int = field(default=8, metadata=at_least(1))
@@ -81,6 +87,9 @@ class CompareVideoConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        known_methods = video_methods()
+        for name in self.methods:
+            check(name in known_methods, f"{self.group}methods", name, f"one of {', '.join(known_methods)}")
         for name in ("methods", "seeds", "shown", "rates", "tested_on"):
             check(len(getattr(self, name)) > 0, f"{self.group}{name}", getattr(self, name), "at least one")
         for name in ("methods", "seeds", "shown", "rates", "tested_on", "values", "objects"):

@@ -79,6 +79,11 @@ class Method:
         return not self.last.data
 
     @property
+    def imagines(self) -> bool:
+        """Whether its policy acts in a world model of its own, too."""
+        return "dynamics" in self.last.parents
+
+    @property
     def labelled_only(self) -> bool:
         """Whether it learns from labelled demonstrations alone; what they leave out, it never sees."""
         return self.last.data == "labelled"

@@ -27,7 +27,7 @@ from playslot_rl.acting.agent import ImaginationActor, oracle_actor, playslot_ac
 from playslot_rl.acting.episodes import Outcome, TaskPool, run_episodes
 from playslot_rl.acting.expert_videos import ReplayActor, perform
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.config.methods import method_stage
+from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, held_out_seeds, training_seeds
@@ -69,7 +69,8 @@ def run_facts(run: Path, method: str = "playslot") -> RunFacts:
     stage = method_stage(method)
     path = run / stage / "checkpoint" / "meta.json"
     if not path.is_file():
-        command = f"train-policy run={run}" if method == "playslot" else f"train-baseline method={method} out={run}"
+        own = METHODS[method].imagines
+        command = f"train-policy run={run}" if own else f"train-baseline method={method} out={run}"
         raise CheckpointError(f"{run}: got no {stage}/checkpoint, expected a trained policy; run `playslot {command}`")
     try:
         meta: dict[str, Any] = json.loads(path.read_text())

@@ -19,6 +19,7 @@ import torch
 from torch import nn
 
 from playslot_rl.config import EnvConfig, ModelConfig, from_dict
+from playslot_rl.config.methods import METHODS
 from playslot_rl.config.plain import flatten
 from playslot_rl.errors import CheckpointError
 from playslot_rl.runtime.precision import native_bf16
@@ -35,17 +36,14 @@ from playslot_rl.storage.tensors import (
 
 FORMAT = "playslot_rl.checkpoint/1"
 STAGES = ("slots", "dynamics", "policy")
-_COMMANDS = {
-    "slots": "train-slots",
-    "dynamics": "train-dynamics",
-    "policy": "train-policy",
-    "lapo_model": "train-baseline method=lapo",
-}
 
 
 def training_command(stage: str) -> str:
-    """The command that trains a stage, or a baseline of that name."""
-    return _COMMANDS.get(stage, f"train-baseline method={stage}")
+    """The command that trains a stage."""
+    if stage in STAGES:
+        return f"train-{stage}"
+    methods = [name for name, method in METHODS.items() if stage in (part.name for part in method.stages)]
+    return f"train-baseline method={stage if stage in methods or not methods else methods[0]}"
 
 
 @dataclass(frozen=True)

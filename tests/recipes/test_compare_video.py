@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from commands import contents, instead, playslot, refused, run_jobs_here, smoke
 
-from playslot_rl.config.compare_video import TITLES, VIDEO_METHODS
+from playslot_rl.config.compare_video import title_of, video_methods
 from playslot_rl.config.compose import compose
 from playslot_rl.studies.launch import sweep_command
 from playslot_rl.studies.video.jobs import VideoJob, in_steps, video_config
 
 pytestmark = pytest.mark.integration
 
-METHODS = ",".join(VIDEO_METHODS)
+METHODS = ",".join(video_methods())
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_every_method_has_its_row_for_each_number_of_seed_frames(finished: Path)
     found = result(finished)
     plain = {(row["title"], row["seed_frames"]) for row in found["summary"] if not row["row"]}
     references = {"last seed frame, repeated", "SAVi's reconstruction of the true frames"}
-    assert plain == {(title, shown) for title in {*TITLES.values(), *references} for shown in (2, 1)}
+    assert plain == {(title, shown) for title in {*map(title_of, video_methods()), *references} for shown in (2, 1)}
     for row in found["summary"]:
         assert len(row["psnr_steps"]) == 3
         low, high = row["psnr_ci95"]
@@ -94,7 +94,7 @@ def test_all_models_predict_the_same_clips(finished: Path) -> None:
 def test_the_same_command_trains_nothing_again_and_gives_the_same_numbers(finished: Path) -> None:
     before = result(finished)
     done = smoke("compare-video", "env=button_press", f"methods={METHODS}", f"out={finished}")
-    assert done.out.count("done before, skipped") == len(VIDEO_METHODS)
+    assert done.out.count("done before, skipped") == len(video_methods())
     assert result(finished)["summary"] == before["summary"]
 
 

@@ -66,7 +66,7 @@ class SuccessJob(Job):
     @property
     def protocols(self) -> tuple[str, ...]:
         """How it is evaluated."""
-        return ("simulation", "imagination") if self.method == "playslot" else ("simulation",)
+        return ("simulation", "imagination") if METHODS[self.method].imagines else ("simulation",)
 
 
 def success_jobs(config: ExperimentConfig, out: Path) -> list[SuccessJob]:

@@ -152,7 +152,7 @@ def _ratios(summary: Sequence[Result]) -> list[str]:
     shares = [
         f"{100 * rate / rates['slot_oracle', demos]:.0f} % at {demos}"
         for (method, demos), rate in rates.items()
-        if method == "playslot" and rates.get(("slot_oracle", demos))
+        if METHODS[method].imagines and rates.get(("slot_oracle", demos))
     ]
     if not shares:
         return []

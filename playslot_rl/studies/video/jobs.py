@@ -7,10 +7,10 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
-from playslot_rl.config.compare_video import ON_SLOTS, TITLES, CompareVideoConfig, VideoMethod
+from playslot_rl.config.compare_video import CompareVideoConfig, method_of, title_of
 from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import without
 from playslot_rl.errors import ConfigError
@@ -20,6 +20,8 @@ VARIED = ("model.inverse_dynamics.", "model.predictor.", "dynamics.")
 """Where the settings are that change what PlaySlot predicts, on a SAVi that is there."""
 PHASES = ("teacher_steps", "warmup_steps", "anneal_steps", "growth_steps", "validate_every")
 """Settings of a training that are parts of its steps."""
+_INVERSE: Final[Mapping[str, Literal["single", "multi"]]] = {"playslot": "single", "playslot_m": "multi"}
+"""Variant of InvDyn of each row of PlaySlot."""
 TRIAL_SEED = 0
 """Of the trials of learning rates, whatever the seeds of the trainings that take the rate from them."""
 NOT_OF_A_JOB = ("methods", "seeds", "vary", "values", "objects", "processes", "launcher", "hydra")
@@ -34,7 +36,7 @@ class VideoJob(Job):
         variant: setting and value it is trained with, as `mode=hybrid`; empty trains it as the config says.
     """
 
-    method: VideoMethod
+    method: str
     seed: int
     out: Path
     variant: str = ""
@@ -51,16 +53,16 @@ class VideoJob(Job):
 
     @property
     def title(self) -> str:
-        return f"{TITLES[self.method]}, {self.variant}" if self.variant else TITLES[self.method]
+        return f"{title_of(self.method)}, {self.variant}" if self.variant else title_of(self.method)
 
     @property
     def trained_as(self) -> str:
         """Its name among `playslot_rl.config.methods`."""
-        return "playslot" if self.method == "playslot_m" else self.method
+        return method_of(self.method).name
 
     @property
     def stage(self) -> str:
-        return "dynamics" if self.trained_as == "playslot" else self.method
+        return "dynamics" if method_of(self.method).imagines else self.method
 
     @property
     def _method_name(self) -> str:
@@ -101,7 +103,7 @@ def video_jobs(config: ExperimentConfig, out: Path) -> list[VideoJob]:
         VideoJob(method, seed, out, variant)
         for seed in wanted.seeds
         for method in wanted.methods
-        for variant in (variants if method.startswith("playslot") else [""])
+        for variant in (variants if method_of(method).imagines else [""])
     ]
 
 
@@ -112,7 +114,7 @@ def check_variants(config: ExperimentConfig) -> None:
         ConfigError: one line.
     """
     own = config.compare_video
-    if own.vary and not any(method.startswith("playslot") for method in own.methods):
+    if own.vary and not any(method_of(method).imagines for method in own.methods):
         raise ConfigError(f"vary: got methods={','.join(own.methods)}, expected playslot or playslot_m among them")
     if own.vary == "dynamics.steps" and own.budget_minutes:
         raise ConfigError("vary: got dynamics.steps with compare_video.budget_minutes, expected one of them")
@@ -158,23 +160,23 @@ def makes_trials(asked: CompareVideoConfig) -> bool:
 
 def uses_slots(config: ExperimentConfig) -> bool:
     """Whether a method builds on SAVi's slots."""
-    return any(method in ON_SLOTS for method in config.compare_video.methods)
+    return any(method_of(method).slots for method in config.compare_video.methods)
 
 
-def with_training(config: ExperimentConfig, method: VideoMethod, **changes: Any) -> ExperimentConfig:
+def with_training(config: ExperimentConfig, method: str, **changes: Any) -> ExperimentConfig:
     """The config with some settings of a method's training changed."""
-    if method.startswith("playslot"):
+    if method_of(method).imagines:
         return replace(config, dynamics=replace(config.dynamics, **changes))
     own = replace(getattr(config.baselines, method), **changes)
     return replace(config, baselines=replace(config.baselines, **{method: own}))
 
 
-def training_of(config: ExperimentConfig, method: VideoMethod) -> Any:
+def training_of(config: ExperimentConfig, method: str) -> Any:
     """A method's training settings, a `StageConfig`."""
-    return config.dynamics if method.startswith("playslot") else getattr(config.baselines, method)
+    return config.dynamics if method_of(method).imagines else getattr(config.baselines, method)
 
 
-def in_steps(config: ExperimentConfig, method: VideoMethod, steps: int) -> ExperimentConfig:
+def in_steps(config: ExperimentConfig, method: str, steps: int) -> ExperimentConfig:
     """The config with a training of so many steps, its phases and warm-up shortened or stretched with it.
 
     So a trial is the training in small: a step of it takes, on average, what a step of the training takes.
@@ -201,11 +203,11 @@ def video_config(config: ExperimentConfig, job: VideoJob, world: str) -> Experim
     own = config.compare_video
     if job.variant:
         config = _with_setting(config, own.vary, job.value)
-    if job.trained_as == "playslot":  # whatever the task brings: the two rows are these two
-        inverse = replace(config.model.inverse_dynamics, variant="multi" if job.method == "playslot_m" else "single")
+    if method_of(job.method).imagines:  # whatever the task brings: the two rows are these two
+        inverse = replace(config.model.inverse_dynamics, variant=_INVERSE[job.method])
         config = replace(config, model=replace(config.model, inverse_dynamics=inverse))
     config = with_training(config, job.method, seed_frames=own.trained_seed, predicted_frames=own.trained_frames)
-    if job.method in ON_SLOTS:  # those on pixels have no such setting
+    if method_of(job.method).slots:  # those on pixels have no such setting
         config = with_training(config, job.method, from_start=0.0)
     config = _with_context(config, job.method, own.trained_seed + own.trained_frames - 1)
     data = replace(
@@ -223,22 +225,22 @@ def video_config(config: ExperimentConfig, job: VideoJob, world: str) -> Experim
         seed=job.seed,
         data=data,
         out=absolute(str(job.run)),
-        run=absolute(world) if job.method in ON_SLOTS else "",
+        run=absolute(world) if method_of(job.method).slots else "",
         logging=replace(config.logging, progress=False),
     )
 
 
-def _with_context(config: ExperimentConfig, method: VideoMethod, frames: int) -> ExperimentConfig:
+def _with_context(config: ExperimentConfig, method: str, frames: int) -> ExperimentConfig:
     """The config with a predictor that attends to as many frames as its training clips show, at most.
 
     Tests are longer than training clips. A frame at a position that was never trained is predicted badly, and all after
     it (PlaySlot lost 6 dB from the third such frame on); past the context the window slides instead.
     """
-    if method in ("slotformer", "ocvp_seq"):
-        own = getattr(config.baselines, method)
+    own = training_of(config, method)
+    if hasattr(own, "predictor"):
         sizes = replace(own.predictor, context=min(own.predictor.context, frames))
         return with_training(config, method, predictor=sizes)
-    if method in ON_SLOTS:
+    if method_of(method).slots:
         sizes = replace(config.model.predictor, context=min(config.model.predictor.context, frames))
         return replace(config, model=replace(config.model, predictor=sizes))
     return config

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from playslot_rl.collectors import collect
 from playslot_rl.collectors.presets import collect_demos, collect_videos
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.config.compare_video import ON_SLOTS
+from playslot_rl.config.compare_video import method_of
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.windows import Clips
 from playslot_rl.envs import PROCEDURAL
@@ -44,7 +44,7 @@ def check_models(config: ExperimentConfig) -> None:
             the weights of a perceptual loss cannot be read.
     """
     for method in config.compare_video.methods:
-        if method not in ON_SLOTS:
+        if not method_of(method).slots:
             check_method(config, method)
     if config.run and uses_slots(config):
         require_config(Run.open(config.run).stage("slots"), {"env": {"image_size": config.env.image_size}})

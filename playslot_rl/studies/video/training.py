@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from playslot_rl.config import ExperimentConfig, plugins
+from playslot_rl.config.compare_video import method_of
 from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import TrainingError
 from playslot_rl.evaluation.lpips import open_lpips
@@ -53,7 +54,7 @@ class VideoTraining:
         self._score(config)
 
     def _train(self, config: ExperimentConfig) -> None:
-        command = "train-dynamics" if self._job.trained_as == "playslot" else "train-baseline"
+        command = "train-dynamics" if method_of(self._job.method).imagines else "train-baseline"
         train(command, config, int(self._record["processes"]), self._commands)
 
     def _chosen(self, config: ExperimentConfig) -> ExperimentConfig:
