@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import require_parent, run_to_write
-from playslot_rl.runtime.devices import open_device
 
 if TYPE_CHECKING:
     from playslot_rl.training.pace import Pace
@@ -21,16 +20,11 @@ def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
     """Train the dynamics into `RUN/dynamics`; killed, the same command carries on; finished, it says so. `pace` is the
     time that `adopt` gives it; without one it trains as many steps as the config says.
     """
-    from playslot_rl.data.cache import Cache
-    from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.methods.playslot.method import DYNAMICS
-    from playslot_rl.seeds.draws import global_seed
-    from playslot_rl.storage.checkpoints import load_weights
     from playslot_rl.training.fit import Part
     from playslot_rl.training.patience import patience_of
     from playslot_rl.training.record import StageRecord, Training, run_stage
-    from playslot_rl.training.stage_dynamics import DynamicsStage
-    from playslot_rl.world_model import WorldModel
+    from playslot_rl.training.stage_dynamics import dynamics_on_slots
 
     run = run_to_write(config)
     slots = Run.of(config, run.folder).own("slots")
@@ -46,19 +40,12 @@ def main(config: ExperimentConfig, pace: Pace | None = None) -> None:
     )
 
     def prepare() -> Training:
-        device, source, own = open_device(config.device, config.threads), record.data, config.dynamics
-        with global_seed(config.seed, 0, "dynamics"):
-            world = WorldModel(model, config.env)
-        load_weights(slots, {"savi": world.savi})
-        world.to(device)
-        cached = slot_cache(
-            source, world.savi, slots.fingerprint, Cache.of(config.data), device, config.logging.progress
-        )
-        clips = record.clips(own.seed_frames + own.predicted_frames)
-        stage = DynamicsStage(world, clips, cached, own)
+        own = config.dynamics
+        stage = dynamics_on_slots(record, model, own)
         part = Part("dynamics", stage, own, patience=patience_of(own.patience, "mse_slot"), pace=pace)
         read = _actions_read(stage)
-        return Training([part], device, said, extra={"episodes": source.episodes, **read}, identity=read)
+        extra = {"episodes": record.data.episodes, **read}
+        return Training([part], record.device, said, extra=extra, identity=read)
 
     def said(metrics: Mapping[str, float]) -> str:
         return (

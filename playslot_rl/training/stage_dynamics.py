@@ -11,7 +11,9 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.config import DynamicsStageConfig
+from playslot_rl.config import DynamicsStageConfig, ModelConfig
+from playslot_rl.data.cache import Cache
+from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.errors import DataError
 from playslot_rl.losses.common import total_loss
@@ -19,7 +21,9 @@ from playslot_rl.losses.dynamics import DynamicsLoss
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
 from playslot_rl.runtime.shares import own_rows
-from playslot_rl.seeds.draws import StepGenerators, step_generator
+from playslot_rl.seeds.draws import StepGenerators, global_seed, step_generator
+from playslot_rl.storage.checkpoints import load_weights
+from playslot_rl.training.record import StageRecord
 from playslot_rl.world_model import WorldModel, module_device
 
 
@@ -94,3 +98,16 @@ class DynamicsStage:
         if self.criterion.needs_actions:
             batch[keys.ACTION] = torch.from_numpy(self.source.require_actions()[rows]).to(self.device)
         return TensorDict(batch, [len(rows)])
+
+
+def dynamics_on_slots(record: StageRecord, sizes: ModelConfig, own: DynamicsStageConfig) -> DynamicsStage:
+    """The stage of a new world model on the SAVi of its parent: its videos are parsed once."""
+    config, slots, device = record.config, record.parents["slots"], record.device
+    with global_seed(config.seed, 0, record.name):
+        world = WorldModel(sizes, config.env)
+    load_weights(slots, {"savi": world.savi})
+    world.to(device)
+    cached = slot_cache(
+        record.data, world.savi, slots.fingerprint, Cache.of(config.data), device, config.logging.progress
+    )
+    return DynamicsStage(world, record.clips(own.seed_frames + own.predicted_frames), cached, own)

@@ -8,16 +8,12 @@ from functools import partial
 import torch
 
 from playslot_rl.config import DynamicsStageConfig, ExperimentConfig, ModelConfig
-from playslot_rl.data.cache import Cache
-from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.methods.video.slots import SlotVideo
 from playslot_rl.methods.video.training import on_clips
 from playslot_rl.runs import Run
-from playslot_rl.seeds.draws import global_seed
-from playslot_rl.storage.checkpoints import load_weights
 from playslot_rl.training.patience import patience_of
 from playslot_rl.training.record import StageRecord, Training
-from playslot_rl.training.stage_dynamics import DynamicsStage
+from playslot_rl.training.stage_dynamics import dynamics_on_slots
 from playslot_rl.world_model import WorldModel
 
 
@@ -29,16 +25,8 @@ def uncontrolled(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
 
 def training(record: StageRecord) -> Training:
     """A new predictor."""
-    config, slots, source = record.config, record.parents["slots"], record.data
-    own: DynamicsStageConfig = getattr(config.baselines, record.name)
-    with global_seed(config.seed, 0, record.name):
-        world = WorldModel(record.groups["model"], config.env)
-    load_weights(slots, {"savi": world.savi})
-    world.to(record.device)
-    cached = slot_cache(
-        source, world.savi, slots.fingerprint, Cache.of(config.data), record.device, config.logging.progress
-    )
-    stage = DynamicsStage(world, record.clips(own.seed_frames + own.predicted_frames), cached, own)
+    own: DynamicsStageConfig = getattr(record.config.baselines, record.name)
+    stage = dynamics_on_slots(record, record.groups["model"], own)
     return on_clips(record, stage, own, patience_of(own.patience, "mse_slot"))
 
 
