@@ -1,4 +1,4 @@
-"""Methods: a folder each, with its `Method` in `method.py`. docs/tutorials/add-a-method.md adds one from another package."""
+"""Methods: a folder each, with its `Method` in `method.py`; docs/tutorials/add-a-method.md brings another one."""
 
 from playslot_rl.config.methods import METHODS as METHODS
 from playslot_rl.config.methods import Load as Load
