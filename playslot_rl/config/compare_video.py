@@ -42,11 +42,10 @@ class CompareVideoConfig(Checked):
         trained_seed, trained_frames: seed frames and predicted frames of a training clip, the same for all methods.
         shown: numbers of seed frames that are tested, each with `predicted` frames after them.
         predicted: frames that a test predicts.
-        test: data sets the test clips are of, separated by commas; each is a table of its own. Empty records them with
+        test: data sets of the test clips, separated by commas, each a table of its own. Empty records them with
             `data.root` empty, and else keeps some of its episodes.
         tested_on: policies of the test sets that are recorded; of drawn clips there is but one kind.
-        tested: fraction of the episodes that are kept for the test where there is no such data set; validation clips,
-            which choose the learning rate, are of others.
+        tested: fraction of the episodes kept for the test where there is no such data set; validation clips are others.
         episodes: that a recorded test set has.
         vary: setting under `model.inverse_dynamics`, `model.predictor` or `dynamics` that PlaySlot is trained with in
             each of `values`, such as `model.inverse_dynamics.mode`; empty trains it as the config says.
@@ -54,10 +53,9 @@ class CompareVideoConfig(Checked):
         objects: with `env=grid_shapes`, numbers of objects: one comparison each, and one table of all.
         clips: clips of these that are scored, at most.
         pictures: of so many of them the predictions are drawn.
-        budget_minutes: wall-clock budget of each training, from its measured steps a second; 0 trains the preset's
-            steps.
-        rates: factors of the preset's learning rate, of which each method takes the one that is best on validation
-            clips; one of them means no choice.
+        budget_minutes: wall-clock budget of each training, from its measured steps a second; 0: the preset's steps.
+        rates: factors of the preset's learning rate, of which each method takes the best on validation clips; one of
+            them means no choice.
         trial_steps: steps of each trial, which is the training in small: its phases are as much shorter.
         processes, launcher, hydra: as for `compare`.
     """

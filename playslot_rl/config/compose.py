@@ -73,12 +73,9 @@ def _files(folder: Traversable) -> list[str]:
 
 
 def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfig:
-    """Build the validated config of one command, which decides whether `run=DIR` brings its stored config.
-
-    Raises:
-        ConfigError: an argument that is not `key=value`, or that interpolates; an unknown environment, preset or key, a
-            value outside its bounds, sizes that fit into no memory here, or a run folder without a usable
-            `config.json`.
+    """Build the validated config of one command, which decides whether `run=DIR` brings its stored config; a
+    ConfigError for arguments, keys, values or sizes that do not fit, and for a run folder without a usable
+    `config.json`.
     """
     for argument in overrides:
         require_plain(argument.partition("=")[0].strip().lstrip("+"), argument)
@@ -150,10 +147,9 @@ def _method_names(key: str, value: str) -> str:
 
 
 def _compare_keys(overrides: Sequence[str], command: str) -> list[str]:
-    """The short keys of a comparison as those of its group in the config, such as `compare`.
-
-    `demos=10,50` (or `demos=[10,50]`) becomes `compare.demos=[10,50]`, `hydra.launcher=joblib` becomes
-    `compare.launcher=joblib`, and other `hydra.` keys are gathered, as they are, in `compare.hydra`.
+    """The short keys of a comparison as those of its group in the config: `demos=10,50` as `compare.demos=[10,50]`,
+    `hydra.launcher=joblib` as `compare.launcher=joblib`; other `hydra.` keys are gathered, as they are, in
+    `compare.hydra`.
     """
     kept, hydra = [], []
     group, lists = command.replace("-", "_"), COMPARISONS[command]
@@ -238,9 +234,8 @@ def _expand_home(folders: str) -> str:
 
 
 def _assignments(pairs: Mapping[str, str]) -> list[str]:
-    """Hydra overrides that set (`++`) values.
-
-    Text is quoted here, since commas, equals signs, brackets and digits in a path mean something to Hydra.
+    """Hydra overrides that set (`++`) values; text is quoted, since commas, equals signs and brackets in a path mean
+    something to Hydra.
     """
     assignments, folders = [], keys_of(ExperimentConfig, "folder")
     for key, value in pairs.items():

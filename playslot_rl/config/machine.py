@@ -1,7 +1,7 @@
 """What this machine can run: threads by its cores, and the least memory that sizes need, before any is allocated.
 
-Every estimate is a lower bound: weights in fp32 with their gradients and Adam's two moments, and of a batch only what
-is certainly there at once. So what is refused would not have run, and what is not may still be too large.
+Every estimate is a lower bound: weights in fp32 with gradients and Adam's two moments, and of a batch what is certainly
+there at once. What is refused would not have run; what is not may still be too large.
 """
 
 from __future__ import annotations
@@ -64,11 +64,8 @@ def machine_memory() -> int:
 
 
 def require_machine(config: ExperimentConfig, typed: Mapping[str, str]) -> None:
-    """Refuse typed sizes that cannot fit, and typed threads that would only wait for one another.
-
-    What none of the typed keys changes was accepted when it was made. A comparison that a launcher runs on other
-    machines
-    is left to them.
+    """Refuse typed sizes that cannot fit, and typed threads that would only wait for one another; not those of a
+    comparison that a launcher runs on other machines.
     """
     if {config.compare.launcher, config.compare_video.launcher} & ELSEWHERE:
         return

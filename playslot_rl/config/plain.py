@@ -35,7 +35,7 @@ def shortened(value: object) -> str:
 
 
 def nearest(text: str, known: Iterable[str], prefix: str = "") -> str:
-    """The end of a message about an unknown name: the known one that it may be meant for; empty where none is near.
+    """The end of a message about an unknown name: the known one that it may be meant for, if one is near.
 
     Examples:
         >>> nearest("smol", ["smoke", "paper"], "preset=")
@@ -67,10 +67,7 @@ def fingerprint(config: Any) -> str:
 
 
 def type_hints(cls: Any) -> dict[str, Any]:
-    """The types of a class's fields, by name; annotations, which are text, are evaluated once (1.5 ms a class).
-
-    A class with a method `whole` stands for what that gives.
-    """
+    """Types of a class's fields, by name, evaluated once; a class with a method `whole` stands for what that gives."""
     return _type_hints(cls)
 
 
@@ -81,10 +78,8 @@ def _type_hints(cls: Any) -> dict[str, Any]:
 
 
 def from_dict[T](cls: type[T], values: dict[str, Any], where: str = "") -> T:
-    """Build a config from nested plain values; missing keys keep their defaults. `where` is the prefix of messages.
-
-    Raises:
-        ValueError: unknown key, wrong type, or a value outside its range.
+    """Build a config from nested plain values; missing keys keep their defaults. A ValueError, with the prefix `where`,
+    for an unknown key, a wrong type, or a value outside its range.
     """
     hints = type_hints(cls)
     names = {f.name for f in dataclasses.fields(cls)}  # type: ignore[arg-type]

@@ -22,10 +22,8 @@ def brought(group: str) -> dict[str, EntryPoint]:
 
 @functools.cache
 def load(group: str, name: str, kind: type, built_in: str = "") -> Any:
-    """The object, of a `kind`, that a name stands for: `module:object` of a built-in, or an entry point of a package.
-
-    Raises:
-        ConfigError: it cannot be loaded, or is something else; names the package.
+    """The object, of a `kind`, that a name stands for: `module:object` of a built-in, or an entry point of a package; a
+    ConfigError, which names the package, where it cannot be loaded or is something else.
     """
     if built_in:
         module, _, attribute = built_in.partition(":")

@@ -11,10 +11,8 @@ from playslot_rl.errors import ConfigError
 
 
 def spelled(config: ExperimentConfig, command: str) -> list[str]:
-    """Arguments with which `playslot COMMAND`, no comparison, gets exactly this config.
-
-    Raises:
-        ConfigError: no arguments make it: `run` is of another preset or task, and the command takes its config.
+    """Arguments with which `playslot COMMAND`, no comparison, gets exactly this config; a ConfigError where none do:
+    `run` is of another preset or task, and the command takes its config.
     """
     continues = command in CONTINUES and config.run != "" and not is_pretrained(config.run)
     base = [] if continues else [f"env={config.env.name}", f"preset={config.preset}"]

@@ -78,6 +78,12 @@ class StageConfig(Checked):
     compile: bool = field(default=False, metadata=role("free"))
 
 
+def clipped_stage(steps: int, lr: float, schedule: Literal["cosine", "constant"]) -> StageConfig:
+    """Batches of 64, without warm-up, gradients clipped at 1."""
+    optim = OptimConfig(lr=lr, warmup_steps=0, schedule=schedule, grad_clip=1.0)
+    return StageConfig(steps=steps, batch_size=64, optim=optim)
+
+
 @dataclass(frozen=True)
 class SlotsStageConfig(StageConfig):
     """Stage 1, SAVi.

@@ -39,11 +39,8 @@ def data_roots(text: str, key: str = "data.root") -> list[DataRoot]:
     """The data sets that a text such as `a`, `a,b` or `a:2,b:1` names; where only some have a weight, the others have
     1.
 
-    What follows a part's last colon is its weight if it is a number, unless a folder has the whole part as its name:
-    `sets/a:2` is the folder of that name where there is one. Windows' `C:/sets/a` has no weight.
-
-    Raises:
-        ConfigError: a weight that is not above 0.
+    What follows a part's last colon is its weight if it is a number, unless a folder has the whole part as its name.
+    Windows' `C:/sets/a` has no weight. A ConfigError where a weight is not above 0.
 
     Examples:
         >>> data_roots("sets/a, sets/b")

@@ -21,7 +21,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.config import ExperimentConfig, Precision, StageConfig
+from playslot_rl.config import ExperimentConfig, StageConfig
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, labelled_rows, moving_frames
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
@@ -53,7 +53,8 @@ class Seen(NamedTuple):
 class LatentCloning(ABC):
     """Policy and decoder, untrained, with the stages that train them one after the other.
 
-    A method makes `policy` and `decoder` after this, which asks it for `infer` and `observe`.
+    A method makes `policy` and `decoder` after this, which asks it for `infer` and `observe`. Both are trained with the
+    batches and the precision of `schedule`, the policy on frames that are shifted by up to `shift` pixels.
 
     Raises:
         DataError: demonstrations without actions, or in which nothing moves, or nothing in the labelled ones.
@@ -62,8 +63,19 @@ class LatentCloning(ABC):
     policy: nn.Module
     decoder: ActionDecoder
 
-    def __init__(self, config: ExperimentConfig, demos: DemonstrationSplit, device: torch.device, shift: int) -> None:
-        self.config, self.device = config, device
+    kind: type[RegressionStage] = RegressionStage
+    """Of the policy's stage."""
+
+    def __init__(
+        self,
+        config: ExperimentConfig,
+        demos: DemonstrationSplit,
+        device: torch.device,
+        shift: int,
+        schedule: StageConfig,
+        loss: str,
+    ) -> None:
+        self.config, self.device, self.schedule, self.loss = config, device, schedule, loss
         self.trained = self._seen(demos.trained, shift)
         self.labelled = labelled_rows(self.trained.episode, config.behaviour.labelled_demos)
         self.held_out = None if demos.held_out is None else self._seen(demos.held_out)
@@ -81,30 +93,24 @@ class LatentCloning(ABC):
         return outputs
 
     @abstractmethod
+    def criterion(self) -> BehaviourLoss:
+        """What compares the policy's outputs and the inferred latents."""
+
     def policy_stage(self) -> RegressionStage:
         """Latent actions from frames of all demonstrations, no action read."""
-
-    @abstractmethod
-    def decoder_stage(self) -> RegressionStage:
-        """Real actions of the labelled demonstrations, from inferred latents, the policy's, or both."""
-
-    def cloning[S: RegressionStage](
-        self, kind: type[S], criterion: BehaviourLoss, batch_size: int, precision: Precision
-    ) -> S:
-        """The policy's stage; `criterion` compares the policy's outputs and the inferred latents."""
-        return kind(
+        return self.kind(
             "policy",
-            criterion,
+            self.criterion(),
             self.trained.inputs,
             self.trained.latents,
-            batch_size,
+            self.schedule.batch_size,
             held_out=self.held_out and (self.held_out.inputs, self.held_out.latents),
             validated=1024,
-            precision=precision,
+            precision=self.schedule.precision,
         )
 
-    def decoding(self, loss: str, batch_size: int, precision: Precision) -> RegressionStage:
-        """The decoder's stage, once the policy is trained."""
+    def decoder_stage(self) -> RegressionStage:
+        """Real actions of the labelled demonstrations, from inferred latents, the policy's, or both."""
         inputs, actions = self._decoded(self.trained, self.labelled.to(self.device))
         held_out = None
         if self.held_out is not None:
@@ -112,12 +118,12 @@ class LatentCloning(ABC):
         self.decoder.standardise(inputs.whole())
         return RegressionStage(
             "action_decoder",
-            ActionDecoderLoss(self.decoder, loss),
+            ActionDecoderLoss(self.decoder, self.loss),
             inputs,
             actions,
-            batch_size,
+            self.schedule.batch_size,
             held_out=held_out,
-            precision=precision,
+            precision=self.schedule.precision,
         )
 
     def _seen(self, source: EpisodeFrames, shift: int = 0) -> Seen:

@@ -30,10 +30,10 @@ from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, mov
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.caddy.config import CADDYOracleConfig, CADDYPolicyConfig
-from playslot_rl.methods.caddy.encoder import Encoder
 from playslot_rl.methods.caddy.heads import MovesHead, StateHead, as_moves, states_of
 from playslot_rl.methods.caddy.load import ORACLE, POLICY, load_model
 from playslot_rl.methods.caddy.model import CADDY
+from playslot_rl.methods.caddy.networks import Encoder
 from playslot_rl.methods.cloning import LatentCloning
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators, global_seed
@@ -67,9 +67,8 @@ class StateInputs:
 
 
 class MovesLoss(BehaviourLoss):
-    """Cross-entropy of the action and squared error of the variability, over its variance.
-
-    Reads STATE_MAPS (b, C, H/8, W/8) and LATENT_ACTION (b, K + Z), moves; writes `loss_policy`.
+    """Cross-entropy of the action and squared error of the variability, over its variance: reads STATE_MAPS
+    (b, C, H/8, W/8) and moves LATENT_ACTION (b, K + Z); writes `loss_policy`.
     """
 
     network: MovesHead
@@ -102,21 +101,17 @@ class MovesStage(RegressionStage):
 
 
 class CADDYBehaviour(LatentCloning):
-    """Policy and decoder, untrained, with the stages that train them one after the other.
-
-    Raises:
-        CheckpointError: a damaged model.
-        DataError: demonstrations without actions.
-    """
+    """See `LatentCloning`; a CheckpointError where the model is damaged."""
 
     policy: MovesHead
+    kind = MovesStage
 
     def __init__(
         self, config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
     ) -> None:
         self.own: CADDYPolicyConfig = config.baselines.caddy_policy
         self.model = load_model(model, device)
-        super().__init__(config, demos, device, self.own.shift)
+        super().__init__(config, demos, device, self.own.shift, self.own.policy, config.behaviour.loss)
         sizes = self.model.config
         width = sizes.actions + sizes.latent_dim
         with global_seed(config.seed, 0, POLICY):
@@ -133,23 +128,15 @@ class CADDYBehaviour(LatentCloning):
     def chosen(self, outputs: Tensor) -> Tensor:
         return as_moves(outputs, self.policy.actions)
 
-    def policy_stage(self) -> RegressionStage:
-        own = self.own.policy
-        return self.cloning(MovesStage, MovesLoss(self.policy), own.batch_size, own.precision)
-
-    def decoder_stage(self) -> RegressionStage:
-        own = self.own.policy
-        return self.decoding(self.config.behaviour.loss, own.batch_size, own.precision)
+    def criterion(self) -> MovesLoss:
+        return MovesLoss(self.policy)
 
 
 def oracle_stage(
     config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
 ) -> RegressionStage:
-    """The CADDY Oracle's training: a new head clones the real actions of all demonstrations.
-
-    Raises:
-        CheckpointError: a damaged model.
-        DataError: demonstrations without actions, or in which nothing moves.
+    """The CADDY Oracle's training: a new head clones the real actions of all demonstrations; a CheckpointError where
+    the model is damaged, a DataError where actions are missing or nothing moves.
     """
     own: CADDYOracleConfig = config.baselines.caddy_oracle
     behaviour, width = config.behaviour, config.env.action_dim

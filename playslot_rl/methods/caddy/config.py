@@ -20,8 +20,7 @@ from playslot_rl.config.roles import (
     between,
     role,
 )
-from playslot_rl.config.stages import OptimConfig, StageConfig
-from playslot_rl.methods.cloning_config import clipped_stage
+from playslot_rl.config.stages import OptimConfig, StageConfig, clipped_stage
 from playslot_rl.methods.video.config import VideoStageConfig
 
 

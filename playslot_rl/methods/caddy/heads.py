@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.methods.caddy.action import Trunk, chosen
-from playslot_rl.methods.caddy.encoder import Encoder, inside
+from playslot_rl.methods.caddy.networks import Encoder, inside
 from playslot_rl.modules.action_range import ActionRange
 
 

@@ -29,11 +29,7 @@ ORACLE: Final = "caddy_oracle"
 
 
 def load_model(done: StageCheckpoint, device: torch.device | str = "cpu") -> CADDY:
-    """The CADDY of a finished stage, frozen.
-
-    Raises:
-        CheckpointError: it is damaged.
-    """
+    """The CADDY of a finished stage, frozen; a CheckpointError where it is damaged."""
     own, size = done.group(CADDYConfig, MODEL), done.group(EnvConfig, "env").image_size
     return done.restore(lambda: CADDY(own, size), MODEL, device)
 
@@ -43,11 +39,7 @@ def load_video(run: Run, device: torch.device | str = "cpu") -> CADDY:
 
 
 def load_policy(run: Run, device: torch.device | str = "cpu") -> Actor:
-    """CADDY's actor.
-
-    Raises:
-        CheckpointError: a stage is missing or damaged, or was trained on another model.
-    """
+    """CADDY's actor; a CheckpointError where a stage is missing, damaged, or of another model."""
     done, caddy = run.stage(POLICY, MODEL), load_video(run, device)
     (sizes, env), own = done.sizes, caddy.config
 
@@ -61,11 +53,7 @@ def load_policy(run: Run, device: torch.device | str = "cpu") -> Actor:
 
 
 def load_oracle(run: Run, device: torch.device | str = "cpu") -> Actor:
-    """The CADDY Oracle's actor; actions clamped to [-1, 1].
-
-    Raises:
-        CheckpointError: as `load_policy`.
-    """
+    """The CADDY Oracle's actor, actions clamped to [-1, 1]; raises as `load_policy`."""
     done, caddy = run.stage(ORACLE, MODEL), load_video(run, device)
     width = done.group(EnvConfig, "env").action_dim
     head = done.restore(lambda: StateHead(caddy.config.encoder[-1], width, acts=True), "oracle", device)

@@ -22,9 +22,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from playslot_rl.losses.common import total_loss
-from playslot_rl.methods.caddy.action import divergence
+from playslot_rl.methods.caddy.action import ActionInformation, divergence
 from playslot_rl.methods.caddy.config import CADDYConfig
-from playslot_rl.methods.caddy.information import ActionInformation
 from playslot_rl.methods.caddy.model import Rollout
 from playslot_rl.methods.caddy.perceptual import VGGFeatures
 

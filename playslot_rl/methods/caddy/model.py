@@ -25,12 +25,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.methods.caddy.action import ActionNetwork, Gaussian, Latents, Moves, chosen, gumbel_softmax
+from playslot_rl.methods.caddy.action import (
+    ActionInformation,
+    ActionNetwork,
+    Gaussian,
+    Latents,
+    Moves,
+    chosen,
+    gumbel_softmax,
+)
 from playslot_rl.methods.caddy.config import CADDYConfig
-from playslot_rl.methods.caddy.dynamics import Dynamics
-from playslot_rl.methods.caddy.encoder import Encoder, inside
-from playslot_rl.methods.caddy.generator import Generator, Pyramid
-from playslot_rl.methods.caddy.information import ActionInformation
+from playslot_rl.methods.caddy.networks import Dynamics, Encoder, Generator, Pyramid, inside
 from playslot_rl.methods.video.predictor import check_clip
 
 
@@ -72,10 +77,7 @@ class Rollout(NamedTuple):
 
 
 class CADDY(nn.Module):
-    """All of CADDY; a `VideoPredictor`.
-
-    Attributes:
-        variability: v in `predict`, see the config; may be set.
+    """All of CADDY; a `VideoPredictor`. `variability`, v in `predict`, may be set.
 
     Raises:
         ValueError: an image size that is no multiple of 16.
@@ -174,10 +176,7 @@ class CADDY(nn.Module):
     def rollout(self, seed: Tensor, latents: Latents) -> Tensor:
         """Frames (B, n + 1 - S, 3, H, W) in (0, 1) after the seed's (B, S, 3, H, W), each from its own predictions.
 
-        `latents` are those of all n moves from the first frame on, at least S. For evaluation mode.
-
-        Raises:
-            ValueError: frames of another size, or moves that do not lead past the seed.
+        `latents` are those of all n moves from the first frame on; fewer than S are refused. For evaluation mode.
         """
         self._check(seed)
         shown, moves = seed.shape[1], latents.a.shape[1]

@@ -75,10 +75,7 @@ class VGGFeatures(nn.Module):
 
 def load_perceptual(weights: str) -> VGGFeatures | None:
     """VGG19's features on the CPU, frozen, for `CADDYConfig.perceptual`; None where it is empty, or `auto` and torch's
-    cache does not have the weights.
-
-    Raises:
-        CheckpointError: the file is missing, damaged or not VGG19's.
+    cache does not have the weights; a CheckpointError where the file is missing, damaged or not VGG19's.
     """
     path = cached_weights() if weights == "auto" else Path(weights)
     if not weights or (weights == "auto" and not path.is_file()):

@@ -21,8 +21,8 @@ from torch import Tensor, nn
 
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise, psnr
+from playslot_rl.methods.caddy.action import joint_distribution, mutual_information
 from playslot_rl.methods.caddy.config import CADDYConfig
-from playslot_rl.methods.caddy.information import joint_distribution, mutual_information
 from playslot_rl.methods.caddy.loss import CADDYLoss
 from playslot_rl.methods.caddy.model import CADDY
 from playslot_rl.methods.caddy.perceptual import load_perceptual
@@ -35,10 +35,8 @@ from playslot_rl.world_model import module_device
 
 
 class CADDYStage:
-    """CADDY, trained in place on clips of S + predicted frames.
-
-    Raises:
-        CheckpointError: weights of VGG19 that are asked for cannot be read.
+    """CADDY, trained in place on clips of S + predicted frames; VGG19's weights that cannot be read are a
+    CheckpointError.
     """
 
     def __init__(self, model: CADDY, clips: Clips, config: CADDYConfig) -> None:

@@ -17,14 +17,11 @@ from playslot_rl.runs import Run
 
 
 def act(networks: DreamerNetworks, memory: TensorDictBase, generator: torch.Generator | None) -> TensorDict:
-    """See a frame and choose an action; networks in eval mode.
+    """See a frame and choose an action; networks in eval mode, without a generator the most likely state and the mean.
 
-    Args:
-        memory: `state` (n, S), `belief` (n, H), `keys.ACTION` (n, A) and `keys.PIXELS` uint8 (n, 3, H, W).
-        generator: of state and action; None takes the most likely state and the mean action.
-
-    Returns:
-        The same keys anew; the frames reduced.
+    The memory is `state` (n, S), `belief` (n, H), ACTION (n, A) and PIXELS uint8 (n, 3, H, W), which come back anew,
+    the
+    frames reduced.
     """
     frames = networks.reduce(memory.get(keys.PIXELS))
     state, belief = networks.filter(
@@ -57,10 +54,8 @@ class DreamerActor(Actor):
 
 
 def load_actor(run: Run, device: torch.device | str = "cpu") -> DreamerActor:
-    """The trained actor of `RUN/dreamer/checkpoint`, in eval mode.
-
-    Raises:
-        CheckpointError: no finished training there, or a damaged one.
+    """The trained actor of `RUN/dreamer/checkpoint`, in eval mode; a CheckpointError where there is none, or a damaged
+    one.
     """
     done = run.stage(NAME)
     own, env = done.group(DreamerConfig, NAME), done.group(EnvConfig, "env")

@@ -141,10 +141,8 @@ def records(batch: TensorDictBase, networks: DreamerNetworks) -> TensorDict:
 
 
 class DreamerLearner:
-    """Acts from pixels and learns world model, actor and critic in one update; see `Learner`.
-
-    Attributes:
-        loss: the objective; holds the slow critic and the scale of the returns.
+    """A `Learner` from pixels: world model, actor and critic in one update. `loss` holds the slow critic and the scale
+    of the returns.
     """
 
     stored: tuple[str, ...] = (keys.PIXELS,)

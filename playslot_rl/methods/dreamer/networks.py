@@ -69,11 +69,7 @@ class TwoHotHead(nn.Module):
 
 
 class DreamerNetworks(nn.Module):
-    """All networks.
-
-    Raises:
-        ConfigError: the frame size does not divide, or does not fit the encoder's stages.
-    """
+    """All networks; a ConfigError where the frame size does not divide, or does not fit the encoder's stages."""
 
     def __init__(self, config: DreamerConfig, env: EnvConfig) -> None:
         super().__init__()

@@ -26,22 +26,17 @@ from playslot_rl.methods.lapo.stage import infer_latents
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
-from playslot_rl.training.stage_regression import RegressionStage
 
 
 class LAPOBehaviour(LatentCloning):
-    """See `LatentCloning`.
-
-    Raises:
-        CheckpointError: a damaged model.
-    """
+    """See `LatentCloning`; a CheckpointError where the model is damaged."""
 
     def __init__(
         self, config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
     ) -> None:
         self.own: LAPOConfig = config.baselines.lapo
         self.inverse = load_inverse(model, device)
-        super().__init__(config, demos, device, self.own.shift)
+        super().__init__(config, demos, device, self.own.shift, self.own.policy, self.own.loss)
         with global_seed(config.seed, 0, NAME):
             self.policy = LAPOPolicy(self.own, config.env.image_size).to(device)
             width = self.own.latent_dim
@@ -50,13 +45,10 @@ class LAPOBehaviour(LatentCloning):
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
         return infer_latents(self.inverse, source, moves, self.device, self.own.targets == "quantised")
 
-    def policy_stage(self) -> RegressionStage:
-        own, criterion = self.own.policy, BehaviourLoss(self.policy, self.own.loss)
+    def criterion(self) -> BehaviourLoss:
+        criterion = BehaviourLoss(self.policy, self.own.loss)
         criterion.set_keys(observation=keys.PIXELS)
-        return self.cloning(RegressionStage, criterion, own.batch_size, own.precision)
-
-    def decoder_stage(self) -> RegressionStage:
-        return self.decoding(self.own.loss, self.own.policy.batch_size, self.own.policy.precision)
+        return criterion
 
 
 def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseModel:

@@ -10,8 +10,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.machine import WEIGHT, Need, chain, frame_numbers, windows
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import COUNT, NOT_NEGATIVE, OPEN_FRACTION, RATE, Checked, at_least, between, role, was
-from playslot_rl.config.stages import StageConfig
-from playslot_rl.methods.cloning_config import clipped_stage
+from playslot_rl.config.stages import StageConfig, clipped_stage
 
 
 @dataclass(frozen=True)

@@ -28,11 +28,7 @@ class LAPOPolicy(nn.Module):
 
 
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
-    """The actor of a finished run.
-
-    Raises:
-        CheckpointError: it is missing or damaged, or was trained on another inverse model.
-    """
+    """The actor of a finished run; a CheckpointError where it is missing, damaged, or of another inverse model."""
     done = run.stage(NAME, MODEL.name)
     own, (model, env) = done.group(LAPOConfig, NAME), done.sizes
 

@@ -90,11 +90,7 @@ class ReplayJournal:
                 path.unlink()
 
     def read(self, total: int) -> TensorDict:
-        """The episodes up to `total`, batch size [m, L].
-
-        Raises:
-            CheckpointError: a file is missing or damaged.
-        """
+        """The episodes up to `total`, batch size [m, L]; a CheckpointError where a file is missing or damaged."""
         parts = [load_tensors(path) for _, path in self.files()]
         first = self.files()[0][0] if parts else 0
         whole = {key: torch.cat([part[key] for part in parts]) for key in (parts[0] if parts else {})}

@@ -51,15 +51,10 @@ def train_online(
 ) -> tuple[OnlineState, int]:
     """Train until `online.steps` agent steps (or `online.minutes`), carrying on from the newest checkpoint.
 
-    Writes `checkpoints`, `replay`, `logs`, `metrics.jsonl` and `curve.json` in `RUN/METHOD`, nothing else.
-
-    Args:
-        begin: called before the first step, when nothing speaks against it.
-        title: as the curve names it.
-        prior_steps: agent steps behind what the learner was given (a world model's data), added to the curve's.
-
-    Returns:
-        Where it ended, and the agent steps that this process started at.
+    Writes `checkpoints`, `replay`, `logs`, `metrics.jsonl` and `curve.json` in `RUN/METHOD`, nothing else. `begin` is
+    called before the first step; `prior_steps`, behind what the learner was given, are added to the curve's. Returns
+    where
+    it ended, and the agent steps that this process started at.
 
     Raises:
         TrainingError: a loss or weight is not finite; the last good checkpoint stays.

@@ -178,10 +178,8 @@ class Players:
         return bool(self._futures)
 
     def finish(self) -> PlayedEpisodes:
-        """The round that was begun, when all of it is played.
-
-        Raises:
-            PlaySlotError: more workers died or hung than `collector.restarts`, or one cannot work.
+        """The round that was begun, when all of it is played; a PlaySlotError where more workers died or hung than
+        `collector.restarts`, or one cannot work.
         """
         parts = [self._wait(i) for i in range(len(self._workers))]
         self._futures = []

@@ -11,11 +11,8 @@ from playslot_rl.seeds.episodes import EPISODES
 
 
 def require_online(config: ExperimentConfig, online: OnlineConfig, method: str) -> None:
-    """Refuse what cannot be learned by acting, before anything is started.
-
-    Raises:
-        ConfigError: an environment without a simulator or without a dense reward, or more episodes than
-            a seed has; several processes.
+    """Refuse what cannot be learned by acting, before anything is started: a ConfigError for several processes, an
+    environment without simulator or dense reward, or more episodes than a seed has.
     """
     if here().world > 1:
         raise ConfigError(

@@ -11,14 +11,10 @@ from playslot_rl.runs import Run
 
 
 def load_actor(run: Run, device: torch.device | str = "cpu") -> SlotActor:
-    """The actor of a finished run.
-
-    Raises:
-        CheckpointError: a stage is missing or damaged, or was trained on other parents.
-    """
+    """The actor of a run; a CheckpointError where a stage is missing or damaged, or was trained on other parents."""
     return playslot_actor(run.load_agent(device))
 
 
 def load_video(run: Run, device: torch.device | str = "cpu") -> SlotVideo:
-    """The world model of a finished run; raises as `load_actor`."""
+    """The world model of a run; raises as `load_actor`."""
     return SlotVideo(run.load_world_model(device))

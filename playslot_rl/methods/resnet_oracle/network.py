@@ -67,11 +67,8 @@ class ResNetPolicy(nn.Module):
 
 
 def load_pretrained(policy: ResNetPolicy, weights: str) -> Pretraining:
-    """Give the trunk its starting weights, and say which: `auto`, `scratch`, `download` or a path
-    (`ResNetOracleConfig`).
-
-    Raises:
-        CheckpointError: the file is missing, damaged or not ResNet-18's, or cannot be fetched.
+    """Give the trunk its starting weights (`ResNetOracleConfig.weights`), and say which; a CheckpointError where the
+    file is missing, damaged or not ResNet-18's, or cannot be fetched.
     """
     if weights == "scratch":
         return "scratch"
@@ -114,11 +111,7 @@ def resnet_actor(policy: ResNetPolicy) -> Actor:
 
 
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
-    """The actor of a finished run.
-
-    Raises:
-        CheckpointError: it is missing or damaged.
-    """
+    """The actor of a finished run; a CheckpointError where it is missing or damaged."""
     done = run.stage(NAME)
     model, env = done.sizes
     policy = done.restore(lambda: ResNetPolicy(model.policy, env.image_size, env.action_dim), "policy", device)

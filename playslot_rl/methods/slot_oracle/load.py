@@ -18,11 +18,7 @@ from playslot_rl.world_model import oracle_module
 
 
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
-    """The actor of a finished run.
-
-    Raises:
-        CheckpointError: the run or its SAVi is missing or damaged, or it was trained on other slots.
-    """
+    """The actor of a run; a CheckpointError where it or its SAVi is missing, damaged, or of other slots."""
     done, savi = run.stage(NAME, "slots"), run.load_savi(device)
     model, env = done.sizes
     oracle = done.restore(

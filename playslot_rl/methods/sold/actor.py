@@ -94,10 +94,7 @@ def prior_steps(config: SOLDConfig, slots: StageCheckpoint) -> int:
     """Agent steps of the data that SAVi was trained on, which count as SOLD's own.
 
     `savi_steps` of the config if given; else what the checkpoint says. One written before it said so names its episodes
-    only: their number times `env.max_steps`, which is what `playslot pipeline` records.
-
-    Raises:
-        ConfigError: the checkpoint says neither.
+    only: their number times `env.max_steps`, as `playslot pipeline` records. A ConfigError where it says neither.
     """
     if config.savi_steps is not None:
         return config.savi_steps
@@ -113,11 +110,7 @@ def prior_steps(config: SOLDConfig, slots: StageCheckpoint) -> int:
 
 
 def load_actor(run: Run, device: torch.device | str = "cpu") -> SOLDActor:
-    """SOLD's policy of a run, in evaluation mode.
-
-    Raises:
-        CheckpointError: a stage is missing or damaged, or it was trained on another SAVi.
-    """
+    """SOLD's policy, in evaluation mode; a CheckpointError where a stage is missing, damaged, or of another SAVi."""
     done, slots = run.stage(NAME, "slots"), run.stage("slots")
     own, env = done.group(SOLDConfig, NAME), done.group(EnvConfig, "env")
     networks = done.restore(

@@ -54,10 +54,7 @@ def alibi_bias(slopes: Tensor, new: int, past: int, tokens: int) -> Tensor:
 
 
 class SlotAggregation(nn.Module):
-    """Summarise the slots of all steps so far, at every step.
-
-    Raises:
-        ValueError: `dim` is no multiple of `heads`.
+    """Summarise the slots of all steps so far, at every step; a ValueError where `dim` is no multiple of `heads`.
 
     Example:
         >>> import torch

@@ -15,7 +15,7 @@ from torch import Tensor
 from playslot_rl.frames import normalise
 from playslot_rl.losses.common import of_frames
 from playslot_rl.methods.svg.model import TeacherForced
-from playslot_rl.methods.svg.recurrent import Gaussian
+from playslot_rl.methods.svg.networks import Gaussian
 
 
 def gaussian_kl(posterior: Gaussian, prior: Gaussian) -> Tensor:

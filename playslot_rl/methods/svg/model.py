@@ -25,9 +25,17 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.frames import normalise
-from playslot_rl.methods.svg.backbone import Decoder, Encoded, Encoder, check_image_size
 from playslot_rl.methods.svg.config import SVGConfig
-from playslot_rl.methods.svg.recurrent import FramePredictor, Gaussian, GaussianLSTM, State
+from playslot_rl.methods.svg.networks import (
+    Decoder,
+    Encoded,
+    Encoder,
+    FramePredictor,
+    Gaussian,
+    GaussianLSTM,
+    State,
+    check_image_size,
+)
 from playslot_rl.methods.video.predictor import check_clip
 
 WEIGHT_STD = 0.02
@@ -35,12 +43,8 @@ WEIGHT_STD = 0.02
 
 
 class TeacherForced(NamedTuple):
-    """A pass over true clips.
-
-    Attributes:
-        predicted: frames (B, k, 3, H, W), float in (0, 1).
-        steps: which of the T - 1 predictions they are (B, k), int64; i predicts frame i + 1, both from 0.
-        posterior, prior: of z_2 .. z_T (B, T - 1, Z).
+    """A pass over true clips: predicted frames (B, k, 3, H, W), float in (0, 1), which of the T - 1 predictions they
+    are (B, k), int64, of which i predicts frame i + 1, both from 0; posterior and prior of z_2 .. z_T (B, T - 1, Z).
     """
 
     predicted: Tensor
@@ -80,16 +84,12 @@ class SVG(nn.Module):
     def forward(
         self, frames: Tensor, seed: int, generator: torch.Generator, steps: Tensor | None = None
     ) -> TeacherForced:
-        """Predict every frame but the first from true ones, with latents sampled from the posterior.
+        """Predict every frame of clips (B, T, 3, H, W) but the first from true ones, z sampled from the posterior.
 
-        Args:
-            frames: clips (B, T, 3, H, W), uint8 or float [0, 1].
-            seed: S, whose last frame's skip maps serve all later ones.
-            generator: draws z.
-            steps: which of the T - 1 predictions are decoded (B, k), int64; None decodes all.
-
-        Raises:
-            ValueError: no frame past the seed, or frames of another size.
+        `steps` (B, k), int64, are those of the T - 1 predictions that are decoded; None decodes all. The skip maps of
+        the
+        seed's last frame serve all later ones. A ValueError where no frame is past the seed, or frames are of another
+        size.
         """
         check_clip(frames, seed)
         batch, count = frames.shape[:2]

@@ -31,11 +31,7 @@ def training(record: StageRecord) -> Training:
 
 
 def _load(name: str, run: Run, device: torch.device | str = "cpu") -> SlotVideo:
-    """The predictor of a finished run.
-
-    Raises:
-        CheckpointError: it is missing or damaged, or was trained on other slots.
-    """
+    """The predictor of a finished run; a CheckpointError where it is missing, damaged, or of other slots."""
     done = run.stage(name, "slots")
     sizes, env = done.sizes
     model = replace(sizes, savi=run.stage("slots").sizes[0].savi)

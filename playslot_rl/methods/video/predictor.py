@@ -21,21 +21,15 @@ class VideoPredictor(Protocol):
     infers: bool
 
     def predict(self, frames: Tensor, seed: int, donors: Tensor | None = None) -> Tensor:
-        """Predict the frames after the seed, each from its own predictions.
+        """Frames (B, T - S, 3, H, W), float, about [0, 1], after the seed, each from its own predictions.
 
         What a frame past the seed shows enters through the latents alone, and with `donors` not even there.
 
         Args:
             frames: clips (B, T, 3, H, W), float [0, 1].
-            seed: S, at least 1 and less than T.
+            seed: S, at least 1 and less than T, else a ValueError.
             donors: clips of the same shape from whose future the latents are inferred instead; whether these steer the
                 prediction shows in the difference. Not looked at where nothing is inferred.
-
-        Returns:
-            Frames (B, T - S, 3, H, W), float, about [0, 1].
-
-        Raises:
-            ValueError: no frame past the seed.
         """
 
 

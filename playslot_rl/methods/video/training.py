@@ -18,21 +18,13 @@ from playslot_rl.training.stage import Stage
 
 
 def pixel_model[Model: nn.Module](build: Callable[[Any, int], Model], own: Any, record: StageRecord) -> Model:
-    """A new model of frames, from its settings and the frames' size.
-
-    Raises:
-        ConfigError: frames of a size that its convolutions do not fit.
-    """
+    """A new model of frames; a ConfigError where its convolutions do not fit the frames' size."""
     with global_seed(record.config.seed, 0, record.name):
         return _fitting(build, own, record.config, record.name).to(record.device)
 
 
 def check_pixel_model(build: Callable[[Any, int], nn.Module], config: ExperimentConfig, name: str) -> None:
-    """Refuse frames that a model of frames cannot take, before anything is computed.
-
-    Raises:
-        ConfigError: as `pixel_model`.
-    """
+    """Refuse frames that a model of frames cannot take, before anything is computed; raises as `pixel_model`."""
     with torch.device("meta"):
         _fitting(build, getattr(config.baselines, name), config, name)
 
@@ -44,15 +36,7 @@ def on_clips(
     patience: Patience | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> Training:
-    """The one part of a model that is trained on clips.
-
-    Args:
-        record: of the stage.
-        stage: what is trained.
-        own: its settings, `baselines.NAME`.
-        patience: with it; None trains all steps.
-        extra: more for `meta.json`.
-    """
+    """The one part of a model trained on clips, by its settings `baselines.NAME`; `extra` goes to `meta.json`."""
     return Training(
         [Part(f"baselines.{record.name}", stage, own, patience=patience)],
         record.device,

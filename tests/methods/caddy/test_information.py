@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from playslot_rl.methods.caddy.information import ActionInformation, joint_distribution, mutual_information
+from playslot_rl.methods.caddy.action import ActionInformation, joint_distribution, mutual_information
 
 
 def random_p(rows: int, actions: int, seed: int) -> torch.Tensor:

@@ -7,9 +7,9 @@ import torch
 from caddy_parts import clips, tiny
 from torch import nn
 
-from playslot_rl.methods.caddy.blocks import ConvLSTM, Res
 from playslot_rl.methods.caddy.config import CADDYConfig
 from playslot_rl.methods.caddy.model import CADDY
+from playslot_rl.methods.caddy.networks import ConvLSTM, Res
 
 PARTS = {"encoder": 249_951, "action": 527_704, "dynamics": 7_933_952, "generator": 619_369, "pretraining": 73_856}
 

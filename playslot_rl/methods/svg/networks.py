@@ -1,12 +1,16 @@
-"""SVG's convolutions (Denton and Fergus, 2018, appendix): a frame to a code and skip maps, and back.
+"""SVG's networks (Denton and Fergus, 2018, section 3 and appendix): a frame to a code and skip maps, what comes next
+and what is likely to, and back.
 
     h_t, k_t = Enc(x_t),   x^_t = Dec(g_t, k_c)
+    g_t = LSTM_f([h_{t-1}, z_t]),   q_t = N(mu, sigma^2) = LSTM_q(h_t),   p_t = N(mu, sigma^2) = LSTM_p(h_{t-1})
 
 A level is a group of 3x3 convolutions, each with BatchNorm and LeakyReLU. The encoder halves the resolution after each
 level, the decoder doubles it before each and joins the encoder's map of the same resolution. At the bottom are 4x4
-pixels, so that G levels belong to frames of 4 * 2^G pixels: 64 for the four of the paper.
+pixels, so that G levels belong to frames of 4 * 2^G pixels: 64 for the four of the paper. The LSTMs run in float32,
+whatever the convolutions do.
 
-Shapes: B frames, H W image height and width, F width of a code, G levels, C_i channels of level i (from 0).
+Shapes: B frames or clips, M steps, H W image height and width, F width of a code, Z latent, G levels, C_i channels of
+level i (from 0).
 """
 
 from __future__ import annotations
@@ -20,11 +24,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from playslot_rl.config.plain import check
+from playslot_rl.runtime.shares import own_noise
 
 BOTTOM = 4
 """Pixels a side at the lowest resolution."""
 SLOPE = 0.2
 """Of LeakyReLU."""
+State = tuple[Tensor, Tensor]
+"""Hidden and cell state of an LSTM (layers, B, hidden)."""
 
 
 class Encoded(NamedTuple):
@@ -56,10 +63,8 @@ class Encoder(nn.Module):
         self.bottom = nn.Sequential(nn.Conv2d(channels[-1], features, BOTTOM), nn.BatchNorm2d(features), nn.Tanh())
 
     def forward(self, frames: Tensor) -> Encoded:
-        """Frames (B, 3, H, W), float [0, 1], to codes and skip maps.
-
-        Raises:
-            ValueError: frames of another size than the levels ask for.
+        """Frames (B, 3, H, W), float [0, 1], to codes and skip maps; a ValueError where the levels ask for another
+        size.
         """
         for side in frames.shape[-2:]:
             check_image_size(side, len(self.levels))
@@ -103,3 +108,63 @@ def _group(widths: Sequence[int]) -> nn.Sequential:
     for before, after in pairwise(widths):
         layers += [nn.Conv2d(before, after, 3, padding=1), nn.BatchNorm2d(after), nn.LeakyReLU(SLOPE, inplace=True)]
     return nn.Sequential(*layers)
+
+
+class Gaussian(NamedTuple):
+    """Diagonal Gaussians: mean and log sigma^2, each (..., Z)."""
+
+    mean: Tensor
+    log_variance: Tensor
+
+    def sample(self, generator: torch.Generator) -> Tensor:
+        """mu + sigma eps (..., Z), differentiable in both; eps is drawn on the generator's device."""
+        device, dtype = generator.device, self.mean.dtype
+        noise = own_noise(
+            self.mean.shape, lambda shape: torch.randn(shape, generator=generator, device=device, dtype=dtype)
+        )
+        return self.mean + (0.5 * self.log_variance).exp() * noise.to(self.mean.device)
+
+
+class Recurrent(nn.Module):
+    """A linear layer and an LSTM of `layers` cells after it."""
+
+    def __init__(self, in_dim: int, hidden: int, layers: int) -> None:
+        super().__init__()
+        self.embed = nn.Linear(in_dim, hidden)
+        self.lstm = nn.LSTM(hidden, hidden, layers, batch_first=True)
+
+    def forward(self, inputs: Tensor, state: State | None = None) -> tuple[Tensor, State]:
+        """Inputs (B, M, in_dim), M at least 1, to outputs (B, M, hidden) and the state after them; None starts at 0."""
+        outputs, after = self.lstm(self.embed(inputs), state)
+        return outputs, after
+
+
+class FramePredictor(nn.Module):
+    """LSTM_f: the last frame's code and the latent of the change, to the code that is decoded."""
+
+    def __init__(self, features: int, latent_dim: int, hidden: int, layers: int) -> None:
+        super().__init__()
+        self.recurrent = Recurrent(features + latent_dim, hidden, layers)
+        self.to_code = nn.Linear(hidden, features)
+
+    def forward(self, codes: Tensor, latents: Tensor, state: State | None = None) -> tuple[Tensor, State]:
+        """h_{t-1} (B, M, F) and z_t (B, M, Z) to g_t (B, M, F) in (-1, 1), and the state after them."""
+        with torch.autocast(codes.device.type, enabled=False):
+            outputs, after = self.recurrent(torch.cat((codes.float(), latents.float()), dim=-1), state)
+            return torch.tanh(self.to_code(outputs)), after
+
+
+class GaussianLSTM(nn.Module):
+    """LSTM_q or LSTM_p: frames' codes to a Gaussian over z after each."""
+
+    def __init__(self, features: int, latent_dim: int, hidden: int) -> None:
+        super().__init__()
+        self.recurrent = Recurrent(features, hidden, 1)
+        self.to_mean = nn.Linear(hidden, latent_dim)
+        self.to_log_variance = nn.Linear(hidden, latent_dim)
+
+    def forward(self, codes: Tensor, state: State | None = None) -> tuple[Gaussian, State]:
+        """Codes (B, M, F) to Gaussians (B, M, Z), and the state after them."""
+        with torch.autocast(codes.device.type, enabled=False):
+            outputs, after = self.recurrent(codes.float(), state)
+            return Gaussian(self.to_mean(outputs), self.to_log_variance(outputs)), after
