@@ -1,0 +1,209 @@
+"""What holds for every stage of every method: a finished one is skipped, one that was begun otherwise is refused by the
+key that is typed, a killed one ends with the weights of one that was not, a NaN ends in one line, and two commands do
+not train it at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
+
+from stages import few_videos
+
+from playslot_rl.config import plugins
+from playslot_rl.config.compose import compose
+from playslot_rl.config.methods import METHODS
+from playslot_rl.config.stage_spec import StageSpec
+from playslot_rl.errors import CheckpointError, OutputError, TrainingError
+from playslot_rl.methods.online.checkpoints import OnlineCheckpoints
+from playslot_rl.recipes import train_baseline, train_dynamics, train_policy, train_slots
+from playslot_rl.runs import Run
+from playslot_rl.runs.opening import STAGE_LOCK
+from playslot_rl.storage import checkpoints
+from playslot_rl.storage.locks import locked
+from playslot_rl.training import record as records
+from playslot_rl.training.batches import GlobalBatches
+from playslot_rl.training.fit import _Run
+
+pytestmark = pytest.mark.integration
+
+WORLD = {"slots": train_slots, "dynamics": train_dynamics, "policy": train_policy}
+RATES = {
+    "slots": "slots.optim.lr",
+    "dynamics": "dynamics.optim.lr",
+    "policy": "behaviour.optim.lr",
+    "slot_oracle": "behaviour.optim.lr",
+    "lapo_model": "baselines.lapo.model.optim.lr",
+    "dreamer": "baselines.dreamer.lr",
+    "sold": "baselines.sold.actor_lr",
+    **{name: f"baselines.{name}.policy.optim.lr" for name in ("lapo", "caddy_policy", "caddy_oracle")},
+}
+"""Where a stage's learning rate is typed, if not in `baselines.STAGE.optim.lr`."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A stage, and the method it is trained by."""
+
+    method: str
+    spec: StageSpec
+
+    @property
+    def rate(self) -> str:
+        """Full name of a learning rate that a stage is identified by."""
+        return RATES.get(self.spec.name, f"baselines.{self.spec.name}.optim.lr")
+
+
+CASES = {
+    stage.name: Case(name, stage)
+    for name, method in METHODS.items()
+    for stage in method.stages
+    if not method.labelled_only
+}
+LEARNED = {name: case for name, case in CASES.items() if case.spec.data}
+
+
+class _Killed(BaseException):
+    """As SIGKILL: nothing is tidied up."""
+
+
+@pytest.fixture(autouse=True)
+def _few_videos() -> Iterator[None]:
+    def open_videos(config: Any, *_: str) -> Any:
+        return few_videos(config.env.image_size, config.env.action_dim)
+
+    with (
+        patch.object(records, "open_videos", open_videos),
+        patch.object(records, "PATIENCE", 0.0),
+        patch.object(checkpoints, "provenance", dict),
+    ):
+        yield
+
+
+def train(case: Case, out: Path, world: Path, *more: str) -> None:
+    """Train a stage, and what it builds on, by its command."""
+    shared = [
+        "preset=smoke", "env=button_press", "data.root=videos", "device=cpu", "logging.backend=none",
+        f"data.cache={world.parent / 'cache'}", f"out={out}", *more,
+    ]  # fmt: skip
+    name = case.spec.name
+    if name in WORLD:
+        WORLD[name].main(compose([*shared, *([] if name == "slots" else [f"run={world}"])]))
+    else:
+        train_baseline.main(compose([*shared, f"method={case.method}", f"run={world}"]))
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Runs by stage, made when they are asked for; `world` is PlaySlot's."""
+    return {"folder": tmp_path_factory.mktemp("runs")}
+
+
+def trained(name: str, runs: dict[str, Path]) -> Path:
+    """A finished run of a stage; look, do not touch."""
+    world = runs["folder"] / "world"
+    for stage in WORLD:
+        if stage not in runs:
+            train(CASES[stage], world, world)
+            runs[stage] = world
+    if name not in runs:
+        runs[name] = runs["folder"] / name
+        train(CASES[name], runs[name], world)
+    return runs[name]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_finished_stage_is_skipped_and_one_of_other_settings_refused(
+    name: str, runs: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, world = trained(name, runs), runs["folder"] / "world"
+    before = Run(run).own(name).fingerprint
+    capsys.readouterr()
+    train(CASES[name], run, world)
+    assert f"{name}: finished before" in capsys.readouterr().out
+    assert Run(run).own(name).fingerprint == before
+    with pytest.raises(CheckpointError, match=f"^{CASES[name].rate}: got 0.5, expected ") as caught:
+        train(CASES[name], run, world, f"{CASES[name].rate}=0.5")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(CheckpointError, match=r"seed: got 5, expected 0"):
+        train(CASES[name], run, world, "seed=5")
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_a_killed_stage_ends_with_the_weights_of_one_that_was_not(
+    name: str, runs: dict[str, Path], tmp_path: Path
+) -> None:
+    whole, world, plain = trained(name, runs), runs["folder"] / "world", _Run.advance
+    out = tmp_path / "run"
+
+    def advance(self: Any, step: int, progress: Any) -> None:
+        if step == self.config.steps - 1 and self.folder.name == name:
+            raise _Killed
+        plain(self, step, progress)
+
+    with patch.object(_Run, "advance", advance), pytest.raises(_Killed):
+        train(CASES[name], out, world)
+    assert not Run(out).has(name)
+    with pytest.raises(CheckpointError, match=f"^{CASES[name].rate}: got 0.5, expected "):
+        train(CASES[name], out, world, f"{CASES[name].rate}=0.5")
+    train(CASES[name], out, world)
+    assert Run(out).own(name).fingerprint == Run(whole).own(name).fingerprint
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_a_loss_that_is_no_number_ends_in_one_line(name: str, runs: dict[str, Path], tmp_path: Path) -> None:
+    trained("policy", runs)
+
+    def backward(*_: Any) -> dict[str, torch.Tensor]:
+        return {"loss": torch.tensor(float("nan"))}
+
+    with patch.object(GlobalBatches, "backward", backward), pytest.raises(TrainingError) as caught:
+        train(CASES[name], tmp_path / "run", runs["folder"] / "world")
+    assert "loss is nan at step 1" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_two_commands_do_not_train_a_stage_at_once(name: str, runs: dict[str, Path], tmp_path: Path) -> None:
+    trained("policy", runs)
+    folder = tmp_path / "run" / name
+    folder.mkdir(parents=True)
+    with (
+        locked(folder / STAGE_LOCK, "", 0.0),
+        pytest.raises(OutputError, match=f"whose {name} another command is training"),
+    ):
+        train(CASES[name], tmp_path / "run", runs["folder"] / "world")
+
+
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.online])
+def test_a_killed_training_by_acting_is_carried_on(name: str, runs: dict[str, Path], tmp_path: Path) -> None:
+    whole, world, plain, saves = trained(name, runs), runs["folder"] / "world", OnlineCheckpoints.save_online, []
+
+    def save_online(self: Any, *state: Any) -> Path:
+        if saves:
+            raise _Killed
+        saves.append(plain(self, *state))
+        return saves[0]
+
+    with patch.object(OnlineCheckpoints, "save_online", save_online), pytest.raises(_Killed):
+        train(CASES[name], tmp_path / "run", world)
+    train(CASES[name], tmp_path / "run", world)
+    assert Run(tmp_path / "run").own(name).fingerprint == Run(whole).own(name).fingerprint
+
+
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if not method.labelled_only])
+def test_a_finished_run_is_loaded_as_what_the_method_says(name: str, runs: dict[str, Path]) -> None:
+    method = METHODS[name]
+    run = Run.open(trained(method.last.name, runs))
+    for reference in filter(None, (method.load.actor, method.load.video)):
+        loaded = plugins.call(reference, run, "cpu")
+        assert callable(getattr(loaded, "predict" if reference == method.load.video else "reset"))
