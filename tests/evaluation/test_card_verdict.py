@@ -101,7 +101,7 @@ def test_a_dead_model_is_not_praised(damage: Callable[[WorldModel], None], name:
 
 
 def of_the_page() -> dict[str, list[Line]]:
-    """The cards of the shipped models as docs/how-to/inspect.md tells them."""
+    """The cards of the shipped models as docs/results/cards.md tells them."""
     rows = [row.strip("|").split("|") for row in PAGE.read_text().splitlines() if row.startswith(("| `", "| line"))]
     names = [name.strip() for name in next(row for row in rows if row[0].strip() == "line")[1:]]
     cards: dict[str, list[Line]] = {name: [] for name in names}
