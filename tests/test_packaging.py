@@ -97,14 +97,21 @@ def test_the_version_is_stated_once(repository: Path) -> None:
     assert playslot_rl.__version__ not in (repository / "pyproject.toml").read_text().partition("[tool.setuptools]")[0]
 
 
-@pytest.mark.integration
-def test_the_wheel_is_complete(repository: Path, tmp_path: Path) -> None:
-    # From a copy: setuptools leaves build/ in the source folder, and stale files there would hide a missing one.
-    source = tmp_path / "source"
+def copied(repository: Path, to: Path) -> Path:
+    """What a wheel is made from: setuptools leaves build/ in the source folder, whose stale files would hide a missing
+    one.
+    """
+    source = to / "source"
     for name in ("playslot_rl", *MAPPED):
         shutil.copytree(repository / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(repository / name, source / name)
+    return source
+
+
+@pytest.mark.integration
+def test_the_wheel_is_complete(repository: Path, tmp_path: Path) -> None:
+    source = copied(repository, tmp_path)
     build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), str(source)]
     done = subprocess.run(build, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -151,9 +158,8 @@ def test_the_plugin_stands_on_this_version(repository: Path) -> None:
 def test_the_wheel_works_outside_the_repository(repository: Path, tmp_path: Path) -> None:
     target = tmp_path / "site"
     install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation"]
-    copy = tmp_path / "source"
-    shutil.copytree(repository, copy, ignore=shutil.ignore_patterns(".venv", ".git", "runs", "build", "__pycache__"))
-    subprocess.run([*install, "--target", str(target), str(copy)], check=True, capture_output=True)
+    source = copied(repository, tmp_path)
+    subprocess.run([*install, "--target", str(target), str(source)], check=True, capture_output=True)
     code = (
         "import playslot_rl, multiprocessing as mp\n"
         "from playslot_rl.config.compose import choices, compose\n"
