@@ -27,11 +27,8 @@ class Style:
 
 @dataclass(frozen=True)
 class Load:
-    """How a finished run of a method is loaded; `module:function` each, or empty.
-
-    Attributes:
-        actor: `(run: Run, device) -> Actor`.
-        video: `(run: Run, device) -> VideoPredictor`.
+    """How a finished run is loaded, `module:function` each or empty: `actor` is `(run: Run, device) -> Actor`, `video`
+    is `(run: Run, device) -> VideoPredictor`.
     """
 
     actor: str = ""
@@ -152,7 +149,6 @@ METHODS: Final[Mapping[str, Method]] = _Methods()
 
 
 def method_stage(method: str) -> str:
-    """Stage of a method's run whose checkpoint is the method's."""
     return METHODS[method].last.name
 
 
@@ -162,17 +158,11 @@ def stage_title(stage: str) -> str:
 
 
 def known_stages() -> set[str]:
-    """Names of all stages of all methods."""
     return {stage.name for method in METHODS.values() for stage in method.stages}
 
 
 def require_method(key: str, name: str) -> None:
-    """Refuse a name of no method.
-
-    Raises:
-        ValueError: there is none.
-        ConfigError: the package that brings it fails.
-    """
+    """Refuse a name of no method by a ValueError; a ConfigError where the package that brings it fails."""
     if name not in METHODS:
         raise ValueError(f"{key}: got {name!r}, expected one of {', '.join(METHODS)}")
 
@@ -180,14 +170,11 @@ def require_method(key: str, name: str) -> None:
 def canonical_method(text: str, acting: bool = False) -> str:
     """The method that somebody names, by its name, title or alias; case, spaces, `-` and `_` do not matter.
 
-    CADDY is two methods: `caddy` predicts videos, and `caddy_policy`, of the title CADDY, acts.
-
-    Args:
-        text: what was typed.
-        acting: a word that names two methods means the one that acts; else a name comes before a title.
-
-    Raises:
-        ConfigError: there is no such method, or the package that brings it fails.
+    CADDY is two methods: `caddy` predicts videos, and `caddy_policy`, of the title CADDY, acts. With `acting` a word
+    that
+    names two means the one that acts; else a name comes before a title. A ConfigError where there is none, or the
+    package
+    that brings it fails.
 
     Examples:
         >>> canonical_method("DreamerV3"), canonical_method("slot-oracle")

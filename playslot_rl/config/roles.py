@@ -110,11 +110,7 @@ EPISODE_COUNT: Final = at_least(0, "0 or more", EPISODES)
 
 
 class Checked:
-    """A config whose fields are checked against the bounds in their metadata when it is made.
-
-    Raises:
-        ValueError: a value outside its bounds.
-    """
+    """A config whose fields are checked against the bounds in their metadata when it is made (ValueError)."""
 
     group: ClassVar[str] = ""
     """Dotted name with a dot at its end, for the messages; empty where several groups are of this class."""

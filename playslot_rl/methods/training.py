@@ -30,19 +30,11 @@ class Checking(Protocol):
     """Settings of a method that refuse what does not fit, before anything is computed."""
 
     def check(self, name: str, config: ExperimentConfig) -> None:
-        """Look, by the dotted name of these settings.
-
-        Raises:
-            ConfigError, CheckpointError: something does not fit.
-        """
+        """Look, by the dotted name of these settings; a ConfigError or CheckpointError where something does not fit."""
 
 
 def check_method(config: ExperimentConfig, name: str) -> None:
-    """Refuse what a method cannot be trained with, before anything is computed.
-
-    Raises:
-        ConfigError, CheckpointError: settings, task or frames that do not fit.
-    """
+    """Refuse what a method cannot be trained with, before anything is computed: a ConfigError or CheckpointError."""
     method = METHODS[name]
     if method.online:
         require_online(config, getattr(config.baselines, name), name)
@@ -76,10 +68,8 @@ def train(config: ExperimentConfig) -> StageCheckpoint:
 
 
 def train_stage(spec: StageSpec, config: ExperimentConfig, run: Run) -> StageCheckpoint:
-    """Train one stage into a run, on `data.root` or the demonstrations, and on the world model of `config.run`.
-
-    Raises:
-        CheckpointError, DataError, OutputError, TrainingError: as `train`.
+    """Train one stage into a run, on `data.root` or the demonstrations, and on the world model of `config.run`; raises
+    as `train`.
     """
     if not spec.parents:
         record = StageRecord(spec, run.folder, config)
@@ -100,11 +90,7 @@ def train_stage(spec: StageSpec, config: ExperimentConfig, run: Run) -> StageChe
 
 
 def train_model(config: ExperimentConfig, spec: StageSpec, folder: Path) -> StageCheckpoint:
-    """Train the model of unlabelled videos that methods build on into a run, or find it there.
-
-    Raises:
-        CheckpointError, DataError, OutputError, TrainingError: as `train`.
-    """
+    """Train the model of unlabelled videos that methods build on into a run, or find it there; raises as `train`."""
     method = spec.name if spec.name in METHODS else config.method
     return train_stage(spec, replace(config, method=method, out=str(folder), run=""), Run(folder))
 

@@ -18,7 +18,6 @@ from playslot_rl.methods.caddy.config import CADDYConfig
 from playslot_rl.methods.caddy.heads import MovesHead, OnFrames, StateHead
 from playslot_rl.methods.caddy.model import CADDY
 from playslot_rl.methods.decoded_policy import DecodedPolicy
-from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.runs import Run
 from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.world_model import oracle_module
@@ -41,14 +40,9 @@ def load_video(run: Run, device: torch.device | str = "cpu") -> CADDY:
 def load_policy(run: Run, device: torch.device | str = "cpu") -> Actor:
     """CADDY's actor; a CheckpointError where a stage is missing, damaged, or of another model."""
     done, caddy = run.stage(POLICY, MODEL), load_video(run, device)
-    (sizes, env), own = done.sizes, caddy.config
-
-    def build() -> DecodedPolicy[MovesHead]:
-        head = MovesHead(own.encoder[-1], own.actions, own.latent_dim)
-        decoder = ActionDecoder(sizes.action_decoder, own.actions + own.latent_dim, env.action_dim)
-        return DecodedPolicy(head, decoder)
-
-    parts = done.restore(build, DecodedPolicy.PARTS, device)
+    own = caddy.config
+    width, k, z = own.encoder[-1], own.actions, own.latent_dim
+    parts = DecodedPolicy.load(done, lambda: MovesHead(width, k, z), k + z, device)
     return latent_actor(OnFrames(caddy.encoder, parts.policy), parts.action_decoder)
 
 

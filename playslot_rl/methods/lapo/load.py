@@ -11,7 +11,6 @@ from playslot_rl.methods.decoded_policy import DecodedPolicy
 from playslot_rl.methods.lapo.config import LAPOConfig
 from playslot_rl.methods.lapo.method import MODEL, NAME
 from playslot_rl.methods.lapo.model import EncoderMLP
-from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.runs import Run
 
 
@@ -30,12 +29,6 @@ class LAPOPolicy(nn.Module):
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a finished run; a CheckpointError where it is missing, damaged, or of another inverse model."""
     done = run.stage(NAME, MODEL.name)
-    own, (model, env) = done.group(LAPOConfig, NAME), done.sizes
-
-    def build() -> DecodedPolicy[LAPOPolicy]:
-        policy = LAPOPolicy(own, env.image_size)
-        decoder = ActionDecoder(model.action_decoder, own.latent_dim, env.action_dim)
-        return DecodedPolicy(policy, decoder)
-
-    parts = done.restore(build, DecodedPolicy.PARTS, device)
+    own, size = done.group(LAPOConfig, NAME), done.sizes[1].image_size
+    parts = DecodedPolicy.load(done, lambda: LAPOPolicy(own, size), own.latent_dim, device)
     return latent_actor(parts.policy, parts.action_decoder)

@@ -1,4 +1,5 @@
-"""Scores of a video predictor on held-out clips, clip by clip and step by step.
+"""Scores of a video predictor on held-out clips, clip by clip and step by step: as it is, and what puts its
+number in its place.
 
 Shapes: C clips, T frames of a clip, S seed frames, P predicted frames, H W image height and width.
 """
@@ -6,7 +7,7 @@ Shapes: C clips, T frames of a clip, S seed frames, P predicted frames, H W imag
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +18,11 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray
 from playslot_rl.evaluation.video import frame_scores
 from playslot_rl.frames import normalise, to_uint8
+from playslot_rl.methods.caddy.model import CADDY
+from playslot_rl.methods.svg.model import SVG
 from playslot_rl.methods.video.predictor import VideoPredictor
 from playslot_rl.methods.video.slots import SlotVideo
+from playslot_rl.world_model import module_device
 
 BATCH = 8
 Predict = Callable[[Tensor, Tensor | None, Tensor | None], Tensor]
@@ -98,3 +102,45 @@ def bootstrap(values: npt.ArrayLike, seed: int = 0, draws: int = 2000) -> tuple[
     drawn = np.random.default_rng(seed).integers(0, len(numbers), (draws, len(numbers)))
     low, high = np.quantile(numbers[drawn].mean(axis=1), [0.025, 0.975])
     return float(low), float(high)
+
+
+class Row(NamedTuple):
+    """One row of a model; `name` is empty for the model as it is, `sees` is what it is told of the true future, and
+    `shuffled` takes the latents from another clip.
+    """
+
+    name: str
+    sees: str
+    predict: Predict
+    shuffled: bool = False
+
+
+def method_rows(model: VideoPredictor, seed: int) -> list[Row]:
+    """All rows of a trained model in evaluation mode."""
+    plain = as_function(model, seed)
+    if not model.infers:
+        return [Row("", "nothing", plain)]
+    told = "actions" if isinstance(model, SlotVideo) and model.needs_actions else "latents"
+    rows = [Row("", f"{told} of the true future", plain), Row(f"{told} of another clip", "nothing", plain, True)]
+    if isinstance(model, SVG):
+        rows.append(Row("latents drawn from the prior", "nothing", _from_prior(model, seed)))
+    if isinstance(model, CADDY):
+        rows.append(Row("actions alone, v = 0", "actions of the true future", _without_variability(model, seed)))
+    return rows
+
+
+def _from_prior(model: SVG, seed: int) -> Predict:
+    generator = torch.Generator(module_device(model)).manual_seed(0)  # one for all clips: each has its own sample
+
+    def predict(frames: Tensor, donors: Tensor | None, actions: Tensor | None) -> Tensor:  # noqa: ARG001
+        return model.sample(frames, seed, generator)
+
+    return predict
+
+
+def _without_variability(model: CADDY, seed: int) -> Predict:
+    def predict(frames: Tensor, donors: Tensor | None, actions: Tensor | None) -> Tensor:  # noqa: ARG001
+        latents = model.infer(frames)
+        return model.rollout(frames[:, :seed], latents._replace(v=torch.zeros_like(latents.v)))
+
+    return predict

@@ -14,8 +14,7 @@ from playslot_rl.config.compare_video import method_of
 from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import TrainingError
 from playslot_rl.evaluation.lpips import open_lpips
-from playslot_rl.methods.video.rows import method_rows
-from playslot_rl.methods.video.scores import score_clips
+from playslot_rl.methods.video.scores import method_rows, score_clips
 from playslot_rl.runs import Run
 from playslot_rl.runtime.devices import open_device
 from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing, write_json
