@@ -157,10 +157,6 @@ def stage_title(stage: str) -> str:
     return next(s.title for method in METHODS.values() for s in method.stages if s.name == stage)
 
 
-def known_stages() -> set[str]:
-    return {stage.name for method in METHODS.values() for stage in method.stages}
-
-
 def require_method(key: str, name: str) -> None:
     """Refuse a name of no method by a ValueError; a ConfigError where the package that brings it fails."""
     if name not in METHODS:

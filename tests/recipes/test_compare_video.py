@@ -163,7 +163,7 @@ def test_a_method_that_fails_leaves_a_row_that_says_so(finished: Path, tmp_path:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("methods=dreamer",), r"compare_video\.methods: got 'dreamer', expected one of svg, caddy"),
+        (("methods=dreamer",), r"compare_video\.methods: got 'dreamer', expected one of playslot, svg, caddy"),
         (("methods=svg,svg",), r"compare_video\.methods: .*each one once"),
         (("seeds=-1",), r"compare_video\.seeds: got -1, expected a non-negative"),
         (("compare_video.predicted=0",), r"compare_video\.predicted: got 0, expected at least 1"),
