@@ -35,6 +35,7 @@ class StageSpec:
             when it is carried on.
         begun: further ones that only a half-finished one must share.
         parents: stages it is trained on.
+        copies: its run has copies of them and is whole, instead of naming the run that they lie in.
         data: what it learns from: `videos`, `demos`, the `labelled` ones of these alone; empty learns by acting.
         parts: `module:function` that makes what is trained from a `StageRecord`: a `Training`.
         sizes: `module:function` that makes the group `model` from the command's config and that of its parents; empty
@@ -50,6 +51,7 @@ class StageSpec:
     settings: tuple[str, ...] = ()
     begun: tuple[str, ...] = ()
     parents: tuple[str, ...] = ()
+    copies: bool = False
     data: Literal["videos", "demos", "labelled", ""] = "videos"
     parts: str = ""
     sizes: str = ""

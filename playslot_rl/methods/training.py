@@ -22,6 +22,7 @@ from playslot_rl.methods.online.requirements import require_online
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import require_parent, run_to_write
 from playslot_rl.storage.checkpoints import StageCheckpoint, require_config, require_whole
+from playslot_rl.training.pace import Pace
 from playslot_rl.training.record import StageRecord, run_stage
 
 
@@ -67,15 +68,16 @@ def train(config: ExperimentConfig) -> StageCheckpoint:
     return run_stage(record, partial(plugins.call, record.spec.parts, record))
 
 
-def train_stage(spec: StageSpec, config: ExperimentConfig, run: Run) -> StageCheckpoint:
+def train_stage(spec: StageSpec, config: ExperimentConfig, run: Run, pace: Pace | None = None) -> StageCheckpoint:
     """Train one stage into a run, on `data.root` or the demonstrations, and on the world model of `config.run`; raises
     as `train`.
     """
     if not spec.parents:
-        record = StageRecord(spec, run.folder, config)
+        record = StageRecord(spec, run.folder, config, pace=pace)
         return run_stage(record, partial(plugins.call, spec.parts, record))
     world = Run.of(config, run.folder)
-    parents = world.world_stages if "dynamics" in spec.parents else {"slots": world.stage("slots")}
+    slots = world.own if spec.copies else world.stage
+    parents = world.world_stages if "dynamics" in spec.parents else {"slots": slots("slots")}
     for checkpoint in parents.values():
         require_parent(config, run, checkpoint, "image_size", *(["action_dim"] if "dynamics" in parents else []))
     groups: dict[str, Any] = {}
@@ -85,7 +87,8 @@ def train_stage(spec: StageSpec, config: ExperimentConfig, run: Run) -> StageChe
         groups["model"] = replace(config.model, savi=parents["slots"].sizes[0].savi)
     if spec.sizes:
         groups["model"] = plugins.call(spec.sizes, config, groups["model"])
-    record = StageRecord(spec, run.folder, config, parents, groups, ready=partial(run.build_on, world))
+    ready = partial(run.take, parents["slots"]) if spec.copies else partial(run.build_on, world)
+    record = StageRecord(spec, run.folder, config, parents, groups, ready, pace)
     return run_stage(record, partial(plugins.call, spec.parts, record))
 
 

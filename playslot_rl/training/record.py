@@ -42,6 +42,7 @@ from playslot_rl.storage.checkpoints import (
 )
 from playslot_rl.storage.locks import locked
 from playslot_rl.training.fit import Part, fit
+from playslot_rl.training.pace import Pace
 
 _ROLES: Final[Mapping[str, Literal["train", "demos", ""]]] = {
     "videos": "train", "demos": "demos", "labelled": "demos", "": "",
@@ -82,6 +83,7 @@ class StageRecord:
         parents: checkpoints it is trained on, by stage.
         groups: groups of the config that are the parents' instead of the command's.
         ready: called before the first step; puts what the stage builds on into the run.
+        pace: the time that it has; None trains as many steps as the config says.
     """
 
     spec: StageSpec
@@ -90,6 +92,7 @@ class StageRecord:
     parents: Mapping[str, StageCheckpoint] = field(default_factory=dict)
     groups: Mapping[str, Any] = field(default_factory=dict)
     ready: Callable[[], None] = lambda: None
+    pace: Pace | None = None
 
     @property
     def name(self) -> str:

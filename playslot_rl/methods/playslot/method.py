@@ -7,12 +7,19 @@ from typing import Final
 from playslot_rl.config.methods import Load, Method, Style
 from playslot_rl.config.stage_spec import StageSpec
 
-SLOTS: Final = StageSpec("slots", keys=("env.image_size", "model.savi"), settings=("slots",))
+SLOTS: Final = StageSpec(
+    "slots",
+    keys=("env.image_size", "model.savi"),
+    settings=("slots",),
+    parts="playslot_rl.methods.playslot.slots:training",
+)
 DYNAMICS: Final = StageSpec(
     "dynamics",
     keys=("model.inverse_dynamics", "model.predictor"),
     settings=("dynamics",),
     parents=("slots",),
+    copies=True,
+    parts="playslot_rl.methods.playslot.dynamics:training",
 )
 POLICY: Final = StageSpec(
     "policy",

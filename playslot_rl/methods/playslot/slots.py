@@ -1,0 +1,34 @@
+"""Training of SAVi on unlabelled videos."""
+
+from __future__ import annotations
+
+from playslot_rl.evaluation.slots import validation_scores
+from playslot_rl.modules.savi import SAVi
+from playslot_rl.runs import Run
+from playslot_rl.runtime.processes import here
+from playslot_rl.seeds.draws import global_seed
+from playslot_rl.training.fit import Part
+from playslot_rl.training.patience import patience_of
+from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.stage_slots import SlotsStage, warm_start
+
+
+def training(record: StageRecord) -> Training:
+    """A fresh SAVi, or one that begins with another's weights (`slots.start_from`)."""
+    config, own, device, source = record.config, record.config.slots, record.device, record.data
+    with global_seed(config.seed, 0, "slots"):
+        savi = SAVi(config.model.savi, config.env.image_size).to(device)
+    known = validation_scores(config) if here().first else None
+    started: dict[str, str] = {}
+    if own.start_from:
+        other = Run.open(own.start_from)
+        warm_start(savi, other.load_savi(device), own.start_from)
+        started = {"started_from": other.stage("slots").fingerprint}
+    stage = SlotsStage(savi, record.clips(own.clip_frames), own, known)
+    return Training(
+        [Part("slots", stage, own, patience=patience_of(own.patience, "mse"), pace=record.pace)],
+        device,
+        lambda metrics: f"slots: {metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {record.folder}",
+        extra={"episodes": source.episodes, "agent_steps": int((source.lengths - 1).sum()), **started},
+        identity=started,
+    )
