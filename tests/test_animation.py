@@ -42,7 +42,7 @@ def test_every_task_of_the_readme_has_its_picture(animation: ModuleType) -> None
             assert stored.size == (128, 128)
 
 
-@pytest.mark.integration
+@pytest.mark.slow
 def test_the_animation_is_drawn_again_as_it_is_stored(animation: ModuleType) -> None:
     """After a change of the models, episodes or drawing: `make animation`."""
     with Image.open(animation.ANIMATION) as stored, Image.open(io.BytesIO(animation.draw())) as drawn:

@@ -45,7 +45,7 @@ def test_every_variant_of_a_case_computes_the_same_thing(variants: dict[str, Var
     assert math.isfinite(first)
 
 
-@pytest.mark.integration
+@pytest.mark.slow
 def test_two_processes_share_the_batch_of_one() -> None:
     shared = Variant("ddp_2")
     with children({"one": [shared], "two": [shared] * 2}, quick_sizes(), 2) as running:

@@ -238,7 +238,7 @@ STORED = {
 """Keys that a recipe reads of what a run has stored, or only to refuse them."""
 
 
-MOVED = {"train-policy": "playslot_rl/methods/playslot/policy.py"}
+MOVED = {f"train-{stage}": f"playslot_rl/methods/playslot/{stage}.py" for stage in ("slots", "dynamics", "policy")}
 """Where what a recipe does is a method's."""
 
 

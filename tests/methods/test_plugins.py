@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -51,29 +52,50 @@ def play(site: Path, *commands: str) -> str:
     return done.stdout + done.stderr
 
 
-def test_a_method_of_a_package_is_trained_evaluated_and_compared(tmp_path: Path) -> None:
-    site, smoke = tmp_path / "site", "preset=smoke env=button_press logging.progress=false"
+SMOKE = "preset=smoke env=button_press logging.progress=false"
+
+
+@pytest.fixture(scope="module")
+def mine(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A folder with the tutorial's method, demonstrations, and runs of it and of one of ours; and what was said."""
+    site = tmp_path_factory.mktemp("mine") / "site"
     assert len(module_of("add-a-method.md").splitlines()) < 80
     install(site, "mine", "playslot_rl.methods", "mine = mine:MINE", module_of("add-a-method.md"))
-    trained = f"train-baseline {smoke} method=Mine baselines.mine.width=3 baselines.mine.steps=2 data.demos=demos"
+    trained = f"train-baseline {SMOKE} method=Mine baselines.mine.width=3 baselines.mine.steps=2 data.demos=demos"
     said = play(
         site,
-        f"collect {smoke} policy=expert episodes=4 out=demos",
+        f"collect {SMOKE} policy=expert episodes=4 out=demos",
         f"{trained} out=run",
         f"{trained} behaviour.loss=l2 out=run",
         "evaluate run=run episodes=2",
-        f"train-baseline {smoke} method=resnet_oracle data.demos=demos out=other",
-        f"compare {smoke} methods=resnet_oracle,mine baselines.mine.steps=2 data.demos=demos demos=2 seeds=0 "
-        "episodes=2 out=compared",
+        f"train-baseline {SMOKE} method=resnet_oracle data.demos=demos out=other",
     )
+    return site, said
+
+
+def test_a_method_of_a_package_is_trained_and_evaluated(mine: tuple[Path, str]) -> None:
+    site, said = mine
     assert "out=run: 0" in said, said
     assert "behaviour.loss: got l2, expected l1" in said, said
     stored = json.loads((site / "run" / "mine" / "checkpoint" / "config.json").read_text())
     assert stored["mine"]["width"] == 3
     assert (site / "run" / "evaluation" / "simulation" / "eval_info.json").is_file(), said
-    assert "| mine-d2-s0 | simulation | done |" in (site / "compared" / "comparison.md").read_text()
-    for left in (site / "mine-1.0.dist-info").iterdir():
-        left.unlink()
+
+
+@pytest.mark.slow
+def test_a_method_of_a_package_is_compared(mine: tuple[Path, str]) -> None:
+    site, _ = mine
+    said = play(
+        site,
+        f"compare {SMOKE} methods=resnet_oracle,mine baselines.mine.steps=2 data.demos=demos demos=2 seeds=0 "
+        "episodes=2 out=compared",
+    )
+    assert "| mine-d2-s0 | simulation | done |" in (site / "compared" / "comparison.md").read_text(), said
+
+
+def test_runs_of_other_methods_are_read_without_the_package(mine: tuple[Path, str], tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    shutil.copytree(mine[0], site, ignore=shutil.ignore_patterns("*.dist-info"))
     said = play(site, "evaluate run=other episodes=2", "evaluate run=run episodes=2")
     assert (site / "other" / "evaluation" / "simulation" / "eval_info.json").is_file(), said
     assert "got 'mine', expected one of playslot" in said, said

@@ -84,6 +84,7 @@ def test_a_set_that_nobody_prepared_becomes_a_world_model(
     refused("adopt", f"data.root={any_set}", f"out={run}", *longer, message="minutes: got 3.0, expected 0.02")
 
 
+@pytest.mark.slow
 def test_videos_of_two_cameras_become_a_model_that_can_be_played(tmp_path: Path) -> None:
     root = write_set(tmp_path / "set", (24, 22, 26, 24, 23), 2, ("top", "side"), (480, 640), video=True)
     run = tmp_path / "run"

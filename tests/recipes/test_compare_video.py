@@ -191,6 +191,7 @@ def test_clips_that_do_not_fit_are_refused_before_anything_is_trained(finished: 
 
 
 @pytest.mark.usefixtures("started")
+@pytest.mark.slow
 def test_a_setting_of_playslot_is_varied_on_two_kinds_of_clips(finished: Path, tmp_path: Path) -> None:
     """Action representation in one command; real actions count as what they are."""
     out, data, other = tmp_path / "out", finished / "data", tmp_path / "random"
@@ -228,6 +229,7 @@ def test_the_command_line_of_a_launcher_takes_every_name() -> None:
 
 
 @pytest.mark.usefixtures("started")
+@pytest.mark.slow
 def test_numbers_of_objects_have_one_table(tmp_path: Path) -> None:
     out = tmp_path / "out"
     smoke(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from playslot_rl.config import DynamicsStageConfig
 from playslot_rl.runtime.processes import here
 from playslot_rl.training.fit import Part
 from playslot_rl.training.patience import patience_of
@@ -14,7 +15,7 @@ from playslot_rl.training.stage_dynamics import DynamicsStage, dynamics_on_slots
 
 def training(record: StageRecord) -> Training:
     """Both from scratch, together."""
-    own = record.config.dynamics
+    own: DynamicsStageConfig = record.config.dynamics
     stage = dynamics_on_slots(record, record.groups["model"], own)
     read = _actions_read(stage)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.slots import validation_scores
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runs import Run
@@ -15,7 +16,8 @@ from playslot_rl.training.stage_slots import SlotsStage, warm_start
 
 def training(record: StageRecord) -> Training:
     """A fresh SAVi, or one that begins with another's weights (`slots.start_from`)."""
-    config, own, device, source = record.config, record.config.slots, record.device, record.data
+    config: ExperimentConfig = record.config
+    own, device, source = config.slots, record.device, record.data
     with global_seed(config.seed, 0, "slots"):
         savi = SAVi(config.model.savi, config.env.image_size).to(device)
     known = validation_scores(config) if here().first else None

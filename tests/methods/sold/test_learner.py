@@ -272,8 +272,8 @@ def test_the_critic_finds_the_value_of_a_constant_reward(make_learner: Make) -> 
     assert value.item() == pytest.approx(2.0, abs=0.15)
 
 
-@pytest.mark.integration
-@pytest.mark.parametrize("gradient", ["dynamics", pytest.param("reinforce", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("gradient", ["dynamics", "reinforce"])
 def test_an_action_that_moves_slots_towards_reward_is_found(make_learner: Make, gradient: str) -> None:
     """A world of one number: the action adds to it and the reward is that number. The policy learns to push it up."""
     learner = make_learner(
