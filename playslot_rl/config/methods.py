@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -121,31 +121,7 @@ _OURS: Final[Mapping[str, str]] = {
 """Below `playslot_rl.methods`."""
 
 
-class _Methods(Mapping[str, Method]):
-    """By name, imported when they are asked for; those of packages that cannot be imported are left out of the list."""
-
-    def __getitem__(self, name: str) -> Method:
-        if name in _OURS:
-            found: Method = plugins.load(GROUP, name, Method, f"playslot_rl.methods.{_OURS[name]}")
-            return found
-        if name in plugins.brought(GROUP):
-            brought: Method = plugins.load(GROUP, name, Method)
-            return brought
-        raise KeyError(name)
-
-    def __iter__(self) -> Iterator[str]:
-        yield from _OURS
-        for name in plugins.brought(GROUP).keys() - _OURS.keys():
-            try:
-                yield self[name].name
-            except ConfigError:  # said where it is named
-                continue
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-
-METHODS: Final[Mapping[str, Method]] = _Methods()
+METHODS: Final = plugins.Registry(GROUP, Method, {name: f"playslot_rl.methods.{at}" for name, at in _OURS.items()})
 
 
 def method_stage(method: str) -> str:

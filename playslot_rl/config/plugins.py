@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import functools
 import importlib
+from collections.abc import Iterator, Mapping
 from importlib.metadata import EntryPoint, entry_points
+from types import MappingProxyType
 from typing import Any
 
 from playslot_rl.errors import ConfigError
@@ -43,6 +45,38 @@ def load(group: str, name: str, kind: type, built_in: str = "") -> Any:
             f"{name}: got {entry.value} of the package {package}, expected a {kind.__name__} of the name {name}: {cure}"
         )
     return found
+
+
+class Registry[Kind](Mapping[str, Kind]):
+    """By name, imported when they are asked for; those of packages that cannot be imported are left out of the list.
+
+    Args:
+        group: of the entry points.
+        kind: what they give.
+        ours: `module:object` of built-in ones.
+    """
+
+    def __init__(self, group: str, kind: type[Kind], ours: Mapping[str, str] = MappingProxyType({})) -> None:
+        self.group, self.ours = group, ours
+        self.kind: type = kind
+
+    def __getitem__(self, name: str) -> Kind:
+        if name not in self.ours and name not in brought(self.group):
+            raise KeyError(name)
+        found: Kind = load(self.group, name, self.kind, self.ours.get(name, ""))
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self.ours
+        for name in brought(self.group).keys() - self.ours.keys():
+            try:
+                self[name]
+            except ConfigError:  # said where it is named
+                continue
+            yield name
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
 
 
 def call(reference: str, *arguments: Any, **named: Any) -> Any:

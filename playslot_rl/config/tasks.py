@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from playslot_rl.config import plugins
 from playslot_rl.config.env import EnvConfig
-from playslot_rl.errors import ConfigError
 
 GROUP: Final = "playslot_rl.envs"
 """Entry points by which a package brings a task: its name, and a `Task`."""
@@ -36,24 +35,4 @@ class Task:
         return f"{self.name}-v0"
 
 
-class _Tasks(Mapping[str, Task]):
-    """By name, imported when they are asked for; those of packages that cannot be imported are left out of the list."""
-
-    def __getitem__(self, name: str) -> Task:
-        if name not in plugins.brought(GROUP):
-            raise KeyError(name)
-        found: Task = plugins.load(GROUP, name, Task)
-        return found
-
-    def __iter__(self) -> Iterator[str]:
-        for name in plugins.brought(GROUP):
-            try:
-                yield self[name].name
-            except ConfigError:  # said where it is named
-                continue
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-
-TASKS: Final[Mapping[str, Task]] = _Tasks()
+TASKS: Final = plugins.Registry(GROUP, Task)

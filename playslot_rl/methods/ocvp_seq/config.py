@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
-from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.machine import Need, predictor_weights, rollouts
 from playslot_rl.config.model import PredictorConfig
 from playslot_rl.config.roles import COUNT, was
-from playslot_rl.config.stages import DynamicsStageConfig
+from playslot_rl.methods.video.config import OnSlotsConfig
 
 
 @dataclass(frozen=True)
@@ -28,7 +25,7 @@ class OCVPSeqSizes(PredictorConfig):
 
 
 @dataclass(frozen=True)
-class OCVPSeqConfig(DynamicsStageConfig):
+class OCVPSeqConfig(OnSlotsConfig):
     """OCVP-Seq on a frozen SAVi's slots: stage 2 with nothing inferred.
 
     Attributes:
@@ -37,7 +34,3 @@ class OCVPSeqConfig(DynamicsStageConfig):
 
     group = "baselines.ocvp_seq."
     predictor: OCVPSeqSizes = field(default_factory=OCVPSeqSizes)
-
-    def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        yield rollouts(name, self, config)
-        yield predictor_weights(f"{name}.predictor", self.predictor, config)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
-from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.machine import Need, predictor_weights, rollouts
 from playslot_rl.config.model import PredictorConfig
 from playslot_rl.config.roles import COUNT, at_least, was
-from playslot_rl.config.stages import DynamicsStageConfig
+from playslot_rl.methods.video.config import OnSlotsConfig
 
 
 @dataclass(frozen=True)
@@ -26,7 +23,7 @@ class SlotFormerSizes(PredictorConfig):
 
 
 @dataclass(frozen=True)
-class SlotFormerConfig(DynamicsStageConfig):
+class SlotFormerConfig(OnSlotsConfig):
     """SlotFormer on a frozen SAVi's slots: stage 2 with nothing inferred.
 
     Attributes:
@@ -35,7 +32,3 @@ class SlotFormerConfig(DynamicsStageConfig):
 
     group = "baselines.slotformer."
     predictor: SlotFormerSizes = field(default_factory=SlotFormerSizes)
-
-    def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        yield rollouts(name, self, config)
-        yield predictor_weights(f"{name}.predictor", self.predictor, config)

@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
@@ -172,3 +173,18 @@ def train(run: Path, learner: ToyLearner | None = None, **changes: Any) -> tuple
     with record.training() as begin:
         done = train_online(learner, toy_online(**changes), record, begin, title="Toy", device=torch.device("cpu"))
     return learner, Trained(*done)
+
+
+def interrupt(monkeypatch: pytest.MonkeyPatch, at: int, folder: Path, message: str, **options: Any) -> None:
+    """Press Ctrl-C in update `at` of a training, which ends with this message."""
+    original = ToyLearner.update
+
+    def pressed(self: ToyLearner, batch: TensorDict, generators: StepGenerators) -> Mapping[str, Tensor]:
+        if generators.step == at:
+            signal.raise_signal(signal.SIGINT)
+        return original(self, batch, generators)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ToyLearner, "update", pressed)
+        with pytest.raises(KeyboardInterrupt, match=message):
+            train(folder, **options)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from online_toy import STEPS, ToyLearner, ToyPool, same, toy_online, train, weights
+from online_toy import STEPS, ToyLearner, ToyPool, interrupt, same, toy_online, train, weights
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -86,17 +85,7 @@ def test_a_run_that_was_interrupted_ends_with_the_weights_of_one_that_was_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, resumed: int
 ) -> None:
     whole, one = train(tmp_path / "whole")
-    original = ToyLearner.update
-
-    def pressed(self: ToyLearner, batch: TensorDict, generators: StepGenerators) -> Mapping[str, Tensor]:
-        if generators.step == at:
-            signal.raise_signal(signal.SIGINT)
-        return original(self, batch, generators)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(ToyLearner, "update", pressed)
-        with pytest.raises(KeyboardInterrupt, match="toy interrupted; the same command carries on from"):
-            train(tmp_path / "broken")
+    interrupt(monkeypatch, at, tmp_path / "broken", "toy interrupted; the same command carries on from")
     broken, other = train(tmp_path / "broken")
     assert same(weights(whole), weights(broken))
     assert other.resumed_from == resumed

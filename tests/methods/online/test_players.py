@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import torch
-from online_toy import STEPS, BrokenPool, HangingPool, ToyLearner, ToyPool, same, toy_online, train, weights
+from online_toy import STEPS, BrokenPool, HangingPool, ToyLearner, ToyPool, interrupt, same, toy_online, train, weights
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -113,17 +113,7 @@ def test_a_run_that_was_interrupted_ends_with_the_weights_of_one_that_was_not(
 ) -> None:
     monkeypatch.setattr(loop, "Players", Beside)
     whole, _ = train(tmp_path / "whole", workers=2)
-    original = ToyLearner.update
-
-    def pressed(self: ToyLearner, batch: TensorDict, generators: StepGenerators) -> Mapping[str, Tensor]:
-        if generators.step == at:
-            signal.raise_signal(signal.SIGINT)
-        return original(self, batch, generators)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(ToyLearner, "update", pressed)
-        with pytest.raises(KeyboardInterrupt, match="the same command carries on from"):
-            train(tmp_path / "broken", workers=2)
+    interrupt(monkeypatch, at, tmp_path / "broken", "the same command carries on from", workers=2)
     broken, result = train(tmp_path / "broken", workers=2)
     assert result.resumed_from > 0
     assert same(weights(whole), weights(broken))
