@@ -17,7 +17,7 @@ from playslot_rl.errors import explain
 from playslot_rl.studies.launch import Status, job_lock, read_status, write_status
 
 if TYPE_CHECKING:
-    from playslot_rl.studies.several import Commands
+    from playslot_rl.studies.launch import Commands
     from playslot_rl.studies.success.measure import SuccessMeasure
     from playslot_rl.studies.video.measure import VideoMeasure
 

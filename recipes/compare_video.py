@@ -16,7 +16,7 @@ def main(config: ExperimentConfig) -> None:
         PlaySlotError: as `playslot_rl.studies.study.run_study`.
         KeyboardInterrupt: Ctrl-C; the same command carries on.
     """
-    from playslot_rl.studies.video.objects import each_number
+    from playslot_rl.studies.video.measure import each_number
 
     config = replace(config, out=config.out or f"runs/video_{config.env.name}_{config.preset}")
     if config.compare_video.objects:

@@ -16,7 +16,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngImageFile
 
 from playslot_rl.config.methods import canonical_method
-from playslot_rl.studies.success.figure import success_figure
+from playslot_rl.studies.success.page import success_figure
 from playslot_rl.visualization.charts import LIGHT, figure_bytes
 
 ROOT: Final = Path(__file__).resolve().parents[2]

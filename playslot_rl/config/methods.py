@@ -115,8 +115,8 @@ _OURS: Final[Mapping[str, str]] = {
     "caddy_oracle": "caddy.method:CADDY_ORACLE",
     "svg": "svg.method:SVG",
     "caddy": "caddy.method:CADDY",
-    "slotformer": "slotformer.method:SLOTFORMER",
-    "ocvp_seq": "ocvp_seq.method:OCVP_SEQ",
+    "slotformer": "video.method:SLOTFORMER",
+    "ocvp_seq": "video.method:OCVP_SEQ",
 }
 """Below `playslot_rl.methods`."""
 

@@ -17,10 +17,13 @@ from playslot_rl.data.demonstrations import (
     require_finite,
     require_labelled,
 )
-from playslot_rl.errors import CheckpointError
-from playslot_rl.methods.online.requirements import require_online
+from playslot_rl.envs import gym_id
+from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.methods.online.config import OnlineConfig
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import require_parent, run_to_write
+from playslot_rl.runtime.processes import here
+from playslot_rl.seeds.episodes import EPISODES
 from playslot_rl.storage.checkpoints import StageCheckpoint, require_config, require_whole
 from playslot_rl.training.pace import Pace
 from playslot_rl.training.record import StageRecord, run_stage
@@ -136,3 +139,25 @@ def _require_moving(record: StageRecord, labelled: int | None) -> None:
         labelled_rows(moves.episode, labelled)
     if record.demos.held_out is not None:
         moving_frames(record.demos.held_out, threshold, margin)
+
+
+def require_online(config: ExperimentConfig, online: OnlineConfig, method: str) -> None:
+    """Refuse what cannot be learned by acting, before anything is started: a ConfigError for several processes, an
+    environment without simulator or dense reward, or more episodes than a seed has.
+    """
+    if here().world > 1:
+        raise ConfigError(
+            f"method={method}: got {here().world} processes, expected one: it learns by acting; start it without "
+            "torchrun or accelerate launch"
+        )
+    gym_id(config.env.name)
+    if config.env.name.startswith("block_") and config.env.blocks.reward != "dense":
+        raise ConfigError(
+            f"env.blocks.reward: got {config.env.blocks.reward} with method={method}, expected dense: "
+            "methods that learn by acting need a dense reward; set env.blocks.reward=dense"
+        )
+    episodes = online.steps // config.env.max_steps + online.envs
+    if episodes > EPISODES:
+        raise ConfigError(
+            f"steps: got {episodes} episodes, expected at most {EPISODES}; lower it, or raise env.max_steps"
+        )

@@ -36,7 +36,7 @@ def resnet() -> Actor:
 
 
 def lapo() -> Actor:
-    from playslot_rl.methods.lapo.load import LAPOPolicy
+    from playslot_rl.methods.lapo.model import LAPOPolicy
     from playslot_rl.modules.action_decoder import ActionDecoder
 
     config = compose(["preset=smoke"])
@@ -57,8 +57,7 @@ def caddy(oracle: bool) -> Actor:
 
 
 def dreamer() -> Actor:
-    from playslot_rl.methods.dreamer.actor import DreamerActor
-    from playslot_rl.methods.dreamer.networks import DreamerNetworks
+    from playslot_rl.methods.dreamer.networks import DreamerActor, DreamerNetworks
 
     config = compose(["preset=smoke"])
     return DreamerActor(DreamerNetworks(config.baselines.dreamer, config.env))

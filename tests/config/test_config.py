@@ -22,7 +22,7 @@ from playslot_rl.config import (
 from playslot_rl.config.compose import choices, compose
 from playslot_rl.config.roles import Checked, keys_of, without
 from playslot_rl.errors import ConfigError
-from playslot_rl.methods.dreamer.config import DreamerConfig
+from playslot_rl.methods.dreamer.method import DreamerConfig
 
 PRESETS = ["compact", "paper", "smoke"]
 ENVS = ["block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "grid_shapes", "sketchy", "video"]

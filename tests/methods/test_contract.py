@@ -24,7 +24,7 @@ from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.errors import CheckpointError, OutputError, TrainingError
-from playslot_rl.methods.online.checkpoints import OnlineCheckpoints
+from playslot_rl.methods.online.replay import OnlineCheckpoints
 from playslot_rl.recipes import train_baseline, train_dynamics, train_policy, train_slots
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import STAGE_LOCK

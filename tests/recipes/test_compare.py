@@ -72,7 +72,7 @@ def test_two_methods_two_numbers_of_demonstrations_one_seed(
 def test_a_method_that_crashes_is_a_row_and_the_others_finish(
     shared_run: Path, tmp_path: Path, started: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from playslot_rl.methods.lapo.behaviour import LAPOBehaviour
+    from playslot_rl.methods.lapo.training import LAPOBehaviour
 
     def broken(self: LAPOBehaviour, *arguments: object) -> None:
         raise ZeroDivisionError("a bug")

@@ -13,7 +13,7 @@ from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.methods import training
-from playslot_rl.methods.dreamer.actor import load_actor
+from playslot_rl.methods.dreamer.networks import load_actor
 from playslot_rl.recipes import train_baseline
 from playslot_rl.runs import Run
 

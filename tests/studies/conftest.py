@@ -11,7 +11,7 @@ from jobs_on_disk import comparison, finish
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.studies.launch import Status, read_status, write_status
 from playslot_rl.studies.success.jobs import SuccessJob
-from playslot_rl.studies.success.rows import job_rows, summarise
+from playslot_rl.studies.success.measure import job_rows, summarise
 
 
 @pytest.fixture

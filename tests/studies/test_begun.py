@@ -16,8 +16,8 @@ from playslot_rl.config.roles import without
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.studies.success.jobs import success_config, success_jobs
-from playslot_rl.studies.video.begun import require_begun_alike, require_same_choice
 from playslot_rl.studies.video.jobs import VideoJob, in_steps, video_config, video_jobs
+from playslot_rl.studies.video.training import require_begun_alike, require_same_choice
 
 CARRIED_ON: dict[str, Any] = {
     "methods": ("svg", "caddy", "playslot"),

@@ -12,10 +12,9 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import ConfigError
 from playslot_rl.studies.launch import read_status
-from playslot_rl.studies.success.figure import success_figure
 from playslot_rl.studies.success.jobs import SuccessJob, success_config, success_jobs
-from playslot_rl.studies.success.page import success_page
-from playslot_rl.studies.success.rows import job_rows, summarise
+from playslot_rl.studies.success.measure import job_rows, summarise
+from playslot_rl.studies.success.page import success_figure, success_page
 from playslot_rl.visualization.charts import LIGHT
 from playslot_rl.visualization.document import to_markdown
 

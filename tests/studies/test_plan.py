@@ -12,17 +12,17 @@ from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.studies.job import absolute_roots
 from playslot_rl.studies.launch import require_launcher
+from playslot_rl.studies.study import absolute_roots
 from playslot_rl.studies.success.jobs import (
     SuccessJob,
+    check_demos,
     latent_models,
     success_config,
     success_jobs,
     success_record,
 )
 from playslot_rl.studies.success.measure import check_success
-from playslot_rl.studies.success.shared import check_demos
 
 OUT = Path("out")
 

@@ -12,12 +12,11 @@ from jobs_on_disk import comparison, finish
 from playslot_rl.config.methods import METHODS
 from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.runs import Run
-from playslot_rl.studies.job import count_parameters
 from playslot_rl.studies.launch import Status, read_status, write_status
-from playslot_rl.studies.success.figure import success_figure
+from playslot_rl.studies.study import count_parameters
 from playslot_rl.studies.success.jobs import SuccessJob
-from playslot_rl.studies.success.page import cell, success_page
-from playslot_rl.studies.success.rows import job_rows, summarise
+from playslot_rl.studies.success.measure import job_rows, summarise
+from playslot_rl.studies.success.page import cell, success_figure, success_page
 from playslot_rl.visualization.charts import LIGHT, figure_bytes
 from playslot_rl.visualization.document import to_markdown
 

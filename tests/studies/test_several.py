@@ -18,8 +18,8 @@ from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS
 from playslot_rl.config.spelling import spelled
 from playslot_rl.errors import ConfigError, PlaySlotError
-from playslot_rl.studies import several
-from playslot_rl.studies.several import train_on_several, training_command
+from playslot_rl.studies import launch
+from playslot_rl.studies.launch import train_on_several, training_command
 from playslot_rl.studies.success.jobs import SuccessJob, success_config, success_jobs, success_record
 from playslot_rl.studies.video.jobs import VideoJob, video_config, video_record
 
@@ -80,7 +80,7 @@ def test_a_training_is_started_by_torchrun_with_a_port_of_its_own(tmp_path: Path
 
 
 def stub(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
-    monkeypatch.setattr(several, "training_command", lambda *_: [sys.executable, "-c", code])
+    monkeypatch.setattr(launch, "training_command", lambda *_: [sys.executable, "-c", code])
 
 
 @pytest.mark.integration
@@ -112,9 +112,9 @@ def alive(process: int) -> bool:
 def test_a_job_that_is_killed_takes_its_training_with_it(tmp_path: Path) -> None:
     waits = f"import os, time; open({str(tmp_path / 'id')!r}, 'w').write(str(os.getpid())); time.sleep(60)"
     code = (
-        "import sys; from playslot_rl.studies import several; from playslot_rl.config import ExperimentConfig; "
-        f"several.training_command = lambda *_: [sys.executable, '-c', {waits!r}]; "
-        "several.train_on_several('train-baseline', ExperimentConfig(), 2)"
+        "import sys; from playslot_rl.studies import launch; from playslot_rl.config import ExperimentConfig; "
+        f"launch.training_command = lambda *_: [sys.executable, '-c', {waits!r}]; "
+        "launch.train_on_several('train-baseline', ExperimentConfig(), 2)"
     )
     job = subprocess.Popen([sys.executable, "-c", code])
     ends = time.monotonic() + 60

@@ -16,10 +16,8 @@ from playslot_rl.config.compose import compose
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.studies import launch
-from playslot_rl.studies.job import Job
-from playslot_rl.studies.launch import Status, write_status
-from playslot_rl.studies.several import Commands
-from playslot_rl.studies.study import FOOTNOTES, Record, Result, open_jobs_notes, run_study
+from playslot_rl.studies.launch import Commands, Status, write_status
+from playslot_rl.studies.study import FOOTNOTES, Job, Record, Result, open_jobs_notes, run_study
 from playslot_rl.visualization.charts import Theme, new_figure
 from playslot_rl.visualization.document import Document, Linked, Notes, Section, Table
 

@@ -30,16 +30,16 @@ from playslot_rl.data.demonstrations import Demonstrations
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips
 from playslot_rl.losses.behaviour import BehaviourLoss
-from playslot_rl.methods.caddy.config import CADDYConfig
+from playslot_rl.methods.caddy.method import CADDYConfig
 from playslot_rl.methods.caddy.model import CADDY
 from playslot_rl.methods.caddy.stage import CADDYStage
-from playslot_rl.methods.lapo.config import LAPOConfig
+from playslot_rl.methods.lapo.method import LAPOConfig
 from playslot_rl.methods.lapo.model import ForwardModel, InverseModel
-from playslot_rl.methods.lapo.stage import LAPOModelStage
+from playslot_rl.methods.lapo.training import LAPOModelStage
 from playslot_rl.methods.resnet_oracle.network import ResNetPolicy
-from playslot_rl.methods.svg.config import SVGConfig
+from playslot_rl.methods.svg.method import SVGConfig
 from playslot_rl.methods.svg.model import SVG
-from playslot_rl.methods.svg.stage import SVGStage
+from playslot_rl.methods.svg.training import SVGStage
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import global_seed

@@ -29,15 +29,19 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, moving_frames
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
-from playslot_rl.methods.caddy.config import CADDYOracleConfig, CADDYPolicyConfig
-from playslot_rl.methods.caddy.heads import MovesHead, StateHead, as_moves, states_of
-from playslot_rl.methods.caddy.load import ORACLE, POLICY, load_model
+from playslot_rl.methods.caddy.heads import ORACLE, POLICY, MovesHead, StateHead, as_moves, load_model, states_of
+from playslot_rl.methods.caddy.method import CADDYConfig, CADDYOracleConfig, CADDYPolicyConfig
 from playslot_rl.methods.caddy.model import CADDY
 from playslot_rl.methods.caddy.networks import Encoder
-from playslot_rl.methods.cloning import LatentCloning
+from playslot_rl.methods.caddy.stage import CADDYStage
+from playslot_rl.methods.cloning import LatentCloning, cloning
+from playslot_rl.methods.video.training import on_clips, pixel_model
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint
+from playslot_rl.training.demonstrated import cloned
+from playslot_rl.training.fit import Part
+from playslot_rl.training.record import StageRecord, Training
 from playslot_rl.training.stage_regression import (
     FrameInputs,
     Inputs,
@@ -171,3 +175,26 @@ def infer_moves(model: CADDY, source: EpisodeFrames, moves: Transitions) -> Tens
         latents = model.infer(pairs)
         parts.append(torch.cat((latents.a, latents.v), dim=-1)[:, 0])
     return torch.cat(parts)
+
+
+def model(record: StageRecord) -> Training:
+    """A new video model."""
+    own: CADDYConfig = record.config.baselines.caddy
+    stage = CADDYStage(pixel_model(CADDY, own, record), record.clips(own.frames), own)
+    return on_clips(record, stage, own, extra={"perceptual": stage.perceptual_on})
+
+
+def policy(record: StageRecord) -> Training:
+    """New policy and decoder on the demonstrations."""
+    own: CADDYPolicyConfig = record.config.baselines.caddy_policy
+    behaviour = CADDYBehaviour(record.config, record.parents["caddy"], record.demos, record.device)
+    return cloning(record, behaviour, own.policy, own.decoder_steps, own.decoder_lr)
+
+
+def oracle(record: StageRecord) -> Training:
+    """A new head on the real actions of the demonstrations."""
+    own: CADDYOracleConfig = record.config.baselines.caddy_oracle
+    stage = oracle_stage(record.config, record.parents["caddy"], record.demos, record.device)
+    said, extra = cloned(record.name, record.demos, len(stage.targets))
+    part = Part(f"{record.name}.policy", stage, own.policy, group=f"baselines.{record.name}.policy")
+    return Training([part], record.device, lambda _: f"{said}, {record.folder}", extra=extra)

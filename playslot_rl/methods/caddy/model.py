@@ -34,7 +34,7 @@ from playslot_rl.methods.caddy.action import (
     chosen,
     gumbel_softmax,
 )
-from playslot_rl.methods.caddy.config import CADDYConfig
+from playslot_rl.methods.caddy.method import CADDYConfig
 from playslot_rl.methods.caddy.networks import Dynamics, Encoder, Generator, Pyramid, inside
 from playslot_rl.methods.video.predictor import check_clip
 

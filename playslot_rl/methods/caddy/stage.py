@@ -1,4 +1,12 @@
-"""Training of CADDY on unlabelled videos: a `Stage` for `fit`.
+"""Training of CADDY on unlabelled videos: a `Stage` for `fit`, and its loss.
+
+    L = mean_r [L1_r + lambda_perc L_perc_r] + lambda_s mean (sg[s_t] - E(x^_t))^2 + lambda_KL mean KL(d_t, N(0, I))
+        - lambda_I I(P)  [+ mean (sg[conv(s_t)] - y_t)^2 in the warm-up]
+
+r runs over the three resolutions, to which the real frames are brought by averaging. Pixels are compared in [-1, 1].
+Image and state terms are means over the frames that are `wanted`: for wanted ones that were drawn uniformly, unbiased
+estimates of those over all of them. The divergence is summed over Z and averaged over moves. Without VGG19's weights
+there is no L_perc: L1 only.
 
 Warm-up, temperature and the clips' length are functions of the step alone:
 
@@ -6,32 +14,81 @@ Warm-up, temperature and the clips' length are functions of the step alone:
     temperature   from the first value to the second, linearly over anneal_steps
     length        from first_frames to S + predicted, linearly over growth_steps, rounded down
 
-Note: the original decays weights by 1e-6; our Adam does not. Counts of steps are those of the original, warm-up
-included.
+Note: in the warm-up the other terms stay, on the reconstructions in place of the predictions. The original decays
+weights by 1e-6; our Adam does not. Counts of steps are those of the original, warm-up included.
 
-Shapes: B batch, T frames, S seed frames, K actions.
+Shapes: B batch, T frames, S seed frames, n frames that were generated, H W image height and width, K actions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise, psnr
-from playslot_rl.methods.caddy.action import joint_distribution, mutual_information
-from playslot_rl.methods.caddy.config import CADDYConfig
-from playslot_rl.methods.caddy.loss import CADDYLoss
-from playslot_rl.methods.caddy.model import CADDY
-from playslot_rl.methods.caddy.perceptual import load_perceptual
+from playslot_rl.losses.common import total_loss
+from playslot_rl.methods.caddy.action import ActionInformation, divergence, joint_distribution, mutual_information
+from playslot_rl.methods.caddy.method import CADDYConfig
+from playslot_rl.methods.caddy.model import CADDY, Rollout
+from playslot_rl.methods.caddy.perceptual import VGGFeatures, load_perceptual
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
 from playslot_rl.runtime.shares import own_rows
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.world_model import module_device
+
+
+class CADDYLoss:
+    """All terms, with their weights; without `perceptual` images are compared by L1 only."""
+
+    def __init__(self, config: CADDYConfig, perceptual: VGGFeatures | None = None) -> None:
+        self.config, self.perceptual = config, perceptual
+
+    @property
+    def perceptual_on(self) -> bool:
+        return self.perceptual is not None
+
+    def __call__(
+        self, rollout: Rollout, frames: Tensor, information: ActionInformation, wanted: Collection[int] | None = None
+    ) -> dict[str, Tensor]:
+        """Terms `loss_*`, weights included, their sum `loss`, and `information` (nats, no weight): scalars.
+
+        Args:
+            rollout: of the clips.
+            frames: the clips (B, T, 3, H, W), float [0, 1].
+            information: its moving average moves in training mode.
+            wanted: times of generated frames that image and state are compared at; None: all.
+        """
+        config, generated = self.config, rollout.generated
+        places = [i for i, time in enumerate(generated.times) if wanted is None or time in wanted]
+        times = [generated.times[i] for i in places]
+        known = information(rollout.real, rollout.again)
+        terms = self._images([x[:, places] for x in generated.frames], frames[:, times] * 2 - 1)
+        terms["loss_state"] = config.state_weight * F.mse_loss(generated.s[:, places], rollout.s[:, times].detach())
+        terms["loss_kl"] = config.kl_weight * divergence(rollout.moves.direction).mean()
+        terms["loss_information"] = -config.information_weight * known
+        if rollout.codes is not None:
+            terms["loss_fit"] = F.mse_loss(generated.y.float(), rollout.codes.detach().float())
+        return {"loss": total_loss(terms), **terms, "information": known.detach()}
+
+    def _images(self, pyramid: list[Tensor], target: Tensor) -> dict[str, Tensor]:
+        """Terms of frames at three resolutions, each (B, n, 3, h, w), against (B, n, 3, H, W), all in [-1, 1]."""
+        target = target.flatten(0, 1)
+        errors, distances = [], []
+        for level in pyramid:
+            wanted = F.avg_pool2d(target, target.shape[-1] // level.shape[-1])
+            errors.append((level.flatten(0, 1) - wanted).abs().mean())
+            if self.perceptual is not None:
+                distances.append(self.perceptual.distance(level.flatten(0, 1), wanted))
+        terms = {"loss_image": torch.stack(errors).mean()}
+        if distances:
+            terms["loss_perceptual"] = self.config.perceptual_weight * torch.stack(distances).mean()
+        return terms
 
 
 class CADDYStage:

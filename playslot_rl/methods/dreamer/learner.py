@@ -23,10 +23,11 @@ from torchrl.trainers.algorithms import DreamerV3OptimizationStepper, DreamerV3O
 
 from playslot_rl import keys
 from playslot_rl.losses.common import total_loss
-from playslot_rl.methods.dreamer.actor import act
-from playslot_rl.methods.dreamer.config import DreamerConfig
-from playslot_rl.methods.dreamer.networks import BINS, UNIMIX, DreamerNetworks, actor_module
-from playslot_rl.seeds.draws import StepGenerators
+from playslot_rl.methods.dreamer.method import DreamerConfig
+from playslot_rl.methods.dreamer.networks import BINS, UNIMIX, DreamerNetworks, act, actor_module
+from playslot_rl.methods.online.loop import OnlineTraining
+from playslot_rl.seeds.draws import StepGenerators, global_seed
+from playslot_rl.training.record import StageRecord
 
 
 def world_model(networks: DreamerNetworks) -> TensorDictSequential:
@@ -190,3 +191,12 @@ class _Slow(nn.Module):
         super().__init__()
         self.critic = loss.value_loss.target_value_model_params
         self.returns = loss.actor_loss.retnorm
+
+
+def training(record: StageRecord) -> OnlineTraining:
+    """A new learner."""
+    config = record.config
+    own: DreamerConfig = config.baselines.dreamer
+    with global_seed(config.seed, 0, record.name):
+        networks = DreamerNetworks(own, config.env).to(record.device)
+        return OnlineTraining(DreamerLearner(networks, own), own, {"networks": networks})

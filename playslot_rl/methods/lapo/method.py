@@ -1,12 +1,77 @@
-"""LAPO: inverse and forward model on videos, then a latent policy and an action decoder."""
+"""LAPO: inverse and forward model on videos, then a latent policy and an action decoder; its settings."""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final, Literal
 
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.machine import WEIGHT, Need, chain, frame_numbers, windows
 from playslot_rl.config.methods import Load, Method, Style
+from playslot_rl.config.plain import check
+from playslot_rl.config.roles import COUNT, NOT_NEGATIVE, OPEN_FRACTION, RATE, Checked, at_least, between, role, was
 from playslot_rl.config.stage_spec import StageSpec
-from playslot_rl.methods.lapo.config import LAPOConfig
+from playslot_rl.config.stages import StageConfig, clipped_stage
+
+
+@dataclass(frozen=True)
+class LAPOConfig(Checked):
+    """Sizes and schedule of LAPO. The action decoder's size is `model.action_decoder`, its inputs
+    `behaviour.decoder_inputs`, its labels `behaviour.labelled_demos`: as for PlaySlot.
+
+    Attributes:
+        channels: of the convolutional encoders; each halves the resolution.
+        hidden: width of the layer between an encoder and its output.
+        groups: G codes that make up a latent action.
+        code_dim: width of each, so that a latent action has `groups * code_dim` numbers.
+        codes: K entries of the codebook, which the groups share.
+        decay: of the codebook's moving average.
+        dead_threshold: EMA cluster size under which a code is revived.
+        commitment: weight beta of the commitment term.
+        loss: of the latent policy and the action decoder: `l2` or `l1`.
+        targets: latents that the policy clones and the decoder reads, `quantised` or `continuous` (before they are).
+        shift: shift of frames in the latent policy's training, pixels.
+        model: training of inverse and forward model.
+        policy: training of the latent policy.
+        decoder_steps: optimiser steps of the action decoder.
+        decoder_lr: its base learning rate; the rest is as for the policy.
+        world: another run of LAPO whose inverse and forward model are taken; empty trains them on `data.root`.
+    """
+
+    group = "baselines.lapo."
+    channels: tuple[int, ...] = field(default=(64, 128, 128), metadata=COUNT)
+    hidden: int = field(default=256, metadata=COUNT)
+    groups: int = field(default=8, metadata=at_least(1))
+    code_dim: int = field(default=16, metadata=COUNT)
+    codes: int = field(default=64, metadata=at_least(2))
+    decay: float = field(default=0.99, metadata=OPEN_FRACTION)
+    dead_threshold: float = field(default=1.0, metadata=NOT_NEGATIVE)
+    commitment: float = field(default=0.05, metadata=NOT_NEGATIVE)
+    loss: Literal["l2", "l1"] = "l2"
+    targets: Literal["quantised", "continuous"] = field(default="quantised", metadata=was("quantised"))
+    shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
+    model: StageConfig = field(default_factory=lambda: clipped_stage(200_000, 3e-4, "cosine"))
+    policy: StageConfig = field(default_factory=lambda: clipped_stage(20_000, 2e-4, "constant"))
+    decoder_steps: int = field(default=20_000, metadata=at_least(1))
+    decoder_lr: float = field(default=2e-4, metadata=RATE)
+    world: str = field(default="", metadata=role("machine", "folder"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(1 <= len(self.channels) <= 5, "baselines.lapo.channels", self.channels, "1 to 5 widths")
+
+    @property
+    def latent_dim(self) -> int:
+        """Z = G times the width of a code."""
+        return self.groups * self.code_dim
+
+    def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
+        for part, stage in (("model", self.model), ("policy", self.policy)):
+            yield windows(f"{name}.{part}", stage, frame_numbers(config))
+        weights = 9 * chain(3, *self.channels) + self.hidden * (self.channels[-1] + self.latent_dim)
+        yield Need((name,), "LAPO's weights", (weights + self.codes * self.code_dim) * WEIGHT)
+
 
 NAME: Final = "lapo"
 SIZES: Final = ("channels", "hidden", "groups", "code_dim", "codes", "decay", "dead_threshold", "commitment")
@@ -44,5 +109,5 @@ LAPO: Final = Method(
     Style(5, "s"),
     LAPOConfig,
     (MODEL, POLICY),
-    Load(actor="playslot_rl.methods.lapo.load:load_actor"),
+    Load(actor="playslot_rl.methods.lapo.model:load_actor"),
 )

@@ -1,15 +1,143 @@
-"""Trainings of LAPO: inverse and forward model on videos; then a latent policy, and an action decoder."""
+"""Trainings of LAPO: inverse and forward model on unlabelled videos; then a latent policy that clones the inverse
+model's latents, and an action decoder.
+
+    L = mean (o^_{t+1} - o_{t+1})^2 / mean (o_t - o_{t+1})^2 + L_VQ
+    L_pi = mean (pi(o_t) - z_t)^2,   L_a = mean (D(z_t) - a_t)^2
+
+Note: LAPO has the plain mean squared error. Most pixels of a scene stand still, so its scale says little; divided by
+the error of predicting no change (a constant of the data set) it is 1 before training, whatever the task, and
+`unexplained` is the fraction of the change that is not predicted. LAPO fine-tunes its policy online or fits a decoder
+on labelled transitions; this is the second.
+
+Shapes: B batch, H W image height and width, M transitions, Z latent-action width.
+"""
 
 from __future__ import annotations
 
-from playslot_rl.methods.cloning import cloning
-from playslot_rl.methods.lapo.behaviour import LAPOBehaviour
-from playslot_rl.methods.lapo.config import LAPOConfig
-from playslot_rl.methods.lapo.model import ForwardModel, InverseModel
-from playslot_rl.methods.lapo.stage import LAPOModelStage
-from playslot_rl.seeds.draws import global_seed
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from playslot_rl import keys
+from playslot_rl.config import ExperimentConfig, StageConfig
+from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.windows import Clips, IntArray
+from playslot_rl.frames import normalise
+from playslot_rl.losses.behaviour import BehaviourLoss
+from playslot_rl.methods.cloning import LatentCloning, cloning
+from playslot_rl.methods.lapo.method import NAME, LAPOConfig
+from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolicy
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.modules.quantizer import usage
+from playslot_rl.runtime.precision import autocast
+from playslot_rl.runtime.processes import spread
+from playslot_rl.runtime.shares import own_rows
+from playslot_rl.seeds.draws import StepGenerators, global_seed
+from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.world_model import module_device
+
+BATCH = 64
+
+
+class LAPOModelStage:
+    """Inverse and forward model together, trained in place on pairs of frames of unlabelled videos."""
+
+    def __init__(self, inverse: InverseModel, forward: ForwardModel, clips: Clips, config: StageConfig) -> None:
+        self.inverse, self.forward, self.clips, self.config = inverse, forward, clips, config
+        first, second = self._frames(self.clips.spread(self.clips.train_episodes))
+        self.still = max(1e-6, float((first - second).square().mean()))
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        return {"inverse": self.inverse, "forward": self.forward}
+
+    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        first, second = self._frames(own_rows(self.clips.sample(self.config.batch_size, generators.numpy("pairs"))))
+        with autocast(first.device.type, self.config.precision):
+            inferred = self.inverse(first, second)
+            predicted = self.forward(first, inferred.z)
+        image = (predicted.float() - second).square().mean() / self.still
+        used, perplexity = usage(inferred.code.detach(), self.inverse.config.codes)
+        return {
+            "loss": image + inferred.vq_loss,
+            "loss_image": image,
+            "loss_vq": inferred.vq_loss,
+            "usage": used,
+            "perplexity": perplexity,
+        }
+
+    def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
+        """`unexplained`: error on held-out pairs over that of no change; `perplexity` of the codes (1 to K)."""
+
+        def look(_: int, rows: IntArray) -> tuple[float, float, Tensor]:
+            first, second = self._frames(rows)
+            inferred = self.inverse(first, second)
+            error = float((self.forward(first, inferred.z) - second).square().sum())
+            return error, float((first - second).square().sum()), inferred.code
+
+        batches = np.array_split(self.clips.held_out, -(-len(self.clips.held_out) // BATCH))
+        errors, stills, codes = zip(*spread(batches, look), strict=True)
+        _, perplexity = usage(torch.cat(codes), self.inverse.config.codes)
+        return {"unexplained": sum(errors) / max(1e-6, sum(stills)), "perplexity": float(perplexity)}
+
+    def _frames(self, rows: IntArray) -> tuple[Tensor, Tensor]:
+        pixels = normalise(self.clips.source.pixels(rows).to(module_device(self.inverse)))
+        return pixels[:, 0], pixels[:, 1]
+
+
+@torch.no_grad()
+def infer_latents(
+    inverse: InverseModel,
+    source: EpisodeFrames,
+    moves: Transitions,
+    device: torch.device | str = "cpu",
+    quantised: bool = True,
+) -> Tensor:
+    """Latent actions (M, Z) of transitions; the model in evaluation mode."""
+    parts = []
+    for rows in np.array_split(moves.rows, -(-len(moves.rows) // BATCH)):
+        pixels = source.pixels(np.stack((rows, rows + 1), axis=1)).to(device)
+        inferred = inverse(pixels[:, 0], pixels[:, 1])
+        parts.append(inferred.z if quantised else inferred.before)
+    return torch.cat(parts)
+
+
+class LAPOBehaviour(LatentCloning):
+    """See `LatentCloning`; a CheckpointError where the model is damaged."""
+
+    def __init__(
+        self, config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
+    ) -> None:
+        self.own: LAPOConfig = config.baselines.lapo
+        self.inverse = load_inverse(model, device)
+        super().__init__(config, demos, device, self.own.shift, self.own.policy, self.own.loss)
+        with global_seed(config.seed, 0, NAME):
+            self.policy = LAPOPolicy(self.own, config.env.image_size).to(device)
+            width = self.own.latent_dim
+            self.decoder = ActionDecoder(config.model.action_decoder, width, config.env.action_dim).to(device)
+
+    def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
+        return infer_latents(self.inverse, source, moves, self.device, self.own.targets == "quantised")
+
+    def criterion(self) -> BehaviourLoss:
+        criterion = BehaviourLoss(self.policy, self.own.loss)
+        criterion.set_keys(observation=keys.PIXELS)
+        return criterion
+
+
+def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseModel:
+    """The inverse model of a finished stage, frozen."""
+    own, (_, env) = model.group(LAPOConfig, NAME), model.sizes
+
+    with torch.random.fork_rng(devices=[]):
+        inverse, forward = InverseModel(own, env.image_size), ForwardModel(own)
+    load_weights(model, {"inverse": inverse, "forward": forward})
+    return inverse.to(device).eval().requires_grad_(False)
 
 
 def model(record: StageRecord) -> Training:

@@ -11,27 +11,28 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from torch import nn
 
 from playslot_rl.acting.episodes import LOCKSTEP, TaskPool
+from playslot_rl.config.methods import METHODS
 from playslot_rl.config.roles import without
 from playslot_rl.evaluation.intervals import wilson
-from playslot_rl.methods.online.acting import PlayedEpisodes, play
-from playslot_rl.methods.online.checkpoints import OnlineCheckpoints, OnlineState
+from playslot_rl.methods.online.acting import Learner, PlayedEpisodes, play
 from playslot_rl.methods.online.config import OnlineConfig
-from playslot_rl.methods.online.learner import Learner
 from playslot_rl.methods.online.players import Players, Round, play_round
-from playslot_rl.methods.online.replay import Replay
+from playslot_rl.methods.online.replay import OnlineCheckpoints, OnlineState, Replay
 from playslot_rl.runtime.progress import StageProgress
 from playslot_rl.seeds.draws import StepGenerators, global_seed, step_generator
 from playslot_rl.seeds.episodes import episode_seed
 from playslot_rl.storage.atomic import write_json
+from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.training.logging import Watch
 from playslot_rl.training.record import StageRecord
 
@@ -268,3 +269,47 @@ class _Run:
     def _log(self, split: str, values: Mapping[str, float], at: int | None = None) -> None:
         numbers = {"updates": self.state.updates, **values, "seconds": round(self._seconds(), 3)}
         self.watch.log(split, self.state.step, numbers, at=at)
+
+
+@dataclass(frozen=True)
+class OnlineTraining:
+    """See `playslot_rl.training.record.Prepared`.
+
+    Attributes:
+        learner: on its device.
+        own: settings of acting, replay and schedule.
+        modules: what a finished run keeps of the learner.
+        prior: agent steps behind what it was given.
+    """
+
+    learner: Learner
+    own: OnlineConfig
+    modules: Mapping[str, nn.Module]
+    prior: int = 0
+
+    def carry_out(self, record: StageRecord, begin: Callable[[], None]) -> StageCheckpoint:
+        """Act and learn, and save."""
+        title = METHODS[record.config.method].title
+        state, _ = train_online(
+            self.learner, self.own, record, begin, title=title, device=record.device, prior_steps=self.prior
+        )
+        return _save(record, state, self.modules, self.prior)
+
+
+def _save(record: StageRecord, state: OnlineState, modules: Mapping[str, nn.Module], prior: int) -> StageCheckpoint:
+    extra = {
+        "env_steps": state.step + prior,
+        "savi_steps": prior,
+        "episodes": state.episodes,
+        "random_policy": state.random,
+        "parameters": sum(p.numel() for module in modules.values() for p in module.parameters()),
+    }
+    done = record.save(modules, state.metrics, state.updates, state.seconds, extra)
+    last, random, before = state.curve[-1], state.random, f" and {prior} of SAVi's data" if prior else ""
+    print(
+        f"{record.name}: {state.step} agent steps{before}, {state.updates} updates; development episodes: return "
+        f"{last['return_mean']:.2f} (random {random['return_mean']:.2f}), success {100 * last['success_rate']:.0f} % "
+        f"(random {100 * random['success_rate']:.0f} %); {record.folder}",
+        flush=True,
+    )
+    return done

@@ -28,9 +28,8 @@ from tensordict import TensorDict
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import CollectorConfig
 from playslot_rl.errors import PlaySlotError
-from playslot_rl.methods.online.acting import PlayedEpisodes, play
-from playslot_rl.methods.online.checkpoints import whole_episodes
-from playslot_rl.methods.online.learner import Learner
+from playslot_rl.methods.online.acting import Learner, PlayedEpisodes, play
+from playslot_rl.methods.online.replay import whole_episodes
 from playslot_rl.runtime.children import begin_worker, worker_context
 from playslot_rl.runtime.ray_cluster import RayCluster, worker_cannot_start
 from playslot_rl.seeds.draws import global_seed, step_generator

@@ -1,4 +1,10 @@
-"""The replay: whole episodes on TorchRL's buffers, sampled as sequences.
+"""The replay, whole episodes on TorchRL's buffers, sampled as sequences; and checkpoints of learning by acting:
+modules, optimisers, counters, and a journal of the replay.
+
+    RUN/METHOD/checkpoints/step_XXXXXXXX   modules.safetensors, optimizers.safetensors, state.json (newest two)
+    RUN/METHOD/replay/XXXXXXXX.safetensors the episodes from number X on that came since the last checkpoint
+
+Frames are most of it, so the journal is only appended to; its file is on the disk before the checkpoint that counts it.
 
 Shapes: n episodes of L frames (`env.max_steps` + 1), B sequences of T frames, A action dim.
 """
@@ -6,16 +12,22 @@ Shapes: n episodes of L frames (`env.max_steps` + 1), B sequences of T frames, A
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
-from collections.abc import Iterator
-from typing import Final
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, Final
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.errors import ConfigError
+from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.methods.online.config import OnlineConfig
+from playslot_rl.storage.resume import KEPT, TrainingCheckpoints, optimizer_tensors, restore_optimizer
+from playslot_rl.storage.tensors import load_modules, load_tensors, module_tensors, save_tensors
 
 STREAM: Final = "stream"
 """Zero everywhere: to the sampler all episodes are one trajectory, and sequences run across them."""
@@ -113,3 +125,157 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(level)
+
+
+@dataclass(frozen=True)
+class OnlineState:
+    """Where a run stands, at the end of a round.
+
+    Attributes:
+        step: agent steps taken.
+        rounds: rounds of episodes.
+        episodes: episodes in the replay's history.
+        updates: optimiser updates.
+        ratio_from: progress of the schedule of updates; None before the first.
+        seconds: wall-clock seconds over all processes.
+        metrics: the last point of the learning curve.
+        curve: all points.
+        random: the random policy's point.
+        ahead: of a round that workers have played ahead (`playslot_rl.methods.online.players`): `returns` and
+            `successes`. Its frames lie in the checkpoint.
+    """
+
+    step: int = 0
+    rounds: int = 0
+    episodes: int = 0
+    updates: int = 0
+    ratio_from: float | None = None
+    seconds: float = 0.0
+    metrics: dict[str, float] = field(default_factory=dict)
+    curve: list[dict[str, Any]] = field(default_factory=list)
+    random: dict[str, Any] = field(default_factory=dict)
+    ahead: dict[str, Any] = field(default_factory=dict)
+
+
+def whole_episodes(tensors: Mapping[str, Tensor]) -> TensorDict:
+    """Tensors (n, L, ...) of one round as a TensorDict of batch size [n, L]."""
+    return TensorDict(dict(tensors), next(iter(tensors.values())).shape[:2])
+
+
+class ReplayJournal:
+    """The episodes of a run on disk."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def files(self) -> list[tuple[int, Path]]:
+        """First episode and file, in order."""
+        return sorted((int(path.stem), path) for path in self.folder.glob("[0-9]*.safetensors"))
+
+    def append(self, first: int, episodes: TensorDictBase) -> None:
+        """Write episodes `first`, `first` + 1, ...; batch size [n, L]."""
+        tensors = {str(key): value for key, value in episodes.items()}
+        save_tensors(self.folder / f"{first:08d}.safetensors", tensors)
+
+    def rewind(self, total: int) -> None:
+        """Remove what came after the checkpoint that counts `total` episodes, and what a kill left."""
+        for leftover in self.folder.glob(".*.tmp-*"):
+            leftover.unlink()
+        for first, path in self.files():
+            if first >= total:
+                path.unlink()
+
+    def forget(self, before: int) -> None:
+        """Remove files with none but episodes before number `before`."""
+        starts = self.files()
+        for (_, path), (following, _) in itertools.pairwise(starts):
+            if following <= before:
+                path.unlink()
+
+    def read(self, total: int) -> TensorDict:
+        """The episodes up to `total`, batch size [m, L]; a CheckpointError where a file is missing or damaged."""
+        parts = [load_tensors(path) for _, path in self.files()]
+        first = self.files()[0][0] if parts else 0
+        whole = {key: torch.cat([part[key] for part in parts]) for key in (parts[0] if parts else {})}
+        found = first + (len(next(iter(whole.values()))) if whole else 0)
+        if found != total:
+            raise CheckpointError(
+                f"{self.folder}: got episodes up to {found}, expected {total}: "
+                f"delete {self.folder.parent} to start anew"
+            )
+        return whole_episodes(whole)
+
+
+class OnlineCheckpoints(TrainingCheckpoints):
+    """The checkpoints of a run in `RUN/METHOD`."""
+
+    def __init__(self, folder: Path, identity: Mapping[str, Any], typed: Callable[[str], str] = str) -> None:
+        super().__init__(folder / "checkpoints", identity, typed)
+        self.journal = ReplayJournal(folder / "replay")
+        self._counted: list[int] = []
+
+    def save_online(
+        self,
+        state: OnlineState,
+        modules: Mapping[str, nn.Module],
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        new: TensorDictBase | None,
+        capacity: int,
+        ahead: TensorDictBase | None = None,
+    ) -> Path:
+        """Write a checkpoint, and the episodes that came since the last one.
+
+        Args:
+            new: episodes since the last checkpoint, batch size [n, L], the last of them number `state.episodes` - 1.
+            capacity: episodes that the replay holds.
+            ahead: the episodes of `state.ahead`, batch size [m, L].
+
+        Raises:
+            OutputError: full disk; the earlier checkpoints stay.
+        """
+        if new is not None:
+            self.journal.append(state.episodes - len(new), new)
+        stored = {
+            f"{name}/{key}": value
+            for name, optimizer in optimizers.items()
+            for key, value in optimizer_tensors(optimizer).items()
+        }
+        tensors = {"modules": module_tensors(modules), "optimizers": stored}
+        if ahead is not None:
+            tensors["ahead"] = {str(key): value for key, value in ahead.items()}
+        final = self._write(state.step, tensors, asdict(state))
+        # Both checkpoints that are kept must find their episodes.
+        self._counted = [*self._counted, state.episodes][-KEPT:]
+        self.journal.forget(self._counted[0] - capacity)
+        return final
+
+    def ahead(self) -> TensorDict:
+        """The frames of `OnlineState.ahead`, of the newest checkpoint, batch size [m, L]."""
+        last = self.last()
+        assert last is not None
+        return whole_episodes(load_tensors(last / "ahead.safetensors"))
+
+    def resume_online(
+        self, modules: Mapping[str, nn.Module], optimizers: Mapping[str, torch.optim.Optimizer], replay: Replay
+    ) -> OnlineState:
+        """Load the newest checkpoint and fill the replay; a fresh state if there is none.
+
+        Raises:
+            CheckpointError: the config differs from the stored one, or something is damaged.
+            OutputError: a file stands where the folder should be.
+        """
+        newest = self._newest()
+        if newest is None:
+            self.journal.rewind(0)
+            return OnlineState()
+        last, stored = newest
+        load_modules(modules, load_tensors(last / "modules.safetensors"), str(last))
+        tensors = load_tensors(last / "optimizers.safetensors")
+        for name, optimizer in optimizers.items():
+            own = {key.removeprefix(f"{name}/"): value for key, value in tensors.items() if key.startswith(f"{name}/")}
+            restore_optimizer(optimizer, own, str(last))
+        state = OnlineState(**{item.name: stored[item.name] for item in fields(OnlineState) if item.name in stored})
+        self.journal.rewind(state.episodes)
+        replay.restore(self.journal.read(state.episodes), state.episodes)
+        self._counted = [state.episodes]
+        return state

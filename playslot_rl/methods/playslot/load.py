@@ -6,7 +6,7 @@ import torch
 
 from playslot_rl.acting.actor import SlotActor
 from playslot_rl.acting.agent import playslot_actor
-from playslot_rl.methods.video.slots import SlotVideo
+from playslot_rl.methods.video.predictor import SlotVideo
 from playslot_rl.runs import Run
 
 

@@ -6,8 +6,7 @@ from playslot_rl import keys
 from playslot_rl.data.demonstrations import Transitions, moving_frames, require_finite
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
-from playslot_rl.methods.resnet_oracle.config import ResNetOracleConfig
-from playslot_rl.methods.resnet_oracle.method import NAME
+from playslot_rl.methods.resnet_oracle.method import NAME, ResNetOracleConfig
 from playslot_rl.methods.resnet_oracle.network import ResNetPolicy, load_pretrained
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.demonstrated import cloned

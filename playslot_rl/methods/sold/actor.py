@@ -17,8 +17,7 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
 from playslot_rl.config import EnvConfig
 from playslot_rl.errors import ConfigError
-from playslot_rl.methods.sold.config import SOLDConfig
-from playslot_rl.methods.sold.method import NAME
+from playslot_rl.methods.sold.method import NAME, SOLDConfig
 from playslot_rl.methods.sold.networks import ActorHead, SOLDNetworks, sample_action
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runs import Run

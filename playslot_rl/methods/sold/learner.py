@@ -19,16 +19,18 @@ from torchrl.modules import PercentileValueNorm
 
 from playslot_rl import keys
 from playslot_rl.frames import normalise
+from playslot_rl.methods.online.loop import OnlineTraining
 from playslot_rl.methods.sold import losses
-from playslot_rl.methods.sold.actor import SOLDActor
-from playslot_rl.methods.sold.config import SOLDConfig
+from playslot_rl.methods.sold.actor import SOLDActor, build_networks, prior_steps
+from playslot_rl.methods.sold.method import SOLDConfig
 from playslot_rl.methods.sold.networks import SOLDNetworks
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.seeds.draws import StepGenerators
+from playslot_rl.seeds.draws import StepGenerators, global_seed
+from playslot_rl.training.record import StageRecord
 
 
 class SOLDLearner:
-    """SOLD as `playslot_rl.methods.online.learner.Learner`; SAVi is frozen, in evaluation mode."""
+    """SOLD as `playslot_rl.methods.online.acting.Learner`; SAVi is frozen, in evaluation mode."""
 
     def __init__(self, savi: SAVi, networks: SOLDNetworks, config: SOLDConfig, action_dim: int) -> None:
         self.savi, self.networks, self.config = savi, networks, config
@@ -201,3 +203,14 @@ class SOLDLearner:
         for copied, network, decay in copies:
             for slow, fast in zip(copied.parameters(), network.parameters(), strict=True):
                 slow.lerp_(cast(Tensor, fast), 1 - decay)
+
+
+def training(record: StageRecord) -> OnlineTraining:
+    """A new learner on the slots of a finished SAVi."""
+    config, slots = record.config, record.parents["slots"]
+    own: SOLDConfig = config.baselines.sold
+    before = prior_steps(own, slots)
+    with global_seed(config.seed, 0, record.name):
+        networks = build_networks(own, slots, config.env.action_dim, config.env.max_steps).to(record.device)
+    learner = SOLDLearner(record.world.load_savi(record.device), networks, own, config.env.action_dim)
+    return OnlineTraining(learner, own, dict(learner.trained), before)

@@ -30,7 +30,7 @@ from torchrl.modules import TruncatedNormal, symexp, symlog
 from torchrl.objectives import two_hot_cross_entropy, two_hot_decode
 
 from playslot_rl.config import PredictorConfig
-from playslot_rl.methods.sold.config import SOLDConfig
+from playslot_rl.methods.sold.method import SOLDConfig
 from playslot_rl.modules.predictors.ocvp_seq import OCVPSeq
 from playslot_rl.modules.transformer import KeysValues, TransformerBlock
 

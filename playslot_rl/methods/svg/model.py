@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.frames import normalise
-from playslot_rl.methods.svg.config import SVGConfig
+from playslot_rl.methods.svg.method import SVGConfig
 from playslot_rl.methods.svg.networks import (
     Decoder,
     Encoded,
@@ -61,7 +61,7 @@ class SVG(nn.Module):
 
     Examples:
         >>> import torch
-        >>> from playslot_rl.methods.svg.config import SVGConfig
+        >>> from playslot_rl.methods.svg.method import SVGConfig
         >>> config = SVGConfig(channels=(4, 8), convs=(1, 1), features=8, latent_dim=2, hidden=8)
         >>> model = SVG(config, 16).eval()
         >>> model.predict(torch.rand(2, 5, 3, 16, 16), seed=3).shape

@@ -20,8 +20,7 @@ from playslot_rl.evaluation.video import frame_scores
 from playslot_rl.frames import normalise, to_uint8
 from playslot_rl.methods.caddy.model import CADDY
 from playslot_rl.methods.svg.model import SVG
-from playslot_rl.methods.video.predictor import VideoPredictor
-from playslot_rl.methods.video.slots import SlotVideo
+from playslot_rl.methods.video.predictor import SlotVideo, VideoPredictor
 from playslot_rl.world_model import module_device
 
 BATCH = 8

@@ -1,20 +1,26 @@
-"""What the trainings of models that predict frames share."""
+"""What the trainings of models that predict frames share; SlotFormer's and OCVP-Seq's, in which nothing is inferred."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import nn
 
-from playslot_rl.config import ExperimentConfig, StageConfig
+from playslot_rl.config import DynamicsStageConfig, ExperimentConfig, ModelConfig, StageConfig
 from playslot_rl.errors import ConfigError
+from playslot_rl.methods.video.predictor import SlotVideo
+from playslot_rl.runs import Run
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.fit import Part
-from playslot_rl.training.patience import Patience
+from playslot_rl.training.patience import Patience, patience_of
 from playslot_rl.training.record import StageRecord, Training
 from playslot_rl.training.stage import Stage
+from playslot_rl.training.stage_dynamics import dynamics_on_slots
+from playslot_rl.world_model import WorldModel
 
 
 def pixel_model[Model: nn.Module](build: Callable[[Any, int], Model], own: Any, record: StageRecord) -> Model:
@@ -52,3 +58,30 @@ def _fitting[Model: nn.Module](
         return build(own, config.env.image_size)
     except ValueError as error:
         raise ConfigError(f"env.{error}: change it, or leave out method {name}") from None
+
+
+def uncontrolled(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
+    """The sizes of a world model in which nothing is inferred, and the method's predictor predicts."""
+    inverse = replace(model.inverse_dynamics, mode="none", variant="single")
+    return replace(model, inverse_dynamics=inverse, predictor=getattr(config.baselines, config.method).predictor)
+
+
+def training(record: StageRecord) -> Training:
+    """A new predictor."""
+    own: DynamicsStageConfig = getattr(record.config.baselines, record.name)
+    stage = dynamics_on_slots(record, record.groups["model"], own)
+    return on_clips(record, stage, own, patience_of(own.patience, "mse_slot"))
+
+
+def _load(name: str, run: Run, device: torch.device | str = "cpu") -> SlotVideo:
+    """The predictor of a finished run; a CheckpointError where it is missing, damaged, or of other slots."""
+    done = run.stage(name, "slots")
+    sizes, env = done.sizes
+    model = replace(sizes, savi=run.stage("slots").sizes[0].savi)
+    world = done.restore(lambda: WorldModel(model, env), ("inverse_dynamics", "predictor"), device)
+    world.savi = run.load_savi(device)
+    return SlotVideo(world)
+
+
+slotformer = partial(_load, "slotformer")
+ocvp_seq = partial(_load, "ocvp_seq")

@@ -14,7 +14,7 @@ from playslot_rl.config.compare_video import CompareVideoConfig, method_of, titl
 from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import without
 from playslot_rl.errors import ConfigError
-from playslot_rl.studies.job import Job, absolute, absolute_roots, fingerprint_of
+from playslot_rl.studies.study import Job, absolute, absolute_roots, fingerprint_of
 
 VARIED = ("model.inverse_dynamics.", "model.predictor.", "dynamics.")
 """Where the settings are that change what PlaySlot predicts, on a SAVi that is there."""

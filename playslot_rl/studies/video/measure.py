@@ -1,8 +1,12 @@
-"""Predicted frames as the measure of a study: `playslot compare-video`."""
+"""Predicted frames as the measure of a study: `playslot compare-video`.
+
+Shapes: C clips, P predicted frames.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,17 +16,15 @@ import numpy.typing as npt
 
 from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.envs import RECORDED
-from playslot_rl.errors import ConfigError
+from playslot_rl.errors import ConfigError, PlaySlotError
 from playslot_rl.evaluation.lpips import open_lpips
-from playslot_rl.studies.launch import Status
-from playslot_rl.studies.several import Commands
-from playslot_rl.studies.study import Record
-from playslot_rl.studies.video.begun import require_begun_alike
-from playslot_rl.studies.video.clips import sheet_name, test_sets
-from playslot_rl.studies.video.figure import video_figure, video_sheet
+from playslot_rl.methods.video.scores import bootstrap
+from playslot_rl.runs import Run
+from playslot_rl.storage.atomic import json_or_nothing, write_json, write_text
+from playslot_rl.studies.launch import Commands, Status
+from playslot_rl.studies.study import Record, count_parameters
 from playslot_rl.studies.video.jobs import VideoJob, check_variants, video_config, video_jobs, video_record
-from playslot_rl.studies.video.page import video_page
-from playslot_rl.studies.video.rows import summarise_video, training_row
+from playslot_rl.studies.video.page import objects_page, video_figure, video_page, video_sheet
 from playslot_rl.studies.video.shared import (
     check_clips,
     check_models,
@@ -30,10 +32,85 @@ from playslot_rl.studies.video.shared import (
     prepare_slots,
     prepare_videos,
     score_references,
+    sheet_name,
+    test_sets,
     true_frames,
 )
-from playslot_rl.studies.video.training import VideoTraining
+from playslot_rl.studies.video.training import VideoTraining, require_begun_alike
+from playslot_rl.visualization.document import to_markdown
 from playslot_rl.visualization.grid import png
+
+METRICS = ("psnr", "ssim", "lpips")
+KIND = ("row", "sees", "clips_of", "seed_frames")
+"""What tells the scores of one training apart."""
+FALLING = 0.05
+"""Gain in dB between the last two validations above which a training was not done."""
+
+
+def training_row(job: VideoJob, status: Status) -> dict[str, Any]:
+    """One training; null where there is nothing to say.
+
+    Of its keys, `rate` and `tried` are factors of the learning rate, `perceptual` says that CADDY's loss had that term,
+    and `scores` are clip by clip.
+    """
+    done = json_or_nothing(job.scores) if status.status == "done" else {}
+    curve = [row["psnr"] for row in done.get("validation", [])]
+    return {
+        "name": job.name,
+        "method": job.method,
+        "title": job.title,
+        "variant": job.variant,
+        "seed": job.seed,
+        "status": status.status,
+        "error": status.error or None,
+        "parameters": count_parameters(Run(job.run), job.stage) if done else None,
+        "steps": done.get("steps"),
+        "train_seconds": done.get("train_seconds"),
+        "rate": done.get("choice", {}).get("rate"),
+        "tried": done.get("choice", {}).get("tried"),
+        "perceptual": done.get("perceptual"),
+        "validation_psnr": curve[-1] if curve else None,
+        "still_improving": curve[-1] - curve[-2] > FALLING if len(curve) > 1 else None,
+        "scores": done.get("scores", []),
+    }
+
+
+def summarise_video(jobs: Sequence[Mapping[str, Any]], references: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """One row a method, kind of row, test set and number of seed frames: means over training seeds and clips.
+
+    Keys: `method` (null for references), `title`, `variant`, `row`, `sees`, `clips_of`, `seed_frames`, `seeds`,
+    `clips`, and for each of `psnr`, `ssim` and `lpips` its mean, `NAME_ci95` (bootstrap over clips, of each clip's mean
+    over the seeds and steps), and `NAME_steps` with `NAME_steps_ci95` (P); null where it was not measured.
+    """
+    groups: dict[tuple[Any, ...], list[tuple[int | None, Mapping[str, Any]]]] = {}
+    for job in jobs:
+        for score in job["scores"]:
+            key = (job["method"], job["title"], job["variant"], *(score[name] for name in KIND))
+            groups.setdefault(key, []).append((job["seed"], score))
+    for score in references:
+        key = (None, score["title"], "", *(score[name] for name in KIND))
+        groups.setdefault(key, []).append((None, score))
+    rows = []
+    for key, group in groups.items():
+        seeds = sorted(seed for seed, _ in group if seed is not None)
+        summary = dict(zip(("method", "title", "variant", *KIND), key, strict=True))
+        summary |= {"seeds": seeds, "clips": len(group[0][1]["psnr"])}
+        for name in METRICS:
+            summary |= _of_metric(name, [score[name] for _, score in group])
+        rows.append(summary)
+    return rows
+
+
+def _of_metric(name: str, values: Sequence[Any]) -> dict[str, Any]:
+    if any(value is None for value in values):
+        return dict.fromkeys((name, f"{name}_ci95", f"{name}_steps", f"{name}_steps_ci95"))
+    clips = np.asarray(values, np.float64).mean(axis=0)  # (C, P)
+    return {
+        name: float(clips.mean()),
+        f"{name}_ci95": list(bootstrap(clips.mean(axis=1))),
+        f"{name}_steps": clips.mean(axis=0).tolist(),
+        f"{name}_steps_ci95": [list(bootstrap(step)) for step in clips.T],
+    }
 
 
 class VideoMeasure:
@@ -138,3 +215,47 @@ def _predictions(jobs: Sequence[VideoJob], name: str) -> dict[str, npt.NDArray[n
                 if name in stored:
                     found[job.title] = stored[name]
     return found
+
+
+def each_number(config: ExperimentConfig, compare: Callable[[ExperimentConfig], None]) -> None:
+    """Run the study for each of `compare_video.objects`, and write `OUT/video.json` and `OUT/video.md`.
+
+    With N objects a frame has N + 1 slots, and an action two numbers for each object.
+
+    Raises:
+        ConfigError: another task, or videos that have their number of objects already.
+        PlaySlotError: trainings failed; all others have finished, and the tables say so.
+    """
+    own, out, failed = config.compare_video, Path(config.out), list[str]()
+    if config.env.name != "grid_shapes" or config.data.root or own.test or config.run:
+        raise ConfigError(
+            "objects: got a task or videos with a number of objects of their own, expected env=grid_shapes without "
+            "data.root=, compare_video.test= and run="
+        )
+    found = {}
+    for number in own.objects:
+        part = out / f"objects_{number}"
+        try:
+            compare(_with_objects(config, number, part))
+        except PlaySlotError as error:
+            if not (part / "video.json").is_file():
+                raise
+            failed.append(str(error))
+        found[str(number)] = json.loads((part / "video.json").read_text())
+        write_json(out / "video.json", {"objects": found})
+        write_text(out / "video.md", to_markdown(objects_page(found)))
+    print(f"compare-video: {out / 'video.md'}", flush=True)
+    if failed:
+        raise PlaySlotError("; ".join(failed))
+
+
+def _with_objects(config: ExperimentConfig, number: int, out: Path) -> ExperimentConfig:
+    grid = replace(config.env.grid, objects=number)
+    savi = replace(config.model.savi, n_slots=number + 1)
+    return replace(
+        config,
+        env=replace(config.env, grid=grid, action_dim=2 * number),
+        model=replace(config.model, savi=savi),
+        compare_video=replace(config.compare_video, objects=()),
+        out=str(out),
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from playslot_rl.config import OptimConfig
-from playslot_rl.methods.caddy.config import CADDYConfig
+from playslot_rl.methods.caddy.method import CADDYConfig
 from playslot_rl.methods.caddy.model import CADDY
 
 SIZE = 16

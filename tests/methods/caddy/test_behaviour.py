@@ -90,7 +90,7 @@ def test_training_leaves_the_encoder_and_its_statistics_as_they_are(
     read: list[CADDY] = []
 
     def kept(done: StageCheckpoint, device: object) -> CADDY:
-        from playslot_rl.methods.caddy.load import load_model
+        from playslot_rl.methods.caddy.heads import load_model
 
         read.append(load_model(done))
         return read[0]

@@ -9,9 +9,9 @@ import torch
 from caddy_parts import clips, tiny, tiny_config
 
 from playslot_rl.methods.caddy.action import divergence
-from playslot_rl.methods.caddy.loss import CADDYLoss
 from playslot_rl.methods.caddy.model import CADDY, Rollout
 from playslot_rl.methods.caddy.perceptual import VGGFeatures
+from playslot_rl.methods.caddy.stage import CADDYLoss
 
 S, T = 2, 5
 

@@ -7,7 +7,7 @@ import torch
 from caddy_parts import clips, tiny
 from torch import nn
 
-from playslot_rl.methods.caddy.config import CADDYConfig
+from playslot_rl.methods.caddy.method import CADDYConfig
 from playslot_rl.methods.caddy.model import CADDY
 from playslot_rl.methods.caddy.networks import ConvLSTM, Res
 

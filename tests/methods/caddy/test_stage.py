@@ -11,7 +11,7 @@ from caddy_parts import tiny, tiny_config
 from clips import moving_square
 
 from playslot_rl.data.windows import Clips
-from playslot_rl.methods.caddy.config import CADDYConfig
+from playslot_rl.methods.caddy.method import CADDYConfig
 from playslot_rl.methods.caddy.perceptual import load_perceptual
 from playslot_rl.methods.caddy.stage import CADDYStage, clip_length, temperature
 from playslot_rl.seeds.draws import StepGenerators, global_seed

@@ -10,8 +10,8 @@ from torchrl.objectives import DreamerV3Loss
 
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig
-from playslot_rl.methods.dreamer.config import DreamerConfig
 from playslot_rl.methods.dreamer.learner import build_loss
+from playslot_rl.methods.dreamer.method import DreamerConfig
 from playslot_rl.methods.dreamer.networks import DreamerNetworks
 from playslot_rl.seeds.draws import global_seed
 

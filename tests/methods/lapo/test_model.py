@@ -13,10 +13,9 @@ from playslot_rl.acting.actor import latent_actor
 from playslot_rl.config import ActionDecoderConfig, OptimConfig, StageConfig
 from playslot_rl.data.demonstrations import transitions
 from playslot_rl.data.windows import Clips
-from playslot_rl.methods.lapo.config import LAPOConfig
-from playslot_rl.methods.lapo.load import LAPOPolicy
-from playslot_rl.methods.lapo.model import ForwardModel, InverseModel
-from playslot_rl.methods.lapo.stage import LAPOModelStage, infer_latents
+from playslot_rl.methods.lapo.method import LAPOConfig
+from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolicy
+from playslot_rl.methods.lapo.training import LAPOModelStage, infer_latents
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 

@@ -18,9 +18,9 @@ from playslot_rl import keys
 from playslot_rl.config import EnvConfig, ExperimentConfig, LoggingConfig, RenderConfig
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.errors import PlaySlotError
-from playslot_rl.methods.online.checkpoints import OnlineState
 from playslot_rl.methods.online.config import OnlineConfig
 from playslot_rl.methods.online.loop import train_online
+from playslot_rl.methods.online.replay import OnlineState
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.tensors import module_tensors
 from playslot_rl.training.record import StageRecord

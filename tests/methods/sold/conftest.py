@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDict
 
 from playslot_rl import keys
-from playslot_rl.methods.sold.config import SOLDConfig
 from playslot_rl.methods.sold.learner import SOLDLearner
+from playslot_rl.methods.sold.method import SOLDConfig
 from playslot_rl.methods.sold.networks import SOLDNetworks
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.testing import tiny_config

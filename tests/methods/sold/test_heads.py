@@ -10,7 +10,7 @@ import torch
 from torchrl.modules import SymExpTwoHot, TruncatedNormal, symlog
 from torchrl.objectives import two_hot_encode
 
-from playslot_rl.methods.sold.config import SOLDConfig
+from playslot_rl.methods.sold.method import SOLDConfig
 from playslot_rl.methods.sold.networks import (
     MAX_STD,
     MIN_STD,

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from playslot_rl.config import OptimConfig
-from playslot_rl.methods.svg.config import SVGConfig
+from playslot_rl.methods.svg.method import SVGConfig
 from playslot_rl.methods.svg.model import SVG
 
 

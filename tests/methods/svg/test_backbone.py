@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from playslot_rl.methods.svg.config import SVGConfig
+from playslot_rl.methods.svg.method import SVGConfig
 from playslot_rl.methods.svg.model import SVG
 from playslot_rl.methods.svg.networks import Decoder, Encoder
 

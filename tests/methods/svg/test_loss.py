@@ -12,7 +12,7 @@ from torch.distributions import Independent, Normal, kl_divergence
 from playslot_rl.losses.common import draw_frames
 from playslot_rl.methods.svg.model import SVG
 from playslot_rl.methods.svg.networks import Gaussian
-from playslot_rl.methods.svg.stage import gaussian_kl, svg_objective
+from playslot_rl.methods.svg.training import gaussian_kl, svg_objective
 
 
 def generator(seed: int = 0) -> torch.Generator:

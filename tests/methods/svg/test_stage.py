@@ -11,9 +11,9 @@ from clips import moving_square
 
 from playslot_rl.data.windows import Clips
 from playslot_rl.frames import normalise
-from playslot_rl.methods.svg.config import SVGConfig
+from playslot_rl.methods.svg.method import SVGConfig
 from playslot_rl.methods.svg.model import SVG
-from playslot_rl.methods.svg.stage import SVGStage
+from playslot_rl.methods.svg.training import SVGStage
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.tensors import load_tensors
 from playslot_rl.training.fit import Part, fit

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from playslot_rl.config import LatentMode, PredictorConfig
-from playslot_rl.methods.video.predictor import VideoPredictor
-from playslot_rl.methods.video.slots import LastFrame, Reconstruction, SlotVideo, parse
+from playslot_rl.methods.video.predictor import LastFrame, Reconstruction, SlotVideo, VideoPredictor, parse
 from playslot_rl.testing import tiny_config
 from playslot_rl.world_model import WorldModel
 

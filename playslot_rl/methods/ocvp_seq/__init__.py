@@ -1,1 +1,0 @@
-"""OCVP-Seq: slots predicted without actions."""

@@ -1,1 +1,0 @@
-"""SlotFormer: slots predicted without actions."""
