@@ -51,13 +51,11 @@ class Seen(NamedTuple):
 
 
 class LatentCloning(ABC):
-    """Policy and decoder, untrained, with the stages that train them one after the other.
+    """Policy and decoder, untrained, with the stages that train them one after the other; a DataError for
+    demonstrations without actions, or in which nothing moves, or nothing in the labelled ones.
 
     A method makes `policy` and `decoder` after this, which asks it for `infer` and `observe`. Both are trained with the
     batches and the precision of `schedule`, the policy on frames that are shifted by up to `shift` pixels.
-
-    Raises:
-        DataError: demonstrations without actions, or in which nothing moves, or nothing in the labelled ones.
     """
 
     policy: nn.Module

@@ -52,7 +52,6 @@ def log_file(job_file: Path) -> Path:
 
 
 def read_status(job_file: Path) -> Status:
-    """The stored status; `waiting` where there is none, or no readable one."""
     try:
         return from_dict(Status, json_or_nothing(job_file.with_suffix(".status.json")))
     except ValueError:
@@ -64,10 +63,8 @@ def write_status(job_file: Path, status: Status) -> None:
 
 
 def comparison_lock(out: Path) -> AbstractContextManager[None]:
-    """Keep other commands out of a comparison's folder; `OUT/comparison.lock` also marks it as one.
-
-    Raises:
-        OutputError: another command works on it, or the folder cannot be written.
+    """Keep other commands out of a comparison's folder; `OUT/comparison.lock` also marks it as one. An OutputError
+    where another command works on it, or it cannot be written.
     """
     with explain_write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -79,16 +76,11 @@ def comparison_lock(out: Path) -> AbstractContextManager[None]:
 
 
 def job_lock(job_file: Path) -> AbstractContextManager[None]:
-    """Wait until no other process works on the job."""
     return locked(job_file.with_suffix(".lock"))
 
 
 def open_comparison(out: Path) -> None:
-    """Refuse a folder that holds something else than a comparison.
-
-    Raises:
-        OutputError: it does.
-    """
+    """Refuse a folder that holds something else than a comparison, by an OutputError."""
     if out.exists() and not out.is_dir():
         raise OutputError(f"out={out}: got a file, expected a folder: choose another out=")
     names = {path.name for path in out.iterdir()} if out.is_dir() else set()
@@ -110,7 +102,6 @@ def run_process(job_file: Path) -> Status:
 
 
 def settle(job_file: Path, code: int) -> Status:
-    """The status after the job's process ended with an exit code; one that died is marked as failed."""
     status = read_status(job_file)
     if code != 0 and status.status != "failed":
         reason = f"signal {-code}" if code < 0 else f"exit code {code}"
@@ -142,11 +133,7 @@ def sweep_command(files: Sequence[Path], launcher: str, overrides: Sequence[str]
 
 
 def require_launcher(name: str) -> None:
-    """Refuse a launcher that is not installed; none is needed for an empty name.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """Refuse a launcher that is not installed, by a ConfigError; none is needed for an empty name."""
     if name and not _installed(LAUNCHERS[name]):
         raise ConfigError(
             f"hydra.launcher: got {name}, expected an installed launcher: install it by `uv pip install -e "
@@ -162,11 +149,7 @@ def _installed(module: str) -> bool:
 
 
 def run_sweep(files: Sequence[Path], launcher: str, overrides: Sequence[str]) -> None:
-    """Run jobs by a Hydra launcher and wait for all of them.
-
-    Raises:
-        PlaySlotError: the launcher itself failed.
-    """
+    """Run jobs by a Hydra launcher and wait for all of them; a PlaySlotError where the launcher itself failed."""
     log = files[0].parent / "launcher.log"
     with log.open("a") as file:
         done = subprocess.run(
@@ -190,7 +173,6 @@ ERROR: Final = re.compile(r"playslot [a-z-]+(?: \(rank \d+\))?: error: (.*)")
 
 
 def train(command: str, config: ExperimentConfig, processes: int, commands: Commands) -> None:
-    """Run a training command, here or on several processes; raises as it does."""
     if processes > 1:
         train_on_several(command, config, processes)
     else:
@@ -198,22 +180,16 @@ def train(command: str, config: ExperimentConfig, processes: int, commands: Comm
 
 
 def training_command(command: str, config: ExperimentConfig, processes: int) -> list[str]:
-    """`torchrun --standalone --nproc-per-node=N -m playslot_rl COMMAND key=value ...`.
-
-    Raises:
-        ConfigError: no arguments make the config.
+    """`torchrun --standalone --nproc-per-node=N -m playslot_rl COMMAND key=value ...`; a ConfigError where no arguments
+    make the config.
     """
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
     return [*torchrun, "-m", "playslot_rl", command, *spelled(config, command)]
 
 
 def train_on_several(command: str, config: ExperimentConfig, processes: int) -> None:
-    """Run a training command on several processes and wait for it; what they print goes where this one's does.
-
-    Raises:
-        ConfigError: as `training_command`.
-        PlaySlotError: it failed, with the one line that it said.
-        KeyboardInterrupt: Ctrl-C; torchrun has ended its processes.
+    """Run a training command on several processes and wait for it; what they print goes where this one's does. A
+    PlaySlotError where it failed, with the one line that it said; after Ctrl-C torchrun has ended its processes.
     """
     started = training_command(command, config, processes)
     # A job that is killed takes torchrun, and that its processes, with it.
@@ -238,7 +214,6 @@ def _relay(lines: IO[str] | None) -> str:
 
 @contextlib.contextmanager
 def _ended(process: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
-    """Whatever happens inside, the process is no more afterwards."""
     try:
         yield process
     finally:

@@ -78,7 +78,6 @@ class Job(ABC):
 
 
 def fingerprint_of(content: Any) -> str:
-    """Short name of plain values, whatever the order of their keys."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -134,10 +133,8 @@ class Measure[J: Job](Protocol):
         """Hydra's name of the launcher that runs the jobs (empty: one after the other), and overrides for Hydra."""
 
     def check(self) -> None:
-        """Refuse what cannot be measured, before anything is written or computed.
-
-        Raises:
-            ConfigError, DataError, CheckpointError: one line.
+        """Refuse what cannot be measured, before anything is written or computed, by a ConfigError, DataError or
+        CheckpointError.
         """
 
     def prepare(self) -> Mapping[J, Record]:
@@ -177,11 +174,8 @@ class Study[J: Job]:
         self._spent = float(json_or_nothing(self._out / f"{measure.name}.json").get("seconds", 0.0))
 
     def run(self) -> None:
-        """Write every job's file, and run those that are not done as they stand there.
-
-        Raises:
-            PlaySlotError: the launcher itself failed.
-            KeyboardInterrupt: Ctrl-C. In both cases what there is has been written.
+        """Write every job's file, and run those that are not done as they stand there. After Ctrl-C, or where the
+        launcher itself failed (PlaySlotError), what there is has been written.
         """
         command, due = self._measure.command, self._due()
         launcher, hydra = self._measure.launcher
@@ -223,11 +217,7 @@ class Study[J: Job]:
         self.write(pictures=False)
 
     def write(self, pictures: bool = True) -> tuple[Document, list[str]]:
-        """Write the result; returns its page, and the names of jobs that are not done.
-
-        Raises:
-            OutputError: full disk.
-        """
+        """Write the result; returns its page, and the names of jobs that are not done."""
         measure, rows = self._measure, [row for job in self._jobs for row in self._measure.rows(job, self._status(job))]
         result = self._result(rows)
         page = measure.page(result)

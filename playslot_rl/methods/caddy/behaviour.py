@@ -89,8 +89,6 @@ class MovesLoss(BehaviourLoss):
 
 
 class MovesStage(RegressionStage):
-    """Cloning of moves; validated by both of their parts."""
-
     criterion: MovesLoss
 
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
@@ -178,21 +176,18 @@ def infer_moves(model: CADDY, source: EpisodeFrames, moves: Transitions) -> Tens
 
 
 def model(record: StageRecord) -> Training:
-    """A new video model."""
     own: CADDYConfig = record.config.baselines.caddy
     stage = CADDYStage(pixel_model(CADDY, own, record), record.clips(own.frames), own)
     return on_clips(record, stage, own, extra={"perceptual": stage.perceptual_on})
 
 
 def policy(record: StageRecord) -> Training:
-    """New policy and decoder on the demonstrations."""
     own: CADDYPolicyConfig = record.config.baselines.caddy_policy
     behaviour = CADDYBehaviour(record.config, record.parents["caddy"], record.demos, record.device)
     return cloning(record, behaviour, own.policy, own.decoder_steps, own.decoder_lr)
 
 
 def oracle(record: StageRecord) -> Training:
-    """A new head on the real actions of the demonstrations."""
     own: CADDYOracleConfig = record.config.baselines.caddy_oracle
     stage = oracle_stage(record.config, record.parents["caddy"], record.demos, record.device)
     said, extra = cloned(record.name, record.demos, len(stage.targets))

@@ -75,8 +75,6 @@ class MovesHead(StateHead):
 
 
 class OnFrames(nn.Module):
-    """A head on the states of a frozen encoder."""
-
     def __init__(self, encoder: Encoder, head: StateHead) -> None:
         super().__init__()
         self.encoder, self.head = encoder, head

@@ -77,10 +77,8 @@ class Rollout(NamedTuple):
 
 
 class CADDY(nn.Module):
-    """All of CADDY; a `VideoPredictor`. `variability`, v in `predict`, may be set.
-
-    Raises:
-        ValueError: an image size that is no multiple of 16.
+    """All of CADDY; a `VideoPredictor`. `variability`, v in `predict`, may be set. A ValueError for an image size that
+    is no multiple of 16.
     """
 
     infers = True

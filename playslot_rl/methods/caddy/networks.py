@@ -56,7 +56,6 @@ def convolution(in_channels: int, out_channels: int, resample: nn.Module | None 
 
 
 def double() -> nn.Upsample:
-    """Bilinear upsampling by two."""
     return nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False)
 
 

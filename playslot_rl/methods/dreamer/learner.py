@@ -52,7 +52,6 @@ def world_model(networks: DreamerNetworks) -> TensorDictSequential:
 
 
 def imagination(networks: DreamerNetworks) -> DreamerEnv:
-    """The environment that the prior and the reward head make."""
     dynamics = TensorDictModule(networks.prior, ["state", "belief", keys.ACTION], ["_", "state", "belief"])
     reward = TensorDictModule(networks.reward, ["state", "belief"], ["_", keys.REWARD])
     device = next(networks.parameters()).device
@@ -194,7 +193,6 @@ class _Slow(nn.Module):
 
 
 def training(record: StageRecord) -> OnlineTraining:
-    """A new learner."""
     config = record.config
     own: DreamerConfig = config.baselines.dreamer
     with global_seed(config.seed, 0, record.name):

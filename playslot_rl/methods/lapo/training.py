@@ -131,7 +131,6 @@ class LAPOBehaviour(LatentCloning):
 
 
 def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseModel:
-    """The inverse model of a finished stage, frozen."""
     own, (_, env) = model.group(LAPOConfig, NAME), model.sizes
 
     with torch.random.fork_rng(devices=[]):
@@ -141,7 +140,6 @@ def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseM
 
 
 def model(record: StageRecord) -> Training:
-    """New models on pairs of frames of the videos."""
     config, device = record.config, record.device
     own: LAPOConfig = config.baselines.lapo
     with global_seed(config.seed, 0, record.name):
@@ -159,7 +157,6 @@ def model(record: StageRecord) -> Training:
 
 
 def policy(record: StageRecord) -> Training:
-    """New policy and decoder on the demonstrations."""
     own: LAPOConfig = record.config.baselines.lapo
     behaviour = LAPOBehaviour(record.config, record.parents["lapo_model"], record.demos, record.device)
     return cloning(record, behaviour, own.policy, own.decoder_steps, own.decoder_lr)

@@ -85,12 +85,8 @@ class Learner(Protocol):
 
 @dataclass(frozen=True)
 class PlayedEpisodes:
-    """Whole episodes.
-
-    Attributes:
-        frames: batch size [n, L], on the CPU: the learner's stored keys, ACTION, REWARD, IS_FIRST, IS_LAST.
-        returns: undiscounted sums of rewards, (n,).
-        successes: whether a step solved the task.
+    """Whole episodes: `frames` of batch size [n, L], on the CPU (the learner's stored keys, ACTION, REWARD, IS_FIRST,
+    IS_LAST), undiscounted sums of rewards (n,), and whether a step solved the task.
     """
 
     frames: TensorDict
@@ -143,10 +139,8 @@ def play(
 ) -> PlayedEpisodes:
     """Play one episode for each seed, all side by side; one that starts solved is drawn anew.
 
-    Args:
-        learner: sees every frame; None looks at none (`random` only) and stores none.
-        explore: it samples its actions.
-        random: uniform actions in [-1, 1] instead, a function of the episode's seed.
+    The learner sees every frame, and samples its actions to `explore`; None looks at none (`random` only) and stores
+    none. With `random` actions are uniform in [-1, 1], a function of the episode's seed.
     """
     drawn = RandomActor(pool.env.max_steps, pool.env.action_dim)
     actor: Actor = drawn

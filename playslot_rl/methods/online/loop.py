@@ -132,7 +132,6 @@ class _Run:
         return self.state.step >= self.online.steps or late
 
     def advance(self, progress: StageProgress) -> None:
-        """One round of episodes, its updates, and whatever is due after it."""
         before = self.state
         if not before.random:
             self.state = replace(before, random=self._measure(random=True))
@@ -199,7 +198,6 @@ class _Run:
                 self._log("train", numbers, at=update + 1)
 
     def _development_seeds(self) -> list[int]:
-        """The fixed episodes behind a learning curve, the same ones for every method and training seed."""
         return [episode_seed("development", 0, i) for i in range(self.online.evaluation_episodes)]
 
     def _measure(self, random: bool = False) -> dict[str, Any]:
@@ -288,7 +286,6 @@ class OnlineTraining:
     prior: int = 0
 
     def carry_out(self, record: StageRecord, begin: Callable[[], None]) -> StageCheckpoint:
-        """Act and learn, and save."""
         title = METHODS[record.config.method].title
         state, _ = train_online(
             self.learner, self.own, record, begin, title=title, device=record.device, prior_steps=self.prior

@@ -51,7 +51,6 @@ class Round:
     random: bool
 
     def split(self, count: int) -> list[Round]:
-        """The parts of `count` workers, equally long, in order."""
         share = len(self.seeds) // count
         return [replace(self, seeds=self.seeds[i * share : (i + 1) * share]) for i in range(count)]
 
@@ -137,15 +136,9 @@ class _RayWorker:
 
 
 class Players:
-    """Workers that play one round ahead of the learner, of which each has a copy.
-
-    Args:
-        make_pool: gives a worker its environments; it is pickled.
-        count: W; divides the episodes of a round.
-
-    Raises:
-        ConfigError: Ray is asked for and not installed.
-        PlaySlotError: the cluster cannot be reached.
+    """Workers that play one round ahead of the learner, of which each has a copy: `count` of them, a divisor of a
+    round's episodes, with environments that `make_pool` gives, which is pickled. A ConfigError where Ray is asked for
+    and not installed, a PlaySlotError where the cluster cannot be reached.
     """
 
     def __init__(
@@ -164,7 +157,6 @@ class Players:
         self._futures: list[Future[Any]] = []
 
     def begin(self, wanted: Round) -> None:
-        """Begin a round with the learner's present weights."""
         self._weights = tensor_bytes(module_tensors(self.learner.modules))
         self._parts = wanted.split(len(self._workers))
         self._futures = [
@@ -187,7 +179,6 @@ class Players:
         return PlayedEpisodes(torch.cat(frames), returns, tuple(s for _, part in parts for s in part.successes))
 
     def close(self) -> None:
-        """End the workers, and Ray if it was started here."""
         for worker in self._workers:
             worker.close()
         self._workers, self._futures = [], []
@@ -224,7 +215,6 @@ class Players:
                 return found
 
     def _replace(self, i: int, reason: str) -> None:
-        """Another worker plays the same part with the same weights."""
         self._workers[i].close()
         if self.replaced >= self.settings.restarts:
             raise PlaySlotError(

@@ -34,17 +34,11 @@ STREAM: Final = "stream"
 
 
 class Replay:
-    """A ring of the latest episodes.
+    """A ring of the latest `capacity` episodes; a ConfigError where that is less than one sequence or one episode.
 
     Every frame comes with `keys.ACTION` and `keys.REWARD`, of the step that led to it (the reward as the task gave it;
     `sample` multiplies it by `reward_scale`), and `keys.IS_FIRST` and `keys.IS_LAST`. A sequence no longer than an
     episode lies within one; a longer one runs on into the next episode, with its `IS_FIRST`.
-
-    Attributes:
-        capacity: episodes it holds.
-
-    Raises:
-        ConfigError: the capacity is less than one sequence or one episode.
     """
 
     def __init__(self, config: OnlineConfig, episode_frames: int) -> None:
@@ -73,7 +67,6 @@ class Replay:
         self.episodes = 0
 
     def __len__(self) -> int:
-        """Frames it holds."""
         return len(self._buffer)
 
     @property
@@ -163,13 +156,10 @@ def whole_episodes(tensors: Mapping[str, Tensor]) -> TensorDict:
 
 
 class ReplayJournal:
-    """The episodes of a run on disk."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def files(self) -> list[tuple[int, Path]]:
-        """First episode and file, in order."""
         return sorted((int(path.stem), path) for path in self.folder.glob("[0-9]*.safetensors"))
 
     def append(self, first: int, episodes: TensorDictBase) -> None:
@@ -207,8 +197,6 @@ class ReplayJournal:
 
 
 class OnlineCheckpoints(TrainingCheckpoints):
-    """The checkpoints of a run in `RUN/METHOD`."""
-
     def __init__(self, folder: Path, identity: Mapping[str, Any], typed: Callable[[str], str] = str) -> None:
         super().__init__(folder / "checkpoints", identity, typed)
         self.journal = ReplayJournal(folder / "replay")
@@ -223,15 +211,9 @@ class OnlineCheckpoints(TrainingCheckpoints):
         capacity: int,
         ahead: TensorDictBase | None = None,
     ) -> Path:
-        """Write a checkpoint, and the episodes that came since the last one.
-
-        Args:
-            new: episodes since the last checkpoint, batch size [n, L], the last of them number `state.episodes` - 1.
-            capacity: episodes that the replay holds.
-            ahead: the episodes of `state.ahead`, batch size [m, L].
-
-        Raises:
-            OutputError: full disk; the earlier checkpoints stay.
+        """Write a checkpoint, and the episodes that came since the last one: `new`, batch size [n, L], the last of them
+        number `state.episodes` - 1. `capacity` is the replay's, `ahead` the episodes of `state.ahead` [m, L]. An
+        OutputError where the disk is full; the earlier checkpoints stay.
         """
         if new is not None:
             self.journal.append(state.episodes - len(new), new)
@@ -258,11 +240,9 @@ class OnlineCheckpoints(TrainingCheckpoints):
     def resume_online(
         self, modules: Mapping[str, nn.Module], optimizers: Mapping[str, torch.optim.Optimizer], replay: Replay
     ) -> OnlineState:
-        """Load the newest checkpoint and fill the replay; a fresh state if there is none.
-
-        Raises:
-            CheckpointError: the config differs from the stored one, or something is damaged.
-            OutputError: a file stands where the folder should be.
+        """Load the newest checkpoint and fill the replay; a fresh state if there is none. A CheckpointError where the
+        config differs from the stored one, or something is damaged; an OutputError where a file stands in the folder's
+        place.
         """
         newest = self._newest()
         if newest is None:

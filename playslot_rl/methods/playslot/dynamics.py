@@ -14,7 +14,6 @@ from playslot_rl.training.stage_dynamics import DynamicsStage, dynamics_on_slots
 
 
 def training(record: StageRecord) -> Training:
-    """Both from scratch, together."""
     own: DynamicsStageConfig = record.config.dynamics
     stage = dynamics_on_slots(record, record.groups["model"], own)
     read = _actions_read(stage)

@@ -16,5 +16,4 @@ def load_actor(run: Run, device: torch.device | str = "cpu") -> SlotActor:
 
 
 def load_video(run: Run, device: torch.device | str = "cpu") -> SlotVideo:
-    """The world model of a run; raises as `load_actor`."""
     return SlotVideo(run.load_world_model(device))

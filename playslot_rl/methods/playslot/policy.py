@@ -20,7 +20,6 @@ from playslot_rl.world_model import Agent
 
 
 def sizes(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
-    """The world model's, with policy and action decoder of the kinds that `behaviour` names."""
     own, typed = config.behaviour, config.model
     decoder = replace(typed.action_decoder, whiten=own.whiten, reads_slots=own.decoder_state)
     return replace(model, policy=replace(typed.policy, whiten=own.whiten), action_decoder=decoder)

@@ -17,7 +17,6 @@ from playslot_rl.training.stage_regression import HELD_OUT, RegressionStage, dem
 
 
 def training(record: StageRecord) -> Training:
-    """A new network on the frames of the demonstrations."""
     config, device, split = record.config, record.device, record.demos
     own: ResNetOracleConfig = config.baselines.resnet_oracle
     behaviour, width = config.behaviour, config.env.action_dim

@@ -15,7 +15,6 @@ from playslot_rl.training.stage_behaviour import oracle_stage
 
 
 def training(record: StageRecord) -> Training:
-    """A new policy on the slots of the demonstrations."""
     config = record.config
     device, split, width = record.device, record.demos, config.env.action_dim
     split.trained.require_actions(width)  # before anything is computed

@@ -206,7 +206,6 @@ class SOLDLearner:
 
 
 def training(record: StageRecord) -> OnlineTraining:
-    """A new learner on the slots of a finished SAVi."""
     config, slots = record.config, record.parents["slots"]
     own: SOLDConfig = config.baselines.sold
     before = prior_steps(own, slots)

@@ -103,7 +103,6 @@ class Decoder(nn.Module):
 
 
 def _group(widths: Sequence[int]) -> nn.Sequential:
-    """3x3 convolutions from each width to the next."""
     layers: list[nn.Module] = []
     for before, after in pairwise(widths):
         layers += [nn.Conv2d(before, after, 3, padding=1), nn.BatchNorm2d(after), nn.LeakyReLU(SLOPE, inplace=True)]

@@ -67,8 +67,6 @@ def svg_objective(out: TeacherForced, frames: Tensor, kl_weight: float) -> dict[
 
 
 class SVGStage:
-    """All of SVG-LP at once, on clips of T frames."""
-
     def __init__(self, model: SVG, clips: Clips, config: SVGConfig) -> None:
         self.model, self.clips, self.config = model, clips, config
 
@@ -121,17 +119,12 @@ def _errors(predicted: Tensor, frames: Tensor) -> Tensor:
 
 
 def training(record: StageRecord) -> Training:
-    """A new model."""
     own: SVGConfig = record.config.baselines.svg
     return on_clips(record, SVGStage(pixel_model(SVG, own, record), record.clips(own.frames), own), own)
 
 
 def load_video(run: Run, device: torch.device | str = "cpu") -> SVG:
-    """The model of a finished run.
-
-    Raises:
-        CheckpointError: it is missing or damaged.
-    """
+    """The model of a finished run; a CheckpointError where it is missing or damaged."""
     done = run.stage("svg")
     own, size = done.group(SVGConfig, "svg"), done.group(EnvConfig, "env").image_size
     return done.restore(lambda: SVG(own, size), "svg", device)

@@ -32,7 +32,6 @@ class VideoStageConfig(StageConfig):
 
     @property
     def frames(self) -> int:
-        """Of a clip."""
         return self.seed_frames + self.predicted_frames
 
 

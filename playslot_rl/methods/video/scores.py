@@ -29,7 +29,6 @@ Predict = Callable[[Tensor, Tensor | None, Tensor | None], Tensor]
 
 
 def as_function(model: VideoPredictor, seed: int) -> Predict:
-    """A predictor as a function of clips."""
 
     def predict(frames: Tensor, donors: Tensor | None, actions: Tensor | None) -> Tensor:
         if isinstance(model, SlotVideo) and model.needs_actions:
@@ -115,7 +114,6 @@ class Row(NamedTuple):
 
 
 def method_rows(model: VideoPredictor, seed: int) -> list[Row]:
-    """All rows of a trained model in evaluation mode."""
     plain = as_function(model, seed)
     if not model.infers:
         return [Row("", "nothing", plain)]

@@ -61,13 +61,11 @@ def _fitting[Model: nn.Module](
 
 
 def uncontrolled(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
-    """The sizes of a world model in which nothing is inferred, and the method's predictor predicts."""
     inverse = replace(model.inverse_dynamics, mode="none", variant="single")
     return replace(model, inverse_dynamics=inverse, predictor=getattr(config.baselines, config.method).predictor)
 
 
 def training(record: StageRecord) -> Training:
-    """A new predictor."""
     own: DynamicsStageConfig = getattr(record.config.baselines, record.name)
     stage = dynamics_on_slots(record, record.groups["model"], own)
     return on_clips(record, stage, own, patience_of(own.patience, "mse_slot"))

@@ -61,7 +61,6 @@ class SuccessJob(Job):
 
     @property
     def online(self) -> bool:
-        """Whether it learns by acting."""
         return METHODS[self.method].online
 
     @property
@@ -77,7 +76,6 @@ class SuccessJob(Job):
 
     @property
     def protocols(self) -> tuple[str, ...]:
-        """How it is evaluated."""
         return ("simulation", "imagination") if METHODS[self.method].imagines else ("simulation",)
 
 
@@ -105,12 +103,10 @@ def _of_demonstrations(method: str, demos: int, seed: int, out: Path, labels: Se
 
 
 def uses_demos(config: ExperimentConfig) -> bool:
-    """Whether a method learns from demonstrations."""
     return any(not METHODS[name].online for name in config.compare.methods)
 
 
 def uses_slots(config: ExperimentConfig) -> bool:
-    """Whether a method builds on a world model."""
     return any(METHODS[name].slots for name in config.compare.methods)
 
 
@@ -184,11 +180,9 @@ RECORDED = Path("data") / "expert"
 
 
 def check_data(config: ExperimentConfig) -> ExperimentConfig:
-    """The config with the data sets that are known already; refuses those that do not fit, before anything is written.
-
-    Raises:
-        ConfigError: too few demonstrations, or an evaluation seed among the training seeds.
-        DataError: a data set cannot be read, or the demonstrations have no actions.
+    """The config with the data sets that are known already; refuses those that do not fit, before anything is written:
+    a ConfigError for too few demonstrations or an evaluation seed among the training seeds, a DataError for a data set
+    that cannot be read or demonstrations without actions.
     """
     out = Path(config.out)
     config = replace(config, data=_known(config), method="playslot", demos=None)
@@ -201,11 +195,7 @@ def check_data(config: ExperimentConfig) -> ExperimentConfig:
 
 
 def check_demos(config: ExperimentConfig, episodes: int, where: str) -> None:
-    """Refuse more demonstrations than there are.
-
-    Raises:
-        ConfigError: there are fewer.
-    """
+    """Refuse more demonstrations than there are, by a ConfigError."""
     most = max(config.compare.demos)
     if most > episodes:
         raise ConfigError(
@@ -214,11 +204,7 @@ def check_demos(config: ExperimentConfig, episodes: int, where: str) -> None:
 
 
 def prepare_shared(config: ExperimentConfig, commands: Commands) -> ExperimentConfig:
-    """Record, train or find what the jobs share, finished parts excepted; the config with `data` and `run` complete.
-
-    Raises:
-        DataError, CheckpointError, OutputError, TrainingError: see `playslot_rl.errors`.
-    """
+    """Record, train or find what the jobs share, finished parts excepted; the config with `data` and `run` complete."""
     out, models = Path(config.out), latent_models(config)
     world = uses_slots(config) and not config.run
     if uses_demos(config) or (world and config.collect.learn_from_demos):
@@ -249,7 +235,6 @@ def _known(config: ExperimentConfig) -> DataConfig:
 
 
 def _recorded(out: Path) -> bool:
-    """Whether this comparison has recorded its demonstrations."""
     return (out / RECORDED / "meta" / "info.json").is_file()
 
 

@@ -215,12 +215,9 @@ class SuccessMeasure:
 
 
 def check_success(config: ExperimentConfig) -> None:
-    """Refuse what cannot be compared, before anything is computed.
-
-    Raises:
-        ConfigError: an environment without simulator, or without dense reward for a method that acts; weights that
-            are not there.
-        CheckpointError: `run` is no finished world model, or one of another task.
+    """Refuse what cannot be compared, before anything is computed: a ConfigError for an environment without simulator,
+    or without dense reward for a method that acts, or weights that are not there; a CheckpointError where `run` is no
+    finished world model, or one of another task.
     """
     env = config.env
     gym_id(env.name)
@@ -239,10 +236,8 @@ def check_success(config: ExperimentConfig) -> None:
 
 
 def _references(config: ExperimentConfig) -> dict[str, dict[str, Any]]:
-    """What the random policy and the scripted expert do in the evaluation episodes, run or read.
-
-    Raises:
-        ConfigError: an evaluation seed that a training data set holds.
+    """What the random policy and the scripted expert do in the evaluation episodes, run or read; a ConfigError for an
+    evaluation seed that a training data set holds.
     """
     seeds = held_out_seeds(config, config.compare.evaluation_seed, config.episodes or 0)
     with TaskPool(config.env, config.render) as pool:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 
 def success_page(result: Result) -> Document:
-    """The page of what `comparison.json` holds."""
     lead = (
         f"Preset `{result['preset']}`, training seeds {_list(result['seeds'])}, {result['episodes']} held-out episodes "
         f"(block {result['evaluation_seed']} of the evaluation seeds, the same for every method and seed), at most "
@@ -118,7 +117,6 @@ def _footnotes(result: Result) -> list[str]:
 
 
 def _acting_cost(result: Result) -> list[str]:
-    """What acting cost, in both kinds of steps."""
     notes = []
     for row in result["summary"]:
         if row["demos"] is None and row["agent_steps"] is not None:

@@ -48,7 +48,6 @@ class VideoJob(Job):
 
     @property
     def value(self) -> str:
-        """Of the setting that varies."""
         return self.variant.partition("=")[2]
 
     @property
@@ -71,7 +70,6 @@ class VideoJob(Job):
 
     @property
     def trials(self) -> Path:
-        """Folder of the trials of learning rates, one for all seeds."""
         return self.out / "trials" / self._method_name
 
     def trial(self, rate: float) -> Path:
@@ -85,12 +83,10 @@ class VideoJob(Job):
 
     @property
     def scores(self) -> Path:
-        """What it scored."""
         return self.run / "video.json"
 
     @property
     def pictures(self) -> Path:
-        """Its predictions of the first clips."""
         return self.run / "video.npz"
 
 
@@ -108,11 +104,7 @@ def video_jobs(config: ExperimentConfig, out: Path) -> list[VideoJob]:
 
 
 def check_variants(config: ExperimentConfig) -> None:
-    """Refuse a setting that is not there or that a comparison sets itself, and values it cannot have.
-
-    Raises:
-        ConfigError: one line.
-    """
+    """Refuse a setting that is not there or that a comparison sets itself, and values it cannot have: a ConfigError."""
     own = config.compare_video
     if own.vary and not any(method_of(method).imagines for method in own.methods):
         raise ConfigError(f"vary: got methods={','.join(own.methods)}, expected playslot or playslot_m among them")
@@ -159,12 +151,10 @@ def makes_trials(asked: CompareVideoConfig) -> bool:
 
 
 def uses_slots(config: ExperimentConfig) -> bool:
-    """Whether a method builds on SAVi's slots."""
     return any(method_of(method).slots for method in config.compare_video.methods)
 
 
 def with_training(config: ExperimentConfig, method: str, **changes: Any) -> ExperimentConfig:
-    """The config with some settings of a method's training changed."""
     if method_of(method).imagines:
         return replace(config, dynamics=replace(config.dynamics, **changes))
     own = replace(getattr(config.baselines, method), **changes)
@@ -172,7 +162,6 @@ def with_training(config: ExperimentConfig, method: str, **changes: Any) -> Expe
 
 
 def training_of(config: ExperimentConfig, method: str) -> Any:
-    """A method's training settings, a `StageConfig`."""
     return config.dynamics if method_of(method).imagines else getattr(config.baselines, method)
 
 
@@ -276,5 +265,4 @@ def video_record(job: VideoJob, config: ExperimentConfig, parents: Mapping[str, 
 
 
 def asked_of(record: Mapping[str, Any]) -> CompareVideoConfig:
-    """The comparison's settings that a job's file names."""
     return from_dict(CompareVideoConfig, dict(record["asked"]))

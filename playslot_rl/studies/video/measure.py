@@ -218,13 +218,11 @@ def _predictions(jobs: Sequence[VideoJob], name: str) -> dict[str, npt.NDArray[n
 
 
 def each_number(config: ExperimentConfig, compare: Callable[[ExperimentConfig], None]) -> None:
-    """Run the study for each of `compare_video.objects`, and write `OUT/video.json` and `OUT/video.md`.
+    """Run the study for each of `compare_video.objects`, and write `OUT/video.json` and `OUT/video.md`. A ConfigError
+    for another task, or videos that have their number of objects already; a PlaySlotError where trainings failed: all
+    others have finished, and the tables say so.
 
     With N objects a frame has N + 1 slots, and an action two numbers for each object.
-
-    Raises:
-        ConfigError: another task, or videos that have their number of objects already.
-        PlaySlotError: trainings failed; all others have finished, and the tables say so.
     """
     own, out, failed = config.compare_video, Path(config.out), list[str]()
     if config.env.name != "grid_shapes" or config.data.root or own.test or config.run:

@@ -38,7 +38,6 @@ PAPER = {
 
 
 def video_page(result: Result) -> Document:
-    """The page of what `video.json` holds."""
     trained = result["trained"]
     lead = (
         f"Preset `{result['preset']}`, training seeds {', '.join(map(str, result['seeds']))}; clips of "
@@ -60,7 +59,6 @@ def video_page(result: Result) -> Document:
 
 
 def objects_page(found: Mapping[str, Result]) -> Document:
-    """The page over numbers of objects, of what `video.json` of each number holds."""
     first = next(iter(found.values()))
     lead = (
         "PSNR in dB and SSIM over the predicted frames; each number has its videos, its SAVi and a page of its own, "

@@ -37,10 +37,8 @@ from playslot_rl.training.record import open_videos
 
 
 def test_sets(config: ExperimentConfig) -> dict[str, str]:
-    """The data sets whose clips are tested, by folder name; one of them, or episodes kept of `data.root`, has none.
-
-    Raises:
-        ConfigError: two folders of one name.
+    """The data sets whose clips are tested, by folder name (a ConfigError for two of one name); one of them, or
+    episodes kept of `data.root`, has none.
     """
     roots = [part.strip() for part in config.compare_video.test.split(",") if part.strip()]
     if len(roots) <= 1:
@@ -55,13 +53,8 @@ def test_sets(config: ExperimentConfig) -> dict[str, str]:
 
 
 class Tested(NamedTuple):
-    """Clips that are predicted from some seed frames on.
-
-    Attributes:
-        label: of their test set; empty where it is the only one.
-        shown: seed frames.
-        source: the episodes.
-        rows: of each clip's frames, int64 (clips, shown + predicted).
+    """Clips that are predicted from `shown` seed frames on: the `label` of their test set (empty where it is the only
+    one), its episodes, and rows of each clip's frames, int64 (clips, shown + predicted).
     """
 
     label: str
@@ -71,16 +64,11 @@ class Tested(NamedTuple):
 
     @property
     def fingerprint(self) -> str:
-        """Of the true frames."""
         return hashlib.sha256(self.source.frames[self.rows].tobytes()).hexdigest()[:16]
 
 
 def tested_clips(config: ExperimentConfig) -> Iterator[Tested]:
-    """The clips of each test set after each number of seed frames.
-
-    Raises:
-        DataError: see `open_clips`.
-    """
+    """The clips of each test set after each number of seed frames; raises as `open_clips`."""
     own = config.compare_video
     for label, test in test_sets(config).items():
         for shown in own.shown:
@@ -93,19 +81,9 @@ def sheet_name(label: str, shown: int) -> str:
 
 
 def open_clips(config: ExperimentConfig, test: str, frames: int, count: int) -> tuple[EpisodeFrames, IntArray]:
-    """Clips of a test set.
-
-    Args:
-        config: names `data.root`.
-        test: the data set; empty takes the episodes that are kept of `data.root`.
-        frames: T, of a clip.
-        count: clips, at most; they do not overlap, and are spread evenly over the episodes.
-
-    Returns:
-        The episodes, and row numbers (at most `count`, T).
-
-    Raises:
-        DataError: too few episodes, none so long, fewer than two clips, or a data set that cannot be read.
+    """The episodes of a test set (empty: those that are kept of `data.root`), and row numbers (at most `count`, T) of
+    clips of T = `frames`, which do not overlap and are spread evenly over the episodes. A DataError for too few
+    episodes, none so long, fewer than two clips, or a data set that cannot be read.
     """
     data = config.data
     place, cure = ("compare_video.test", "") if test else ("data.root", ", or raise compare_video.tested")
@@ -130,11 +108,9 @@ TEST_SEED = 1_000_003
 
 
 def check_models(config: ExperimentConfig) -> None:
-    """Refuse models that do not fit the frames, before anything is computed.
-
-    Raises:
-        ConfigError, CheckpointError: SAVi was trained on frames of another size, SVG-LP or CADDY cannot take these, or
-            the weights of a perceptual loss cannot be read.
+    """Refuse models that do not fit the frames, before anything is computed: a ConfigError or CheckpointError where
+    SAVi was trained on frames of another size, SVG-LP or CADDY cannot take these, or the weights of a perceptual loss
+    cannot be read.
     """
     for method in config.compare_video.methods:
         if not method_of(method).slots:
@@ -144,11 +120,8 @@ def check_models(config: ExperimentConfig) -> None:
 
 
 def check_clips(config: ExperimentConfig) -> None:
-    """Refuse data without enough clips, and tests on what is trained on, before anything long is computed.
-
-    Raises:
-        ConfigError: a test set is one of the sets that are trained on.
-        DataError: too few episodes, or none as long as a clip of training or test.
+    """Refuse data without enough clips (DataError), and tests on what is trained on (ConfigError), before anything long
+    is computed.
     """
     own = config.compare_video
     trained = open_videos(config, config.data.root, "compare-video")
@@ -164,11 +137,7 @@ def check_clips(config: ExperimentConfig) -> None:
 
 
 def prepare_videos(config: ExperimentConfig) -> ExperimentConfig:
-    """The config with the data sets of training and test, which are recorded where none were named.
-
-    Raises:
-        DataError, OutputError: see `playslot_rl.errors`.
-    """
+    """The config with the data sets of training and test, which are recorded where none were named."""
     own, out = config.compare_video, Path(config.out)
     if config.data.root:
         return config
@@ -186,11 +155,7 @@ def prepare_videos(config: ExperimentConfig) -> ExperimentConfig:
 
 
 def prepare_slots(config: ExperimentConfig, commands: Commands) -> ExperimentConfig:
-    """The config with the run of the SAVi that methods on slots share, which is trained where none was named.
-
-    Raises:
-        DataError, CheckpointError, OutputError, TrainingError: see `playslot_rl.errors`.
-    """
+    """The config with the run of the SAVi that methods on slots share, which is trained where none was named."""
     if config.run or not uses_slots(config):
         return config
     model = str(Path(config.out) / "world_model")

@@ -46,10 +46,8 @@ TRIED_WITH: Final = (*TRAINED_WITH, "trial_steps")
 
 
 def require_begun_alike(jobs: Iterable[VideoJob], asked: CompareVideoConfig) -> None:
-    """Refuse settings other than those with which a job's training or trials were begun, before anything is computed.
-
-    Raises:
-        CheckpointError: names the key that was typed.
+    """Refuse settings other than those with which a job's training or trials were begun, before anything is computed,
+    by a CheckpointError that names the key that was typed.
     """
     wanted = to_dict(asked)
     for job in jobs:
@@ -63,15 +61,9 @@ def require_begun_alike(jobs: Iterable[VideoJob], asked: CompareVideoConfig) -> 
 def require_same_choice(
     job: VideoJob, asked: CompareVideoConfig, choice: Mapping[str, Any], before: Mapping[str, Any]
 ) -> None:
-    """Refuse a learning rate or a number of steps that a job's training was not begun with.
-
-    Args:
-        job: whose.
-        asked: the comparison's settings.
-        choice, before: `rate` and `steps` that the trials lead to now, and led to then (empty for nothing).
-
-    Raises:
-        CheckpointError: names the key that was typed.
+    """Refuse a learning rate or a number of steps that a job's training was not begun with, by a CheckpointError that
+    names the key that was typed: `choice` has `rate` and `steps` that the trials lead to now, `before` those they led
+    to then (empty for nothing).
     """
     stored = _begun_with(job.run)
     if not before or not stored:
@@ -118,11 +110,7 @@ class VideoTraining:
         self._asked = asked_of(record)
 
     def run(self, config: ExperimentConfig) -> None:
-        """Choose, train, score; finished parts are skipped.
-
-        Raises:
-            PlaySlotError: whatever the training or its data refuse.
-        """
+        """Choose, train, score; finished parts are skipped."""
         config = self._chosen(config)
         self._train(config)
         self._score(config)
@@ -187,7 +175,6 @@ class VideoTraining:
         }
 
     def _score(self, config: ExperimentConfig) -> None:
-        """Write `RUN/video.json` and the predictions of the first clips."""
         job, began = self._job, time.monotonic()
         device = open_device(config.device, config.threads)
         run = Run(job.run)
