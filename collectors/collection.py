@@ -1,25 +1,26 @@
-"""Collect a data set: record what the journal lacks, then export it."""
+"""Collect a data set: record what the journal lacks, then export it; and what a preset has recorded: demonstrations,
+and the videos a world model learns from.
+"""
 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from playslot_rl.collectors.export import META_NAME, export
 from playslot_rl.collectors.journal import SPEC_NAME, Journal, journal_path, read_spec, remove_leftover
 from playslot_rl.collectors.spec import CollectionSpec
-from playslot_rl.config import CollectorConfig, ExperimentConfig
+from playslot_rl.config import CollectorConfig, DataConfig, ExperimentConfig
 from playslot_rl.data.metadata import INFO_NAME, json_content
+from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import ConfigError, DataError, OutputError
 from playslot_rl.runtime.progress import StageProgress
 from playslot_rl.runtime.threads import available_cores
 
 
 def is_complete(out: Path, spec: CollectionSpec) -> bool:
-    """Whether the data set `out` is there.
-
-    Returns:
-        True for this collection's finished data set; False where there is nothing yet.
+    """Whether `out` is this collection's finished data set; False where there is nothing yet.
 
     Raises:
         OutputError: it holds something else, or a collection with other settings.
@@ -59,19 +60,15 @@ def begun_episodes(out: Path) -> int | None:
 def collect(
     config: ExperimentConfig, policy: str, episodes: int, steps: int, out: Path, seed: int, workers: int
 ) -> Path:
-    """Record episodes as a LeRobot v3.0 data set.
+    """Record episodes as the LeRobot v3.0 data set `out`.
 
     Episodes go to a journal, `OUT.journal`, and from there in one transaction to `out`. Killed at any moment, it loses
     at most the episodes in hand (one per worker), and the same call carries on. A finished data set is left alone.
     Workers that die or hang are replaced, at most `config.collector.restarts` times.
 
     Args:
-        config: its `env`, `render`, `collect`, `collector` and `logging` are used.
         seed: base seed; the data depend on it, not on the number of workers.
         workers: processes; 0 means one per core, 1 records in this process.
-
-    Returns:
-        `out`.
 
     Raises:
         ConfigError: unknown environment or policy, or a number outside its range.
@@ -91,8 +88,7 @@ def collect(
     """
     spec = CollectionSpec.make(config, policy, episodes, steps, seed)
     out = Path(out).absolute()
-    shown = config.logging.progress
-    folder = journal_path(out)
+    shown, folder = config.logging.progress, journal_path(out)
     if is_complete(out, spec):
         remove_leftover(folder, spec)  # of a process that was killed after the rename
         if shown:
@@ -132,3 +128,38 @@ def _record_missing(journal: Journal, workers: int, settings: CollectorConfig, s
         if len(journal.missing()) == total:
             journal.remove()  # no other command would go on with it
         raise
+
+
+def collect_demos(config: ExperimentConfig, folder: Path) -> DataConfig:
+    """Record demonstrations into `FOLDER/data/expert` unless `data.demos` names some; returns where the data are.
+
+    Where nothing can be acted on there are none. `collect.validation_episodes` more than `collect.expert_episodes` are
+    recorded and held out; a data set begun without them stays as it is.
+    """
+    if config.data.demos or config.env.name in PROCEDURAL:
+        return config.data
+    demos, want = folder / "data" / "expert", config.collect
+    held_out = 0 if begun_episodes(demos) == want.expert_episodes else want.validation_episodes
+    episodes = want.expert_episodes + held_out
+    collect(config, "expert", episodes, want.expert_steps, demos, config.seed, config.workers)
+    return replace(config.data, demos=str(demos), held_out=held_out)
+
+
+def collect_videos(config: ExperimentConfig, folder: Path) -> DataConfig:
+    """Record the world model's videos below `FOLDER/data`; `data.demos` are among them where the preset wants it."""
+    random, want = folder / "data" / "random", config.collect
+    collect(config, "random", want.random_episodes, want.random_steps, random, config.seed, config.workers)
+    if config.env.name in PROCEDURAL:
+        return replace(config.data, root=str(random))
+    roots = [str(random)]
+    if want.noisy_episodes:
+        # Random actions never reach the object. Videos of a noisy expert (no action is read from them) show the world
+        # model the places a policy goes to; the paper has 9,000 random episodes instead.
+        noisy = folder / "data" / "noisy_expert"
+        noise = replace(config, collect=replace(want, noise=want.exploration_noise))
+        # The next base seed: no episode of the demonstrations comes twice.
+        collect(noise, "expert", want.noisy_episodes, want.expert_steps, noisy, config.seed + 1, config.workers)
+        roots.append(str(noisy))
+    if want.learn_from_demos and config.data.demos:
+        roots.append(config.data.demos)
+    return replace(config.data, root=",".join(roots))

@@ -31,21 +31,14 @@ from playslot_rl.seeds.episodes import redraw_stride
 
 EPISODE_INDEX: Final = "episode_index"
 REDRAWN: Final = "redrawn"
-EPISODE_SEED: Final = "episode_seed"
-"""Seed of the running episode: int64 (1,)."""
-EPISODE_STEP: Final = "episode_step"
-"""Agent steps since its reset: int64 (1,)."""
-POLICY_STREAM: Final = 2
-"""Spawn key of the policy's random numbers; the environment uses 0 and 1 of the same seed."""
+EPISODE_SEED: Final = "episode_seed"  # seed of the running episode: int64 (1,)
+EPISODE_STEP: Final = "episode_step"  # agent steps since its reset: int64 (1,)
+POLICY_STREAM: Final = 2  # spawn key of the policy's random numbers; the environment uses 0 and 1 of the same seed
 MAX_REDRAWS: Final = 20
 
 
 class CollectionPolicy(nn.Module):
-    """Uniform actions in [-1, 1], or the expert's with Gaussian noise.
-
-    Args:
-        noise: standard deviation for the expert's actions; the sum is clipped to [-1, 1].
-    """
+    """Uniform actions in [-1, 1], or the expert's with Gaussian noise of that deviation, clipped to [-1, 1]."""
 
     def __init__(self, name: str, noise: float = 0.0) -> None:
         super().__init__()
@@ -75,9 +68,7 @@ class SeededView(TensorView):
     A reset before the running episode's end starts it again. TorchRL resets more often than there are episodes (when it
     looks at the environment, and after an episode's last step): a reset without a job touches neither the simulator nor
     the renderer, and its observation is all zeros.
-
-    Attributes:
-        jobs: episodes that have not been started: place in the collection and seed of each.
+    `jobs` are places in the collection and seeds of episodes that have not been started.
     """
 
     def __init__(self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]] = ()) -> None:
@@ -100,15 +91,13 @@ class SeededView(TensorView):
         }
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[View, dict[str, Any]]:
-        """Start the next job at the first seed that does not start solved; `seed` and `options` are ignored.
-
-        Raises:
-            ConfigError: every draw starts solved.
-        """
+        """Start the next job at the first seed that does not start solved (a ConfigError where there is none); the
+        arguments are ignored."""
         del seed, options
         if self._running is None:
             if not self.jobs:
-                return self._idle(), {"success": False}
+                spaces = self.observation_space.spaces  # type: ignore[attr-defined]
+                return {name: np.zeros(space.shape, space.dtype) for name, space in spaces.items()}, {"success": False}
             self._running = self.jobs.popleft()
         first, self._step = self._running[1], 0
         for attempt in range(MAX_REDRAWS):
@@ -128,10 +117,6 @@ class SeededView(TensorView):
         if result[2] or result[3]:
             self._running = None
         return result
-
-    def _idle(self) -> View:
-        spaces = self.observation_space.spaces  # type: ignore[attr-defined]
-        return {name: np.zeros(space.shape, space.dtype) for name, space in spaces.items()}
 
 
 class TaskMaker:
@@ -206,12 +191,7 @@ def _episode(batch: TensorDictBase) -> RecordedEpisode:
 
 
 def record(spec: CollectionSpec, indices: Sequence[int]) -> Iterator[RecordedEpisode]:
-    """Record the episodes `indices` of a collection in this process, one after the other.
-
-    Raises:
-        RenderError: there is no working GL backend.
-        ConfigError: every draw of an episode starts solved.
-    """
+    """Record the episodes `indices` of a collection in this process; errors of `EpisodeCollector.record`."""
     collector = EpisodeCollector.make(spec)
     try:
         for index in indices:

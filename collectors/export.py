@@ -28,12 +28,9 @@ from playslot_rl.storage.folders import new_folder
 
 META_NAME = "meta/playslot.json"
 PACKAGES = ("metaworld", "gymnasium-robotics", "mujoco", "gymnasium", "torchrl", "lerobot", "playslot_rl")
-VIDEO_ERROR = 2.0
-"""Mean difference [0, 255] that h264 in yuv444p may make."""
-METADATA_ROWS = 200
-"""Episodes in a row group of the episodes' metadata."""
-FREE_BYTES = 16 * 2**20
-"""Less free space than this after a failed export is reported as a full disk."""
+VIDEO_ERROR = 2.0  # mean difference [0, 255] that h264 in yuv444p may make
+METADATA_ROWS = 200  # episodes in a row group of the episodes' metadata
+FREE_BYTES = 16 * 2**20  # less free space than this after a failed export is reported as a full disk
 
 
 def repo_id(spec: CollectionSpec) -> str:
@@ -58,8 +55,7 @@ def features(spec: CollectionSpec, state_dim: int) -> dict[str, dict[str, Any]]:
 def columns(episode: RecordedEpisode) -> dict[str, npt.NDArray[Any]]:
     """LeRobot features of an episode, (T + 1, ...): T transitions, then the last observation, whose action is padding.
 
-    Reward, success and done of row t belong to the agent step from frame t to t + 1; done is true on the last
-    transition and stays true on the last observation.
+    Reward, success and done of row t belong to the step from frame t to t + 1; done stays true on the last observation.
     """
     steps = len(episode.actions)
     index = np.arange(steps + 1)
@@ -87,14 +83,9 @@ def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str,
     with finalising(dataset):
         for episode in write(dataset, journal, metadata["task"]):
             solved = bool(episode.success.any())
-            records.append(
-                {
-                    "seed": episode.seed,
-                    "success": solved,
-                    "steps_to_success": int(episode.success.argmax()) + 1 if solved else None,
-                    "redrawn": episode.redrawn,
-                }
-            )
+            steps = int(episode.success.argmax()) + 1 if solved else None
+            outcome = {"seed": episode.seed, "success": solved, "steps_to_success": steps, "redrawn": episode.redrawn}
+            records.append(outcome)
     return records
 
 
@@ -121,11 +112,7 @@ def _write_video(dataset: Any, journal: Journal, task: str) -> Iterator[Recorded
 
 
 def _check(root: Path, spec: CollectionSpec, journal: Journal) -> None:
-    """Read the data set back.
-
-    Raises:
-        OutputError: it does not hold what was recorded.
-    """
+    """Read the data set back; an OutputError where it does not hold what was recorded."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
     meta = LeRobotDatasetMetadata(repo_id(spec), root=root)
@@ -145,11 +132,8 @@ def _check_images(root: Path, spec: CollectionSpec, journal: Journal) -> None:
         episode, images = journal.read_with_images(index, decode=False)
         for t, image in enumerate(images):
             row = next(stored, None)
-            want = {
-                "index": index * (spec.steps + 1) + t,
-                "episode_index": index,
-                keys.FEATURE_SEED: episode.seed,
-            }
+            place = index * (spec.steps + 1) + t
+            want = {"index": place, "episode_index": index, keys.FEATURE_SEED: episode.seed}
             if row is None or row[keys.FEATURE_IMAGE]["bytes"] != image or any(row[k] != v for k, v in want.items()):
                 raise OutputError(
                     f"{root}: got another row {t} of episode {index} than was recorded, expected the same; "

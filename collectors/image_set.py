@@ -17,8 +17,7 @@ import numpy.typing as npt
 
 from playslot_rl.data.metadata import CAMERAS
 
-EPISODES_AT_ONCE: Final = 32
-"""Episodes in a row group."""
+EPISODES_AT_ONCE: Final = 32  # episodes in a row group
 
 
 def feature(dtype: str, *shape: int, names: Sequence[str] | None = None) -> dict[str, Any]:
@@ -61,11 +60,8 @@ def finalising(dataset: Any) -> Iterator[None]:
 
 
 class ImageSetWriter:
-    """Appends episodes to a data set that LeRobot has just created.
-
-    Args:
-        meta: LeRobot's metadata of it (`LeRobotDatasetMetadata`); one image feature.
-    """
+    """Appends episodes to a data set that LeRobot has just created, with one image feature; `meta` is its
+    `LeRobotDatasetMetadata`."""
 
     def __init__(self, meta: Any, root: Path, task: str) -> None:
         from lerobot.datasets.feature_utils import get_hf_features_from_features
@@ -79,11 +75,7 @@ class ImageSetWriter:
         meta.save_episode_tasks([task])
 
     def add(self, values: dict[str, npt.NDArray[Any]], frames: npt.NDArray[np.uint8], images: list[bytes]) -> None:
-        """Append an episode of T frames.
-
-        Args:
-            values: (T, ...) of each feature that is neither the image nor LeRobot's own index.
-        """
+        """Append an episode of T frames; `values` (T, ...) are neither the image nor LeRobot's own index."""
         size = sum(map(len, images))
         if self._bytes and self._bytes + size > self.meta.data_files_size_in_mb * 2**20:
             self._next_file()

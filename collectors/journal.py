@@ -30,16 +30,14 @@ from playslot_rl.storage.locks import locked
 SPEC_NAME = "collection.json"
 LOCK_NAME = "lock"
 ARRAYS: Final = ("states", "actions", "rewards", "success")
-PNG_LEVEL: Final = 6
-"""Compression that LeRobot uses for stored images."""
+PNG_LEVEL: Final = 6  # compression that LeRobot uses for stored images
 
 
 @dataclass(frozen=True)
 class RecordedEpisode:
-    """One recorded episode.
+    """One recorded episode; `redrawn` seeds were passed over because it started solved.
 
     Attributes:
-        redrawn: seeds passed over because the episode started solved.
         frames: uint8 [0, 255] (T + 1, H, W, 3).
         states: float32 (T + 1, S).
         actions: float32 (T, A) in [-1, 1].
@@ -117,11 +115,7 @@ class Journal:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Keep other processes out.
-
-        Raises:
-            OutputError: another process is collecting into this folder.
-        """
+        """Keep other processes out; an OutputError where one is collecting into this folder."""
         busy = f"{self.folder}: got another process collecting into it, expected none; wait for it or choose out="
         spec = self.folder / SPEC_NAME
         with contextlib.ExitStack() as stack:
@@ -143,11 +137,7 @@ class Journal:
         return self.folder / f"episode_{index:06d}.npz"
 
     def add(self, episode: RecordedEpisode) -> None:
-        """Store an episode; when this returns it survives a kill and a power cut.
-
-        Raises:
-            OutputError: full disk.
-        """
+        """Store an episode; when this returns it survives a kill and a power cut. An OutputError for a full disk."""
         self.add_encoded(episode.index, encode(episode))
 
     def add_encoded(self, index: int, content: bytes) -> None:
@@ -155,11 +145,6 @@ class Journal:
         write_bytes(self.path(index), content)
 
     def read(self, index: int) -> RecordedEpisode:
-        """Load episode `index`.
-
-        Raises:
-            OutputError: its file is missing or damaged.
-        """
         return self.read_with_images(index)[0]
 
     def read_with_images(self, index: int, decode: bool = True) -> tuple[RecordedEpisode, list[bytes]]:
@@ -212,11 +197,7 @@ def remove_leftover(folder: Path, spec: CollectionSpec) -> None:
 
 
 def read_spec(path: Path) -> dict[str, Any]:
-    """Read a stored specification.
-
-    Raises:
-        OutputError: it is not JSON of ours.
-    """
+    """Read a stored specification; an OutputError where it is not JSON of ours."""
     try:
         found = json.loads(path.read_text())
     except (OSError, ValueError) as error:

@@ -29,10 +29,7 @@ class RemoteEpisodeCollector(EpisodeCollector):
 
 
 class RayWorkers:
-    """Actors of a Ray cluster, one core each.
-
-    Args:
-        address: of the cluster; empty means `$RAY_ADDRESS`, or a cluster of this machine alone.
+    """Actors of a Ray cluster, one core each; without an address that of `$RAY_ADDRESS`, or of this machine alone.
 
     Raises:
         ConfigError: Ray is not installed.

@@ -29,20 +29,15 @@ from playslot_rl.envs.rendering import check_rendering
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.runtime.children import begin_worker, worker_context
 
-AHEAD = 2
-"""Episodes in a worker's hands: while it records one, the next is there already."""
+AHEAD = 2  # episodes in a worker's hands: while it records one, the next is there already
 POLL_S = 1.0
-START_S = 300.0
-"""What a worker is given to import everything, beyond `collector.timeout_s`."""
+START_S = 300.0  # what a worker is given to import everything, beyond `collector.timeout_s`
 CLIPS_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
 class Report:
-    """News of a worker: it stored episode `index`; or ended with an `error`; or died, and of what (`dead`).
-
-    With none of them, it is ready.
-    """
+    """News of a worker: it stored episode `index`; or ended with an `error`; or died, and of what; else it is ready."""
 
     slot: int
     index: int | None = None
@@ -154,14 +149,11 @@ def record_into(
     settings: CollectorConfig | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Iterator[int]:
-    """Record the episodes `indices` of a journal's collection into it.
+    """Record the episodes `indices` of a journal's collection into it; yields each once, when it is stored.
 
     Args:
         journal: locked by the caller.
         workers: how many; 1 local one records in this process. The episodes do not depend on it, only their order.
-
-    Yields:
-        Each index once, when its episode is stored.
 
     Raises:
         RenderError: there is no working GL backend.
@@ -196,8 +188,7 @@ def record_into(
 def draw(spec: CollectionSpec, indices: Sequence[int]) -> Iterator[RecordedEpisode]:
     """Draw the episodes `indices` of an environment without a simulator (GridShapes): no policy, no workers.
 
-    Yields:
-        Each episode once. Actions say what the objects did, states where they were; reward and success are zero.
+    Actions say what the objects did, states where they were; reward and success are zero.
     """
     for first in range(0, len(indices), CLIPS_AT_ONCE):
         some = indices[first : first + CLIPS_AT_ONCE]

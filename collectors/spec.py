@@ -18,12 +18,7 @@ OFFSETS = {"random": 0, "expert": EPISODES // 2}
 
 @dataclass(frozen=True)
 class CollectionSpec:
-    """A collection.
-
-    Attributes:
-        noise: standard deviation of Gaussian noise on the expert's actions.
-        env: the task; its `max_steps` equals `steps`.
-    """
+    """A collection; `noise` is the deviation of that on the expert's actions, and `env.max_steps` equals `steps`."""
 
     policy: str
     episodes: int
@@ -40,8 +35,8 @@ class CollectionSpec:
         """Check the request and name it.
 
         Raises:
-            ConfigError: unknown policy or environment, an expert of an environment without one, actions of another
-                width than the environment's, too few or too many episodes or steps, or a seed beyond 32 bits.
+            ConfigError: unknown policy or environment, an expert where there is none, actions of another width than the
+                environment's, too few or too many episodes or steps, or a seed beyond 32 bits.
         """
         if policy not in OFFSETS:
             hint = nearest(policy, OFFSETS, "policy=") or "; choose one of these"

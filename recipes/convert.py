@@ -10,7 +10,7 @@ def main(config: ExperimentConfig) -> None:
     """Convert the data set at `data.root`; `data.camera` (all of the paper's if empty), `env.image_size`,
     `collect.storage` and `episodes` (all if empty) are used, too.
     """
-    from playslot_rl.data.camera_names import camera_list
+    from playslot_rl.data.contents import camera_list
     from playslot_rl.datasets.sketchy import PAPER_CAMERAS, convert_sketchy
 
     if config.env.name != "sketchy":

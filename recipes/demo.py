@@ -20,7 +20,7 @@ def main(config: ExperimentConfig) -> None:
     """Collect demonstrations, train policy and decoder, inspect the world model on them, evaluate under both protocols,
     write the report.
     """
-    from playslot_rl.collectors.presets import collect_demos
+    from playslot_rl.collectors.collection import collect_demos
     from playslot_rl.envs import gym_id
 
     began = time.monotonic()

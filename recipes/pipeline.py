@@ -42,7 +42,7 @@ def main(config: ExperimentConfig) -> None:
 
 def _collect(config: ExperimentConfig, folder: Path) -> DataConfig:
     """Record what is missing; returns where the data are."""
-    from playslot_rl.collectors.presets import collect_demos, collect_videos
+    from playslot_rl.collectors.collection import collect_demos, collect_videos
 
     config = replace(config, data=collect_demos(config, folder))
     return config.data if config.data.root else collect_videos(config, folder)

@@ -95,7 +95,7 @@ def recorded_starts(
     config: ExperimentConfig, run: Run, world: WorldModel, agent: Agent | None
 ) -> RecordedStarts | None:
     """Frames of `data.root`, or of the data sets that the run names and that are on this machine."""
-    from playslot_rl.data.opening import open_configured
+    from playslot_rl.data.weighted import open_configured
     from playslot_rl.envs import ENVIRONMENTS
     from playslot_rl.evaluation.seeds import data_folders
     from playslot_rl.play.starts import RecordedStarts, task_maker

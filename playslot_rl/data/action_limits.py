@@ -25,13 +25,10 @@ if TYPE_CHECKING:
     from playslot_rl.data.contents import Contents
     from playslot_rl.modules.action_range import ActionRange
 
-WIDE: Final = 3.0
-"""Smallest to largest is so many times as wide as q01 to q99 where there may be outliers."""
+WIDE: Final = 3.0  # smallest to largest is so many times as wide as q01 to q99 where there may be outliers
 FEW: Final = 0.001
 """Share of the rows up to which values far outside q01 to q99 are outliers; more are a motion, such as a gripper's."""
-
-HUGE: Final = 1e30
-"""Numbers that no robot knows: with them float32 would overflow."""
+HUGE: Final = 1e30  # numbers that no robot knows: with them float32 would overflow
 
 Floats = npt.NDArray[np.float32]
 

@@ -23,8 +23,7 @@ from playslot_rl.data.tables import TASKS_NAME, UNREADABLE, WRONG_COLUMN, Episod
 from playslot_rl.errors import DataError
 from playslot_rl.runtime.processes import here
 
-TIME_TOLERANCE_S: Final = 1e-4
-"""As LeRobot's default; float32 holds it up to about half an hour."""
+TIME_TOLERANCE_S: Final = 1e-4  # as LeRobot's default; float32 holds it up to about half an hour
 DISORDER: Final = ("episode order", "missing episode", "missing metadata", "wrong length", "frame order")
 """Kinds of faults after which nobody knows which rows follow on which."""
 
@@ -53,13 +52,9 @@ def row_faults(contents: Contents, span: Span) -> list[tuple[str, str]]:
     late = np.abs(contents.columns["timestamp"][rows].astype(np.float64) - np.arange(span.length) / contents.fps)
     if not bool((late <= TIME_TOLERANCE_S).all()):
         worst = int(np.argmax(np.nan_to_num(late, nan=np.inf)))
-        got = contents.columns["timestamp"][rows][worst]
-        faults.append(
-            (
-                "timestamp",
-                f"got timestamp {got:.6g} at frame {worst}, expected {worst / contents.fps:.6g} (frame / fps)",
-            )
-        )
+        got, expected = contents.columns["timestamp"][rows][worst], worst / contents.fps
+        fault = f"got timestamp {got:.6g} at frame {worst}, expected {expected:.6g} (frame / fps)"
+        faults.append(("timestamp", fault))
     unknown = set(np.unique(contents.columns["task_index"][rows]).tolist()) - contents.tasks.keys()
     if unknown:
         faults.append(("task_index", f"got task_index {sorted(unknown)}, expected one of {TASKS_NAME}"))
@@ -90,12 +85,9 @@ def length_fault(episode: Episode, span: Span) -> str:
 
 
 def _check_counts(contents: Contents, problems: Problems) -> None:
-    info = contents.info
-    for name, got in (
-        ("total_frames", contents.rows),
-        ("total_episodes", len(contents.episodes)),
-        ("total_tasks", len(contents.tasks)),
-    ):
+    info, of_tasks = contents.info, len(contents.tasks)
+    held = {"total_frames": contents.rows, "total_episodes": len(contents.episodes), "total_tasks": of_tasks}
+    for name, got in held.items():
         if name in info and int(info[name]) != got:
             problems.error("wrong count", f"{INFO_NAME}: got {name} {info[name]}, but the files hold {got}")
     if not contents.rows:

@@ -22,16 +22,13 @@ import numpy.typing as npt
 from playslot_rl.config.sizes import bytes_of
 from playslot_rl.errors import DataError, PlaySlotError
 from playslot_rl.storage.atomic import explain_write_errors, replace_dir
-from playslot_rl.storage.folders import new_folder
 from playslot_rl.storage.locks import locked
 from playslot_rl.storage.sharing_locks import release_with, share
 
 if TYPE_CHECKING:
     from playslot_rl.config import DataConfig
 
-
-RELEASE_EVERY: Final = 2**28
-"""Bytes that are read from memory maps before their pages are given back."""
+RELEASE_EVERY: Final = 2**28  # bytes that are read from memory maps before their pages are given back
 
 
 @dataclass(frozen=True)
@@ -49,8 +46,7 @@ class Cache:
         return Cache(config.cache, bytes_of(config.cache_limit), config.workers)
 
 
-CachePlace = str | Path | Cache
-"""A cache, or only its folder."""
+CachePlace = str | Path | Cache  # A cache, or only its folder
 
 
 def cache_folder(cache: CachePlace = "") -> Path:
@@ -64,41 +60,27 @@ def settings(cache: CachePlace) -> Cache:
 
 
 def build_once(folder: Path, build: Callable[[Path], None]) -> Path:
-    """Return `folder`, made by `build(temporary)` if it does not exist.
+    """Return `folder`, made by `build(part)` if it does not exist; a lock lets one process build while others wait.
 
-    A lock lets one process build while others wait.
-
-    Raises:
-        OutputError: full disk; nothing is left behind.
-    """
-    if folder.is_dir():
-        return folder
-    with _turn(folder):
-        if not folder.is_dir():
-            with new_folder(folder) as temporary:
-                build(temporary)
-    return folder
-
-
-def build_on(folder: Path, build: Callable[[Path], None]) -> Path:
-    """As `build_once`, but a build that was killed is gone on with: `build` finds in its folder what it has made.
+    A build that was killed is gone on with: `build` finds in its folder what it has made.
 
     Raises:
         OutputError: full disk; nothing is left behind, as after every other error.
     """
     if folder.is_dir():
         return folder
-    part = part_folder(folder)
-    with _turn(folder):
+    with explain_write_errors(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    with locked(lock_file(folder)):
         if not folder.is_dir():
+            part = part_folder(folder)
             part.mkdir(exist_ok=True)
             try:
                 build(part)
                 replace_dir(part, folder)
             except Exception as error:  # not a kill or Ctrl-C
-                if type(error) is PlaySlotError:  # a worker of ours was killed
-                    raise
-                shutil.rmtree(part, ignore_errors=True)
+                if type(error) is not PlaySlotError:  # a worker of ours was killed
+                    shutil.rmtree(part, ignore_errors=True)
                 raise
     return folder
 
@@ -113,17 +95,10 @@ def lock_file(folder: Path) -> Path:
     return folder.with_name(f".{folder.name}.lock")
 
 
-def _turn(folder: Path) -> Any:
-    with explain_write_errors(folder):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-    return locked(lock_file(folder))
-
-
 def load_cached(folder: Path, name: str, make: Callable[[], object] | None = None) -> npt.NDArray[Any]:
     """Memory-map an array of a cache folder, read-only. The folder is in use as long as the array, or a view of it.
 
-    Args:
-        make: makes the entry; called where it is not there (any more: another process may make room at any time).
+    `make` makes the entry where it is not there (any more: another process may make room at any time).
 
     Raises:
         DataError: the file was damaged after it was made.
@@ -144,16 +119,15 @@ def load_cached(folder: Path, name: str, make: Callable[[], object] | None = Non
     return array
 
 
-_MAPPED: weakref.WeakSet[Any] = weakref.WeakSet()
-"""Maps of this process."""
+_MAPPED: weakref.WeakSet[Any] = weakref.WeakSet()  # maps of this process
 _read = [0]
 
 
 def note_read(count: int) -> None:
     """Say that so many bytes of memory maps were read: now and then their pages are given back.
 
-    Windows are drawn from all over a cache, and the system counts every page that was ever touched as this process's
-    memory, with those around it, although it may take them back at any time. They stay in the system's own cache.
+    The system counts every page that was ever touched as this process's memory, although it may take them back at any
+    time. They stay in the system's own cache.
     """
     _read[0] += count
     if _read[0] < RELEASE_EVERY or not hasattr(mmap, "MADV_DONTNEED"):
@@ -168,41 +142,27 @@ class ArrayWriter:
     """Writes an `.npy` file piece by piece along its first axis.
 
     Plain writes, because a full disk under a memory map is a bus error, not an exception. The file has its length from
-    the beginning, all holes.
-
-    Args:
-        rows: so many are in the file already, and it is gone on with.
+    the beginning, all holes; one that has begun is gone on with.
     """
 
-    def __init__(self, path: Path, shape: Sequence[int], dtype: npt.DTypeLike, rows: int = 0) -> None:
-        self.path, self.shape, self.dtype, self.rows = path, tuple(shape), np.dtype(dtype), rows
-        self._file: IO[bytes] = path.open("r+b" if rows else "wb")
-        self._begin = write_header(self._file, self.shape, self.dtype)
+    def __init__(self, path: Path, shape: Sequence[int], dtype: npt.DTypeLike, begun: bool = False) -> None:
+        self.path, self.shape, self.dtype = path, tuple(shape), np.dtype(dtype)
+        self._file: IO[bytes] = path.open("r+b" if begun else "wb")
+        header = {"descr": np.lib.format.dtype_to_descr(self.dtype), "fortran_order": False, "shape": self.shape}
+        np.lib.format.write_array_header_1_0(self._file, header)
+        self._begin = self._file.tell()
         self._file.truncate(self._begin + int(np.prod(self.shape)) * self.dtype.itemsize)
 
-    def write(self, rows: npt.NDArray[np.generic], first: int | None = None) -> None:
-        """Write rows (n, *shape[1:]) from row `first` on; None goes on where the last ones ended."""
+    def write(self, rows: npt.NDArray[np.generic], first: int = 0) -> None:
+        """Write rows (n, *shape[1:]) from row `first` on."""
         if rows.shape[1:] != self.shape[1:]:
             raise ValueError(f"{self.path}: got rows of shape {rows.shape[1:]}, expected {self.shape[1:]}")
-        if first is not None:
-            self._file.seek(self._begin + first * int(np.prod(self.shape[1:])) * self.dtype.itemsize)
+        self._file.seek(self._begin + first * int(np.prod(self.shape[1:])) * self.dtype.itemsize)
         self._file.write(np.ascontiguousarray(rows, self.dtype).data)
-        self.rows += len(rows)
 
     def sync(self) -> None:
-        """Have what was written on the disk."""
         self._file.flush()
         os.fsync(self._file.fileno())
 
-    def close(self, *, whole: bool = True) -> None:
-        """Finish; all rows must have been written, unless it is not `whole`: the others are zeros."""
+    def close(self) -> None:
         self._file.close()
-        if whole and self.rows != self.shape[0]:
-            raise ValueError(f"{self.path}: got {self.rows} rows, expected {self.shape[0]}")
-
-
-def write_header(file: IO[bytes], shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
-    """Write the beginning of an `.npy` file; returns where its rows begin."""
-    header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
-    np.lib.format.write_array_header_1_0(file, header)
-    return file.tell()

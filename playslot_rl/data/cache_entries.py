@@ -106,11 +106,7 @@ def _unmade(part: Path) -> Iterator[bool]:
 
 
 def remove(entry: Entry) -> bool:
-    """Remove an entry that nobody uses.
-
-    Returns:
-        Whether it is gone.
-    """
+    """Remove an entry that nobody uses; whether it is gone."""
     folder = Path(entry.path)
     if not entry.part:
         return remove_unused(folder)
@@ -124,10 +120,7 @@ def remove(entry: Entry) -> bool:
 def room(cache: CachePlace, needed: int, key: str) -> Iterator[None]:
     """Make room, and begin an entry in the block, by making its file as large as it will be: two processes do not both
     take the same room. Arguments and errors: see `make_room`."""
-    if settings(cache).limit is None:
-        yield
-        return
-    with locked(cache_folder(cache) / ".room.lock"):
+    with locked(cache_folder(cache) / ".room.lock") if settings(cache).limit is not None else contextlib.nullcontext():
         make_room(cache, needed, key)
         yield
 

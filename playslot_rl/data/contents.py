@@ -7,17 +7,20 @@ Shapes: F rows (frames), E episodes.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from playslot_rl.data.camera_names import cameras_of, full_name
-from playslot_rl.data.metadata import DATA_PATH, INFO_NAME, VIDEO_PATH, read_info
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.weights import data_roots
+from playslot_rl.data.metadata import CAMERAS, DATA_PATH, INFO_NAME, VIDEO_PATH, read_info
 from playslot_rl.data.places import filled, inside, note_odd_files, parquet_files
 from playslot_rl.data.problems import Problems
 from playslot_rl.data.tables import Array, Episode, episodes_of, holds_numbers, read_columns, read_table, read_tasks
@@ -26,8 +29,7 @@ from playslot_rl.errors import DataError
 if TYPE_CHECKING:
     from playslot_rl.data.remote import Remote
 
-LATEST_S: Final = 1e8
-"""Seconds: no video is longer."""
+LATEST_S: Final = 1e8  # seconds: no video is longer
 
 
 @dataclass(frozen=True)
@@ -104,11 +106,8 @@ class Contents:
         return cameras_of(self.features)
 
     def camera(self, wanted: str) -> str:
-        """The camera to read, by its full name: the wanted one, or the only one.
-
-        Raises:
-            DataError: there is no such camera, none at all, or several and none was named.
-        """
+        """The camera to read, by its full name: the wanted one, or the only one. A DataError where there is none, or
+        several and none was named."""
         names = ", ".join(self.cameras) or "none"
         if not wanted and len(self.cameras) == 1:
             return self.cameras[0]
@@ -192,3 +191,50 @@ def read_metadata(
             episodes += episodes_of(path, table, problems)
     episodes.sort(key=lambda episode: episode.index)
     return info, episodes, tasks
+
+
+def full_name(wanted: str, cameras: Sequence[str], where: str) -> str:
+    """The camera that a name means: itself, or the only one that ends with it after a dot, else a DataError.
+
+    Examples:
+        >>> full_name("top", ["observation.images.top", "observation.images.side"], "data/mine")
+        'observation.images.top'
+    """
+    if wanted in cameras:
+        return wanted
+    called = [name for name in cameras if wanted and name.endswith(f".{wanted}")]
+    if len(called) == 1:
+        return called[0]
+    if called:
+        raise DataError(
+            f"data.camera={wanted}: {where} has {len(called)} cameras of that name, expected one: say which of "
+            f"{', '.join(called)}"
+        )
+    raise DataError(
+        f"data.camera={wanted}: {where} has no such camera, expected one of: {', '.join(cameras) or 'none'}"
+    )
+
+
+def camera_list(text: str) -> list[str]:
+    """The names in a text such as `top,side`."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def cameras_of(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    return [name for name, feature in features.items() if feature["dtype"] in CAMERAS]
+
+
+def with_full_cameras(config: ExperimentConfig) -> ExperimentConfig:
+    """The config with the full names of `data.camera`, as a run stores it.
+
+    Names stay as they were typed where the data sets are not there (yet), or do not know them: whoever reads them says
+    what is wrong.
+    """
+    data = config.data
+    typed = camera_list(data.camera)
+    for root in () if not typed else (*data_roots(data.root), *data_roots(data.demos)):
+        with contextlib.suppress(DataError):
+            known = cameras_of(read_info(Path(root.path).expanduser())["features"])
+            names = ",".join(full_name(name, known, root.path) for name in typed)
+            return config if names == data.camera else replace(config, data=replace(data, camera=names))
+    return config

@@ -1,4 +1,9 @@
-"""Demonstrations as the behaviour stage sees them: slots, inferred latents, predicted slots, and some real actions.
+"""Demonstrations as the behaviour stage sees them: slots, inferred latents, predicted slots, and some real actions; and
+which of their transitions say something, those in which something moves and a few after them:
+
+    m_t = sqrt(mean (S_{t+1} - S_t)^2),   kept_t = m_t > threshold, or m_u > threshold for some t - margin <= u < t
+
+An expert that holds still once the task is solved fills half of the rows with the one action of doing nothing.
 
 Shapes: M transitions of all demonstrations in a row, N slots, D slot width, Z latent-action width, A action width,
 F frames, H W image height and width.
@@ -17,7 +22,6 @@ from torch import Tensor
 
 from playslot_rl.data.cache import note_read
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.trimming import moving_rows, slot_motion
 from playslot_rl.data.views import drawn_demonstrations, episode_range, first_demonstrations
 from playslot_rl.errors import DataError
 from playslot_rl.frames import normalise
@@ -26,8 +30,7 @@ from playslot_rl.modules.action_range import ActionRange
 FRAMES_AT_ONCE = 1024
 BY_ROW: Final = ("slots", "imagined", "latents", "actions", "episode", "step")
 """Parts of `Demonstrations` that have a row a transition."""
-MotionOf = Callable[[npt.NDArray[np.int64]], Tensor]
-"""The motion (M,) of the transitions from some rows (M,)."""
+MotionOf = Callable[[npt.NDArray[np.int64]], Tensor]  # the motion (M,) of the transitions from some rows (M,)
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class Demonstrations:
     lengths: Tensor
 
     def take(self, rows: Tensor) -> Demonstrations:
-        """Some transitions: an index int64 (M',) or a mask bool (M,); `lengths` stays."""
+        """Some transitions, by an index int64 (M',) or a mask bool (M,); `lengths` stays."""
         there = [name for name in BY_ROW if getattr(self, name) is not None]
         return replace(self, **{name: getattr(self, name)[rows] for name in there})
 
@@ -64,22 +67,15 @@ class Demonstrations:
         return self.actions
 
     def labelled(self, demos: int) -> Tensor:
-        """Rows (int64) of the first `demos` demonstrations and their copies, the only ones whose actions the action
-        decoder sees.
-
-        Raises:
-            DataError: there are fewer demonstrations, or trimming has left no row of them.
-        """
+        """Rows (int64) of the first `demos` demonstrations and their copies, whose actions the action decoder sees; a
+        DataError where there are fewer, or trimming has left no row of them."""
         require_labelled(demos, len(self.lengths))
         return labelled_rows(self.episode, demos)
 
 
 def labelled_rows(episode: Tensor | npt.NDArray[np.int64], demos: int) -> Tensor:
-    """Rows (int64) of the first `demos` demonstrations, by the demonstration of each row (M,).
-
-    Raises:
-        DataError: trimming has left none.
-    """
+    """Rows (int64) of the first `demos` demonstrations, by the demonstration of each row (M,); a DataError where
+    trimming has left none."""
     rows = torch.nonzero(torch.as_tensor(episode < demos))[:, 0]
     if not len(rows):
         raise DataError(
@@ -118,11 +114,10 @@ def split_demonstrations(
     """Train on the first demonstrations, and measure on the last ones.
 
     Args:
-        demos: how many are trained on; None for all that are not kept.
-        measured: at most so many of the last ones beyond those that are trained on measure, if more than `kept`.
+        demos: how many are trained on; None for all but the last `kept`.
+        measured: at most so many beyond those that are trained on measure, if more than `kept`.
         draw: seed that decides which are the first ones, the same whatever `demos`; None keeps their order. The last
-            ones, which may measure (but half of the set at most, beyond `kept`), are not drawn: they come after the
-            others.
+            ones, which may measure (half of the set at most, beyond `kept`), are not drawn.
 
     Raises:
         DataError: there are fewer episodes than `demos`, or none that is not kept.
@@ -167,12 +162,34 @@ class Transitions:
         return replace(self, rows=self.rows[kept], episode=self.episode[kept], step=self.step[kept])
 
 
-def moving_frames(source: EpisodeFrames, threshold: float, margin: int) -> Transitions:
-    """Transitions of a data set in which its frames move: RMS change of the pixels, in [0, 1], above `threshold`.
+def slot_motion(slots: Tensor) -> Tensor:
+    """RMS change of the slots from one frame to the next: (..., T + 1, N, D) to (..., T), in units of the slots."""
+    return (slots[..., 1:, :, :] - slots[..., :-1, :, :]).square().mean(dim=(-2, -1)).sqrt()
 
-    Raises:
-        DataError: nothing is left, or no episode has two frames.
+
+def moving_rows(motion: Tensor, step: Tensor, threshold: float, margin: int, key: str = "behaviour.trim") -> Tensor:
+    """Transitions in which something moves, and `margin` still ones after each stretch of them: mask bool (M,).
+
+    Args:
+        motion: of each transition (M,), the episodes one after the other.
+        step: number of each in its episode, int64 (M,).
+        key: of the threshold, for the DataError where nothing moves.
     """
+    moving = motion > threshold
+    if not bool(moving.any()):
+        raise DataError(
+            f"{key}: got {threshold:g}, which leaves none of {len(motion)} transitions, expected less than "
+            f"their largest motion, {float(motion.max()):.3g}: lower it, or change data.held_out if they are held out"
+        )
+    kept = moving.clone()
+    for after in range(1, min(margin, len(moving) - 1) + 1):
+        kept[after:] |= moving[:-after] & (step[after:] >= after)
+    return kept
+
+
+def moving_frames(source: EpisodeFrames, threshold: float, margin: int) -> Transitions:
+    """Transitions of a data set in which its frames move: RMS change of the pixels, in [0, 1], above `threshold`. A
+    DataError where nothing is left."""
 
     def motion(rows: npt.NDArray[np.int64]) -> Tensor:
         pairs = normalise(source.pixels(np.stack((rows, rows + 1), axis=1)))
@@ -182,11 +199,8 @@ def moving_frames(source: EpisodeFrames, threshold: float, margin: int) -> Trans
 
 
 def moving_slots(moves: Transitions, slots: npt.NDArray[np.float32], threshold: float, margin: int) -> Transitions:
-    """Those transitions in which the slots (F, N, D) move: `slot_motion` above `threshold`.
-
-    Raises:
-        DataError: nothing is left.
-    """
+    """Those transitions in which the slots (F, N, D) move: `slot_motion` above `threshold`. A DataError where nothing
+    is left."""
 
     def motion(rows: npt.NDArray[np.int64]) -> Tensor:
         pairs = slots[np.stack((rows, rows + 1), axis=1)]
@@ -197,11 +211,7 @@ def moving_slots(moves: Transitions, slots: npt.NDArray[np.float32], threshold: 
 
 
 def transitions(source: EpisodeFrames) -> Transitions:
-    """All transitions of a data set; episodes of one frame have none and are left out.
-
-    Raises:
-        DataError: no episode has two frames.
-    """
+    """All transitions of a data set; episodes of one frame are left out. A DataError where there are no others."""
     kept = np.nonzero(source.lengths >= 2)[0]
     if not len(kept):
         raise DataError("demonstrations: got no episode of two frames or more, expected videos: collect again")
@@ -212,11 +222,8 @@ def transitions(source: EpisodeFrames) -> Transitions:
 
 
 def real_actions(source: EpisodeFrames, rows: npt.NDArray[np.int64], width: int) -> Tensor:
-    """Real actions (M, A) of transitions, in [-1, 1] by the range of the data set; what lies outside is clipped.
-
-    Raises:
-        DataError: the data set has none, or of another width.
-    """
+    """Real actions (M, A) of transitions, in [-1, 1] by the range of the data set; what lies outside is clipped. A
+    DataError where there are none, or some of another width."""
     return _unit_actions(source, source.require_actions(width)[rows]).clamp(-1, 1)
 
 

@@ -10,6 +10,7 @@ Shapes: F frames, H W image height and width.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 import zlib
@@ -17,14 +18,13 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.data.cache import write_header
+from playslot_rl.data.cache import ArrayWriter
 from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.frames import rgb_frames, sized
 from playslot_rl.data.metadata import stated_size
@@ -32,8 +32,7 @@ from playslot_rl.errors import PlaySlotError
 from playslot_rl.runtime.threads import available_cores
 from playslot_rl.storage.atomic import explain_write_errors, write_text
 
-UNIT_FRAMES: Final = 2048
-"""Frames of a unit, about: some seconds of work."""
+UNIT_FRAMES: Final = 2048  # frames of a unit, about: some seconds of work
 
 
 @dataclass(frozen=True)
@@ -61,10 +60,9 @@ class FrameArray:
         Raises:
             OutputError: the disk is full.
         """
-        if self.path.is_file() and self.path.stat().st_size == self._start() + self.bytes:
-            return
-        with explain_write_errors(self.path), self.path.open("wb") as file:
-            file.truncate(write_header(file, self.shape, np.dtype(np.uint8)) + self.bytes)
+        with explain_write_errors(self.path):
+            if not self.path.is_file() or self.path.stat().st_size < self.bytes:
+                ArrayWriter(self.path, self.shape, np.uint8).close()
 
     def decode(self, spans: Sequence[Span]) -> str:
         """Decode some episodes to their rows; returns their digest.
@@ -73,26 +71,22 @@ class FrameArray:
             DataError: a frame cannot be decoded.
             OutputError: the disk is full.
         """
-        start, one, digest = self._start(), self.bytes // self.shape[0], 0
-        with explain_write_errors(self.path), self.path.open("r+b") as file:
+        digest = 0
+        with (
+            explain_write_errors(self.path),
+            contextlib.closing(ArrayWriter(self.path, self.shape, np.uint8, begun=True)) as writer,
+        ):
             for row, frame in rgb_frames(self.contents, self.camera, spans):
                 pixels = sized(frame, self.size)
-                file.seek(start + row * one)
-                file.write(np.ascontiguousarray(pixels).data)
+                writer.write(pixels[None], row)
                 digest += _digest(row, pixels)
-            file.flush()
-            os.fsync(file.fileno())
+            writer.sync()
         return f"{digest:x}"
 
     def digest(self, spans: Sequence[Span]) -> str:
         """Of what the file holds of some episodes."""
         frames: npt.NDArray[np.uint8] = np.load(self.path, mmap_mode="r")
         return f"{sum(_digest(row, frames[row]) for span in spans for row in range(span.start, span.stop)):x}"
-
-    def _start(self) -> int:
-        import io
-
-        return write_header(io.BytesIO(), self.shape, np.dtype(np.uint8))
 
 
 def _digest(row: int, pixels: npt.NDArray[np.uint8]) -> int:
@@ -112,12 +106,14 @@ def build_frames(contents: Contents, camera: str, size: int | None, folder: Path
     array.begin()
     marks = folder / "units"
     marks.mkdir(exist_ok=True)
-    missing = {
-        number: spans for number, spans in enumerate(units(contents, camera)) if not _done(array, marks, number, spans)
-    }
+    missing = {}
+    for number, spans in enumerate(units(contents, camera)):
+        mark = marks / f"{number:05d}"
+        if not mark.is_file() or mark.read_text() != array.digest(spans):
+            missing[number] = spans
     count = min(workers or available_cores(), len(missing))
     for number, digest in _decoded(array, missing, count):
-        write_text(_mark(marks, number), digest)
+        write_text(marks / f"{number:05d}", digest)
     for mark in marks.iterdir():
         mark.unlink()
     marks.rmdir()
@@ -137,15 +133,6 @@ def units(contents: Contents, camera: str) -> list[list[Span]]:
     return found
 
 
-def _mark(marks: Path, number: int) -> Path:
-    return marks / f"{number:05d}"
-
-
-def _done(array: FrameArray, marks: Path, number: int, spans: Sequence[Span]) -> bool:
-    path = _mark(marks, number)
-    return path.is_file() and path.read_text() == array.digest(spans)
-
-
 def _decoded(array: FrameArray, missing: dict[int, list[Span]], workers: int) -> Iterator[tuple[int, str]]:
     if workers <= 1:
         for number, spans in missing.items():
@@ -155,7 +142,7 @@ def _decoded(array: FrameArray, missing: dict[int, list[Span]], workers: int) ->
 
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin, (array,))
     try:
-        running = {pool.submit(partial(_work, spans)): number for number, spans in missing.items()}
+        running = {pool.submit(_work, spans): number for number, spans in missing.items()}
         for future in as_completed(running):
             yield running[future], future.result()
     except BrokenProcessPool as error:
@@ -167,8 +154,7 @@ def _decoded(array: FrameArray, missing: dict[int, list[Span]], workers: int) ->
         pool.shutdown(cancel_futures=True)
 
 
-_ARRAY: list[Any] = []
-"""Of a worker: what it decodes to; sent once, not with every unit."""
+_ARRAY: list[Any] = []  # of a worker: what it decodes to; sent once, not with every unit
 
 
 def _begin(array: FrameArray) -> None:

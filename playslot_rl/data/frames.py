@@ -28,21 +28,16 @@ from playslot_rl.errors import DataError
 
 ROWS_A_PIECE = 256
 DAMAGED = "damaged frame"
-FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF")
-"""Of stored images; Pillow knows more, and starts other programs for some."""
+FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF")  # Pillow knows more, and starts programs for some
 
-Decoded = Any
-"""Pixels of an image, uint8 (H, W, 3), or (H, W) of a depth map; or PyAV's `VideoFrame`."""
+Decoded = Any  # pixels of an image, uint8 (H, W, 3), or (H, W) of a depth map; or PyAV's `VideoFrame`
 
 
 def decoded_frames(
     contents: Contents, camera: str, problems: Problems, spans: Sequence[Span] | None = None
 ) -> Iterator[tuple[int, Decoded]]:
-    """Frames of a camera with their row numbers, ascending within a file.
-
-    Args:
-        problems: notes what cannot be decoded or has another size than stated; such frames are left out.
-    """
+    """Frames of a camera with their row numbers, ascending within a file. What cannot be decoded or has another size
+    than stated is left out and noted in `problems`."""
     chosen = contents.spans if spans is None else spans
     read = _video_frames if camera in contents.videos else _image_frames
     yield from read(contents, camera, chosen, problems)
@@ -69,11 +64,7 @@ def rgb_frames(
 
 
 def to_rgb(frame: Decoded) -> npt.NDArray[np.uint8]:
-    """Pixels of a decoded frame, uint8 (H, W, 3); of 16 bits the upper eight.
-
-    Raises:
-        DataError: a picture of one number a pixel that has neither 8 nor 16 bits.
-    """
+    """Pixels of a decoded frame, uint8 (H, W, 3); of 16 bits the upper eight. A DataError for other numbers a pixel."""
     if not isinstance(frame, np.ndarray):
         frame = frame.to_ndarray(format="rgb24")
     if frame.ndim == 2 and frame.dtype not in (np.uint8, np.uint16):
@@ -89,8 +80,7 @@ def resize_frames(frames: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.ui
     """Resize whole frames by area averaging: uint8 (n, H, W, 3) to (n, size, size, 3)."""
     from PIL import Image
 
-    resized = [np.asarray(Image.fromarray(f).resize((size, size), Image.Resampling.BOX)) for f in frames]
-    return np.stack(resized)
+    return np.stack([np.asarray(Image.fromarray(f).resize((size, size), Image.Resampling.BOX)) for f in frames])
 
 
 def sized(frame: npt.NDArray[np.uint8], size: int | None) -> npt.NDArray[np.uint8]:
@@ -159,10 +149,8 @@ def is_image_type(stored: Any) -> bool:
 
 
 def _decode_image(root: Path, size: tuple[int, int], cell: dict[str, Any] | None) -> Array | str:
-    """Pixels of a stored image, (H, W, 3) uint8 for colours, or what is wrong with it.
-
-    Its header is read first: nothing is decoded that has another size (H, W) than stated.
-    """
+    """Pixels of a stored image, (H, W, 3) uint8 for colours, or what is wrong with it: its header is read first, and
+    nothing is decoded that has another size (H, W) than stated."""
     from PIL import Image, UnidentifiedImageError
 
     expected = "expected a PNG or JPEG image"
@@ -226,11 +214,7 @@ def _video_frames(
 
 
 def _frames_at(contents: Contents, path: Path, times: Sequence[float], tolerance: float) -> Iterator[Any]:
-    """Frames of a video at ascending times, seconds.
-
-    Raises:
-        DataError: the video cannot be opened or decoded, or has no frame at one of the times.
-    """
+    """Frames of a video at ascending times, seconds; a DataError where it has none at one of them."""
     import av
 
     # A video without an index may be sought past what is wanted; then it is read from its beginning.

@@ -19,8 +19,7 @@ from playslot_rl.data.demonstrations import BY_ROW, Demonstrations, moving_slots
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.world_model import WorldModel
 
-BATCH = 64
-"""Episodes labelled at once."""
+BATCH = 64  # episodes labelled at once
 
 
 @torch.no_grad()
@@ -38,7 +37,6 @@ def label_demonstrations(
     eight slots are 1.1 GB.
 
     Args:
-        source: the videos; its actions are carried along where it has some.
         trim: motion of the slots up to which a transition is still; 0 keeps every one.
         margin: still ones kept after each stretch of motion.
 
@@ -94,11 +92,7 @@ def _label(
 
 
 def with_copies(demos: Sequence[Demonstrations]) -> Demonstrations:
-    """Demonstrations and shifted copies of them, labelled one by one, as one set.
-
-    Args:
-        demos: the originals first; of each the transitions in which it moves.
-    """
+    """Demonstrations, and shifted copies of them after them, as one set."""
     first, *copies = demos
     if not copies:
         return first

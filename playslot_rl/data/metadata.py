@@ -26,22 +26,15 @@ VIDEO_PATH: Final = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index
 EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 PLACE: Final = ("index", "episode_index", "task_index")
 """Columns that say where a row stands in its data set: they change when data sets are merged or split."""
-WHOLE: Final = ("frame_index", *PLACE)
-"""Columns of whole numbers."""
+WHOLE: Final = ("frame_index", *PLACE)  # columns of whole numbers
 REQUIRED: Final = ("timestamp", *WHOLE)
 
-FASTEST: Final = 10_000
-"""Frames a second."""
-MOST: Final = 2**40
-"""Frames, episodes and tasks."""
-LARGEST_VALUE: Final = 2**28
-"""Numbers of a feature in one frame."""
-LARGEST_PICTURE: Final = 2**26
-"""Pixels of a frame: 8192x8192."""
-LONGEST_JSON: Final = 2**28
-"""Bytes."""
-NUMBERS: Final = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
-"""Types of features whose values are numbers."""
+FASTEST: Final = 10_000  # frames a second
+MOST: Final = 2**40  # frames, episodes and tasks
+LARGEST_VALUE: Final = 2**28  # numbers of a feature in one frame
+LARGEST_PICTURE: Final = 2**26  # pixels of a frame: 8192x8192
+LONGEST_JSON: Final = 2**28  # bytes
+NUMBERS: Final = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")  # types of features whose values are numbers
 CAMERAS: Final = ("image", "video")
 OTHERS: Final = (*CAMERAS, "string", "large_string", "language")
 
@@ -51,12 +44,7 @@ class _BoundsError(ValueError):
 
 
 def json_content(path: Path) -> Any:
-    """What a JSON file holds (`parsed`).
-
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is no JSON, too long, or nested too deeply.
-    """
+    """What a JSON file holds (`parsed`); a ValueError also where it is too long, an OSError where it cannot be read."""
     size = path.stat().st_size
     if size > LONGEST_JSON:
         raise ValueError(f"{size} bytes, expected at most {LONGEST_JSON}")
@@ -64,11 +52,7 @@ def json_content(path: Path) -> Any:
 
 
 def parsed(content: bytes) -> Any:
-    """What JSON says; a byte-order mark before it is passed over.
-
-    Raises:
-        ValueError: it is no JSON, or nested too deeply.
-    """
+    """What JSON says, a byte-order mark before it passed over; a ValueError where it is none, or nested too deeply."""
     try:
         values = json.loads(content)
         json.dumps(values, ensure_ascii=False).encode()  # halves of characters could not be printed
@@ -135,11 +119,7 @@ def stated_size(feature: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def whole(value: Any, low: int, high: int) -> int:
-    """A whole number within bounds; one with a point counts, as pandas gives them.
-
-    Raises:
-        ValueError: it is not.
-    """
+    """A whole number within bounds, else a ValueError; one with a point counts, as pandas gives them."""
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:

@@ -15,12 +15,9 @@ from typing import Any, Final, TypeGuard
 
 from playslot_rl.data.problems import Problems
 
-OUTSIDE: Final = "outside"
-"""Kind of problem: a link out of the data set."""
-CLUTTER: Final = "clutter"
-"""Kind of warning: files of another file system that LeRobot takes for rows."""
-FARTHEST: Final = 10**9
-"""The highest number of a folder or a file."""
+OUTSIDE: Final = "outside"  # kind of problem: a link out of the data set
+CLUTTER: Final = "clutter"  # kind of warning: files of another file system that LeRobot takes for rows
+FARTHEST: Final = 10**9  # the highest number of a folder or a file
 _FIELD: Final = re.compile(r"\{(chunk_index|file_index|video_key)(?::0?(\d)d?)?\}")
 _CLUTTER: Final = (".DS_Store", "Thumbs.db", "desktop.ini")
 _LONGEST_PATH: Final = 1024

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-SHOWN = 5
-"""Messages of one kind before the rest is only counted."""
+SHOWN = 5  # messages of one kind before the rest is only counted
 
 
 class Problems:

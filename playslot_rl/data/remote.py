@@ -31,8 +31,7 @@ from playslot_rl.errors import DataError
 from playslot_rl.runtime.processes import here
 from playslot_rl.storage.secrets import checked_token, mask
 
-BUFFER: Final = 1 << 20
-"""Bytes that are asked of the client at once; it reads ahead by more."""
+BUFFER: Final = 1 << 20  # bytes that are asked of the client at once; it reads ahead by more
 _LOOK = "pull it and run `playslot dataset verify`"
 _ADDRESS = re.compile(r"hf://datasets/([\w.-]+/[\w.-]+?)(?:@([^@\s]+))?/?")
 
@@ -54,11 +53,8 @@ class Remote:
     token: str | None = field(repr=False)
 
     def open(self, path: Path) -> io.BufferedReader:
-        """A file, to be read by ranges of a few megabytes; each reader has its own.
-
-        Raises:
-            DataError: the Hub does not answer.
-        """
+        """A file, to be read by ranges of a few megabytes; each reader has its own. A DataError where the Hub does not
+        answer."""
         from huggingface_hub import HfFileSystem
 
         name = f"{self.place}/{path.relative_to(self.root).as_posix()}"

@@ -35,9 +35,8 @@ class FrameRows(Protocol):
 
 
 def row_numbers(rows: Any, count: int) -> tuple[IntArray, tuple[int, ...]]:
-    """The rows that an index means, from 0 on, int64 (n,), and the shape of the index: of an integer, a slice or an
-    integer array of any shape, in which negative numbers count from the end. An IndexError where there is no such
-    row."""
+    """The rows that an index means, int64 (n,) from 0 on, and its shape: an integer, a slice or an integer array of any
+    shape, in which negative numbers count from the end. An IndexError where there is no such row."""
     if isinstance(rows, slice):
         rows = np.arange(*rows.indices(count))
     index = np.asarray(rows, np.int64)
@@ -48,9 +47,7 @@ def row_numbers(rows: Any, count: int) -> tuple[IntArray, tuple[int, ...]]:
 
 
 def shift_frames(frames: Frames, offsets: npt.ArrayLike) -> Frames:
-    """Frames (..., H, W, C) moved by pixels (down, right), all by offsets (2,) or each by its own (..., 2).
-
-    Content that enters repeats the edge.
+    """Frames (..., H, W, C) moved by pixels (down, right), by offsets (2,) or each by its own (..., 2); edges repeat.
 
     Example:
         >>> frames = np.arange(4, dtype=np.uint8).reshape(1, 2, 2, 1)
@@ -92,7 +89,6 @@ class RowView:
 
     @property
     def dtype(self) -> Any:
-        """Of the parts."""
         return self.parts[0].dtype
 
     def __len__(self) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from playslot_rl.data.cache import ArrayWriter, CachePlace, build_on, cache_folder, load_cached
+from playslot_rl.data.cache import ArrayWriter, CachePlace, build_once, cache_folder, load_cached
 from playslot_rl.data.cache_entries import ENTRY_NAME, room
 from playslot_rl.data.rows import RowView
 from playslot_rl.data.source import EpisodeFrames
@@ -32,15 +32,11 @@ SlotRows = npt.NDArray[np.float32]
 """Slots (F, N, D) by row: an array, or (`RowView`) several that are indexed by rows as one."""
 
 _FORMAT = "1"
-_BY_ROW = "2"
-"""Where episodes are left out between others: slots stand at their frames' rows, too."""
+_BY_ROW = "2"  # where episodes are left out between others: slots stand at their frames' rows, too
 EPISODES_A_BATCH = 32
-MARK_EVERY = 16
-"""Batches after which a build says how far it is."""
-BEGUN = "begun.json"
-"""How many episodes are parsed, in an entry that is being made."""
-FRAMES_A_PASS = 4
-"""Frames of each episode parsed at a time: bounds the memory of the encoder's activations."""
+MARK_EVERY = 16  # batches after which a build says how far it is
+BEGUN = "begun.json"  # how many episodes are parsed, in an entry that is being made
+FRAMES_A_PASS = 4  # frames of each episode parsed at a time: bounds the memory of the encoder's activations
 
 
 def slot_cache(
@@ -71,7 +67,8 @@ def slot_cache(
         # Each set's own, whatever the weights.
         parts = [slot_cache(s, savi, savi_fingerprint, cache, device, progress) for s in shares.sources]
         return cast("SlotRows", RowView(parts))
-    whole = _in_order(source)
+    # Of some chosen episodes those between are left out.
+    whole = np.array_equal(source.starts, np.cumsum(source.lengths) - source.lengths)
     identity = [_FORMAT if whole else _BY_ROW, source.fingerprint, source.camera, source.image_size, savi_fingerprint]
     key = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:24]
     folder = cache_folder(cache) / "slots" / key
@@ -79,31 +76,27 @@ def slot_cache(
 
     def build(part: Path) -> None:
         shape = (count, savi.config.n_slots, savi.config.slot_dim)
-        begun = _begun(part)  # episodes that a build which was killed has parsed
+        mark = part / BEGUN
+        begun = int(json.loads(mark.read_text())) if mark.is_file() else 0  # episodes that a killed build has parsed
         left = int(source.lengths[begun:].sum())
         if progress:
             print(f"slots: parsing {left} frames once", file=sys.stderr, flush=True)
         with room(cache, int(np.prod(shape)) * 4, key):
-            writer = ArrayWriter(part / "slots.npy", shape, np.float32, int(source.lengths[:begun].sum()))
+            writer = ArrayWriter(part / "slots.npy", shape, np.float32, begun > 0)
         for number, episodes in enumerate(_batches(source, begun), 1):
             for episode, slots in zip(episodes, _parse(source, savi, device, episodes), strict=True):
                 writer.write(slots, int(source.starts[episode]))
             if number % MARK_EVERY == 0:
                 writer.sync()
-                write_json(part / BEGUN, int(episodes[-1]) + 1)
-        writer.close(whole=whole)
+                write_json(mark, int(episodes[-1]) + 1)
+        writer.close()
         facts = {"name": source.name, "camera": source.camera, "fingerprint": source.fingerprint}
         write_json(part / ENTRY_NAME, {**facts, "savi": savi_fingerprint})
-        (part / BEGUN).unlink(missing_ok=True)
+        mark.unlink(missing_ok=True)
 
-    build_on(folder, build)
-    slots: npt.NDArray[np.float32] = load_cached(folder, "slots.npy", lambda: build_on(folder, build))
+    build_once(folder, build)
+    slots: npt.NDArray[np.float32] = load_cached(folder, "slots.npy", lambda: build_once(folder, build))
     return slots
-
-
-def _begun(part: Path) -> int:
-    mark = part / BEGUN
-    return int(json.loads(mark.read_text())) if mark.is_file() else 0
 
 
 def _batches(source: EpisodeFrames, first: int = 0) -> Iterator[npt.NDArray[np.int64]]:
@@ -117,11 +110,6 @@ def _batches(source: EpisodeFrames, first: int = 0) -> Iterator[npt.NDArray[np.i
             last = max(first + 1, first + int(np.searchsorted(np.cumsum(lengths[first:last]), most, side="right")))
         yield np.arange(first, last)
         first = last
-
-
-def _in_order(source: EpisodeFrames) -> bool:
-    """Whether the episodes fill all rows up to the last one of theirs; of some chosen ones, those between are left."""
-    return bool(np.array_equal(source.starts, np.cumsum(source.lengths) - source.lengths))
 
 
 def parse_episodes(

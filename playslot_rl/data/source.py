@@ -22,7 +22,7 @@ from playslot_rl import keys
 from playslot_rl.config.weights import is_remote
 from playslot_rl.data.action_limits import ActionLimits, limits_of
 from playslot_rl.data.agreement import open_files
-from playslot_rl.data.cache import CachePlace, build_on, cache_folder, load_cached, note_read, settings
+from playslot_rl.data.cache import CachePlace, build_once, cache_folder, load_cached, note_read, settings
 from playslot_rl.data.cache_entries import ENTRY_NAME, room
 from playslot_rl.data.contents import Contents
 from playslot_rl.data.frame_build import FrameArray, build_frames
@@ -39,8 +39,7 @@ if TYPE_CHECKING:
 
     from playslot_rl.data.weighted import Shares
 
-_FORMAT = "1"
-"""Of the frame cache."""
+_FORMAT = "1"  # of the frame cache
 
 
 @dataclass(frozen=True)
@@ -100,11 +99,7 @@ class EpisodeFrames:
         return np.arange(self.starts[episode], self.starts[episode] + self.lengths[episode])
 
     def require_actions(self, width: int | None = None) -> npt.NDArray[np.float32]:
-        """The actions.
-
-        Raises:
-            DataError: the data set has none, or of another width.
-        """
+        """The actions; a DataError where there are none, or some of another width."""
         if self.actions is None:
             raise DataError(
                 "got a data set without actions, expected the feature `action`: use labelled demonstrations"
@@ -118,7 +113,7 @@ class EpisodeFrames:
 
 
 def open_sources(
-    roots: str | Sequence[str | Path],
+    roots: str | Path | Sequence[str | Path],
     camera: str = "",
     cache: CachePlace = "",
     *,
@@ -143,9 +138,10 @@ def open_sources(
             sizes. With a `buffer`, a frame that cannot be decoded is found when it is read.
         OutputError: full disk.
     """
-    names = [name.strip() for name in roots.split(",")] if isinstance(roots, str) else list(roots)
+    if isinstance(roots, str | Path):
+        roots = [roots] if isinstance(roots, Path) else [name.strip() for name in roots.split(",")]
     sources: list[EpisodeFrames] = []
-    for root in [name for name in names if str(name)] or [""]:
+    for root in [name for name in roots if str(name)] or [""]:
         remote = buffer is not None and is_remote(root)
         files = open_remote(str(root), cache_folder(cache)) if remote else open_files(root)
         labels = labels_of(files)
@@ -157,7 +153,7 @@ def open_sources(
                     frames=frames,
                     fingerprint=fingerprint,
                     fps=files.fps,
-                    task=_task(files),
+                    task=next(iter(files.episodes[0].tasks), ""),
                     camera=feature,
                     robot=str(files.info.get("robot_type") or ""),
                     name=str(root),
@@ -175,27 +171,14 @@ def open_sources(
     return concatenate(sources) if len(sources) > 1 else first
 
 
-def open_source(
-    root: str | Path,
-    camera: str = "",
-    cache: CachePlace = "",
-    *,
-    image_size: int | None = None,
-    resize: bool = False,
-    buffer: int | None = None,
-) -> EpisodeFrames:
-    """`open_sources` of a single data set."""
-    return open_sources([root], camera, cache, image_size=image_size, resize=resize, buffer=buffer)
+open_source = open_sources
 
 
 def _frames_of(
     files: Contents, camera: str, cache: CachePlace, image_size: int | None, resize: bool, buffer: int | None
 ) -> tuple[FrameRows, str, str]:
-    """A camera's frames, cached or (with a `buffer`) streamed, the data set's fingerprint, and the camera's full name.
-
-    Raises:
-        DataError, OutputError: see `open_sources`.
-    """
+    """A camera's frames, cached or (with a `buffer`) streamed, the data set's fingerprint, and the camera's full
+    name."""
     camera, size = files.camera(camera), image_size if resize else None
     stated = stated_size(files.features[camera])
     # Refused before everything is decoded, where the metadata say it.
@@ -219,7 +202,6 @@ def _frames_of(
 
 
 def _wrong_size(files: Contents, camera: str, got: tuple[int, int], expected: int) -> DataError:
-    """Frames of another size than the model's."""
     return DataError(
         f"{files.name}: got frames of {got[0]}x{got[1]} from {camera}, expected {expected}x{expected}: "
         "set env.image_size, resize them by data.resize=true, or record at that size"
@@ -229,8 +211,8 @@ def _wrong_size(files: Contents, camera: str, got: tuple[int, int], expected: in
 def _frame_cache(files: Contents, camera: str, cache: CachePlace, size: int | None, fingerprint: str) -> Path:
     """The cache folder of a data set's camera, made if needed.
 
-    It holds `frames.npy` uint8 (F, H, W, 3), `columns.npz` and `meta.json`, and is keyed by the data set's content, the
-    camera and the frame size (None keeps it), never by the path.
+    It holds `frames.npy` uint8 (F, H, W, 3) and `meta.json`, and is keyed by the data set's content, the camera and the
+    frame size (None keeps it), never by the path.
     """
     folder = cache_folder(cache)
     if folder.resolve().is_relative_to(files.root.resolve()):  # a push would upload it
@@ -244,17 +226,10 @@ def _frame_cache(files: Contents, camera: str, cache: CachePlace, size: int | No
         with room(cache, array.bytes, key):
             array.begin()
         build_frames(files, camera, size, part, settings(cache).workers)
-        labels = {name: values for name, values in labels_of(files).items() if values is not None}
-        np.savez(part / "columns.npz", **labels)
         facts = {"name": str(files.root), "camera": camera, "fingerprint": fingerprint}
-        write_json(part / ENTRY_NAME, {**facts, "fps": files.fps, "task": _task(files)})
+        write_json(part / ENTRY_NAME, {**facts, "fps": files.fps, "task": next(iter(files.episodes[0].tasks), "")})
 
-    return build_on(folder / "frames" / key, build)
-
-
-def _task(files: Contents) -> str:
-    tasks = files.episodes[0].tasks
-    return tasks[0] if tasks else ""
+    return build_once(folder / "frames" / key, build)
 
 
 def files_fingerprint(files: Contents, camera: str, cache: Path) -> str:

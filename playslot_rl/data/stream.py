@@ -30,12 +30,9 @@ from playslot_rl.data.metadata import stated_size
 from playslot_rl.data.rows import FrameRows, Frames, IntArray, RowView, row_numbers
 from playslot_rl.runtime import processes
 
-BLOCKS: Final = 16
-"""Blocks of a full buffer."""
-FEW: Final = 4
-"""Blocks below which a buffer hardly shuffles."""
-ORDER_STREAM: Final = 0x57EA
-"""Keeps the order of the blocks apart from what else a seed draws."""
+BLOCKS: Final = 16  # of a full buffer
+FEW: Final = 4  # with fewer blocks a buffer hardly shuffles
+ORDER_STREAM: Final = 0x57EA  # keeps the order of the blocks apart from what else a seed draws
 
 
 class FrameStream:
@@ -43,9 +40,6 @@ class FrameStream:
 
     Blocks that `hold` names stay in memory once they are read; of other episodes those read last, up to a quarter of
     the buffer, or a single one that is longer.
-
-    Args:
-        contents: the data set; its columns are not kept.
     """
 
     def __init__(self, contents: Contents, camera: str, size: int | None, buffer: int) -> None:

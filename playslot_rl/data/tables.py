@@ -18,12 +18,10 @@ from playslot_rl.data.places import inside
 from playslot_rl.data.problems import Problems
 
 TASKS_NAME: Final = "meta/tasks.parquet"
-EPISODES_AT_ONCE: Final = 64
-"""Of the metadata with statistics, some 150 columns."""
+EPISODES_AT_ONCE: Final = 64  # of the metadata with statistics, some 150 columns
 UNREADABLE: Final = "unreadable parquet"
 WRONG_COLUMN: Final = "wrong column"
-MOST_ROWS: Final = 10**9
-"""Of a data set, its frames or its episodes."""
+MOST_ROWS: Final = 10**9  # of a data set, its frames or its episodes
 
 Array = npt.NDArray[Any]
 Stats = dict[str, dict[str, Array]]
@@ -48,11 +46,8 @@ class Episode:
 def read_columns(
     paths: Sequence[Path], info: dict[str, Any], problems: Problems, opened: Callable[[Path], Any] = Path
 ) -> tuple[list[Path], list[int], dict[str, Array]]:
-    """The readable ones of some data files, rows of each, and every feature that is no camera.
-
-    Args:
-        opened: a file as pyarrow takes one.
-    """
+    """The readable ones of some data files, rows of each, and every feature that is no camera; `opened` gives a file as
+    pyarrow takes one."""
     features = info["features"]
     names = [name for name, feature in features.items() if feature["dtype"] not in CAMERAS]
     files, parts = [], []
@@ -86,11 +81,8 @@ def read_table(
 
 
 def _to_array(column: Any, shape: Sequence[int]) -> Array:
-    """A table's column as (n, *shape); the shape (1,) gives (n,). Text and records come as objects.
-
-    Raises:
-        ValueError: it has missing values, or another shape.
-    """
+    """A table's column as (n, *shape); the shape (1,) gives (n,). Text and records come as objects. A ValueError where
+    it has missing values, or another shape."""
     import pyarrow as pa
 
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
@@ -147,11 +139,7 @@ def holds_numbers(values: Array) -> bool:
 
 
 def _check_kind(name: str, values: Array, dtype: str) -> None:
-    """Refuse text for numbers and numbers for text; other numbers than stated are still numbers.
-
-    Raises:
-        ValueError: what was got.
-    """
+    """Refuse text for numbers and numbers for text by a ValueError; other numbers than stated are still numbers."""
     stated, stored = bool(NUMBERS.fullmatch(dtype)), holds_numbers(values)
     if stated != stored and (stated or dtype in OTHERS):
         raise ValueError(f"values of type {'text or records' if values.dtype == object else values.dtype} for {dtype}")

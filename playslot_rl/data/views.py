@@ -24,14 +24,11 @@ if TYPE_CHECKING:
 
 DIRECTIONS = ((1, 1), (-1, -1), (1, -1), (-1, 1), (1, 0), (-1, 0), (0, 1), (0, -1))
 """Of shifted copies, (down, right): corners first, so that the first four surround the original."""
-DRAW_STREAM = 14
-"""Keeps the draws of demonstrations apart from what else a seed draws."""
-TEST_STREAM = 0x7E57
-"""Seed of the split in training and test episodes."""
+DRAW_STREAM = 14  # keeps the draws of demonstrations apart from what else a seed draws
+TEST_STREAM = 0x7E57  # seed of the split in training and test episodes
 
 
 def text_hash(text: str) -> str:
-    """16 hex digits."""
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -91,9 +88,6 @@ def every(source: EpisodeFrames, stride: int) -> EpisodeFrames:
 
     The action of a kept row is the mean of the k actions that lead to the next kept one (those of a velocity or of a
     displacement a step stay in their range).
-
-    Raises:
-        ValueError: `stride` below 1.
     """
     if stride < 1:
         raise ValueError(f"stride: got {stride}, expected 1 (every frame) or more")
@@ -143,11 +137,7 @@ def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames
 
 
 def first_demonstrations(source: EpisodeFrames, demos: int | None) -> EpisodeFrames:
-    """The first `demos` episodes; None, or as many as there are, gives the data set itself.
-
-    Raises:
-        DataError: there are fewer episodes.
-    """
+    """The first `demos` episodes (a DataError where there are fewer); None, or all of them, gives the set itself."""
     if demos is None or demos == source.episodes:
         return source
     if demos > source.episodes:
@@ -168,10 +158,7 @@ def drawn_demonstrations(source: EpisodeFrames, seed: int, among: int | None = N
 
 
 def split_tested(source: EpisodeFrames, fraction: float) -> tuple[EpisodeFrames, EpisodeFrames]:
-    """The episodes that are trained on, and those that are kept for a test, the same ones for every seed.
-
-    Args:
-        fraction: of its episodes that are kept, at least two.
+    """The episodes that are trained on, and a fraction, two at least, that is kept for a test, the same for every seed.
 
     Raises:
         DataError: fewer than two would be left for either.

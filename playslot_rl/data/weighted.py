@@ -1,4 +1,5 @@
-"""Several data sets as one, each drawn from as often as its weight says: first the set, then a window of it.
+"""Data sets as a config wants them, and several as one, each drawn from as often as its weight says: first the set,
+then a window of it.
 
     P(window w of set i) = weight_i / sum_j weight_j  *  1 / (windows of set i)
 
@@ -11,13 +12,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.weights import DataRoot, data_roots
+from playslot_rl.data.cache import Cache
 from playslot_rl.data.rows import IntArray
-from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.views import concatenate, text_hash
+from playslot_rl.data.source import EpisodeFrames, open_sources
+from playslot_rl.data.views import concatenate, every, text_hash
 from playslot_rl.errors import DataError
 
 
@@ -48,10 +53,7 @@ class Shares:
 
 
 def weighted(sources: Sequence[EpisodeFrames], weights: Sequence[float | None], names: Sequence[str]) -> EpisodeFrames:
-    """Several data sets as one. Nothing is copied: each keeps its own frame cache.
-
-    Args:
-        weights: of each; all None draws every window of all sets alike, as `concatenate`.
+    """Several data sets as one, each with its own frame cache; without any weight as `concatenate`.
 
     Raises:
         DataError: sets with weights differ in frame size, rate or width of their actions.
@@ -73,8 +75,9 @@ def weighted(sources: Sequence[EpisodeFrames], weights: Sequence[float | None], 
 
 
 def _facts(source: EpisodeFrames, other: EpisodeFrames) -> list[tuple[str, object, object]]:
+    size, expected = ("x".join(map(str, each.image_size)) for each in (source, other))
     facts: list[tuple[str, object, object]] = [
-        ("frames of", _size(source), _size(other)),
+        ("frames of", size, expected),
         ("frames a second", f"{source.fps:g}", f"{other.fps:g}"),
     ]
     if source.robot and other.robot:
@@ -84,21 +87,11 @@ def _facts(source: EpisodeFrames, other: EpisodeFrames) -> list[tuple[str, objec
     return facts
 
 
-def _size(source: EpisodeFrames) -> str:
-    return "x".join(map(str, source.image_size))
-
-
 def draw_episodes(
     shares: Shares, starts: IntArray, places: IntArray, batch: int, generator: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
-    """Draw a set by its weight, then one of the places in its episodes.
-
-    Returns:
-        Episode and place in it, int64 (B,) each.
-
-    Raises:
-        DataError: a set has no place at all.
-    """
+    """Draw a set by its weight, then one of the places in its episodes: episode and place in it, int64 (B,) each. A
+    DataError where a set has no place at all."""
     groups = shares.of(starts)
     counts = np.bincount(groups, weights=places, minlength=len(shares.ends)).astype(np.int64)
     if (counts == 0).any():
@@ -115,3 +108,23 @@ def draw_episodes(
     position = np.searchsorted(cumulative, wanted, side="right")
     offset = wanted - (cumulative[position] - places[order][position])
     return order[position].astype(np.int64), offset.astype(np.int64)
+
+
+def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path]) -> EpisodeFrames:
+    """One or several data sets as one, by `env.image_size` and what `data` says of cameras, caches, size and stride.
+
+    `roots` are folders, or a text with commas and weights (`playslot_rl.config.weights`).
+
+    Raises:
+        DataError: as `open_sources`; or sets with weights do not agree.
+        ConfigError: a weight that is not above 0.
+    """
+    named = data_roots(roots) if isinstance(roots, str) else [DataRoot(str(root), None) for root in roots]
+    if any(root.weight is not None for root in named):
+        parts = [open_configured(config, [root.path]) for root in named]
+        return weighted(parts, [root.weight for root in named], [root.path for root in named])
+    data, size = config.data, config.env.image_size
+    paths = [root.path for root in named]
+    buffer = data.shuffle_buffer if data.stream else None
+    source = open_sources(paths, data.camera, Cache.of(data), image_size=size, resize=data.resize, buffer=buffer)
+    return every(source, data.stride)

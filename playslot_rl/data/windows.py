@@ -26,13 +26,8 @@ def sample_windows(
     generator: np.random.Generator,
     episodes: Sequence[int] | IntArray | None = None,
 ) -> IntArray:
-    """Draw windows: every valid first frame is equally likely, so long episodes count for more.
-
-    Returns:
-        Row indices (B, T), int64.
-
-    Raises:
-        DataError: no episode has `window` frames.
+    """Draw windows (B, T) of rows: every valid first frame is equally likely, so long episodes count for more. A
+    DataError where no episode has `window` frames.
 
     Example:
         >>> sample_windows([0, 3], [3, 2], 3, 2, np.random.default_rng(0))
@@ -51,14 +46,8 @@ def sample_windows(
 def spread_windows(
     starts: npt.ArrayLike, lengths: npt.ArrayLike, window: int, count: int, episodes: Sequence[int] | IntArray
 ) -> IntArray:
-    """At most `count` disjoint windows, spread evenly over the episodes; a stage's validation set.
-
-    Returns:
-        Row indices (at most `count`, T).
-
-    Raises:
-        DataError: no episode has `window` frames.
-    """
+    """At most `count` disjoint windows (., T) of rows, spread evenly over the episodes; a stage's validation set. A
+    DataError where no episode has `window` frames."""
     first, valid = _valid_starts(starts, lengths, window, episodes)
     begins = np.concatenate([s + np.arange(0, n, window) for s, n in zip(first, valid, strict=True)])
     windows: IntArray = begins[:, None].astype(np.int64) + np.arange(window)
@@ -90,13 +79,9 @@ def _valid_starts(
 
 
 def split_episodes(episodes: int, validation: float, seed: int) -> tuple[IntArray, IntArray]:
-    """Split episode indices into training and validation, at random but always the same for a seed.
+    """Split episode indices into training and validation, sorted, at random but always the same for a seed.
 
-    Args:
-        validation: fraction held out; at least one episode is, if the fraction is not 0 and there are two.
-
-    Returns:
-        Sorted training and validation indices; with nothing held out, validation is the training set.
+    At least one is held out, if the fraction is not 0 and there are two; with none, validation is the training set.
     """
     held_out = round(episodes * validation)
     if validation > 0 and episodes >= 2:

@@ -17,11 +17,7 @@ from torch import Tensor
 
 
 def corners(clips: int, size: int, zoom: float, generator: np.random.Generator) -> npt.NDArray[np.int64]:
-    """Upper left corners (B, 2) of the squares, row and column, pixels.
-
-    Args:
-        zoom: how many times things are enlarged, 1 or more.
-    """
+    """Upper left corners (B, 2) of the squares, row and column, pixels; `zoom` is 1 or more."""
     return generator.integers(0, size - _side(size, zoom) + 1, (clips, 2))
 
 

@@ -25,28 +25,21 @@ SHARES: Final = {"slots_trials": 0.18, "slots": 0.42, "dynamics_trial": 0.06, "d
 too."""
 TIMED_STEPS: Final = 24
 FEWEST_TIMED: Final = 2
-TIMED_SHARE: Final = 0.03
-"""Of the time, which steps that are timed may take: then fewer are."""
-SHORTEST: Final = 20
-"""Steps of a training at least, however little time there is."""
+TIMED_SHARE: Final = 0.03  # of the time, which steps that are timed may take: then fewer are
+SHORTEST: Final = 20  # steps of a training at least, however little time there is
 TELLING: Final = 150
 """Steps from which on a trial says something: before that slots are not taken apart and one prototype holds all."""
-PASSES: Final = 3
-"""A training step takes so many times as long as parsing its frames."""
-PICTURES: Final = 1000
-"""Frames that a report card draws, whatever it is measured on."""
-PROBED: Final = 0.001
-"""Seconds that its probes take for a transition."""
-FEWEST: Final = 8
-"""Episodes of a report card, at least."""
+PASSES: Final = 3  # A training step takes so many times as long as parsing its frames
+PICTURES: Final = 1000  # frames that a report card draws, whatever it is measured on
+PROBED: Final = 0.001  # seconds that its probes take for a transition
+FEWEST: Final = 8  # episodes of a report card, at least
 
 
 class Decisions:
     """What was decided (`made`), by name, in `RUN/adopt.json`, so that a second call decides the same.
 
-    Args:
-        facts: what the decisions depend on; a ConfigError where the run was begun with others.
-        began: `time.monotonic()` when this process began with the work.
+    A ConfigError where the run was begun with other `facts`, which the decisions depend on. This process `began` with
+    the work at that `time.monotonic()`.
     """
 
     def __init__(self, run: Path, facts: dict[str, Any], began: float) -> None:
@@ -85,12 +78,9 @@ class Decisions:
 
 @dataclass(frozen=True)
 class Budget:
-    """The time of an adoption: what is left, less what comes after a training, is shared out each time.
+    """The `seconds` of an adoption: what is left, less what comes after a training, is shared out each time.
 
-    Attributes:
-        seconds: that it may take.
-        frames, episodes: of the data set, as far as the stride leaves them.
-        actions: whether there are any, to be probed.
+    `frames` and `episodes` are those of the data set as far as the stride leaves them; `actions` are probed.
     """
 
     decide: Decisions
@@ -100,7 +90,6 @@ class Budget:
     actions: bool
 
     def left(self) -> float:
-        """Seconds."""
         return self.seconds - self.decide.spent
 
     def parsing(self, config: ExperimentConfig, milliseconds: float) -> float:
@@ -137,7 +126,6 @@ class Budget:
         return max(whole * FEWEST_TIMED / TIMED_STEPS, min(whole, self.seconds * TIMED_SHARE))
 
     def trial(self, of: str, seconds: float, milliseconds: float) -> int:
-        """Steps of a trial."""
         fits = steps_within(seconds, milliseconds / 1000)
         return self.decide(f"steps of a trial of {of}", lambda: Choice(fits, "as many as there is time for"))
 
@@ -165,12 +153,10 @@ def too_short(steps: int, what: str, preset: int) -> Choice | None:
 
 
 def with_slots(config: ExperimentConfig, slots: int) -> ExperimentConfig:
-    """The config with another number of slots."""
     return replace(config, model=replace(config.model, savi=replace(config.model.savi, n_slots=slots)))
 
 
 def with_prototypes(config: ExperimentConfig, prototypes: int) -> ExperimentConfig:
-    """The config with another number of prototypes."""
     own = replace(config.model.inverse_dynamics, n_prototypes=prototypes)
     return replace(config, model=replace(config.model, inverse_dynamics=own))
 
@@ -196,12 +182,9 @@ def clip_room(lengths: IntArray, least: int, validation: float, seed: int) -> tu
     """The longest clip that nine tenths of the episodes which have one at all have room for, and one of those held out.
 
     Args:
-        lengths: frames of each episode that the stride leaves.
-        least: frames of a clip, at least; half of the episodes have them.
-        validation: fraction of the episodes that is held out, by a split of that seed.
-
-    Returns:
-        Frames; and the fraction, which is larger where all that were held out are too short.
+        lengths: frames of each episode that the stride leaves; half of them have the `least` of a clip.
+        validation: fraction of the episodes that is held out by a split of that seed; larger in what is returned where
+            all that were held out are too short.
     """
     room = np.sort(lengths[lengths >= least])
     longest = int(room[len(room) // 10])

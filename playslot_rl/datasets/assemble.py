@@ -31,16 +31,13 @@ from playslot_rl.data.metadata import (
 )
 from playslot_rl.data.places import inside
 from playslot_rl.data.tables import TASKS_NAME, Array, Episode, Stats
-from playslot_rl.datasets.statistics import aggregate, of_numbers, reduced
+from playslot_rl.datasets.statistics import Aggregate, of_numbers, reduced
 from playslot_rl.datasets.video_copy import VideoCopier
 from playslot_rl.errors import DataError
 from playslot_rl.storage.atomic import write_json
 
-DATA_SIZE_MB: Final = 100
-VIDEO_SIZE_MB: Final = 200
-FILES_IN_A_FOLDER: Final = 1000
-ROWS_OF_METADATA: Final = 1000
 MEGABYTE: Final = 2**20
+ROWS_OF_METADATA: Final = 1000
 
 
 @dataclass(frozen=True)
@@ -63,11 +60,7 @@ def choose(contents: Contents, indices: Sequence[int]) -> Choice:
 
 
 def assemble(choices: Sequence[Choice], out: Path, made_by: str) -> None:
-    """Write the data set `out` from the chosen episodes, one data set after the other.
-
-    Args:
-        choices: of data sets with the same features and rate.
-        made_by: command, for our own record.
+    """Write the data set `out` from the chosen episodes of sets with the same features and rate, one after the other.
 
     Raises:
         DataError: no episode was chosen, or a source cannot be read.
@@ -78,13 +71,15 @@ def assemble(choices: Sequence[Choice], out: Path, made_by: str) -> None:
     out.mkdir(parents=True, exist_ok=True)
     info = _info(choices)
     tasks: dict[str, int] = {}  # numbered as they appear
-    video_bytes = int(float(info.get("video_files_size_in_mb") or VIDEO_SIZE_MB) * MEGABYTE)
-    files = int(info.get("chunks_size") or FILES_IN_A_FOLDER)
+    # LeRobot's defaults where nothing is stated.
+    video_bytes = int(float(info.get("video_files_size_in_mb") or 200) * MEGABYTE)
+    files = int(info.get("chunks_size") or 1000)
     cameras = choices[0].contents.videos
     copiers = {camera: VideoCopier(out, camera, float(info["fps"]), video_bytes, files) for camera in cameras}
-    rows = _RowWriter(out, float(info.get("data_files_size_in_mb") or DATA_SIZE_MB) * MEGABYTE, files)
+    rows = _RowWriter(out, float(info.get("data_files_size_in_mb") or 100) * MEGABYTE, files)
     table: list[dict[str, Any]] = []
     all_stats: list[Stats] = []
+    total = Aggregate()
     try:
         for choice in choices:
             contents = choice.contents
@@ -105,9 +100,10 @@ def assemble(choices: Sequence[Choice], out: Path, made_by: str) -> None:
         for copier in copiers.values():
             copier.close()
     try:
-        total = aggregate(all_stats)
+        for stats in all_stats:
+            total.add(stats)
         _write_metadata(out, table, list(tasks))
-        write_json(out / STATS_NAME, _plain(total))
+        write_json(out / STATS_NAME, _plain(total.result()))
     except (ValueError, TypeError, KeyError) as error:  # pyarrow's are among them
         raise DataError(
             f"{choices[0].contents.root}: got statistics in meta/episodes that are no numbers, or of another shape in "

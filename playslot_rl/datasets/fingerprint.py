@@ -41,11 +41,7 @@ class Fingerprint:
 
 
 def content_fingerprint(root: str | Path) -> Fingerprint:
-    """Fingerprint of the data set at `root`; decodes all its frames.
-
-    Raises:
-        DataError: something cannot be read.
-    """
+    """Fingerprint of the data set at `root`; decodes all its frames. A DataError where something cannot be read."""
     problems = Problems()
     contents = read_contents(root, problems)
     scans = scan_frames(contents, problems)
@@ -89,13 +85,9 @@ def _bytes(values: Array) -> bytes:
 
 @dataclass
 class CameraScan:
-    """One camera's frames.
-
-    Attributes:
-        digests: of the decoded pixels of each row (F); empty where a frame cannot be decoded.
-        stats: of each span, from the frames that LeRobot would sample; None for depth maps and damaged episodes.
-        theirs: the same with LeRobot's rounding of mean and standard deviation.
-    """
+    """One camera's frames: `digests` of the decoded pixels of each row (F), empty where one cannot be decoded, and
+    `stats` of each span, from the frames that LeRobot would sample (None for depth maps and damaged episodes); `theirs`
+    with LeRobot's rounding of mean and standard deviation."""
 
     digests: list[bytes]
     stats: list[dict[str, Array] | None] = field(default_factory=list)

@@ -26,14 +26,12 @@ class DatasetSummary:
 
     Attributes:
         format: LeRobot's version of it.
-        robot: robot type, empty if not stated.
-        episodes, frames: how many.
         lengths: shortest, mean and longest episode, frames.
         tasks: words -> episodes.
         features: name -> type and shape; without those that every data set has.
         bytes: of rows, videos and metadata.
         success_rate: share of episodes with a true `next.success`; None where there is no such feature.
-        seeds: smallest and largest seed, or None.
+        seeds: smallest and largest, or None.
         source: what our own record says about its making, or None.
     """
 
@@ -81,11 +79,7 @@ class DatasetSummary:
 
 
 def info(root: str | Path) -> DatasetSummary:
-    """Summarise the data set at `root`.
-
-    Raises:
-        DataError: it is missing, of another format version, or its rows and metadata do not agree.
-    """
+    """Summarise the data set at `root`; a DataError where it cannot be read, or rows and metadata do not agree."""
     contents = require_sound(root)
     lengths = [span.length for span in contents.spans]
     sizes = {}

@@ -16,11 +16,7 @@ from playslot_rl.storage.folders import new_folder, require_free
 
 @dataclass(frozen=True)
 class MergeResult:
-    """What `merge` made.
-
-    Attributes:
-        sources: those it was made from, with their numbers of episodes.
-    """
+    """What `merge` made, and of which data sets with how many episodes each."""
 
     out: Path
     sources: tuple[tuple[Path, int], ...]
@@ -34,12 +30,9 @@ class MergeResult:
 
 
 def merge(roots: Sequence[str | Path], out: str | Path) -> MergeResult:
-    """Write the episodes of `roots`, one data set after the other, as the new data set `out`.
+    """Write the episodes of two or more data sets of one kind, one after the other, as the new data set `out`.
 
-    Frames and rows are those of the sources, unchanged; tasks with the same words become one. A kill leaves no `out`.
-
-    Args:
-        roots: two or more data sets with the same features, rate and robot.
+    Frames and rows are unchanged; tasks with the same words become one. A kill leaves no `out`.
 
     Raises:
         DataError: fewer than two, a damaged one, or ones that do not fit together.
@@ -63,11 +56,7 @@ def merge(roots: Sequence[str | Path], out: str | Path) -> MergeResult:
 
 
 def require_same_kind(first: Contents, other: Contents) -> None:
-    """Refuse data sets that do not fit together.
-
-    Raises:
-        DataError: other rate, robot, features, types or shapes.
-    """
+    """Refuse data sets of another rate, robot, features, types or shapes by a DataError."""
     if first.fps != other.fps:
         raise DataError(f"{other.root}: got {other.fps:g} fps, expected {first.fps:g} as in {first.root}; resample one")
     robots = first.info.get("robot_type"), other.info.get("robot_type")

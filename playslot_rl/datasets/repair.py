@@ -26,19 +26,11 @@ from playslot_rl.errors import DataError, OutputError
 from playslot_rl.storage.atomic import explain_write_errors, fsync_folder
 from playslot_rl.storage.folders import held, new_folder, require_free
 
-JOURNAL_SUFFIX = ".journal"
-
 
 @dataclass(frozen=True)
 class RepairResult:
-    """What `repair` did.
-
-    Attributes:
-        stated: episodes the damaged one said it had; None where nothing was wrong.
-        lost: what is not there any more, a line each.
-        damaged: where the damaged one is kept, or None where it was left in its place.
-        journal: an unfinished collection of ours beside it, or None.
-    """
+    """What `repair` did: episodes the damaged one `stated` (None where nothing was wrong), what is `lost`, a line each,
+    where the `damaged` one is kept, if it was replaced, and the `journal` of an unfinished collection beside it."""
 
     root: Path
     verification: Verification
@@ -64,21 +56,19 @@ def repair(root: str | Path, out: str | Path | None = None) -> RepairResult:
     """Restore a data set that was never finalised, was interrupted, or is damaged.
 
     The repaired one is written under a temporary name and verified. Then the damaged one is renamed to `NAME.damaged`
-    and the repaired one takes its place, unless `out` says where it goes. A sound data set is left alone.
-
-    Args:
-        root: the damaged data set; needs a readable `meta/info.json`.
-        out: folder that does not exist yet; None repairs in place.
+    and the repaired one takes its place, unless `out`, a new folder, says where it goes. A sound one is left alone.
 
     Raises:
-        DataError: there is no whole episode, or no metadata to begin with.
+        DataError: there is no whole episode, or no `meta/info.json` to begin with.
         OutputError: `out` exists, another command repairs in the same place, or the disk is full.
     """
     folder = Path(root)
     if out is not None:
         require_free(Path(out), "--out ")
         return _repair(folder, Path(out))
-    _undo_half_rename(folder)
+    repaired = _beside(folder)
+    if not folder.exists() and repaired.is_dir() and verify(repaired).ok:
+        repaired.rename(folder)  # a kill came between the two renames
     if not folder.is_dir():
         return _repair(folder, None)  # which says so
     with held(folder) as free:
@@ -89,7 +79,7 @@ def repair(root: str | Path, out: str | Path | None = None) -> RepairResult:
 
 def _repair(folder: Path, out: Path | None) -> RepairResult:
     before = verify(folder)
-    journal = folder.with_name(folder.name + JOURNAL_SUFFIX)
+    journal = folder.with_name(f"{folder.name}.journal")
     beside = journal if journal.is_dir() else None
     if before.ok:
         return RepairResult(folder, before, None, (), None, None)
@@ -129,13 +119,6 @@ def _journal_note(journal: Path) -> str:
         f"{journal} holds the episodes of an unfinished collection: `playslot collect` with the same arguments as "
         "then may restore more than a repair"
     )
-
-
-def _undo_half_rename(folder: Path) -> None:
-    """A kill between the two renames left no `folder`, but the repaired one beside it."""
-    repaired = _beside(folder)
-    if not folder.exists() and repaired.is_dir() and verify(repaired).ok:
-        repaired.rename(folder)
 
 
 def _beside(folder: Path) -> Path:
@@ -257,8 +240,7 @@ def _locate_videos(contents: Contents, spans: list[Span], known: Mapping[int, Ep
     return located
 
 
-Place = tuple[int, int, int]
-"""Chunk, file, and number of frames."""
+Place = tuple[int, int, int]  # chunk, file, and number of frames
 
 
 def _video_files(contents: Contents, camera: str) -> list[Place]:

@@ -44,10 +44,8 @@ CAMERAS: Final = {
 }
 """Name of a camera in our data sets -> feature of a timestep."""
 PAPER_CAMERAS: Final = ("front_left", "front_right")
-TAGS: Final = ("lift_green__demos", "stack_green_on_red__demos")
-"""The published sets of human demonstrations."""
-PAPER_SPLIT: Final = (316, 78)
-"""Training and evaluation episodes of the paper."""
+TAGS: Final = ("lift_green__demos", "stack_green_on_red__demos")  # the published sets of human demonstrations
+PAPER_SPLIT: Final = (316, 78)  # training and evaluation episodes of the paper
 STATE: Final = {"sawyer/tcp/pose": 7, "gripper/joints/angle": 1}
 """Proprioception and its widths: position (metres) and quaternion of the tool, opening of the gripper (radians)."""
 ACTIONS: Final = "actions"
@@ -71,11 +69,7 @@ class SketchyEpisode:
 
 
 def find_demonstrations(source: Path, tags: Sequence[str] = TAGS) -> list[SketchyEpisode]:
-    """The demonstrations that the metadata name, ordered by file name.
-
-    Args:
-        source: folder with `metadata.sqlite` and the extracted episode files, at any depth.
-        tags: episodes with one of these tags are taken.
+    """The demonstrations with one of the tags that the metadata name, ordered by file name; files lie at any depth.
 
     Raises:
         DataError: another layout, no such episode, or an episode file that is not there.
@@ -156,7 +150,7 @@ def read_steps(episode: SketchyEpisode, cameras: Sequence[str], size: int) -> It
     Raises:
         DataError: a truncated or damaged record, a missing camera, or features of another layout.
     """
-    count = 0
+    step = None
     for step, record in enumerate(read_records(episode.path)):
         try:
             example = parse_example(record)
@@ -169,8 +163,7 @@ def read_steps(episode: SketchyEpisode, cameras: Sequence[str], size: int) -> It
             keys.FEATURE_ACTION: _numbers(episode.path, step, example, ACTIONS, ACTION_DIM),
             "task": episode.task,
         }
-        count += 1
-    if count == 0:
+    if step is None:
         raise DataError(f"{episode.path}: got an empty file, expected timesteps: download or extract it again")
 
 
@@ -246,11 +239,7 @@ def convert_sketchy(
 
 
 def masked_crc(data: bytes) -> int:
-    """The checksum that frames a record.
-
-    Raises:
-        DataError: the package `crc32c` is not installed.
-    """
+    """The checksum that frames a record; a DataError where the package `crc32c` is not installed."""
     try:
         from crc32c import crc32c
     except ImportError as error:
@@ -262,11 +251,7 @@ def masked_crc(data: bytes) -> int:
 
 
 def read_records(path: Path) -> Iterator[bytes]:
-    """The records of a file, in order.
-
-    Raises:
-        DataError: the file is missing, truncated, damaged, or no TFRecord file.
-    """
+    """The records of a file, in order; a DataError where it is missing, truncated, damaged, or no TFRecord file."""
     try:
         with path.open("rb") as file:
             number = 0
@@ -275,11 +260,11 @@ def read_records(path: Path) -> Iterator[bytes]:
                     raise _truncated(path, number, f"{len(header)} of 12 bytes of its header")
                 length, crc = struct.unpack("<QI", header)
                 if masked_crc(header[:8]) != crc or length > LONGEST:
-                    what = (
-                        "the file is damaged: download it again"
-                        if number
-                        else "expected a TFRecord file: check the path"
+                    damaged, foreign = (
+                        "the file is damaged: download it again",
+                        "expected a TFRecord file: check the path",
                     )
+                    what = damaged if number else foreign
                     raise DataError(f"{path}: record {number} has a wrong checksum of its length, {what}")
                 body = file.read(length + 4)
                 if len(body) < length + 4:
@@ -332,11 +317,7 @@ def example_class() -> Any:
 
 
 def parse_example(record: bytes) -> dict[str, Value]:
-    """Features of a `tf.train.Example`: name -> list of bytes, float32 array or int64 array.
-
-    Raises:
-        DataError: the record is not one.
-    """
+    """Features of a `tf.train.Example`: name -> list of bytes, float32 array or int64 array; else a DataError."""
     from google.protobuf.message import DecodeError
 
     try:

@@ -17,11 +17,7 @@ from playslot_rl.storage.folders import new_folder, require_free
 
 @dataclass(frozen=True)
 class SplitResult:
-    """What `split` made.
-
-    Attributes:
-        episodes: part -> episodes of the source, ascending.
-    """
+    """What `split` made: the episodes of the source in each part, ascending."""
 
     out: Path
     episodes: dict[str, tuple[int, ...]]
@@ -71,11 +67,7 @@ def split(root: str | Path, out: str | Path, fractions: Mapping[str, float], *, 
 
 
 def draw(episodes: int, fractions: Mapping[str, float], seed: int) -> dict[str, list[int]]:
-    """Episodes of each part, ascending: sizes by largest remainders, so that they add up.
-
-    Raises:
-        DataError: a part would be empty.
-    """
+    """Episodes of each part, ascending: sizes by largest remainders, that add up. A DataError if one is empty."""
     exact = {name: share * episodes for name, share in fractions.items()}
     sizes = {name: int(value) for name, value in exact.items()}
     for name in sorted(exact, key=lambda name: sizes[name] - exact[name])[: episodes - sum(sizes.values())]:

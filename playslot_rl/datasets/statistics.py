@@ -21,8 +21,7 @@ from playslot_rl.data.tables import Array, Stats
 
 QUANTILES: Final = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 BASIC: Final = ("min", "max", "mean", "std", "count")
-LARGE_IMAGE: Final = 300
-"""From this side on LeRobot thins out the pixels."""
+LARGE_IMAGE: Final = 300  # from this side on LeRobot thins out the pixels
 THINNED_SIDE: Final = 150
 
 
@@ -42,16 +41,9 @@ def thinned(frame: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 
 def rounded(pieces: Iterable[Array]) -> dict[str, Array]:
-    """Mean and standard deviation as LeRobot's `RunningQuantileStats` comes by them, to the last bit.
-
-    It adds up all values and their squares one row after the other, integers as float32, and takes the variance as
-    the difference of two means.
-
-    Args:
-        pieces: rows (n, K), one piece after the other.
-
-    Returns:
-        `mean` and `std`, (K,).
+    """Mean and standard deviation (K,) of rows (n, K), one piece after the other, as LeRobot's `RunningQuantileStats`
+    comes by them, to the last bit: it adds up all values and their squares one row after the other, integers as
+    float32, and takes the variance as the difference of two means.
     """
     count = 0
     total: Any = None
@@ -101,14 +93,8 @@ def _of_levels(counts: Array) -> dict[str, float]:
     return {**stats, **{name: values[np.searchsorted(below, share * total)] for name, share in QUANTILES.items()}}
 
 
-def aggregate(episodes: Sequence[Stats]) -> Stats:
-    """Statistics of all from those of the episodes, weighted by their counts; features that none has are left out."""
-    names = dict.fromkeys(name for stats in episodes for name in stats)
-    return {name: _aggregate([stats[name] for stats in episodes if name in stats]) for name in names}
-
-
 class Aggregate:
-    """`aggregate`, one episode after the other: nothing is kept of them but sums.
+    """Statistics of all from those of the episodes, one after the other, weighted by their counts.
 
     Deviations are combined as by Chan, Golub and LeVeque: no difference of large numbers.
     """
@@ -119,36 +105,24 @@ class Aggregate:
     def add(self, episode: Stats) -> None:
         for name, given in episode.items():
             values = {key: np.asarray(value, np.float64) for key, value in given.items()}
-            count = float(values["count"].reshape(-1)[0])
+            values["count"] = values["count"].reshape(-1)[:1]
             there = self._features.get(name)
             self._features[name] = values if there is None else _joined(there, values)
-            self._features[name]["count"] = np.array([(0.0 if there is None else there["count"][0]) + count])
 
     def result(self) -> Stats:
         return {name: {**v, "count": v["count"].astype(np.int64)} for name, v in self._features.items()}
 
 
 def _joined(one: dict[str, Array], other: dict[str, Array]) -> dict[str, Array]:
-    n, m = float(one["count"].reshape(-1)[0]), float(other["count"].reshape(-1)[0])
+    if one["mean"].shape != other["mean"].shape:
+        raise ValueError(f"{other['mean'].shape} beside {one['mean'].shape}")
+    n, m = float(one["count"][0]), float(other["count"][0])
     share = m / (n + m)
     total = {key: one[key] + share * (other[key] - one[key]) for key in one if key in other}
     between = n * m / (n + m) * (other["mean"] - one["mean"]) ** 2
     total["std"] = np.sqrt((n * one["std"] ** 2 + m * other["std"] ** 2 + between) / (n + m))
     total["min"], total["max"] = np.minimum(one["min"], other["min"]), np.maximum(one["max"], other["max"])
-    return total
-
-
-def _aggregate(parts: Sequence[dict[str, Array]]) -> dict[str, Array]:
-    count = np.array([float(np.asarray(part["count"]).reshape(-1)[0]) for part in parts])
-    weight = count / count.sum()
-    names = [name for name in parts[0] if all(name in part for part in parts)]
-    values = {name: np.stack([np.asarray(part[name], np.float64) for part in parts]) for name in names}
-    total = {name: np.tensordot(weight, value, axes=1) for name, value in values.items()}
-    total["min"], total["max"] = values["min"].min(0), values["max"].max(0)
-    spread = values["std"] ** 2 + (values["mean"] - total["mean"]) ** 2
-    total["std"] = np.sqrt(np.tensordot(weight, spread, axes=1))
-    total["count"] = np.array([int(count.sum())])
-    return total
+    return total | {"count": one["count"] + other["count"]}
 
 
 def reduced(stats: dict[str, Array], width: int) -> dict[str, Array]:
@@ -169,9 +143,8 @@ def differing(
 ) -> list[str]:
     """Names of the basic statistics that are missing, not finite, or differ.
 
-    Args:
-        theirs: the same with LeRobot's rounding; a value no further from `actual` than these is not wrong.
-        loose: tolerance of mean and standard deviation; with one, count, min and max are not compared.
+    A value no further from `actual` than `theirs`, with LeRobot's rounding, is not wrong. `loose` is a tolerance of
+    mean and standard deviation; with one, count, min and max are not compared.
     """
     found = []
     scale = float(max(np.abs(actual["min"]).max(), np.abs(actual["max"]).max(), 1e-6))

@@ -20,6 +20,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from playslot_rl import keys
 from playslot_rl.data.agreement import open_files
 from playslot_rl.data.contents import Contents
 from playslot_rl.data.frames import resize_frames, rgb_frames
@@ -29,19 +30,14 @@ from playslot_rl.errors import DataError
 
 Frames = npt.NDArray[np.uint8]
 
-EPISODES: Final = 12
-FRAMES: Final = 240
-"""Episodes, and frames of each, that are looked at."""
+EPISODES: Final = 12  # that are looked at
+FRAMES: Final = 240  # of each
 SIZES: Final = (64, 128)
 STRIDES: Final = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32)
-MOVED: Final = 8
-"""Pixels of a 64x64 frame that have to change for a pair of frames to count."""
-DETAIL: Final = 16
-"""Pixels that the typical motion has to cover in a frame of 64x64."""
-FAR: Final = 1.0
-"""Pixels of the model's frame that things typically have to move by."""
-KEPT: Final = 12
-"""Frames that a typical episode has to keep."""
+MOVED: Final = 8  # pixels of a 64x64 frame that have to change for a pair of frames to count
+DETAIL: Final = 16  # pixels that the typical motion has to cover in a frame of 64x64
+FAR: Final = 1.0  # pixels of the model's frame that things typically have to move by
+KEPT: Final = 12  # frames that a typical episode has to keep
 
 
 class Choice(NamedTuple):
@@ -53,14 +49,8 @@ class Choice(NamedTuple):
 
 @dataclass(frozen=True)
 class Survey:
-    """What was seen.
-
-    Attributes:
-        root, camera, fps, size: the data set, the feature that was read, frames a second, stated (H, W).
-        lengths: int64 (E,) frames of all episodes.
-        action_dim: width of its actions; 0 has none.
-        episodes: frames of some episodes, uint8 (F, S, S, 3), S at most 128.
-    """
+    """What was seen: the camera that was read, its stated size (H, W), frames of all episodes (E,), the width of the
+    actions (0 has none), and frames of some `episodes`, uint8 (F, S, S, 3), S at most 128."""
 
     root: Path
     camera: str
@@ -89,16 +79,9 @@ def survey(root: str | Path, camera: str = "") -> Survey:
         raise DataError(f"{root}: got episodes of one frame, expected videos: nothing can move from frame to frame")
     side = 128 if min(stated_size(files.features[camera])) >= 128 else 64
     episodes = _some_episodes(files, camera, side)
-    found = Survey(
-        files.root,
-        camera,
-        files.fps,
-        stated_size(files.features[camera]),
-        lengths,
-        _action_dim(files),
-        episodes,
-        _noise(episodes),
-    )
+    actions: dict[str, Any] = files.features.get(keys.FEATURE_ACTION, {})
+    width, size = int(np.prod(actions.get("shape", [0]))), stated_size(files.features[camera])
+    found = Survey(files.root, camera, files.fps, size, lengths, width, episodes, _noise(episodes))
     longest = max(len(frames) for frames in episodes) - 1
     if not any(_moved(frames, lag, found.threshold).max(initial=0) for frames in episodes for lag in (1, longest)):
         raise DataError(
@@ -143,10 +126,7 @@ def choose_stride(seen: Survey, size: int) -> Choice:
 
 def typical_motion(episodes: Sequence[Frames], stride: int, threshold: float) -> float:
     """Median over the pairs of frames `stride` apart that differ of how far things moved, pixels; 0 where none does.
-
-    Args:
-        episodes: frames of each, uint8 (F, S, S, 3).
-    """
+    Episodes are uint8 (F, S, S, 3)."""
     found = []
     for frames in episodes:
         least = MOVED * (frames.shape[1] / 64) ** 2
@@ -188,8 +168,3 @@ def _some_episodes(files: Contents, camera: str, side: int) -> list[Frames]:
                 break
         found.append(np.stack(frames))
     return found
-
-
-def _action_dim(files: Contents) -> int:
-    feature: dict[str, Any] = files.features.get("action", {})
-    return int(np.prod(feature.get("shape", [0]))) if feature else 0

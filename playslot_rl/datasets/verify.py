@@ -26,11 +26,7 @@ LOOSE_CAMERA = 0.05
 
 @dataclass(frozen=True)
 class Verification:
-    """Result of `verify`.
-
-    Attributes:
-        fingerprint: of the content (see `fingerprint.py`); empty where it cannot be read.
-    """
+    """Result of `verify`; `fingerprint` is of the content (`fingerprint.py`), empty where it cannot be read."""
 
     root: str
     ok: bool
@@ -54,10 +50,8 @@ class Verification:
 def verify(root: str | Path, *, statistics: bool = True) -> Verification:
     """Check everything; reads all rows and decodes all frames (about 2,700 PNG frames of 64x64 a CPU second).
 
-    Never raises for what is wrong with the data set: that is what the result says.
-
-    Args:
-        statistics: also compare statistics and our own record; others' may be made in another way.
+    Never raises for what is wrong with the data set: that is what the result says. Without `statistics` those and our
+    own record are not compared: others' may be made in another way.
     """
     problems = Problems()
     try:
@@ -77,11 +71,7 @@ def verify(root: str | Path, *, statistics: bool = True) -> Verification:
 
 
 def require_verified(root: Path, sources: Sequence[Path]) -> Verification:
-    """Verify a data set that has just been written.
-
-    Raises:
-        DataError: it is not sound; then a source was damaged in its frames or statistics.
-    """
+    """Verify a data set that has just been written; a DataError says which sources were damaged."""
     result = verify(root)
     if not result.ok:
         names = " ".join(map(str, sources))
@@ -94,11 +84,7 @@ def require_verified(root: Path, sources: Sequence[Path]) -> Verification:
 
 
 def require_sound(root: str | Path) -> Contents:
-    """Read a data set whose rows and metadata agree; frames and statistics are not looked at.
-
-    Raises:
-        DataError: they do not.
-    """
+    """Read a data set whose rows and metadata agree, else a DataError; frames and statistics are not looked at."""
     problems = Problems()
     contents = read_contents(root, problems)
     check_rows(contents, problems)

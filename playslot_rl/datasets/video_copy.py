@@ -23,11 +23,7 @@ from playslot_rl.errors import DataError
 
 
 class VideoCopier:
-    """Writes the files of one camera of a new data set.
-
-    Args:
-        limit: bytes after which the next file begins.
-    """
+    """Writes the files of one camera of a new data set; after `limit` bytes the next one begins."""
 
     def __init__(self, root: Path, camera: str, fps: float, limit: int, files: int) -> None:
         self.root, self.camera, self.fps, self.limit, self.files = root, camera, fps, limit, files
@@ -41,13 +37,7 @@ class VideoCopier:
         self._source: _Source | None = None
 
     def copy(self, path: Path, begin: float, length: int) -> dict[str, Any]:
-        """Copy an episode.
-
-        Args:
-            begin: seconds of the episode's first frame in it.
-
-        Returns:
-            The new `chunk_index`, `file_index`, `from_timestamp` and `to_timestamp`, as in `meta/episodes`.
+        """Copy an episode, whose first frame is at `begin` seconds; returns its new places, as in `meta/episodes`.
 
         Raises:
             DataError: the file has no such frames.
@@ -190,11 +180,7 @@ class _Source:
 
 
 def frame_count(path: Path) -> int:
-    """Frames in a video file, counted in its packets.
-
-    Raises:
-        DataError: it cannot be opened.
-    """
+    """Frames in a video file, counted in its packets; a DataError where it cannot be opened."""
     import av
 
     try:

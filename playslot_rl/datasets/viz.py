@@ -30,23 +30,15 @@ from playslot_rl.visualization.document import Block, Document, Picture, Section
 from playslot_rl.visualization.grid import animation, image_grid, png
 from playslot_rl.visualization.words import feature_text
 
-STRIP: Final = 8
-"""Frames of the strip: the first, the last, and some between."""
-SHOWN_SIDE: Final = 128
-"""Frames are stored about this large: small ones enlarged pixel for pixel, large ones reduced."""
-ENLARGED: Final = 3
-"""How many times larger the page shows an animation."""
-ANIMATED: Final = 60
-"""At most this many frames of an animation."""
+STRIP: Final = 8  # frames of the strip: the first, the last, and some between
+SHOWN_SIDE: Final = 128  # frames are stored about this large: small ones enlarged pixel for pixel, large ones reduced
+ENLARGED: Final = 3  # how many times larger the page shows an animation
+ANIMATED: Final = 60  # at most this many frames of an animation
 
 
 @dataclass(frozen=True)
 class Clip:
-    """An episode as it is shown.
-
-    Attributes:
-        frames: camera -> uint8 (T, H, W, 3).
-    """
+    """An episode as it is shown: frames uint8 (T, H, W, 3) of each camera."""
 
     span: Span
     episode: Episode
@@ -66,9 +58,6 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
     Args:
         out: file to write, replaced if it exists; None means `ROOT.html` beside the data set, never in it.
         episodes: episodes to show, evenly spread.
-
-    Returns:
-        The file.
 
     Raises:
         ConfigError: fewer than one episode.
@@ -91,10 +80,7 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
 
 
 def show_in_rerun(root: str | Path, episodes: int = 6) -> str:
-    """Open the rerun viewer on some episodes.
-
-    Returns:
-        The numbers of the episodes shown, in words.
+    """Open the rerun viewer on some episodes; returns their numbers, in words.
 
     Raises:
         ConfigError: rerun is not installed, or fewer than one episode.
@@ -123,11 +109,7 @@ def show_in_rerun(root: str | Path, episodes: int = 6) -> str:
 
 
 def spread(total: int, wanted: int) -> list[int]:
-    """`wanted` numbers below `total`, evenly spread, the first and the last among them.
-
-    Raises:
-        ConfigError: `wanted` is less than 1.
-    """
+    """`wanted` numbers below `total`, evenly spread, first and last among them; a ConfigError for less than 1."""
     if wanted < 1:
         raise ConfigError(f"--episodes: got {wanted}, expected at least 1")
     chosen: list[int] = spread_evenly(np.arange(total), wanted).tolist()
@@ -163,11 +145,7 @@ def _clips(contents: Contents, chosen: Sequence[int]) -> list[Clip]:
 
 
 def episode_frames(contents: Contents, camera: str, number: int) -> npt.NDArray[np.uint8]:
-    """Frames of one episode of a sound data set: uint8 (T, H, W, 3).
-
-    Raises:
-        DataError: one cannot be decoded.
-    """
+    """Frames of one episode of a sound data set: uint8 (T, H, W, 3); a DataError where one cannot be decoded."""
     return np.stack([frame for _, frame in rgb_frames(contents, camera, [contents.spans[number]])])
 
 

@@ -13,14 +13,10 @@ if TYPE_CHECKING:
 def episode(env: str = "button_press") -> npt.NDArray[np.uint8]:
     """Frames of an episode that no training has seen, played by the shipped policy in the simulator until it ended.
 
-    Args:
-        env: `button_press`, `block_push_easy` or `block_push`.
+    A ValueError for other tasks than `button_press`, `block_push_easy` and `block_push`.
 
     Returns:
         (T, 64, 64, 3).
-
-    Raises:
-        ValueError: no such model ships.
 
     Examples:
         >>> episode("block_push").shape

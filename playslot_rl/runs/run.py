@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import DataConfig, EnvConfig, ExperimentConfig, ModelConfig, from_dict, to_dict
 from playslot_rl.config.compose import PRETRAINED, near_run, stored_config
-from playslot_rl.data.camera_names import with_full_cameras
+from playslot_rl.data.contents import with_full_cameras
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import read_json, write_bytes, write_json
 from playslot_rl.storage.folders import new_folder

@@ -37,13 +37,7 @@ class StepRandom(np.random.Generator):
 
 @dataclass(frozen=True)
 class StepGenerators:
-    """What the fit loop hands to a stage: generators of one step, made on demand by the name of their stream.
-
-    Attributes:
-        seed: the run's seed.
-        step: the step, from 0.
-        device: device of the torch generators.
-    """
+    """What the fit loop hands to a stage: generators of one step, made on demand by the name of their stream."""
 
     seed: int
     step: int

@@ -16,10 +16,8 @@ Stream = Literal["collection", "evaluation", "training", "development"]
 """Recorded data; measured success; what a method that acts learns from; the points of its learning curve."""
 
 LARGEST_SEED: Final = 2**32 - 1
-LARGEST_DRAW: Final = 2**63 - 1
-"""Of seeds that only shuffle what is there."""
-EPISODES: Final = 1_000_000
-"""Episodes of one seed in one stream."""
+LARGEST_DRAW: Final = 2**63 - 1  # of seeds that only shuffle what is there
+EPISODES: Final = 1_000_000  # episodes of one seed in one stream
 
 _SMALL: Final[dict[Stream, tuple[int, int]]] = {
     "collection": (0, 1_000_000_000),

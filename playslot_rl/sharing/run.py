@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import data_roots
-from playslot_rl.data.camera_names import camera_list, cameras_of, full_name
+from playslot_rl.data.contents import camera_list, cameras_of, full_name
 from playslot_rl.data.metadata import INFO_NAME, RECORD_NAME, read_info
 from playslot_rl.envs import ENVIRONMENTS, RECORDED
 from playslot_rl.errors import CheckpointError, ConfigError, DataError, OutputError

@@ -19,10 +19,9 @@ from playslot_rl.config.stage_spec import StageSpec, group_of
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.action_limits import ActionLimits, said, scaled
 from playslot_rl.data.demonstrations import DemonstrationSplit, split_demonstrations, transitions
-from playslot_rl.data.opening import open_configured
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import episode_range, split_tested
-from playslot_rl.data.weighted import weighted
+from playslot_rl.data.weighted import open_configured, weighted
 from playslot_rl.data.windows import Clips
 from playslot_rl.errors import CheckpointError, DataError
 from playslot_rl.modules.action_range import range_of

@@ -44,8 +44,8 @@ def data_roots(given: ReportInput) -> list[Path]:
 def read_latents(model: WorldModel, root: Path, given: ReportInput, most_episodes: int = 200) -> LatentData:
     """Latent actions of up to `most_episodes` episodes of a data set, with the probe where it has actions."""
     from playslot_rl.data.cache import Cache
-    from playslot_rl.data.opening import open_configured
     from playslot_rl.data.slot_cache import slot_cache
+    from playslot_rl.data.weighted import open_configured
 
     data = given.config.data
     source = open_configured(given.config, [root])

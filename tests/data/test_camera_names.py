@@ -10,7 +10,7 @@ import pytest
 from foreign import write_foreign
 
 from playslot_rl.config.compose import compose
-from playslot_rl.data.camera_names import full_name, with_full_cameras
+from playslot_rl.data.contents import full_name, with_full_cameras
 from playslot_rl.data.source import open_source, open_sources
 from playslot_rl.datasets.survey import survey
 from playslot_rl.errors import DataError

@@ -9,10 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from playslot_rl.data.demonstrations import Demonstrations, moving_frames, moving_slots, transitions
+from playslot_rl.data.demonstrations import (
+    Demonstrations,
+    moving_frames,
+    moving_rows,
+    moving_slots,
+    slot_motion,
+    transitions,
+)
 from playslot_rl.data.labels import label_demonstrations, with_copies
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.trimming import moving_rows, slot_motion
 from playslot_rl.errors import DataError
 from playslot_rl.testing import tiny_agent
 

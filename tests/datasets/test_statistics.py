@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from damage import edit_column
 
-from playslot_rl.datasets.statistics import QUANTILES, Aggregate, aggregate, of_frames, of_numbers, rounded
+from playslot_rl.datasets.statistics import QUANTILES, Aggregate, of_frames, of_numbers, rounded
 from playslot_rl.datasets.verify import verify
 
 Frames = np.ndarray[Any, np.dtype[np.uint8]]
@@ -115,7 +115,7 @@ def iter_once(values: Any) -> Iterator[Any]:
     yield values
 
 
-def test_statistics_of_all_one_episode_after_the_other_are_the_same() -> None:
+def test_statistics_of_all_are_the_weighted_ones_of_the_episodes() -> None:
     generator = np.random.default_rng(3)
     episodes = []
     for count in (5, 1, 40, 7):
@@ -124,10 +124,15 @@ def test_statistics_of_all_one_episode_after_the_other_are_the_same() -> None:
     running = Aggregate()
     for episode in episodes:
         running.add(episode)
-    for name, stats in aggregate(episodes).items():
-        for key, value in stats.items():
-            np.testing.assert_allclose(running.result()[name][key], value, rtol=1e-9, atol=1e-6)
-            assert running.result()[name][key].shape == value.shape
+    counts = np.array([episode["a"]["count"][0] for episode in episodes])
+    for name, stats in running.result().items():
+        means, deviations = (np.stack([episode[name][key] for episode in episodes]) for key in ("mean", "std"))
+        mean = np.average(means, axis=0, weights=counts)
+        variance = np.average(deviations**2 + (means - mean) ** 2, axis=0, weights=counts)
+        assert stats["count"].tolist() == [counts.sum()]
+        np.testing.assert_allclose(stats["mean"], mean, rtol=1e-9)
+        np.testing.assert_allclose(stats["std"], np.sqrt(variance), rtol=1e-6)
+        assert np.array_equal(stats["min"], np.min([episode[name]["min"] for episode in episodes], axis=0))
 
 
 def test_quantiles_are_numpys_without_interpolation() -> None:

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from playslot_rl.collectors import presets
-from playslot_rl.collectors.presets import collect_demos
+from playslot_rl.collectors import collection
+from playslot_rl.collectors.collection import collect_demos
 from playslot_rl.config.compose import compose
 
 pytestmark = pytest.mark.integration
@@ -33,7 +33,7 @@ def test_a_set_begun_without_held_out_demonstrations_stays_as_it_is(
     def collect(_config: Any, _policy: str, episodes: int, *_rest: Any) -> None:
         asked.append(episodes)
 
-    monkeypatch.setattr(presets, "collect", collect)
+    monkeypatch.setattr(collection, "collect", collect)
     if begun is not None:
         path = tmp_path / "data" / record
         path.parent.mkdir(parents=True)

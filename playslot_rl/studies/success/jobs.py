@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from playslot_rl.collectors.presets import collect_demos, collect_videos
+from playslot_rl.collectors.collection import collect_demos, collect_videos
 from playslot_rl.config import DataConfig, ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.compose import is_pretrained
 from playslot_rl.config.methods import METHODS, method_stage

@@ -13,13 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.collectors import collect
-from playslot_rl.collectors.presets import collect_demos, collect_videos
+from playslot_rl.collectors.collection import collect_demos, collect_videos
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compare_video import method_of
 from playslot_rl.config.weights import data_roots
-from playslot_rl.data.opening import open_configured
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import split_tested
+from playslot_rl.data.weighted import open_configured
 from playslot_rl.data.windows import Clips, IntArray, spread_windows
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import ConfigError, DataError
