@@ -75,7 +75,7 @@ def _command_parser(name: str) -> argparse.ArgumentParser:
         prog=f"playslot {name}",
         usage=f"playslot {name} [key=value ...]{flag}",
         description=f"{command.summary}\n\n{textwrap.fill(command.details, 100)}",
-        epilog=f"examples:\n{examples}\n\n{explained(name, command.keys)}\n\n{ENVIRONMENT}",
+        epilog=f"examples:\n{examples}\n\n{explained(name, command.reads.split())}\n\n{ENVIRONMENT}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="changes one value of the config")
@@ -85,13 +85,8 @@ def _command_parser(name: str) -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command.
-
-    Args:
-        argv: arguments without the program's name; None reads `sys.argv`.
-
-    Returns:
-        The exit code. `--help`, `--version` and bad usage raise `SystemExit`, as argparse does.
+    """Run one command, of `sys.argv` where None is given, and return the exit code. `--help`, `--version` and bad usage
+    raise `SystemExit`, as argparse does.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments:

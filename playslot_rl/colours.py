@@ -14,11 +14,8 @@ OKABE_ITO: Final = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55
 
 
 def segmentation(frames: npt.NDArray[np.uint8], masks: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """Colour each pixel by the slot with the largest mask, over the faded frame.
-
-    Args:
-        frames: (T, H, W, 3) uint8.
-        masks: (T, N, 1, H, W), sum to one over N.
+    """Colour each pixel of frames (T, H, W, 3) uint8 by the slot with the largest mask (T, N, 1, H, W), over the faded
+    frame.
     """
     named = [tuple(bytes.fromhex(OKABE_ITO[n % len(OKABE_ITO)][1:])) for n in range(masks.shape[1])]
     colour = np.array(named, np.float32)[masks[:, :, 0].argmax(1)]

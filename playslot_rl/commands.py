@@ -24,11 +24,6 @@ class Command:
     examples: tuple[str, ...]
     reads: str
 
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """What it reads, one by one."""
-        return tuple(self.reads.split())
-
 
 COMMANDS: Final[dict[str, Command]] = {
     "collect": Command(

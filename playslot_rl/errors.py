@@ -50,11 +50,7 @@ class HubError(PlaySlotError, RuntimeError):
 
 
 def require_type(given: object, what: str, *kinds: type, expected: str) -> None:
-    """Refuse an argument of another type; a bool is no number.
-
-    Raises:
-        TypeError: in one line.
-    """
+    """Refuse, by a TypeError of one line, an argument of another type; a bool is no number."""
     if not isinstance(given, kinds) or isinstance(given, bool):
         said = " ".join(repr(given).split())[:60]
         raise TypeError(f"{what}: got {said} ({type(given).__name__}), expected {expected}")

@@ -41,15 +41,8 @@ def to_uint8(frames: Tensor) -> npt.NDArray[np.uint8]:
 
 
 def as_numbers(given: object, what: str, expected: str) -> Tensor:
-    """What somebody hands over, as a tensor of real numbers.
-
-    Args:
-        given: a tensor or an array, or nested lists of numbers, of any shape.
-        what: the argument's name, for the message.
-        expected: what it should be, for the message.
-
-    Raises:
-        TypeError: anything else, such as the name of a file.
+    """What somebody hands over, a tensor, an array or nested lists of numbers, as a tensor of real numbers; a
+    TypeError, with the argument's name and what is expected, for anything else, such as the name of a file.
 
     Examples:
         >>> as_numbers([[0.5]], "actions", "floats").shape

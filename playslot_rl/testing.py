@@ -22,11 +22,7 @@ if TYPE_CHECKING:
 
 
 def tiny_savi(seed: int = 0, **changes: object) -> SAVi:
-    """SAVi for frames of 32x32: N 3 slots of D 16, seeded weights.
-
-    Args:
-        seed: of the weights.
-        changes: fields of `SAViConfig` that differ.
+    """SAVi for frames of 32x32: N 3 slots of D 16, seeded weights, and `changes` of fields of `SAViConfig`.
 
     Examples:
         >>> tiny_savi(n_slots=2).config.n_slots
@@ -58,13 +54,8 @@ def tiny_savi(seed: int = 0, **changes: object) -> SAVi:
 def tiny_config(
     mode: LatentMode = "hybrid", multi: bool = False, context: int = 8, max_steps: int = 6
 ) -> ExperimentConfig:
-    """Frames of 64x64, N 4 slots of D 32, Z 8, K 5, networks of one or two layers of 32.
-
-    Args:
-        mode: latent-action mode.
-        multi: one latent action per slot (InvDyn_M) instead of one per step (InvDyn_S).
-        context: C, frames the predictor attends to.
-        max_steps: agent steps in an episode.
+    """Frames of 64x64, N 4 slots of D 32, Z 8, K 5, networks of one or two layers of 32; with `multi` one latent action
+    per slot (InvDyn_M), not one per step (InvDyn_S).
 
     Examples:
         >>> tiny_config().model.savi.slot_dim
@@ -108,11 +99,8 @@ def tiny_config(
 
 
 def tiny_agent(config: ExperimentConfig | None = None, seed: int = 0) -> Agent:
-    """Untrained networks of `tiny_config` in evaluation mode, their codebook initialised, the same for the same seed.
-
-    Args:
-        config: other sizes.
-        seed: of the weights; the global random state is left as it was.
+    """Untrained networks of `tiny_config`, or of another, in evaluation mode, their codebook initialised, the same for
+    the same seed; the global random state is left as it was.
 
     Examples:
         >>> tiny_agent().world_model.slot_shape

@@ -18,8 +18,7 @@ from playslot_rl.errors import PlaySlotError, explain
 
 def main(config: ExperimentConfig) -> str:
     """The tables, in Markdown; progress goes to standard error."""
-    from playslot_rl.runtime.allocator import tune_allocator
-    from playslot_rl.runtime.threads import set_threads
+    from playslot_rl.runtime.threads import set_threads, tune_allocator
     from playslot_rl.speed.report import cost_tables
 
     tune_allocator()

@@ -113,7 +113,7 @@ def test_help_explains_with_examples_and_the_commands_own_keys(
 def test_every_key_is_in_the_help_of_a_command() -> None:
     from playslot_rl.config.plain import flatten, to_dict
 
-    listed = {key for command in cli.COMMANDS.values() for key in command.keys}
+    listed = {key for command in cli.COMMANDS.values() for key in command.reads.split()}
     keys = flatten(to_dict(ExperimentConfig()))
     assert [key for key in keys if not any(f"{key}.".startswith(f"{of}.") for of in listed)] == []
 
@@ -126,7 +126,7 @@ def test_the_help_lists_the_keys_of_its_examples(command: str) -> None:
     for example in cli.COMMANDS[command].examples:
         for key in re.findall(r" ([a-z_.]+)=", example):
             own = key in short or key.startswith("hydra.")
-            assert own or any(f"{key}.".startswith(f"{of}.") for of in cli.COMMANDS[command].keys), key
+            assert own or any(f"{key}.".startswith(f"{of}.") for of in cli.COMMANDS[command].reads.split()), key
 
 
 def test_the_words_of_a_key_are_those_of_its_field(capsys: pytest.CaptureFixture[str]) -> None:

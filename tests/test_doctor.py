@@ -13,8 +13,7 @@ import pytest
 from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.recipes import doctor
 from playslot_rl.runtime import checks
-from playslot_rl.runtime.allocator import tune_allocator
-from playslot_rl.runtime.threads import available_cores, set_threads
+from playslot_rl.runtime.threads import available_cores, set_threads, tune_allocator
 
 pytestmark = pytest.mark.integration
 
@@ -73,7 +72,7 @@ def test_little_disk_space_is_found(free: float, status: str, tmp_path: Path, mo
 def test_the_allocator_setting_is_accepted_and_changes_no_result() -> None:
     # In a process of its own, since it cannot be undone.
     code = (
-        "from playslot_rl.runtime.allocator import tune_allocator\n"
+        "from playslot_rl.runtime.threads import tune_allocator\n"
         "print(tune_allocator(), tune_allocator(), len(bytes(300_000_000)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -13,7 +13,6 @@ from playslot_rl.errors import ConfigError
 
 NAME_BYTES: Final = 255
 PATH_BYTES: Final = 4095
-"""Longest name of a file or folder, and longest path, on the file systems of Linux and macOS."""
 LONGEST_NUMBER: Final = 1000
 
 _INTERPOLATION: Final = re.compile(r"\$\\*\{")

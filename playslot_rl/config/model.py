@@ -70,30 +70,17 @@ class SAViConfig(Checked):
         super().__post_init__()
         for name in ("encoder_channels", "decoder_channels"):
             check(len(getattr(self, name)) > 0, self.group + name, getattr(self, name), "at least one width")
-        check(
-            len(self.encoder_channels) == len(self.encoder_strides),
-            "model.savi.encoder_strides",
-            self.encoder_strides,
-            f"one stride for each of the {len(self.encoder_channels)} encoder channels",
-        )
-        check(
-            self.encoder == "strided" or set(self.encoder_strides) <= {1},
-            "model.savi.encoder_strides",
-            self.encoder_strides,
-            "strides of 1 with model.savi.encoder=full",
-        )
-        check(
-            self.decoder_position == "linear" or self.decoder == "pixel_shuffle",
-            "model.savi.decoder_position",
-            self.decoder_position,
-            f"linear with model.savi.decoder={self.decoder}",
-        )
-        check(
-            self.slot_dim % self.transition_heads == 0,
-            "model.savi.transition_heads",
-            self.transition_heads,
-            f"a divisor of slot_dim {self.slot_dim}",
-        )
+        strides, heads = self.encoder_strides, self.transition_heads
+        fit = len(self.encoder_channels) == len(strides)
+        each = f"one stride for each of the {len(self.encoder_channels)} encoder channels"
+        check(fit, "model.savi.encoder_strides", strides, each)
+        full = self.encoder == "strided" or set(strides) <= {1}
+        check(full, "model.savi.encoder_strides", strides, "strides of 1 with model.savi.encoder=full")
+        position = self.decoder_position == "linear" or self.decoder == "pixel_shuffle"
+        linear = f"linear with model.savi.decoder={self.decoder}"
+        check(position, "model.savi.decoder_position", self.decoder_position, linear)
+        divides = self.slot_dim % heads == 0
+        check(divides, "model.savi.transition_heads", heads, f"a divisor of slot_dim {self.slot_dim}")
 
 
 @dataclass(frozen=True)
@@ -155,12 +142,9 @@ class PredictorConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         check(self.dim % 2 == 0, f"{self.group}dim", self.dim, "an even number: sines and cosines of a position")
-        check(
-            self.project_out or self.heads * self.head_dim == self.dim,
-            f"{self.group}head_dim",
-            self.head_dim,
-            f"dim / heads with project_out=false, dim {self.dim} and {self.heads} heads",
-        )
+        fits = self.project_out or self.heads * self.head_dim == self.dim
+        parts = f"dim / heads with project_out=false, dim {self.dim} and {self.heads} heads"
+        check(fits, f"{self.group}head_dim", self.head_dim, parts)
 
 
 @dataclass(frozen=True)

@@ -37,12 +37,8 @@ LARGEST: Final = 10**9
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """Which values a field takes, each of a tuple; None always.
-
-    Attributes:
-        accepts: whether a value is one of them.
-        expected: the values in words.
-        smallest, largest: of numbers, finite; outside of them none is accepted. None for text.
+    """Which values a field takes, each of a tuple, None always, and what they are in words. Numbers outside of
+    `smallest` and `largest` are refused; for text these are None.
     """
 
     accepts: Callable[[Any], bool]

@@ -9,10 +9,7 @@ BINARY: Final = {"kib": 2**10, "mib": 2**20, "gib": 2**30, "tib": 2**40}
 
 
 def bytes_of(text: str) -> int | None:
-    """Bytes; None for an empty text.
-
-    Raises:
-        ValueError: no such amount.
+    """Bytes; None for an empty text, a ValueError for no such amount.
 
     Examples:
         >>> bytes_of("20GB"), bytes_of("1.5 GiB"), bytes_of("")

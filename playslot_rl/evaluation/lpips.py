@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import torch
 from torch import nn
 
-from playslot_rl.storage.published import pick_published, read_published
+from playslot_rl.storage.tensors import pick_published, read_published
 
 KEY: Final = "metrics.lpips_weights"
 

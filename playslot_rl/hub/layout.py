@@ -48,10 +48,8 @@ def is_pulled(path: str) -> bool:
 
 
 def require_plain(paths: Iterable[str], name: str) -> None:
-    """Refuse files of a repository that would not be written where their names say.
-
-    Raises:
-        HubError: such as `meta/a\\..\\b.json`, which leads elsewhere on another system.
+    """Refuse, by a HubError, files of a repository that would not be written where their names say, such as
+    `meta/a\\..\\b.json`, which leads elsewhere on another system.
     """
     odd = [path for path in paths if not is_plain_path(path)]
     if odd:
@@ -100,10 +98,8 @@ SCHEME = 1
 
 @dataclass(frozen=True)
 class HubRecord:
-    """What was pushed; equal to another record of the same content.
-
-    Attributes:
-        fingerprint: content hash of the data set, as `playslot dataset verify` prints it.
+    """What was pushed, with the fingerprint that `playslot dataset verify` prints; equal to another record of the same
+    content.
     """
 
     fingerprint: str
@@ -114,16 +110,11 @@ class HubRecord:
 
     @classmethod
     def of(cls, fingerprint: str, episodes: int, frames: int) -> HubRecord:
-        """The record of a checked data set, made by this version."""
         return cls(fingerprint, episodes, frames, SCHEME, __version__)
 
 
 def read_record(root: Path) -> HubRecord | None:
-    """The record of a pulled data set; None where it was pushed by something else.
-
-    Raises:
-        HubError: it is there and damaged.
-    """
+    """The record of a pulled data set; None where it was pushed by something else. A HubError where it is damaged."""
     path = root / REMOTE_RECORD
     if not path.is_file():
         return None

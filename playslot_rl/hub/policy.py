@@ -15,8 +15,6 @@ from playslot_rl.sharing.folder import CONFIG, FILES, RANGE, WEIGHTS, files_of, 
 
 @dataclass(frozen=True)
 class PolicyPushResult(Pushed):
-    """What a push of a policy did."""
-
     fingerprint: str
 
     def lines(self) -> list[str]:
@@ -32,17 +30,8 @@ def push_policy(
     tag: str | None = None,
     token: str | None = None,
 ) -> PolicyPushResult:
-    """Upload a policy. An interrupted push changes nothing there; the same command carries on.
-
-    Other files of the repository, such as videos or results of others, stay as they are.
-
-    Args:
-        folder: made by `playslot export`; nothing is written into it.
-        token: None takes HF_TOKEN or what `hf auth login` stored.
-
-    Raises:
-        CheckpointError: the folder is not whole, or its files do not belong together.
-        HubError: bad names, no or bad token, offline, no network, an error of the Hub, or a tag that is taken.
+    """Upload the folder of a policy; other files of the repository, such as videos, stay as they are. Otherwise as
+    `playslot_rl.hub.push.push`, with a CheckpointError where the folder is not whole.
     """
     config = require_whole(folder)
     files: dict[str, Path | bytes] = {name: folder / name for name in files_of(config)}
@@ -54,15 +43,11 @@ def push_policy(
 
 
 def pull_policy(repo_id: str, revision: str = "", cache: str | Path = "", token: str | None = None) -> Path:
-    """Download a policy, unless that commit of it is in the cache.
-
-    Returns:
-        The model folder.
+    """Download a policy, unless that commit of it is in the cache, and return the model folder.
 
     Raises:
         CheckpointError: the repository holds no policy.
         HubError: no such repository or revision, a bad token, offline, no network, damaged files, an error of the Hub.
-        OutputError: full disk.
     """
     home = cache_folder(cache) / "policies" / repo_id.replace("/", "--")
     with open_repository(repo_id, home, token=token, writing=False, revision=revision, kind="model") as hub:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Mapping
@@ -16,7 +15,7 @@ from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, HubError, OutputError
 from playslot_rl.hub.layout import LOCAL_RECORD, SCHEME, HubRecord, is_pulled, read_record, require_plain
 from playslot_rl.hub.session import Repository, open_repository
-from playslot_rl.storage.atomic import explain_write_errors, replace_dir, write_json
+from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing, replace_dir, write_json
 from playslot_rl.storage.locks import locked
 
 if TYPE_CHECKING:
@@ -28,11 +27,8 @@ SPARE = 64 << 20
 
 @dataclass(frozen=True)
 class PullResult:
-    """What a pull did.
-
-    Attributes:
-        why: how it was chosen; empty if it was asked for.
-        compared: whether the Hub named a fingerprint to compare it with.
+    """What a pull did: why that revision, empty if it was asked for; whether the Hub named a fingerprint to compare it
+    with.
     """
 
     repo_id: str
@@ -109,11 +105,9 @@ def _refuse_existing(root: Path) -> None:
     if root.is_dir() and not any(root.iterdir()):
         return
     if root.exists() or root.is_symlink():
-        try:
-            origin = json.loads((root / LOCAL_RECORD).read_text())
-            held = f", commit {origin['commit'][:12]} of {origin['repo_id']}"
-        except (OSError, ValueError, KeyError, TypeError):
-            held = ""  # not pulled, or nobody can tell from where
+        origin = json_or_nothing(root / LOCAL_RECORD)
+        pulled = {"commit", "repo_id"} <= origin.keys()  # or nobody can tell from where
+        held = f", commit {str(origin['commit'])[:12]} of {origin['repo_id']}" if pulled else ""
         raise OutputError(f"{root}: got a folder that holds something{held}, expected none: choose another, or move it")
 
 

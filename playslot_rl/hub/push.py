@@ -106,8 +106,6 @@ _VERSION = re.compile(r"v?\d+(\.\d+)*")
 
 @dataclass(frozen=True)
 class PushResult(Pushed):
-    """What a push of a data set did."""
-
     record: HubRecord
     left: tuple[str, ...]
 
@@ -162,12 +160,9 @@ def push(
 
 def _check_names(branch: str, tag: str | None, version: str) -> None:
     """Refuse branches and tags that LeRobot would take for a format version."""
-    if branch != MAIN and _VERSION.fullmatch(branch):
-        raise HubError(
-            f"branch={branch}: got the name of a format version, expected another: LeRobot would load it as that"
-        )
-    if tag is not None and _VERSION.fullmatch(tag):
-        raise HubError(
-            f"tag={tag}: got the name of a format version, expected another: LeRobot would load it as that; "
-            f"{version} is set by every push to main"
-        )
+    more = f"; {version} is set by every push to main"
+    for key, name, cure in (("branch", "" if branch == MAIN else branch, ""), ("tag", tag or "", more)):
+        if _VERSION.fullmatch(name):
+            raise HubError(
+                f"{key}={name}: got the name of a format version, expected another: LeRobot would load it as that{cure}"
+            )

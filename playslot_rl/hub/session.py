@@ -68,13 +68,8 @@ class Repository(Asked):
         raise AssertionError("unreachable")
 
     def create(self, private: bool) -> bool:
-        """Make the repository if it is not there.
-
-        Returns:
-            Whether it is private.
-
-        Raises:
-            HubError: it is there and public, though `private` is asked for.
+        """Make the repository if it is not there; whether it is private. A HubError where it is there and public,
+        though `private` is asked for.
         """
         self.call(self.api.create_repo, **self.here, private=private, exist_ok=True)
         is_private = bool(self.call(self.api.repo_info, **self.here).private)
@@ -109,13 +104,10 @@ class Repository(Asked):
         self.call(self.api.create_tag, **self.here, tag=tag, revision=commit, exist_ok=True)
 
     def commit(self, files: dict[str, Path | bytes], stale: Sequence[str], message: str, branch: str, head: str) -> str:
-        """Add `files` and delete `stale` in one commit on top of `head`; nothing is visible before it.
+        """Add `files` and delete `stale` in one commit on top of `head`; returns it, or `head` if nothing differs.
 
         Note: `HfApi.upload_folder` (with `delete_patterns`) uploads in several commits where hf_xet is installed, so a
         reader could meet half a data set: we name the operations ourselves.
-
-        Returns:
-            The commit; `head` itself if nothing differs.
         """
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
@@ -134,13 +126,11 @@ class Repository(Asked):
         return Path(got).read_bytes()
 
     def download(self, files: Mapping[str, RepoFile], commit: str, folder: Path) -> None:
-        """Fetch files and compare each with what the Hub lists; those already there and whole stay.
+        """Fetch files and compare each with what the Hub lists; those already there and whole stay, those of another
+        size or hash are removed (HubError).
 
         `commit` has to be a full commit: for a name the client takes what lies in `folder` where the Hub does not
         answer, and says nothing.
-
-        Raises:
-            HubError: the size or hash of a file is another; such files are removed.
         """
         self.call(self.api.snapshot_download, **self.here, revision=commit, local_dir=folder,
                   allow_patterns=[glob.escape(path) for path in files])  # fmt: skip
@@ -181,10 +171,7 @@ def _limit_silence() -> None:
 def open_repository(
     repo_id: str, root: Path, *, token: str | None, writing: bool, revision: str = "", kind: Kind = "dataset"
 ) -> Iterator[Repository]:
-    """Talk to the Hub about one data set or model.
-
-    Args:
-        token: None takes HF_TOKEN or what `hf auth login` stored.
+    """Talk to the Hub about one data set or model; without a token by HF_TOKEN or what `hf auth login` stored.
 
     Raises:
         HubError: a bad name, offline mode, no token, or anything that goes wrong inside, in one line without tokens.
@@ -214,11 +201,8 @@ Owned = Callable[[str], bool]
 
 @dataclass(frozen=True)
 class Pushed:
-    """What every push says.
-
-    Attributes:
-        stale: files deleted on the Hub because they are no longer part of what is pushed.
-        card_kept: whether the card is one that somebody wrote by hand.
+    """What every push says: also which files were deleted on the Hub because they are no longer part of it, and whether
+    the card is one that somebody wrote by hand.
     """
 
     repo_id: str
@@ -272,15 +256,11 @@ def send(
 
     Args:
         root: local folder, which may hold a card written by hand.
-        files: what to send, by path, with the card as it is made here.
-        mark: line of a card by which those made here are known.
+        files: what to send, by path, with the card as it is made here, known by the line `mark`.
         branch: made from main if it is not there.
-        tag: one more tag for the commit; never moved.
+        tag: one more tag for the commit; never moved. A HubError where it is on something else.
         version: tag that moves to the commit; empty for none.
         owned: which paths there must be part of `files`; others are left alone.
-
-    Raises:
-        HubError: what the Hub then lists is not what was sent, or the tag is on something else.
     """
     hub.call(hub.api.whoami)  # tells a bad token from every other 401
     is_private = hub.create(private)

@@ -25,12 +25,8 @@ _KNOWN: Final = ("slots", "dynamics", "policy", "world_model.json", "adopt.json"
 
 
 def run_to_read(config: ExperimentConfig, command: str, expected: str) -> Run:
-    """The run that a command reads, and writes its results into unless it is a pretrained model. `expected` is what
-    `run` is to name, for the message.
-
-    Raises:
-        ConfigError: none is named, or `out` names another folder.
-        CheckpointError: there is no such run.
+    """The run that a command reads, and writes its results into unless it is a pretrained model. A ConfigError where none
+    is named, `expected` is what, or `out` names another folder; a CheckpointError where there is no such run.
     """
     if not config.run:
         raise ConfigError(f"run: got nothing, expected {expected}")
@@ -43,11 +39,8 @@ def run_to_read(config: ExperimentConfig, command: str, expected: str) -> Run:
 
 
 def run_to_write(config: ExperimentConfig) -> Run:
-    """The run that a command writes, `out` or else `run`. Nothing is written yet.
-
-    Raises:
-        ConfigError: neither is given.
-        OutputError: the folder holds something else.
+    """The run that a command writes, `out` or else `run`, with a ConfigError for neither; an OutputError where the folder
+    holds something else. Nothing is written yet.
     """
     folder = Path(config.out or config.run)
     if str(folder) == "." or is_pretrained(str(folder)):
@@ -83,12 +76,8 @@ def _is_begun(stage: Path) -> bool:
 
 
 def run_of_pretrained(config: ExperimentConfig, model: Run) -> Run:
-    """Make `out` a run of a pretrained model: its world model's name, its policy if it has one, and this config.
-
-    Raises:
-        ConfigError: no `out`, or the model is of another task.
-        CheckpointError: `out` has another policy.
-        OutputError: the folder cannot be written.
+    """Make `out` a run of a pretrained model: its world model's name, its policy if it has one, and this config. A
+    ConfigError where `out` is missing or the model is of another task; a CheckpointError where it has another policy.
     """
     if not config.out:
         raise ConfigError(f"out: got nothing with run={config.run}, expected a folder to write, such as out=runs/check")

@@ -50,11 +50,8 @@ def pretrained_folder(env: str = "button_press") -> Path:
 
 class Run:
     """A run, opened once; what was read of it is kept, so open it again after it was trained on. Whatever reads a stage
-    raises a CheckpointError where that is missing, damaged, of another version, or was trained on other parents.
-
-    Args:
-        folder: may not be there yet, for a run to write.
-        pretrained: the task whose pretrained model it is; empty for other runs.
+    raises a CheckpointError where that is missing, damaged, of another version, or was trained on other parents. The
+    folder of a run to write may not be there yet; `pretrained` is the task whose pretrained model it is.
     """
 
     def __init__(self, folder: Path, pretrained: str = "") -> None:

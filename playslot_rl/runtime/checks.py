@@ -55,7 +55,6 @@ class Check:
 
 
 def check_python() -> Check:
-    """Python 3.12, the only version that the pinned libraries share."""
     found = f"{platform.python_version()} at {sys.prefix}"
     if platform.python_version_tuple()[:2] == ("3", "12"):
         return Check("Python", "ok", found)
@@ -167,7 +166,6 @@ def check_ffmpeg() -> Check:
 
 
 def check_disk(folder: Path) -> Check:
-    """Free space where data and runs go."""
     try:
         there = next(path for path in (folder, *folder.parents) if path.exists())
         free = shutil.disk_usage(there).free / 1e9
@@ -182,7 +180,6 @@ def check_disk(folder: Path) -> Check:
 
 
 def check_cores() -> Check:
-    """Cores that this process may use."""
     cores = available_cores()
     if cores < 2:
         return Check("cores", "warn", "1 core", "the times in the README are for two cores; expect twice as long")
@@ -190,7 +187,6 @@ def check_cores() -> Check:
 
 
 def check_cache(folder: Path) -> Check:
-    """The folder of the frame and slot caches can be written."""
     cure = "set PLAYSLOT_CACHE (or data.cache=) to a folder that you can write"
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -20,10 +20,8 @@ def worker_context(imported: Sequence[str] = IMPORTED) -> ForkServerContext:
     """How workers start: forked from one server, which has the imports, and no thread, GL context or GPU.
 
     The first worker starts as quickly as a fresh process, each further one in tens of milliseconds, and all of them
-    share the memory of the imports. The server ends with this process, and its workers with it (`begin_worker`).
-
-    Args:
-        imported: modules; a process has one server, with the imports that were wanted when its first worker started.
+    share the memory of the imports. The server ends with this process, and its workers with it (`begin_worker`). A
+    process has one server, with the imports that were wanted when its first worker started.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(imported))

@@ -14,10 +14,7 @@ KINDS: Final = ("cpu", "cuda", "mps", "xpu")
 
 
 def named_device(name: str | torch.device = "") -> torch.device:
-    """The device of a name, which need not be there (`probed`).
-
-    Args:
-        name: `cpu`, `cuda`, `cuda:1`, ...; empty means a GPU if there is one.
+    """The device of a name such as `cuda:1`, which need not be there (`probed`); empty means a GPU if there is one.
 
     Raises:
         TypeError: no text.
@@ -43,14 +40,10 @@ def named_device(name: str | torch.device = "") -> torch.device:
 
 def open_device(name: str, threads: int) -> torch.device:
     """The device of a name (`named_device`) that computes, after setting threads and the allocator; of several
-    processes on GPUs each has its own.
-
-    Raises:
-        ConfigError: no such device.
+    processes on GPUs each has its own. A ConfigError where there is none.
     """
-    from playslot_rl.runtime.allocator import tune_allocator
     from playslot_rl.runtime.processes import own_device
-    from playslot_rl.runtime.threads import set_threads
+    from playslot_rl.runtime.threads import set_threads, tune_allocator
 
     tune_allocator()
     set_threads(threads)
@@ -58,11 +51,7 @@ def open_device(name: str, threads: int) -> torch.device:
 
 
 def probed(device: torch.device) -> torch.device:
-    """The device, after a look whether it is there.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """The device, after a look whether it is there, else a ConfigError."""
     import torch
 
     try:

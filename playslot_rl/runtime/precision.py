@@ -38,11 +38,7 @@ def resolve_precision(precision: Precision, device_type: str) -> Precision:
 
 
 def autocast(device_type: str, precision: Precision) -> torch.autocast:
-    """Surrounds what a stage computes in its precision.
-
-    Warns:
-        RuntimeWarning: `bf16` is asked for where it is emulated.
-    """
+    """Surrounds what a stage computes in its precision; a RuntimeWarning says where `bf16` is emulated."""
     import torch
 
     if precision == "bf16" and not native_bf16(device_type):

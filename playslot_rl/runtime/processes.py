@@ -3,7 +3,8 @@
     g = 1/W sum_r g_r,   g_r the gradient of the mean over the rows of rank r
 
 Hugging Face accelerate opens the process group; what is exchanged is small (models of some million parameters, one flat
-vector a step). Without a launcher there is one process, and nothing of this does anything.
+vector a step). Without a launcher there is one process, and nothing of this does anything. Every exchange raises a
+PeerError where another process has ended.
 
 Shapes: W processes ("world"), r rank of one of them, from 0.
 """
@@ -27,19 +28,13 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 TIMEOUT: Final = timedelta(minutes=10)
-"""How long a process waits for the others: longer than a validation's batch or a checkpoint takes, and not for ever. A
-process that dies is noticed at once, by its closed connection.
-"""
+"""How long a process waits for the others: longer than a validation's batch or a checkpoint takes. One that dies is
+noticed at once, by its closed connection."""
 
 
 @dataclass(frozen=True)
 class Processes:
-    """Which of the processes this is.
-
-    Attributes:
-        rank: r, from 0.
-        world: W.
-    """
+    """Which of the processes this is: r, and W."""
 
     rank: int = 0
     world: int = 1
@@ -72,12 +67,6 @@ def free_port() -> int:
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         return int(found.getsockname()[1])
-
-
-def launcher_variables(rank: int, world: int, port: int) -> dict[str, str]:
-    """The environment that torchrun gives process `rank` of `world` on one machine, which meet at `port`."""
-    numbers = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": world, "LOCAL_WORLD_SIZE": world, "MASTER_PORT": port}
-    return {"MASTER_ADDR": "127.0.0.1", **{name: str(number) for name, number in numbers.items()}}
 
 
 def start(device: str = "") -> None:
@@ -126,11 +115,7 @@ def stop() -> None:
 
 
 def wait() -> None:
-    """Until all are here.
-
-    Raises:
-        PeerError: one of them ended.
-    """
+    """Until all are here."""
     if _here.world > 1:
         import torch
         import torch.distributed as dist
@@ -151,11 +136,7 @@ def own_device(device: torch.device) -> torch.device:
 
 
 def summed(values: Tensor) -> Tensor:
-    """Sum over the processes, in place; no gradient.
-
-    Raises:
-        PeerError: one of them ended.
-    """
+    """Sum over the processes, in place; no gradient."""
     if _here.world > 1:
         import torch.distributed as dist
 
@@ -165,11 +146,7 @@ def summed(values: Tensor) -> Tensor:
 
 
 def stacked(values: Tensor) -> Tensor:
-    """The tensors (b, ...) of all processes, rank by rank: (W b, ...); no gradient.
-
-    Raises:
-        PeerError: one of them ended.
-    """
+    """The tensors (b, ...) of all processes, rank by rank: (W b, ...); no gradient."""
     if _here.world == 1:
         return values
     import torch
@@ -182,11 +159,7 @@ def stacked(values: Tensor) -> Tensor:
 
 
 def agreed(number: int) -> list[int]:
-    """This number of every process, by rank.
-
-    Raises:
-        PeerError: one of them ended.
-    """
+    """This number of every process, by rank."""
     if _here.world == 1:
         return [number]
     import torch.distributed as dist
@@ -198,11 +171,7 @@ def agreed(number: int) -> list[int]:
 
 
 def copied(tensors: Sequence[Tensor]) -> None:
-    """Give all processes the first one's tensors, in place.
-
-    Raises:
-        PeerError: one of them ended.
-    """
+    """Give all processes the first one's tensors, in place."""
     if _here.world == 1:
         return
     import torch
@@ -246,28 +215,20 @@ def spread[Item, Result](items: Sequence[Item], compute: Callable[[int, Item], R
 
     Outside of `spreading`, and without other processes, this one computes them all. Every process must come here with
     the same items. Tensors among shared results are on the CPU.
-
-    Raises:
-        PeerError: a process ended.
     """
     if not _spreading:
         return [compute(number, item) for number, item in enumerate(items)]
+    import torch
     import torch.distributed as dist
+    from torch.utils._pytree import tree_map_only
 
     own = range(_here.rank, len(items), _here.world)
-    mine = {number: _on_cpu(compute(number, items[number])) for number in own}
+    mine = {number: tree_map_only(torch.Tensor, torch.Tensor.cpu, compute(number, items[number])) for number in own}
     gathered: list[Any] = [None] * _here.world
     with _exchange():
         dist.all_gather_object(gathered, mine)
     found = {number: result for part in gathered for number, result in part.items()}
     return [found[number] for number in range(len(items))]
-
-
-def _on_cpu(result: Any) -> Any:
-    import torch
-    from torch.utils._pytree import tree_map_only
-
-    return tree_map_only(torch.Tensor, lambda tensor: tensor.cpu(), result)
 
 
 @contextlib.contextmanager

@@ -26,14 +26,8 @@ def format_seconds(seconds: float) -> str:
 
 
 class StageProgress:
-    """How far a stage is, how fast, and what remains of its time.
-
-    Args:
-        name: the stage.
-        start, total: what was done before, and all there is to do.
-        enabled: `false` prints nothing.
-        plain_every: `unit` between lines where standard error is no terminal; 0 means ten seconds.
-        unit: what is counted.
+    """How far a stage is, how fast, and what remains of its time: `start` were done before, of `total`. Where standard
+    error is no terminal there is a line every `plain_every` of a unit; 0 means ten seconds.
     """
 
     def __init__(

@@ -22,11 +22,8 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class RayCluster:
-    """A cluster to be connected to.
-
-    Attributes:
-        where: its address; empty for this machine alone, where it is started and ended by who asked.
-        init: arguments of `ray.init`.
+    """A cluster to be connected to: its address, empty for this machine alone, where it is started and ended by who
+    asked; and the arguments of `ray.init`.
     """
 
     where: str
@@ -34,11 +31,8 @@ class RayCluster:
 
     @classmethod
     def find(cls, address: str, count: int) -> RayCluster:
-        """Look for the cluster, without connecting.
-
-        Args:
-            address: empty means `$RAY_ADDRESS`, or a cluster of this machine alone.
-            count: cores that a cluster of this machine offers.
+        """Look for the cluster, without connecting. No `address` means `$RAY_ADDRESS`, or a cluster of this machine
+        alone, of `count` cores.
 
         Raises:
             ConfigError: Ray is not installed.
@@ -61,10 +55,8 @@ class RayCluster:
         return cls(where, quiet | ({"address": where} if where else {"address": "local", "num_cpus": count}))
 
     def connect(self, start: Callable[[dict[str, Any]], T]) -> T:
-        """What `start` makes of `init`, which it hands to `ray.init` sooner or later.
-
-        Raises:
-            PlaySlotError: the cluster cannot be reached, or this machine's does not start.
+        """What `start` makes of `init`, which it hands to `ray.init` sooner or later; a PlaySlotError where the cluster
+        cannot be reached, or this machine's does not start.
         """
         for attempt in range(1 if self.where else STARTS):
             try:

@@ -29,13 +29,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Share:
-    """One slice of the global batch.
-
-    Attributes:
-        index: i, from 0; those of one process are consecutive.
-        count: n: processes, times the micro-batches of each.
-        micro, micros: which micro-batch of this process it is, and how many there are.
-        rehearsal: no step is made of it: it only shows what the first batch is like.
+    """One slice of the global batch: i of n, which is processes times the micro-batches of each, those of one process
+    consecutive; `micro` of the process's `micros`. Of a `rehearsal` no step is made: it shows what the first batch is
+    like.
     """
 
     index: int = 0
@@ -65,11 +61,7 @@ def sharing(of: Share) -> Iterator[None]:
 
 
 def own_rows[Rows: (Tensor, npt.NDArray[np.int64])](rows: Rows) -> Rows:
-    """The own slice (b, ...) of what belongs to the global batch (B, ...).
-
-    Raises:
-        ValueError: the shares do not divide the rows.
-    """
+    """The own slice (b, ...) of what belongs to the global batch (B, ...), which the shares have to divide."""
     own = _share.get()
     if own.count == 1:
         return rows
@@ -80,12 +72,7 @@ def own_rows[Rows: (Tensor, npt.NDArray[np.int64])](rows: Rows) -> Rows:
 
 
 def own_noise(shape: tuple[int, ...] | torch.Size, draw: Callable[[tuple[int, ...]], Tensor]) -> Tensor:
-    """Random numbers of the own rows: `draw` is called with the global batch's shape.
-
-    Args:
-        shape: of the own share, (b, ...).
-        draw: makes random numbers of a shape, such as `lambda shape: torch.randn(shape, generator=generator)`.
-    """
+    """Random numbers of the own rows, of the shape (b, ...): `draw` is called with the global batch's."""
     own = _share.get()
     return own_rows(draw((shape[0] * own.count, *shape[1:])))
 

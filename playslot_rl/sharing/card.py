@@ -15,7 +15,7 @@ from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.action_limits import said
 from playslot_rl.envs import ENVIRONMENTS, task_metadata
-from playslot_rl.sharing.commands import Result, frames_comment, places, rate_words, reproduce, use
+from playslot_rl.sharing.commands import Result, places, rate_words, reproduce, use
 from playslot_rl.sharing.folder import LICENCE, TAGS, SharedPolicyConfig, shared_modules
 from playslot_rl.visualization.document import table
 
@@ -37,7 +37,7 @@ CLOCKED: Final = (
     "with another outcome."
 )
 PROTOCOL_NAMES: Final = {"simulation": "in simulation (closed loop)", "imagination": "in imagination (open loop)"}
-
+UNKNOWN: Final = "not recorded"
 REFERENCES: Final = {
     "random": "random actions",
     "expert": "scripted expert",
@@ -82,7 +82,7 @@ def make_card(
         data=facts_table(_data(policy.source)),
         results=_results(results),
         use=use(policy, experiment),
-        frames=frames_comment(policy),
+        frames=f"for each frame of an episode, uint8 (H, W, 3); {rate_words(policy)}",
         commands=commands,
         versions=facts_table(versions),
     )
@@ -124,51 +124,43 @@ def _data(source: dict[str, Any]) -> dict[str, str]:
     data = source.get("data", {})
     world = "the one that ships with playslot_rl" if source.get("shipped_world_model") else "trained for this policy"
     recorded = source.get("recorded") or {}
-    maker = (
-        f"{recorded['policy']}, noise {recorded['noise']:g}, seed {recorded['seed']}" if recorded else "not recorded"
+    maker = f"{recorded['policy']}, noise {recorded['noise']:g}, seed {recorded['seed']}" if recorded else UNKNOWN
+    demos, labels, seed = (
+        UNKNOWN if source.get(key) is None else str(source[key]) for key in ("demos", "labelled_demos", "seed")
     )
     return {
-        "demonstrations": f"videos of {_count(source.get('demos'))}",
-        "labels used": f"real actions of {_count(source.get('labelled_demos'))} demonstrations, by the action decoder",
+        "demonstrations": f"videos of {demos}",
+        "labels used": f"real actions of {labels} demonstrations, by the action decoder",
         "demonstrator": maker,
-        "data set of the demonstrations": f"fingerprint `{data.get('demonstrations') or 'not recorded'}`",
-        "data set of the world model": f"fingerprint `{data.get('world_model') or 'not recorded'}`",
+        "data set of the demonstrations": f"fingerprint `{data.get('demonstrations') or UNKNOWN}`",
+        "data set of the world model": f"fingerprint `{data.get('world_model') or UNKNOWN}`",
         "world model": world,
         "weights by stage": ", ".join(f"{name} `{mark}`" for name, mark in source.get("fingerprints", {}).items()),
-        "training seed": _count(source.get("seed")),
-        "commit": f"`{source['commit']}`" if source.get("commit") else "not recorded",
+        "training seed": seed,
+        "commit": f"`{source['commit']}`" if source.get("commit") else UNKNOWN,
     }
-
-
-def _count(value: Any) -> str:
-    return "not recorded" if value is None else str(value)
 
 
 def _results(results: Sequence[Result]) -> str:
     if not results:
         return "Not evaluated yet. `playslot evaluate`, then `playslot export` again, puts success rates here."
-    rows = []
-    for result in results:
-        steps = "–" if result.mean_steps is None else f"{result.mean_steps:.1f}"
-        title = f"this policy, {PROTOCOL_NAMES[result.protocol]}"
-        rows.append(
-            [title, _share(result.success_rate), _interval(result.ci95), steps, str(result.episodes), str(result.seed)]
-        )
     first = results[0]
-    for name, (rate, ci95) in first.references.items():
-        title = REFERENCES.get(name, name.replace("_", " "))
-        rows.append([title, _share(rate), _interval(ci95), "–", str(first.episodes), str(first.seed)])
+    measured = [
+        (f"this policy, {PROTOCOL_NAMES[own.protocol]}", own.success_rate, own.ci95, own.mean_steps, own)
+        for own in results
+    ]
+    measured += [
+        (REFERENCES.get(name, name.replace("_", " ")), rate, ci95, None, first)
+        for name, (rate, ci95) in first.references.items()
+    ]
+    rows = []
+    for title, rate, (low, high), steps, of in measured:
+        mean = "–" if steps is None else f"{steps:.1f}"
+        interval = f"{100 * low:.0f} to {100 * high:.0f} %"
+        rows.append([title, f"{100 * rate:.0f} %", interval, mean, str(of.episodes), str(of.seed)])
     titles = ["", "success", "95 % interval", "mean agent steps to success", "episodes", "seed"]
     return f"{table(titles, rows)}\n\n{MEASURED}"
 
 
-def _share(rate: float) -> str:
-    return f"{100 * rate:.0f} %"
-
-
-def _interval(ends: tuple[float, float]) -> str:
-    return f"{100 * ends[0]:.0f} to {100 * ends[1]:.0f} %"
-
-
 def _numbers(versions: dict[str, str]) -> str:
-    return ", ".join(f"{name} {number or 'not recorded'}" for name, number in versions.items()) or "not recorded"
+    return ", ".join(f"{name} {number or UNKNOWN}" for name, number in versions.items()) or UNKNOWN

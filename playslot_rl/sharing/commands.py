@@ -42,11 +42,8 @@ BEHAVIOUR: Final = (
 
 @dataclass(frozen=True)
 class Result:
-    """A measured success rate.
-
-    Attributes:
-        mean_steps: agent steps to the first success, of the episodes that had one; None without any.
-        references: success rate and interval of other policies in simulation, on the same seeds, by name.
+    """A measured success rate, the mean agent steps to the first success of the episodes that had one, and rate and
+    interval of other policies in simulation, on the same seeds, by name.
     """
 
     protocol: str
@@ -69,7 +66,6 @@ def reproduce(config: ExperimentConfig, source: Mapping[str, Any], results: Sequ
 
 
 def recorded_elsewhere(config: ExperimentConfig, source: Mapping[str, Any]) -> bool:
-    """Whether the data sets are not those that our commands collect."""
     return config.env.name in RECORDED or bool(source.get("recorded_elsewhere"))
 
 
@@ -81,10 +77,8 @@ def _from_nothing(config: ExperimentConfig, source: Mapping[str, Any]) -> list[s
     first = [f"demos={demos}"] if demos is not None and demos != episodes else []
     if not source.get("shipped_world_model"):
         world = source.get("world_model_seed", seed)
-        whole = demos is None or episodes in (
-            demos,
-            demos + config.data.held_out,
-        )  # what the pipeline itself keeps apart
+        # Those that are held out the pipeline itself keeps apart.
+        whole = demos is None or episodes in (demos, demos + config.data.held_out)
         if world in (None, seed) and whole:
             return [_line("pipeline", *base, *seeded, *changes(config, GROUPS), f"out={RUN}")]
         collected = f"data.demos={WORLD}/data/expert"
@@ -142,10 +136,8 @@ def _videos(config: ExperimentConfig) -> str:
 
 
 def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
-    """`key=value` of what differs from the run's preset, in some groups of keys.
-
-    Raises:
-        ConfigError: the preset or the environment is not one of this version.
+    """`key=value` of what differs from the run's preset, in some groups of keys; a ConfigError where the preset or the
+    environment is not one of this version.
     """
     free, machine, folders = (keys_of(ExperimentConfig, role) for role in ("free", "machine", "folder"))
     preset = flatten(to_dict(compose([f"env={config.env.name}", f"preset={config.preset}"])))
@@ -161,12 +153,8 @@ def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
             continue
         if key in folders and value and not is_pretrained(str(value)):
             value = START  # no folder of this machine
-        found.append(f"{key}={_value(value)}")
+        found.append(f"{key}={value if isinstance(value, str) else json.dumps(value, separators=(',', ':'))}")
     return found
-
-
-def _value(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
 
 
 def _line(command: str, *arguments: str) -> str:
@@ -192,11 +180,6 @@ def rate_words(policy: SharedPolicyConfig) -> str:
     of = f" of {rate * stride:g}" if rate else ""
     now = f"{rate:g} a second" if rate else f"1 / {stride} of the demonstrations' rate"
     return f"{now}: one frame in {stride}{of}, and each action is held until the next"
-
-
-def frames_comment(policy: SharedPolicyConfig) -> str:
-    """The same, beside a call of `act`."""
-    return f"for each frame of an episode, uint8 (H, W, 3); {rate_words(policy)}"
 
 
 def use(policy: SharedPolicyConfig, experiment: ExperimentConfig | None = None) -> str:

@@ -8,10 +8,8 @@
                                         its range of the actions, where they are not in [-1, 1]
     FOLDER/README.md                    model card
 
-LeRobot 0.6.1 finds a policy's class by `type` in `config.json`; the shapes of what goes in and out are its
-`input_features` and `output_features`. The rest, `env` to `source`, is ours: sizes of the networks and where the
-weights came from. The slot oracle of a run stays behind: it was trained on every real action, and is no part of the
-policy.
+LeRobot 0.6.1 finds a policy's class by `type` in `config.json`. The slot oracle of a run stays behind: it was trained
+on every real action, and is no part of the policy.
 """
 
 from __future__ import annotations
@@ -110,10 +108,8 @@ class SharedPolicyConfig:
 
     @classmethod
     def of(cls, camera: str, ours: dict[str, Any]) -> SharedPolicyConfig:
-        """The config of `OURS` as plain values; those that older folders do not have may be missing.
-
-        Raises:
-            ValueError: unknown keys, wrong types, or values outside their range.
+        """The config of `OURS` as plain values, of which older folders may lack some; a ValueError where one is
+        unknown, of another type or outside its range.
         """
         env, model = from_dict(EnvConfig, ours["env"], "env."), from_dict(ModelConfig, ours["model"], "model.")
         plain = {name: kind(ours[name]) for name, kind in _PLAIN.items() if ours.get(name) is not None}
@@ -121,11 +117,7 @@ class SharedPolicyConfig:
 
 
 def camera_of(inputs: dict[str, Any]) -> str:
-    """The one camera among LeRobot's input features, as plain values.
-
-    Raises:
-        ValueError: there is none, or there are several.
-    """
+    """The one camera among LeRobot's input features, as plain values, else a ValueError."""
     cameras = [name for name, feature in inputs.items() if feature["type"] == "VISUAL"]
     if len(cameras) != 1:
         raise ValueError(f"input_features: got {len(cameras)} cameras ({', '.join(cameras)}), expected one")
@@ -142,10 +134,8 @@ def is_model_folder(folder: Path) -> bool:
 
 
 def read_config(folder: Path) -> SharedPolicyConfig:
-    """Read `config.json` of a model folder.
-
-    Raises:
-        CheckpointError: it is missing, damaged, another policy's, or of another version.
+    """`config.json` of a model folder; a CheckpointError where it is missing, damaged, another policy's, or of another
+    version.
     """
     path = folder / CONFIG
     if not path.is_file():
@@ -191,11 +181,7 @@ ROOT: Final = "agent"
 
 
 def build_agent(config: SharedPolicyConfig) -> Agent:
-    """Networks of a config with fresh weights, without a slot oracle; the global random state stays as it was.
-
-    Raises:
-        ConfigError: the model has one latent action per slot, and therefore no policy.
-    """
+    """Networks of a config with fresh weights, without a slot oracle; the global random state stays as it was."""
     from playslot_rl.world_model import Agent, WorldModel
 
     with torch.random.fork_rng(devices=[]):
@@ -208,24 +194,14 @@ def shared_modules(agent: nn.Module) -> dict[str, nn.Module]:
 
 
 def write_weights(agent: nn.Module, path: Path) -> str:
-    """Write an agent's weights, atomically, and return their fingerprint.
-
-    Raises:
-        OutputError: full disk.
-    """
+    """Write an agent's weights, atomically, and return their fingerprint."""
     save_tensors(path, module_tensors(shared_modules(agent)))
     return weights_fingerprint(path)
 
 
 def load_weights(agent: nn.Module, path: Path, config: SharedPolicyConfig) -> None:
-    """Load a weights file into an agent, in place; nothing is changed unless everything fits.
-
-    Args:
-        config: what it says of the file: its fingerprint (empty says nothing), and the range of the actions.
-
-    Raises:
-        CheckpointError: missing or damaged file, missing, unexpected or misshapen tensors, or another file than the
-            config's.
+    """Load a weights file into an agent, in place; nothing is changed unless everything fits, else a CheckpointError:
+    the tensors, and the fingerprint (empty says nothing) and range of the actions that the config names.
     """
     if not path.is_file():
         raise CheckpointError(f"{path} is missing, expected a policy's weights: export or download the policy again")
@@ -258,18 +234,8 @@ def ranged(agent: Any, config: SharedPolicyConfig) -> dict[str, Any]:
 def save_pretrained(
     agent: Agent, folder: Path, config: SharedPolicyConfig, card: Callable[[SharedPolicyConfig], str]
 ) -> SharedPolicyConfig:
-    """Write a model folder, whole or not at all.
-
-    Args:
-        agent: what to store, without its slot oracle.
-        config: its fingerprint, and the ends of `actions`, are set here.
-        card: gives the text of README.md for the config with its fingerprint.
-
-    Returns:
-        The config with both.
-
-    Raises:
-        OutputError: `folder` holds something, the disk is full, or it cannot be written.
+    """Write a model folder, whole or not at all: an OutputError where it holds something or cannot be written. Returns
+    the config with its fingerprint and the ends of `actions`, of which `card` makes the text of README.md.
     """
     with new_folder(folder) as temporary:
         config = replace(config, fingerprint=write_weights(agent, temporary / WEIGHTS), actions=ranged(agent, config))
@@ -281,10 +247,8 @@ def save_pretrained(
 
 
 def load_pretrained(folder: Path, device: torch.device | str = "cpu") -> tuple[Agent, SharedPolicyConfig]:
-    """Agent and config of a model folder; the agent in evaluation mode, without gradients for its weights.
-
-    Raises:
-        CheckpointError: the folder is not whole, or its files do not belong together.
+    """Agent and config of a model folder; the agent in evaluation mode, without gradients for its weights. A
+    CheckpointError where the folder is not whole, or its files do not belong together.
     """
     if not folder.is_dir():
         raise CheckpointError(f"{folder}: no such folder, expected a policy made by `playslot export`")
@@ -300,11 +264,7 @@ def files_of(config: SharedPolicyConfig) -> tuple[str, ...]:
 
 
 def require_whole(folder: Path) -> SharedPolicyConfig:
-    """The config of a model folder, after checking that every file is there and that the weights load.
-
-    Raises:
-        CheckpointError: the folder is not whole, or its files do not belong together.
-    """
+    """The config of a model folder in which every file is there and the weights load, else a CheckpointError."""
     _, config = load_pretrained(folder)
     missing = [name for name in files_of(config) if not (folder / name).is_file()]
     if missing:
@@ -318,38 +278,27 @@ def make_processors(device: str, actions: dict[str, Any] | None = None) -> tuple
     Frames go in as LeRobot gives them, floats in [0, 1]. The policy gives actions in [-1, 1], as LeRobot's policies do;
     LeRobot's own normaliser turns them into those of the robot, on the CPU, where they have another range.
     """
+    from lerobot import processor
     from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
-    from lerobot.processor import (
-        AddBatchDimensionProcessorStep,
-        DeviceProcessorStep,
-        PolicyProcessorPipeline,
-        RenameObservationsProcessorStep,
-        UnnormalizerProcessorStep,
-        policy_action_to_transition,
-        transition_to_policy_action,
-    )
 
-    before = PolicyProcessorPipeline(
-        steps=[
-            RenameObservationsProcessorStep(rename_map={}),
-            AddBatchDimensionProcessorStep(),
-            DeviceProcessorStep(device=device),
-        ],
-        name=PREPROCESSOR,
-    )
-    outwards: list[Any] = [DeviceProcessorStep(device="cpu")]
+    inwards = [
+        processor.RenameObservationsProcessorStep(rename_map={}),
+        processor.AddBatchDimensionProcessorStep(),
+        processor.DeviceProcessorStep(device=device),
+    ]
+    outwards: list[Any] = [processor.DeviceProcessorStep(device="cpu")]
     if actions and scaled(actions):
         outwards.append(
-            UnnormalizerProcessorStep(
+            processor.UnnormalizerProcessorStep(
                 features={keys.FEATURE_ACTION: PolicyFeature(FeatureType.ACTION, (len(actions["low"]),))},
                 norm_map={FeatureType.ACTION: NormalizationMode.MIN_MAX},
                 stats={keys.FEATURE_ACTION: {"min": actions["low"], "max": actions["high"]}},
             )
         )
-    after = PolicyProcessorPipeline(
+    after = processor.PolicyProcessorPipeline(
         steps=outwards,
         name=POSTPROCESSOR,
-        to_transition=policy_action_to_transition,
-        to_output=transition_to_policy_action,
+        to_transition=processor.policy_action_to_transition,
+        to_output=processor.transition_to_policy_action,
     )
-    return before, after
+    return processor.PolicyProcessorPipeline(steps=inwards, name=PREPROCESSOR), after

@@ -33,10 +33,8 @@ LIBRARIES: Final = ("torch", "torchrl", "tensordict", "lerobot", "gymnasium", "m
 
 
 def read_source(run: Run) -> dict[str, Any]:
-    """Plain values: fingerprints of weights and data, demonstrations, labels, commit, seed, versions.
-
-    Raises:
-        CheckpointError: the run has no policy, or its checkpoints are damaged or do not belong together.
+    """Plain values: fingerprints of weights and data, demonstrations, labels, commit, seed, versions. A CheckpointError
+    where the run has no policy, or its checkpoints are damaged or do not belong together.
     """
     run_facts(run.folder)  # a run without a policy is refused with what to do
     policy, parents = run.own("policy"), run.world_stages
@@ -92,11 +90,7 @@ def _elsewhere(root: Path) -> bool:
 
 
 def read_results(run: Run, source: dict[str, Any]) -> list[Result]:
-    """Evaluations of exactly this policy, from `RUN/evaluation/*/eval_info.json`; those of an older one are left out.
-
-    Raises:
-        CheckpointError: a file is damaged.
-    """
+    """Evaluations of exactly this policy, not of an older one, from `RUN/evaluation/*/eval_info.json`."""
     results = []
     for protocol in POLICY_PROTOCOLS:
         path = run.folder / "evaluation" / protocol / "eval_info.json"
@@ -136,12 +130,7 @@ def _result(info: dict[str, Any]) -> Result:
 def export_run(
     run: Run, folder: Path, config: ExperimentConfig, source: dict[str, Any] | None = None
 ) -> SharedPolicyConfig:
-    """Write the policy of a run to a new folder.
-
-    Args:
-        run: with a finished policy.
-        config: of the run; `data.camera` and `data.resize` say what the policy looks at.
-        source: `read_source(run)`, if it has been read.
+    """Write the policy of a run to a new folder. `source` is `read_source(run)`, if it has been read.
 
     Raises:
         CheckpointError: no policy, or damaged checkpoints.
@@ -159,14 +148,8 @@ def export_run(
 
 
 def require_exported(run: Run, folder: Path, config: ExperimentConfig, source: dict[str, Any]) -> None:
-    """Check that a model folder is whole and holds what `export_run` would write into it.
-
-    Versions of libraries and results on its card may be those of the day on which it was made.
-
-    Raises:
-        CheckpointError: the folder is damaged, or as `export_run`.
-        ConfigError: as `export_run`.
-        OutputError: it holds another policy.
+    """Check that a model folder is whole and holds what `export_run` would write into it, but for versions of libraries
+    and results on its card; an OutputError where it holds another policy, other errors as of `export_run`.
     """
     made = require_whole(folder)
     wanted = replace(_policy(run, run.load_agent(), config, source), fingerprint=made.fingerprint)
@@ -232,13 +215,9 @@ def _frame_rate(config: ExperimentConfig, demos: tuple[str, dict[str, Any]] | No
 
 
 def _camera(run: Run, config: ExperimentConfig, known: Sequence[str], demos: tuple[str, dict[str, Any]] | None) -> str:
-    """LeRobot's name of the camera a run looks at: `data.camera`, else the only one of its demonstrations.
-
-    Where the demonstrations are no longer there it is that of the run, or of our own data sets: the last one `known`.
-
-    Raises:
-        ConfigError: there are several.
-        DataError: there is no such camera.
+    """LeRobot's name of the camera a run looks at: `data.camera`, else the only one of its demonstrations; a
+    ConfigError for several. Where these are no longer there it is that of the run, or of our data sets: the last one
+    `known`.
     """
     names, where, otherwise = camera_list(config.data.camera), run.name, known[-1]
     if demos is not None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl.config import BlocksConfig, EnvConfig, ExperimentConfig
-from playslot_rl.runtime.threads import available_cores, set_threads
+from playslot_rl.runtime.threads import available_cores, set_threads, tune_allocator
 from playslot_rl.visualization import document
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ Say = Callable[[str], None]
 def measure(sizes: Sizes, threads: int, quick: bool, say: Say) -> Figures:
     """For each case `unit` and the median of each variant in it, and `machine`; a RenderError without a GL backend."""
     from playslot_rl.envs import block_config
-    from playslot_rl.runtime.allocator import tune_allocator
     from playslot_rl.speed import cases
     from playslot_rl.speed.sets import render_seconds, set_rates
 

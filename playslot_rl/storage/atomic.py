@@ -41,8 +41,7 @@ def explain_write_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        known = None if isinstance(error, OutputError) else write_error(path, error)
-        if known is None:
+        if isinstance(error, OutputError) or (known := write_error(path, error)) is None:
             raise
         raise known from error
 
@@ -97,10 +96,7 @@ def is_open_at(handle: int, path: Path) -> bool:
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically; its folder is made if needed. What a process that was killed in here has left is written
-    over by the next one.
-
-    Raises:
-        OutputError: full disk or a folder that cannot be written; `path` keeps its old content.
+    over by the next one. After an OutputError `path` has its old content.
     """
     with explain_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)

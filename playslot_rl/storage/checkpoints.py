@@ -26,13 +26,7 @@ from playslot_rl.runtime.precision import native_bf16
 from playslot_rl.storage.atomic import read_json, write_json
 from playslot_rl.storage.folders import new_folder
 from playslot_rl.storage.resume import first_difference
-from playslot_rl.storage.tensors import (
-    load_modules,
-    load_tensors,
-    module_tensors,
-    save_tensors,
-    weights_fingerprint,
-)
+from playslot_rl.storage.tensors import load_modules, load_tensors, module_tensors, save_tensors, weights_fingerprint
 
 FORMAT = "playslot_rl.checkpoint/1"
 STAGES = ("slots", "dynamics", "policy")
@@ -48,12 +42,8 @@ def training_command(stage: str) -> str:
 
 @dataclass(frozen=True)
 class StageCheckpoint:
-    """A finished stage on disk.
-
-    Attributes:
-        config: `{"env": ..., "model": ..., STAGE: ...}`, the plain values it was trained with.
-        meta: how it was made: commit, data, parents, metrics, steps, seconds, command.
-        fingerprint: first 16 hex digits of the SHA-256 of its weights.
+    """A finished stage on disk: the plain values it was trained with, `{"env": ..., "model": ..., STAGE: ...}`; how it
+    was made; and the fingerprint of its weights, the first 16 hex digits of their SHA-256.
     """
 
     path: Path
@@ -87,10 +77,6 @@ class StageCheckpoint:
         Args:
             build: makes it anew.
             parts: the name that the whole network is stored under, or those of its attributes that are stored.
-            device: of the network.
-
-        Raises:
-            CheckpointError: missing, unexpected or misshapen tensors, or a file that is not the one that was saved.
         """
         with torch.random.fork_rng(devices=[]):
             network = build()
@@ -121,15 +107,10 @@ def save_stage(
 
     Args:
         modules: what to store, by name.
-        config: `{"env": ..., "model": ..., STAGE: ...}`, plain values.
+        config: as of a `StageCheckpoint`.
         data: fingerprints of the data sets, by role (`train`, `demos`).
         parents: fingerprints of the parents' weights, by stage.
-        metrics: final numbers.
-        seconds: wall-clock seconds of training.
         extra: more plain values for `meta.json` (`labelled_demos`, `demos`).
-
-    Raises:
-        OutputError: full disk, or a folder that cannot be written.
     """
     with new_folder(path, replace=True) as temporary:
         save_tensors(temporary / "weights.safetensors", module_tensors(modules))
@@ -153,10 +134,8 @@ def save_stage(
 
 
 def read_stage(path: Path, stage: str) -> StageCheckpoint:
-    """Read config and meta of a finished stage and check that its weights are the ones that were saved.
-
-    Raises:
-        CheckpointError: no checkpoint there, another stage or format, or a damaged file.
+    """A finished stage, without its weights; a CheckpointError where it is none, of another stage or format, or
+    damaged.
     """
     if not (path / "meta.json").is_file():
         raise CheckpointError(
@@ -180,10 +159,8 @@ def read_stage(path: Path, stage: str) -> StageCheckpoint:
 
 
 def load_weights(checkpoint: StageCheckpoint, modules: Mapping[str, nn.Module]) -> None:
-    """Load a finished stage into freshly built modules, in place.
-
-    Raises:
-        CheckpointError: missing, unexpected or misshapen tensors, or a file that is not the one that was saved.
+    """Load a finished stage into freshly built modules, in place; a CheckpointError where a tensor is missing,
+    unexpected or of another shape, or the file is not the one that was saved.
     """
     load_modules(modules, load_tensors(checkpoint.path / "weights.safetensors"), str(checkpoint.path))
     require_whole(checkpoint)
@@ -212,15 +189,8 @@ def require_parents(child: StageCheckpoint, parents: Mapping[str, StageCheckpoin
 
 
 def require_config(checkpoint: StageCheckpoint, wanted: Mapping[str, Any], typed: Callable[[str], str] = str) -> None:
-    """Check that the parts of a config in `wanted`, such as `{"model": {"savi": ...}}`, are those of a checkpoint.
-
-    Args:
-        checkpoint: a finished stage.
-        wanted: nested as in its config.
-        typed: see `first_difference`.
-
-    Raises:
-        CheckpointError: names the first key that differs.
+    """Check that the parts of a config in `wanted`, such as `{"model": {"savi": ...}}`, are those of a checkpoint; a
+    CheckpointError names the first key that differs, as `typed` (see `first_difference`).
     """
     stored, keys = flatten(checkpoint.config), flatten(wanted).keys()
     difference = first_difference({key: stored[key] for key in stored.keys() & keys}, wanted, typed)

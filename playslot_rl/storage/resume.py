@@ -35,11 +35,10 @@ _ABSENT = "nothing"
 
 @dataclass(frozen=True)
 class TrainingState:
-    """Where a stage stands.
+    """Where a stage stands: steps, wall-clock seconds spent on them over all processes, and the last validation's
+    numbers.
 
     Attributes:
-        seconds: wall-clock seconds spent on its steps, over all processes.
-        metrics: the last validation's numbers.
         best: those of the best validation, where a training stops early; else empty.
         stale: validations since then.
         planned: steps that it ends after, where the clock has changed them; 0 leaves those of its config.
@@ -59,11 +58,8 @@ def first_difference(
     """The first dotted key at which two nested configs differ: (key as it is typed, stored value, wanted value).
 
     A wanted precision of `auto` is equal to any that was stored. A key that came after what is stored counts as what
-    was computed without it (`playslot_rl.config.roles.was`).
-
-    Args:
-        stored, wanted: what is compared.
-        typed: from a key as it is stored to the full name under which it is typed.
+    was computed without it (`playslot_rl.config.roles.was`). `typed` makes of a key as it is stored the full name under
+    which it is typed.
     """
     right, known = flatten(wanted), earlier(ExperimentConfig)
     left = {**{key: known[typed(key)] for key in right if typed(key) in known}, **flatten(stored)}
@@ -113,11 +109,7 @@ class TrainingCheckpoints:
         average: Mapping[str, Tensor] | None = None,
     ) -> TrainingState:
         """Load the newest checkpoint into the modules, the optimiser and the average of the weights, if there is one; a
-        fresh `TrainingState` if there is no checkpoint.
-
-        Raises:
-            CheckpointError: the config differs from the stored one, or the checkpoint is damaged.
-            OutputError: a file stands where the folder should be.
+        fresh `TrainingState` if there is no checkpoint. A CheckpointError where its config is another or it is damaged.
         """
         newest = self._newest()
         if newest is None:
@@ -142,9 +134,7 @@ class TrainingCheckpoints:
         return final
 
     def _newest(self) -> tuple[Path, dict[str, Any]] | None:
-        """The newest checkpoint and its `state.json`, checked to belong to this run; None if there is none. Errors as
-        of `resume`.
-        """
+        """The newest checkpoint and its `state.json`, checked to belong to this run; None if there is none."""
         if self.folder.exists() and not self.folder.is_dir():
             raise OutputError(f"{self.folder} is a file, expected a folder of checkpoints: use another out=")
         # A killed process leaves its unfinished folder; that of one that is writing is left alone.

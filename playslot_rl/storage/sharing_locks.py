@@ -22,11 +22,9 @@ NAME: Final = "in_use.lock"
 
 
 def share(folder: Path) -> int | None:
-    """Take a folder into use; its last use is now.
-
-    Returns:
-        An open file that holds it until it is closed (`release_with`), -1 where the folder cannot be locked (a
-        read-only file system), or None where the folder is not there any more.
+    """Take a folder into use; its last use is now. Gives an open file that holds it until it is closed
+    (`release_with`), -1 where the folder cannot be locked (a read-only file system), or None where it is not there any
+    more.
     """
     path = folder / NAME
     try:

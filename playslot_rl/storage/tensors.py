@@ -128,3 +128,37 @@ def weights_fingerprint(path: Path) -> str:
     """First 16 hex digits of the SHA-256 of a weights file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
+def read_published(path: Path, key: str, network: str, cure: str) -> dict[str, Tensor]:
+    """Tensors by name of a `network` that others published: a `.safetensors` file, or a `.pth` as torchvision stores
+    them, of which tensors are read only, nothing is run. A CheckpointError, with the config's `key` and the `cure`,
+    where it is missing or damaged.
+    """
+    import pickle
+
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    try:
+        if path.suffix == ".safetensors":
+            return load(path.read_bytes())
+        state: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, ValueError, EOFError, SafetensorError, pickle.UnpicklingError) as error:
+        said = (str(error).splitlines() or [type(error).__name__])[0]  # an empty file says nothing
+        raise CheckpointError(
+            f"{key}={path}: got {said}, expected a file of {network}'s weights: check the path, or {cure}"
+        ) from error
+    return state
+
+
+def pick_published(
+    state: Mapping[str, Tensor], names: Mapping[str, str], shapes: Mapping[str, Tensor], where: str, cure: str
+) -> dict[str, Tensor]:
+    """The tensors a network of ours, with these shapes, takes; `names` are the published ones of each of ours. A
+    CheckpointError, with `where` (the key and the file) and the `cure`, where one is missing or of another shape.
+    """
+    wrong = sorted(old for own, old in names.items() if old not in state or state[old].shape != shapes[own].shape)
+    if wrong:
+        raise CheckpointError(f"{where}: got no tensor {wrong[0]} of its shape, expected another file: {cure}")
+    return {own: state[old] for own, old in names.items()}

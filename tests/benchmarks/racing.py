@@ -11,12 +11,12 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from statistics import median
 
+from ranks import launcher_variables
 from variants import Variant, build_step
 
-from playslot_rl.runtime.allocator import tune_allocator
 from playslot_rl.runtime.children import begin_worker, worker_context
-from playslot_rl.runtime.processes import free_port, launcher_variables, start
-from playslot_rl.runtime.threads import set_threads
+from playslot_rl.runtime.processes import free_port, start
+from playslot_rl.runtime.threads import set_threads, tune_allocator
 from playslot_rl.speed.cases import Sizes
 from playslot_rl.speed.steps import Step
 from playslot_rl.speed.timing import seconds

@@ -243,7 +243,7 @@ MOVED = {f"train-{stage}": f"playslot_rl/methods/playslot/{stage}.py" for stage 
 
 
 def listed(command: str) -> tuple[str, ...]:
-    return COMMANDS[command].keys
+    return COMMANDS[command].reads.split()
 
 
 @pytest.mark.parametrize("command", [name for name in COMMANDS if name != "doctor"])

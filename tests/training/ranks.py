@@ -30,11 +30,17 @@ def run_ranks(world: int, work: Callable[..., None], *arguments: Any) -> list[in
     return [process.exitcode or 0 for process in ranks]
 
 
+def launcher_variables(rank: int, world: int, port: int) -> dict[str, str]:
+    """The environment that torchrun gives process `rank` of `world` on one machine, which meet at `port`."""
+    numbers = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": world, "LOCAL_WORLD_SIZE": world, "MASTER_PORT": port}
+    return {"MASTER_ADDR": "127.0.0.1", **{name: str(number) for name, number in numbers.items()}}
+
+
 def _rank(rank: int, world: int, port: int, work: Callable[..., None], arguments: tuple[Any, ...]) -> None:
     import torch
 
     torch.set_num_threads(1)
-    os.environ |= processes.launcher_variables(rank, world, port)
+    os.environ |= launcher_variables(rank, world, port)
     try:
         processes.start("cpu")
         work(*arguments)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from ranks import log_of, run_ranks
+from ranks import launcher_variables, log_of, run_ranks
 from tiny_stages import DOUBLE, STAGES, in_double
 
 from playslot_rl.errors import CheckpointError, ConfigError, PeerError
@@ -91,7 +91,7 @@ def test_one_rank_has_what_all_of_them_claim() -> None:
 
 
 def test_more_processes_than_gpus_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in processes.launcher_variables(1, 3, 1).items():
+    for name, value in launcher_variables(1, 3, 1).items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)

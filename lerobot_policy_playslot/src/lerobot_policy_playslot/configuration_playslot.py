@@ -19,19 +19,8 @@ NOT_TRAINED_HERE = (
 @PreTrainedConfig.register_subclass(TYPE)
 @dataclass
 class PlaySlotConfig(PreTrainedConfig):
-    """A PlaySlot policy.
-
-    Attributes:
-        env: the task it was trained on, plain values of `playslot_rl.config.EnvConfig`.
-        model: sizes of its networks, plain values of `playslot_rl.config.ModelConfig`.
-        resize: resize frames of another size by area averaging; False refuses them.
-        stride, fps: it has to be shown one frame in so many of its demonstrations', so many a second (0: unknown).
-        fingerprint: first 16 hex digits of the SHA-256 of `model.safetensors`; empty for fresh weights.
-        source: where the weights came from.
-        actions: names and range of the actions in the robot's units; empty for [-1, 1].
-
-    Raises:
-        ValueError: unknown keys or values outside their range in `env` or `model`, or features that do not fit them.
+    """A PlaySlot policy, with the fields of `SharedPolicyConfig`, `env` and `model` as plain values. A ValueError for
+    unknown keys or values outside their range in these two, and for features that do not fit them.
     """
 
     env: dict[str, Any] = field(default_factory=lambda: to_dict(EnvConfig()))
@@ -62,11 +51,7 @@ class PlaySlotConfig(PreTrainedConfig):
         return SharedPolicyConfig.of(camera, {name: getattr(self, name) for name in OURS})
 
     def validate_features(self) -> None:
-        """Check that frames and actions have the sizes of `env`.
-
-        Raises:
-            ValueError: they have not.
-        """
+        """Check that frames and actions have the sizes of `env`, else a ValueError."""
         inputs, outputs = self.policy_config().features()
         for got, expected in ((self.input_features, inputs), (self.output_features, outputs)):
             for name, feature in expected.items():
@@ -83,11 +68,7 @@ class PlaySlotConfig(PreTrainedConfig):
     action_delta_indices = reward_delta_indices = observation_delta_indices
 
     def get_optimizer_preset(self) -> NoReturn:
-        """Refuse `lerobot-train` before it reads any data.
-
-        Raises:
-            NotImplementedError: always.
-        """
+        """Refuse `lerobot-train` before it reads any data."""
         raise NotImplementedError(NOT_TRAINED_HERE)
 
     get_scheduler_preset = get_optimizer_preset

@@ -32,11 +32,6 @@ class PlaySlotEnv(EnvConfig):
             frame in three acts at a third of the rate: three times as many.
         image_size: side of the square frames.
         quality: `fast` or `full`, as `render.quality` of the commands.
-        fps: agent steps a second, set from the task.
-
-    Raises:
-        ConfigError: there is no such task, or it has no simulator.
-        ValueError: a value outside its range.
     """
 
     task: str | None = "button_press"
@@ -72,12 +67,8 @@ class PlaySlotEnv(EnvConfig):
         return {"env": self.task_config(), "render": render}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """`n_envs` environments side by side, in processes of their own if asked for.
-
-        An environment that is done waits for the others without simulating; what it does then is not counted.
-
-        Returns:
-            {task: {0: the vector environment}}.
+        """`n_envs` environments side by side, in processes of their own if asked for, as {task: {0: environments}}. One
+        that is done waits for the others without simulating; what it does then is not counted.
         """
         make = freeze_after_episode_end(partial(LeRobotTask, **self.gym_kwargs))
         makers = [make for _ in range(n_envs)]

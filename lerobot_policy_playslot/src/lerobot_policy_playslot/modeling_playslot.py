@@ -18,11 +18,8 @@ class PlaySlotPolicy(PreTrainedPolicy):
     """World model, latent policy and action decoder.
 
     The policy remembers: it carries SAVi's recurrent state from one `select_action` to the next, one row for each
-    environment. `reset` forgets it, and has to be called before new episodes, as LeRobot's programs do.
-
-    Args:
-        config: sizes.
-        kwargs: what LeRobot's factory passes to every policy (`dataset_stats`, `dataset_meta`); not used.
+    environment. `reset` forgets it, and has to be called before new episodes, as LeRobot's programs do. What LeRobot's
+    factory passes besides (`dataset_stats`, `dataset_meta`) is not used.
     """
 
     config_class = PlaySlotConfig
@@ -41,14 +38,9 @@ class PlaySlotPolicy(PreTrainedPolicy):
         self._loop.reset()
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Actions (B, A) in [-1, 1] for the present frames; LeRobot's postprocessor gives them in the robot's units.
-
-        Args:
-            batch: the policy's camera, float (B, 3, H, W) in [0, 1]; other entries are not looked at.
-            kwargs: not used.
-
-        Raises:
-            ValueError: no such camera, frames of another shape, or another number of environments without a `reset`.
+        """Actions (B, A) in [-1, 1] for the frames of the policy's camera, float (B, 3, H, W) in [0, 1]; LeRobot's
+        postprocessor gives them in the robot's units. A ValueError where there is no such camera, for frames of another
+        shape, and for another number of environments without a `reset`.
         """
         del kwargs
         camera = self.policy_config.camera
@@ -62,36 +54,19 @@ class PlaySlotPolicy(PreTrainedPolicy):
         return self._loop.act(batch[camera], camera)
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """The next action as a chunk of one, (B, 1, A). It is an agent step: the frames are remembered.
-
-        Raises:
-            ValueError: see `select_action`.
-        """
+        """The next action as a chunk of one, (B, 1, A). It is an agent step: the frames are remembered."""
         return self.select_action(batch, **kwargs)[:, None]
 
     def forward(self, batch: dict[str, Tensor]) -> NoReturn:
-        """Refuse to train.
-
-        Raises:
-            NotImplementedError: always; `lerobot-train` is refused before, by the config.
-        """
+        """Refuse to train; `lerobot-train` is refused before, by the config."""
         raise NotImplementedError(NOT_TRAINED_HERE)
 
     def get_optim_params(self) -> NoReturn:
-        """Refuse to train.
-
-        Raises:
-            NotImplementedError: always.
-        """
         raise NotImplementedError(NOT_TRAINED_HERE)
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        """Write weights, then the config with their fingerprint.
-
-        Raises:
-            NotImplementedError: a gathered `state_dict` is given, as sharded training does.
-            OutputError: full disk.
-        """
+        """Write weights, then the config with their fingerprint; a gathered `state_dict`, as of sharded training, is
+        refused."""
         if state_dict is not None:
             raise NotImplementedError(NOT_TRAINED_HERE)
         self.config.fingerprint = write_weights(self.agent, save_directory / WEIGHTS)
@@ -101,11 +76,7 @@ class PlaySlotPolicy(PreTrainedPolicy):
     def _load_as_safetensor(
         cls, model: PlaySlotPolicy, model_file: str, map_location: str, strict: bool
     ) -> PlaySlotPolicy:
-        """Load the weights, every one of them, whatever `strict` says.
-
-        Raises:
-            CheckpointError: missing, unexpected or misshapen tensors, or a file that is not the config's.
-        """
+        """Load the weights, every one of them, whatever `strict` says, else a CheckpointError."""
         del strict
         load_weights(model.agent, Path(model_file), model.policy_config)
         model.to(map_location)

@@ -13,11 +13,8 @@ from playslot_rl.sharing.folder import make_processors
 def make_playslot_pre_post_processors(
     config: PlaySlotConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
 ) -> tuple[Any, Any]:
-    """Fresh pipelines; see `playslot_rl.sharing.folder.make_processors`.
-
-    Args:
-        config: for its device, and for the range of the actions.
-        dataset_stats: not used: the range is that of the data which the policy was trained on.
+    """Fresh pipelines; see `playslot_rl.sharing.folder.make_processors`. The range of the actions is that of the data
+    which the policy was trained on, not of `dataset_stats`.
     """
     del dataset_stats
     return make_processors(str(config.device), config.actions)

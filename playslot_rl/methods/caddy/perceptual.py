@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.storage.published import pick_published, read_published
+from playslot_rl.storage.tensors import pick_published, read_published
 
 KEY = "baselines.caddy.perceptual"
 

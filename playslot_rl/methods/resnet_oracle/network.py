@@ -27,7 +27,7 @@ from playslot_rl.frames import normalise
 from playslot_rl.methods.resnet_oracle.method import NAME
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.runs import Run
-from playslot_rl.storage.published import pick_published, read_published
+from playslot_rl.storage.tensors import pick_published, read_published
 from playslot_rl.world_model import oracle_module
 
 WIDTH = 512
