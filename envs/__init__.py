@@ -121,14 +121,8 @@ def task_config(env: EnvConfig | str | None = None) -> EnvConfig:
 
 
 def make_env(env: EnvConfig | str | None = None, render: RenderConfig | None = None) -> gym.Env[Any, Any]:
-    """Make a task as a Gymnasium environment without wrappers, so that `expert_action()` can be called on it.
-
-    Observations: `keys.PIXELS` uint8 (H, W, 3), `keys.STATE` float32 (S,); actions float32 (A,) in [-1, 1];
-    `info["success"]: bool` from `reset` and `step`.
-
-    Raises:
-        ConfigError: unknown environment name.
-        RenderError: there is no working GL backend.
+    """Make a task (`playslot_rl.envs.pixel_task.PixelTask`) as a Gymnasium environment without wrappers, so that
+    `expert_action()` can be called on it; a RenderError where there is no working GL backend.
     """
     env = task_config(env)
     name = gym_id(env.name)
@@ -161,12 +155,9 @@ def task_metadata(env: EnvConfig) -> dict[str, Any]:
 
 
 def make_torchrl_env(env: EnvConfig | str | None = None, render: RenderConfig | None = None) -> EnvBase:
-    """Make a task (`make_env`) for TorchRL.
-
-    Returns:
-        Environment with batch size () that reads `keys.ACTION` float32 (A,) and writes `keys.PIXELS` uint8 (3, H, W),
-        `keys.STATE` float32 (S,), `keys.SUCCESS` bool (1,), reward, done, terminated and truncated. `set_seed(s)`
-        makes `s` the seed of the next episode; later resets draw theirs from the environment's generator.
+    """Make a task (`make_env`) for TorchRL: batch size (), reads `keys.ACTION` float32 (A,) and writes `keys.PIXELS`
+    uint8 (3, H, W), `keys.STATE` float32 (S,), `keys.SUCCESS` bool (1,), reward, done, terminated and truncated.
+    `set_seed(s)` makes `s` the seed of the next episode; later resets draw theirs from the environment's generator.
     """
     task = make_env(env, render)  # before torchrl, which imports mujoco too
     from playslot_rl.envs.torchrl import TensorView, wrap

@@ -90,10 +90,8 @@ def generate(seeds: Iterable[int], steps: int, env: EnvConfig) -> Clips:
 
     Each object starts at a place drawn uniformly from those where it lies inside the frame, and with a random move. At
     each step it draws a new move with probability `env.grid.change` (uniformly from all five), else it keeps the last
-    one. A move that would leave the frame is reversed. Later objects occlude earlier ones.
-
-    Raises:
-        ConfigError: a shape is larger than the frame.
+    one. A move that would leave the frame is reversed. Later objects occlude earlier ones. A ConfigError where a shape
+    is larger than the frame.
 
     Examples:
         >>> clips = generate([3, 4], 5, EnvConfig(name="grid_shapes"))

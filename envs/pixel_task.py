@@ -54,13 +54,8 @@ class PixelTask(gym.Env[Observation, Action]):
     of the same action; `info["success"]` says whether any of them solved the task. Success does not terminate: clips
     have a fixed length, `max_steps`.
 
-    Attributes:
-        draw_steps: False makes `step` return the last frame that was drawn instead of a new one, for controllers that
-            do not look at it: rendering is most of a step's time. `reset` always draws, unless `draw_resets` is False.
-
-    Raises:
-        ConfigError: `env.action_dim` is not 4.
-        RenderError: there is no working GL backend.
+    `draw_steps` False makes `step` return the last frame that was drawn instead of a new one, for controllers that do
+    not look at it: rendering is most of a step's time. `reset` always draws, unless `draw_resets` is False.
     """
 
     _simulation: Any  # MuJoCo's `model` and `data`, and `close`; made by the subclass, as is the next one
@@ -160,11 +155,8 @@ class PixelTask(gym.Env[Observation, Action]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start the episode of a seed; None draws one from the environment's generator.
-
-        Returns:
-            The first observation and `{"success": bool}`: True for an episode that starts solved, which only random
-            warm-up steps can make.
+        """Start the episode of a seed; None draws one from the environment's generator. `{"success": True}` is an
+        episode that starts solved, which only random warm-up steps can make.
         """
         del options
         self.open_renderer()
@@ -178,10 +170,8 @@ class PixelTask(gym.Env[Observation, Action]):
         return self._observe(self.draw_resets), {"success": self._solved()}
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One agent step of an action (4,), clipped to [-1, 1].
-
-        Raises:
-            ValueError: an action of another shape, or not finite.
+        """One agent step of an action (4,), clipped to [-1, 1]; a ValueError where it is of another shape, or not
+        finite.
         """
         action = np.asarray(action, np.float32)
         if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():

@@ -46,10 +46,8 @@ def import_mujoco() -> Any:
 
     MuJoCo reads `MUJOCO_GL` once, when it is first imported, and torchrl.envs imports it too. On Linux the variable is
     set to `egl` where it is not set, with or without a display, so that every machine and every worker process draws by
-    the same path; where mujoco was imported before that, its choice of context is replaced.
-
-    Raises:
-        RenderError: mujoco cannot be imported with the backend asked for.
+    the same path; where mujoco was imported before that, its choice of context is replaced. A RenderError where that
+    backend does not work.
     """
     linux = sys.platform.startswith("linux")
     imported_before = "mujoco" in sys.modules
@@ -114,14 +112,9 @@ def box_mean(frame: npt.NDArray[np.uint8], factor: int) -> npt.NDArray[np.uint8]
 
 
 class FrameRenderer:
-    """Draws the scene of one MuJoCo model.
-
-    Args:
-        camera: the viewpoint; or the name of a camera of the model that is at rest in the world.
-        still: parts that never move, of which `fast` draws only what a fixed camera can see.
-
-    Raises:
-        RenderError: there is no working GL backend.
+    """Draws the scene of one MuJoCo model from a viewpoint, or a camera of the model, by its name, that is at rest in
+    the world; of `still` parts, which never move, `fast` draws only what it can see. A RenderError without a GL
+    backend.
     """
 
     def __init__(

@@ -47,11 +47,10 @@ Array = npt.NDArray[Any] | Tensor
 
 
 def load(run: str | Path | Run = "pretrained", device: str = "", seed: int = 0) -> PlaySlot:
-    """Load a run folder, or the world model that ships with the package.
+    """Load a run folder, an exported policy, or a model that ships with the package, `pretrained/ENV` (`pretrained` is
+    ButtonPress's). Without a finished `train-policy` it cannot `act`.
 
     Args:
-        run: folder of a run, of an exported policy, or `pretrained/ENV` (`pretrained` is ButtonPress's). Without a
-            finished `train-policy` the model cannot `act`.
         device: torch device; empty means a GPU if there is one.
         seed: of sampled initial slots (only models with `initial: gaussian` draw any).
 
@@ -84,13 +83,9 @@ def load(run: str | Path | Run = "pretrained", device: str = "", seed: int = 0) 
 
 
 class PlaySlot:
-    """A world model, maybe with an agent, behind five methods.
-
-    Args:
-        agent: the agent of that world model; without one `act` is refused.
-        seed: of sampled initial slots; equal calls give equal results.
-        resize: whether frames of another size are resized by area averaging, as those of the training were
-            (`data.resize`), or refused.
+    """A world model, maybe with its agent, without which `act` is refused. Equal calls give equal results, by the
+    `seed` of sampled initial slots. Frames of another size are refused, or with `resize` resized by area averaging, as
+    those of the training were (`data.resize`).
     """
 
     def __init__(
@@ -121,14 +116,12 @@ class PlaySlot:
     def from_pretrained(
         cls, name: str | Path, device: str = "", revision: str = "", token: str | None = None, seed: int = 0
     ) -> PlaySlot:
-        """Load a policy that `playslot export` or `save_pretrained` wrote, from a folder or from the Hugging Face Hub.
+        """Load a policy that `playslot export` or `save_pretrained` wrote, from a folder or, where there is none of
+        that name, `user/name` on the Hugging Face Hub; `device` and `seed` are as of `load`.
 
         Args:
-            name: a folder, or `user/name` on the Hub where there is no such folder.
-            device: torch device; empty means a GPU if there is one.
             revision: branch, tag or commit on the Hub; empty means main.
             token: None takes HF_TOKEN or what `hf auth login` stored; not needed for public models.
-            seed: see `load`.
 
         Raises:
             CheckpointError: the folder is not whole, its files do not belong together, or it is no PlaySlot policy.
@@ -152,11 +145,8 @@ class PlaySlot:
         """Write the policy as a new folder that LeRobot loads (`playslot_rl.sharing.folder`).
 
         What a loaded policy says of its origin is written again; of one that was just trained nothing is known here:
-        `playslot export` reads it from the run, with the results for the card.
-
-        Raises:
-            CheckpointError: the model has no policy.
-            OutputError: `folder` holds something, or cannot be written.
+        `playslot export` reads it from the run, with the results for the card. A CheckpointError where the model has no
+        policy, an OutputError where the folder cannot be written.
         """
         from dataclasses import replace
 
@@ -164,12 +154,9 @@ class PlaySlot:
         from playslot_rl.sharing.folder import SharedPolicyConfig, save_pretrained
         from playslot_rl.sharing.run import versions
 
-        if self.agent is None:
-            raise CheckpointError(
-                "save_pretrained: got a world model without a policy; run `playslot train-policy` and load that run"
-            )
+        agent = self._require_agent("save_pretrained")
         require_type(folder, "folder", str, PathLike, expected="the folder to write")
-        path, agent = Path(folder), self.agent
+        path = Path(folder)
         known = self._policy or SharedPolicyConfig(resize=self._resize)
         source = {**known.source, "versions": versions()}
         config = replace(known, env=agent.world_model.env, model=agent.world_model.config, source=source)
@@ -177,11 +164,8 @@ class PlaySlot:
 
     @torch.no_grad()
     def parse(self, frames: Array) -> Tensor:
-        """Slots ([B,] [T,] N, D) of frames ([B,] [T,] H, W, 3) or ([B,] [T,] 3, H, W); each clip starts an episode.
-
-        Raises:
-            ValueError: other shapes, another frame size than the model's where its training did not resize either, or
-                floats outside [0, 1].
+        """Slots ([B,] [T,] N, D) of frames ([B,] [T,] H, W, 3) or ([B,] [T,] 3, H, W); each clip starts an episode. A
+        ValueError for other shapes, and floats outside [0, 1].
 
         Examples:
             >>> video = np.random.default_rng(0).integers(256, size=(5, 64, 64, 3), dtype=np.uint8)
@@ -200,10 +184,8 @@ class PlaySlot:
     @torch.no_grad()
     def infer_actions(self, slots: Array) -> LatentActions:
         """Latent actions between consecutive frames, from slots ([B,] T, N, D) as `parse` gives them, T at least 2: z,
-        its mean, prototype and variability ([B,] T-1, [N,] Z), code ([B,] T-1, [N]) and the quantiser's loss.
-
-        Raises:
-            ValueError: other shapes, or a model of mode `ground_truth`, which infers none.
+        its mean, prototype and variability ([B,] T-1, [N,] Z), code ([B,] T-1, [N]) and the quantiser's loss. A
+        ValueError for other shapes, and for a model of mode `ground_truth`, which infers none.
 
         Examples:
             >>> model = PlaySlot.untrained()
@@ -228,9 +210,6 @@ class PlaySlot:
         Args:
             actions: latent actions, float ([B,] P, [N,] Z), or prototypes by number, integer ([B,] P, [N]); of a model
                 of mode `ground_truth` real actions, in the units of the data set.
-
-        Raises:
-            ValueError: other shapes, unequal batches, or a prototype that does not exist.
 
         Examples:
             >>> model = PlaySlot.untrained()
@@ -270,14 +249,10 @@ class PlaySlot:
     @torch.no_grad()
     def act(self, frame: Array) -> npt.NDArray[np.float32]:
         """The real action (A,) for an observed frame, (H, W, 3) or (3, H, W), in the units of the demonstrations' data
-        set; of our simulators, in [-1, 1].
+        set; of our simulators, in [-1, 1]. A CheckpointError where the model has no policy.
 
         The frames of an episode are given one after the other: SAVi's recurrent state is carried from call to call, so
         `reset` before each episode.
-
-        Raises:
-            CheckpointError: the model has no policy.
-            ValueError: not one frame of the model's size.
 
         Examples:
             >>> model = PlaySlot.untrained()
@@ -285,10 +260,8 @@ class PlaySlot:
             >>> [model.act(torch.rand(3, 64, 64)).shape for _ in range(2)]
             [(4,), (4,)]
         """
-        if self._loop is None:
-            raise CheckpointError(
-                "act: got a world model without a policy; run `playslot train-policy` and load that run"
-            )
+        self._require_agent("act")
+        assert self._loop is not None
         pixels = self._frames(frame)
         if pixels.ndim != 3:
             raise ValueError(f"frame: got shape {tuple(pixels.shape)}, expected one frame, (H, W, 3) or (3, H, W)")
@@ -301,6 +274,13 @@ class PlaySlot:
         """Forget the episode: the next frame `act` gets is a first one."""
         if self._loop is not None:
             self._loop.reset()
+
+    def _require_agent(self, method: str) -> Agent:
+        if self.agent is None:
+            raise CheckpointError(
+                f"{method}: got a world model without a policy; run `playslot train-policy` and load that run"
+            )
+        return self.agent
 
     def imagination(
         self, batch_size: Sequence[int] = (), horizon: int = 0, reward: Reward | None = None
@@ -324,20 +304,13 @@ class PlaySlot:
 
     def simulation(self, render: RenderConfig | None = None) -> TransformedEnv:
         """The simulated task with slots as observation and latent actions as action (`playslot_rl.acting.simulation`),
-        drawn as `render` says: use what the training data were drawn with.
-
-        Raises:
-            CheckpointError: the model has no action decoder.
-            ConfigError: an environment without a simulator.
+        drawn as `render` says: use what the training data were drawn with. A CheckpointError where the model has no
+        policy, a ConfigError where the task has no simulator.
         """
-        if self.agent is None:
-            raise CheckpointError(
-                "simulation: got a world model without a policy; run `playslot train-policy` and load that run"
-            )
+        decoder, env = self._require_agent("simulation").action_decoder, self.world_model.env
         from playslot_rl.acting.simulation import make_simulation_env
 
         require_type(render, "render", RenderConfig, type(None), expected="a RenderConfig, or None")
-        env, decoder = self.world_model.env, self.agent.action_decoder
         return make_simulation_env(env, render or RenderConfig(), self.world_model, decoder, self._generator())
 
     def _generator(self) -> torch.Generator:

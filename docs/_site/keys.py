@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 from collections.abc import Iterator
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, Literal, get_args, get_origin
 
@@ -56,13 +57,9 @@ def own(cls: type) -> dict[str, dataclasses.Field[Any]]:
     if not dataclasses.is_dataclass(cls):
         return {}
     bases = [base for base in cls.__mro__[1:] if dataclasses.is_dataclass(base)]
-    inherited = {field.name for base in bases for field in dataclasses.fields(base)}
-    hints = key_help.fields_of(cls)
-    return {
-        field.name: field
-        for field in dataclasses.fields(cls)
-        if field.name not in inherited and not dataclasses.is_dataclass(hints[field.name])
-    }
+    inherited, hints = {field.name for base in bases for field in dataclasses.fields(base)}, key_help.fields_of(cls)
+    fields = [field for field in dataclasses.fields(cls) if field.name not in inherited]
+    return {field.name: field for field in fields if not dataclasses.is_dataclass(hints[field.name])}
 
 
 def rows(cls: type, groups: list[str], compact: Any) -> Iterator[str]:
@@ -70,7 +67,7 @@ def rows(cls: type, groups: list[str], compact: Any) -> Iterator[str]:
     fields = [field for field in own(cls).values() if groups[0] + field.name not in GROUPS]
     changed = {}
     if len(groups) == 1:
-        here = {field.name: shown(value(compact, groups[0] + field.name)) for field in fields}
+        here = {field.name: shown(attrgetter(groups[0] + field.name)(compact)) for field in fields}
         changed = {field.name: here[field.name] for field in fields if here[field.name] != shown(field.default)}
     yield "| key | default | `compact` | meaning |" if changed else "| key | default | meaning |"
     yield "|---|---|---|---|" if changed else "|---|---|---|"
@@ -95,13 +92,6 @@ def heading(groups: list[str]) -> str:
     if len(names) < 4:
         return ", ".join(names)
     return f"{names[0]} and {len(names) - 1} more\n\nIn {', '.join(names)}."
-
-
-def value(config: Any, key: str) -> Any:
-    """Of a key, by its full name."""
-    for name in key.split("."):
-        config = getattr(config, name)
-    return config
 
 
 def shown(default: Any) -> str:

@@ -34,11 +34,7 @@ def tables() -> dict[str, Any]:
 
 
 def numbers(tables: dict[str, Any], task: str) -> dict[str, Any]:
-    """Percentages of a task by method, protocol, videos and labels, and its two references.
-
-    Raises:
-        ValueError: the table has no rows of that task.
-    """
+    """Percentages of a task by method, protocol, videos and labels, and its two references."""
     table = tables["videos_and_labels"]
     cells = {}
     for name, videos, labels, *values in table["rows"]:

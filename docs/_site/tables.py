@@ -24,11 +24,7 @@ Table = dict[str, Any]
 
 
 def load_tables(folder: Path) -> dict[str, Table]:
-    """All tables of all files, by name. Numbers keep the digits that the file gives them.
-
-    Raises:
-        ValueError: two tables of one name, or a row that is not as wide as the columns.
-    """
+    """All tables of all files, by name. Numbers keep the digits that the file gives them."""
     tables: dict[str, Table] = {}
     for path in sorted(folder.glob("*.json")):
         read = json.loads(path.read_text(), parse_float=Decimal, parse_int=Decimal)
@@ -43,11 +39,7 @@ def load_tables(folder: Path) -> dict[str, Table]:
 
 
 def shown(name: str, tables: dict[str, Table]) -> str:
-    """What stands between the markers of NAME, NAME/VIEW or NAME/made.
-
-    Raises:
-        KeyError: there is no such table or view.
-    """
+    """What stands between the markers of NAME, NAME/VIEW or NAME/made."""
     table, _, view = name.partition("/")
     if view == MADE:
         return made(tables[table])
