@@ -22,7 +22,7 @@ def is_remote(root: str | Path) -> bool:
 
 
 class DataRoot(NamedTuple):
-    """One data set of `data.root`, as it was written, and how often windows are drawn from it, relative to the others."""
+    """One data set of `data.root`, as it was written; windows are drawn from it so often, relative to the others."""
 
     path: str
     weight: float | None
