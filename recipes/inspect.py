@@ -16,6 +16,7 @@ from playslot_rl.errors import DataError
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import run_of_pretrained, run_to_read, run_to_write
 from playslot_rl.runtime.devices import open_device
+from playslot_rl.storage.atomic import write_json
 
 if TYPE_CHECKING:
     from playslot_rl.data.source import EpisodeFrames
@@ -27,8 +28,8 @@ def main(config: ExperimentConfig) -> None:
 
     A pretrained model (`run=pretrained/ENV`) is made a run in `out` first, as `evaluate` does.
     """
-    from playslot_rl.evaluation.card import DEFAULT_EPISODES, FOLDER, card_json, make_card, write_card
-    from playslot_rl.evaluation.card_verdict import concluded
+    from playslot_rl.evaluation.card import DEFAULT_EPISODES, FOLDER, RESULT, card_json, make_card
+    from playslot_rl.evaluation.card_lines import concluded
     from playslot_rl.visualization.card_page import card_document
     from playslot_rl.visualization.document import write_document
 
@@ -39,7 +40,7 @@ def main(config: ExperimentConfig) -> None:
     out = (run_of_pretrained(config, run) if run.pretrained else run).folder
     result = card_json(card, source, facts(config, run), began)
     page = write_document(card_document(result, card, model), out / FOLDER, "inspect")
-    write_card(out, result)
+    write_json(out / RESULT, result)
     print(f"{describe(result)}\nreport card: {page}\n{concluded(result)}", flush=True)
 
 
@@ -86,7 +87,7 @@ def main_if_needed(config: ExperimentConfig) -> None:
     moves) that is said, and the rest of a pipeline goes on. The last line is the verdict in every case.
     """
     from playslot_rl.evaluation.card import RESULT
-    from playslot_rl.evaluation.card_verdict import Conclusion, concluded
+    from playslot_rl.evaluation.card_lines import Conclusion, concluded
 
     run = Run.open(config.run)
     stored = run.result(RESULT, facts(config, run))

@@ -30,12 +30,12 @@ def main(config: ExperimentConfig, run: Run) -> None:
 
 def main_if_needed(config: ExperimentConfig, run: Run) -> None:
     """As `main`, unless this world model was scored on these clips before."""
-    from playslot_rl.evaluation.objects import DEFAULT_CLIPS, RESULT, run_fingerprints
+    from playslot_rl.evaluation.objects import DEFAULT_CLIPS, RESULT
 
     facts = {
         "episodes": config.episodes or DEFAULT_CLIPS,
         "seed": config.seed,
-        "fingerprints": run_fingerprints(run),
+        "fingerprints": {name: stage.fingerprint for name, stage in run.world_stages.items()},
     }
     stored = run.result(RESULT, facts)
     if stored is not None and (run.folder / "report.html").is_file():

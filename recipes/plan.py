@@ -29,7 +29,7 @@ EPISODES = 20
 
 def main(config: ExperimentConfig) -> None:
     """Plan towards both kinds of goals, beside random actions and the latent policy, and print the table."""
-    from playslot_rl.acting.planners.size import search_size
+    from playslot_rl.acting.planners import search_size
 
     run = run_with_policy(config, "plan")
     gym_id(config.env.name)  # refuses what has no simulator

@@ -8,7 +8,7 @@ Shapes: n episodes side by side, T agent steps, N slots, D slot width, A action 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
 import numpy as np
@@ -71,6 +71,14 @@ class Actor(TensorDictModuleBase):
     @abstractmethod
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """One agent step."""
+
+
+def put_rows(tensordict: TensorDictBase, rows: int | Tensor, found: Mapping[str, Tensor]) -> None:
+    """Renew some rows of a memory; its tensors are others' too, and stay as they are."""
+    for key, value in found.items():
+        whole = tensordict.get(key).clone()
+        whole[rows] = value.to(whole.device)
+        tensordict.set(key, whole)
 
 
 class SlotActor(Actor):

@@ -1,4 +1,5 @@
-"""The agent as an actor: closed loop (simulation), open loop (imagination), and its slot oracle.
+"""The agent as an actor: closed loop (simulation), open loop (imagination, or the expert's videos), and its slot
+oracle.
 
 Shapes: E episodes, T agent steps, N slots, D slot width, Z latent-action width, A action width, H W image height and
 width.
@@ -6,7 +7,7 @@ width.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,21 +16,23 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import PlannedActor, SlotActor
+from playslot_rl.acting.actor import ExpertActor, PlannedActor, SlotActor, put_rows
+from playslot_rl.acting.episodes import Moment, TaskPool, record
 from playslot_rl.acting.imagination import ImaginationEnv
+from playslot_rl.frames import normalise
 from playslot_rl.runs import Run
 from playslot_rl.world_model import Agent, action_decoder_module, latent_policy_module, oracle_module
 
 
 def playslot_actor(agent: Agent) -> SlotActor:
     """Observe, parse with SAVi's recurrent state, choose a latent action, decode it (paper, section "Learning
-    behaviours")."""
+    behaviours").
+    """
     heads = (latent_policy_module(agent.policy), action_decoder_module(agent.action_decoder))
     return SlotActor(agent.world_model.savi, *heads)
 
 
 def load_actor(run: Path, device: torch.device | str = "cpu") -> SlotActor:
-    """The actor of a run with a trained policy; a CheckpointError as of `Run.load_agent`."""
     return playslot_actor(Run.open(run).load_agent(device))
 
 
@@ -94,8 +97,51 @@ class ImaginationActor(PlannedActor):
         if bool(fresh.any()):
             imagined = imagine(self.agent, tensordict.select(keys.PIXELS)[fresh], self.steps, self._generator)
             found = {keys.PLANNED_ACTIONS: imagined.actions, keys.PREDICTED_SLOTS: imagined.slots}
-            for key, value in found.items():
-                whole = tensordict.get(key).clone()
-                whole[fresh] = value
-                tensordict.set(key, whole)
+            put_rows(tensordict, fresh, found)
         return super().forward(tensordict)
+
+
+class Performance(NamedTuple):
+    """Whole episodes of the expert: frames (n, T + 1, 3, H, W) uint8 [0, 255] and actions (n, T, A) in [-1, 1]."""
+
+    frames: Tensor
+    actions: Tensor
+
+
+def perform(pool: TaskPool, seeds: Sequence[int]) -> Performance:
+    """Film the scripted expert in episodes, none of which starts solved, to their last step: frames (E, T + 1, 3, H, W)
+    uint8 [0, 255] and actions (E, T, A) in [-1, 1].
+    """
+    actions = torch.zeros(len(seeds), pool.env.max_steps, pool.env.action_dim)
+
+    def note(moment: Moment) -> None:
+        if moment.seen is not None:
+            actions[list(moment.episodes), moment.step] = moment.seen[keys.ACTION].float().cpu()
+
+    frames, _ = record(pool, ExpertActor(), seeds, note)
+    return Performance(torch.from_numpy(frames).movedim(-1, -3), actions.clamp(-1, 1))
+
+
+class ReplayActor(PlannedActor):
+    """Executes what the latents of the expert's own videos decode to, decoded alone as in imagination, without looking.
+
+        S_0..S_T = SAVi(x_0..x_T),    z_t = InvDyn(S_t, S_{t+1}),    a_t = D_a(z_t)
+
+    Beside imagination, whose latents come from the policy on predicted slots, everything but the decoder is the truth
+    here: what fails is lost between a motion that was seen and the actions that made it.
+    """
+
+    def __init__(self, agent: Agent, performed: Callable[[Sequence[int]], Performance]) -> None:
+        env = agent.world_model.env
+        super().__init__(env.max_steps, env.action_dim)
+        self.agent, self.performed = agent, performed
+
+    @torch.no_grad()
+    def reset(self, seeds: Sequence[int]) -> TensorDict:
+        """Plan whole episodes; initial slots that are sampled depend on the first seed."""
+        memory, model = super().reset(seeds), self.agent.world_model
+        frames, actions = (part.to(self.device) for part in self.performed(seeds))
+        generator = torch.Generator(self.device).manual_seed(seeds[0])
+        slots, _ = model.savi(normalise(frames), generator=generator)
+        memory[keys.PLANNED_ACTIONS] = self.agent.action_decoder(model.inverse_dynamics(slots, actions).z)
+        return memory

@@ -21,10 +21,8 @@ from playslot_rl.frames import to_uint8
 class ClosedLoop:
     """An actor in evaluation mode, with its memory.
 
-    Args:
-        image_size: side of the frames that `act` takes; 0 takes them as they come.
-        resize: whether `act` resizes frames of another size, by area averaging as in training, or refuses them.
-        seed: of episodes that begin without one.
+    `act` takes frames of `image_size`, 0 for as they come, and with `resize` resizes others by area averaging as in
+    training, where it would refuse them. `seed` is that of episodes that begin without one.
     """
 
     def __init__(self, actor: Actor, image_size: int = 0, resize: bool = False, seed: int = 0) -> None:
@@ -37,10 +35,8 @@ class ClosedLoop:
 
     @torch.no_grad()
     def step(self, observation: TensorDictBase, rows: Sequence[int] | None = None) -> TensorDictBase:
-        """See the present observation, batch size [n], of episodes `rows` (all if None) that have begun, and choose.
-
-        Returns:
-            What the actor writes, batch size [n]: ACTION (n, A), its memory, and whatever it found on the way.
+        """See the present observation, batch size [n], of episodes `rows` (all if None) that have begun, and choose:
+        what the actor writes, batch size [n], is ACTION (n, A), its memory, and whatever it found on the way.
         """
         memory = self._memory
         if memory is None:
@@ -56,10 +52,8 @@ class ClosedLoop:
 
     def act(self, frames: Tensor, name: str = "frames") -> Tensor:
         """Actions (B, A) in [-1, 1] for the present frames (B, 3, H, W), float in [0, 1] or uint8 [0, 255], of all
-        episodes; rows keep their place until `reset`. `actor.executed` gives them in the robot's units.
-
-        Raises:
-            ValueError: another shape, or another number of episodes than at the last call.
+        episodes; rows keep their place until `reset`. `actor.executed` gives them in the robot's units. A ValueError
+        for another shape, or another number of episodes than at the last call.
         """
         pixels = self._fitted(frames, name).to(self.actor.device)
         if self._memory is not None and len(self._memory) != len(pixels):
@@ -73,7 +67,6 @@ class ClosedLoop:
         return actions.clamp(-1, 1)
 
     def _fitted(self, frames: Tensor, name: str) -> Tensor:
-        """Frames of the model's size."""
         side = self._side or frames.shape[-1]
         if frames.ndim != 4 or frames.shape[1] != 3:
             raise ValueError(f"{name}: got shape {tuple(frames.shape)}, expected (batch, 3, {side}, {side})")
@@ -89,7 +82,8 @@ class ClosedLoop:
 
 def resized(frames: Tensor, side: int) -> Tensor:
     """(..., 3, H, W) to uint8 (..., 3, side, side), by what the frames of the training went through, to the last digit
-    (floats are bytes divided by 255, as LeRobot gives them)."""
+    (floats are bytes divided by 255, as LeRobot gives them).
+    """
     from playslot_rl.data.frames import resize_frames
 
     pictures = to_uint8(frames)

@@ -35,17 +35,13 @@ class ImaginationEnv(ModelBasedEnvBase):
 
     A reset takes the first slots from SLOTS (..., N, D) in the tensordict it gets, else parses PIXELS (..., 3, H, W) in
     it, else asks `first_slots`, else parses a mid-grey frame (which is there so that the specs can be checked, not to
-    be learned from). PlaySlot has no reward model: without `reward` there is no reward, and a loss that reads one fails
-    where it would learn from zeros in silence.
+    be learned from). `generator` is that of sampled initial slots. PlaySlot has no reward model: without `reward`, of
+    the slots that a step leads to, there is no reward, and a loss that reads one fails where it would learn from zeros
+    in silence.
 
-    The histories are part of the state, so a rollout stores them at every step: `rollout.select(keys.SLOTS,
-    keys.LATENT_ACTION, ("next", keys.SLOTS))` keeps what is wanted.
-
-    Args:
-        horizon: steps after which an episode is truncated; 0 never does.
-        differentiable: keep the graph, for learning through imagination.
-        reward: of the slots that a step leads to.
-        generator: of sampled initial slots where a reset parses frames.
+    An episode is truncated after `horizon` steps, 0 never. `differentiable` keeps the graph, for learning through
+    imagination. The histories are part of the state, so a rollout stores them at every step:
+    `rollout.select(keys.SLOTS, keys.LATENT_ACTION, ("next", keys.SLOTS))` keeps what is wanted.
 
     Examples:
         >>> from playslot_rl.testing import tiny_agent
@@ -77,16 +73,11 @@ class ImaginationEnv(ModelBasedEnvBase):
             device=device,
             batch_size=torch.Size(batch_size),
         )
-        self.savi = world_model.savi
-        self.slot_shape = world_model.slot_shape
-        self.latent_shape = world_model.latent_shape
+        self.savi, self.image_size = world_model.savi, world_model.env.image_size
+        self.slot_shape, self.latent_shape = world_model.slot_shape, world_model.latent_shape
         self.context = world_model.config.predictor.context
-        self.image_size = world_model.env.image_size
-        self.first_slots = first_slots
-        self.horizon = horizon
-        self.differentiable = differentiable
-        self.generator = generator
-        self.reward = reward
+        self.first_slots, self.horizon, self.differentiable = first_slots, horizon, differentiable
+        self.generator, self.reward = generator, reward
         self._make_specs()
 
     def _make_specs(self) -> None:
@@ -115,12 +106,6 @@ class ImaginationEnv(ModelBasedEnvBase):
         self.done_spec = Composite(
             {name: flag.clone() for name in ("done", "terminated", "truncated")}, shape=batch, device=device
         )
-
-    def reset_from_slots(self, slots: Tensor) -> TensorDict:
-        """Start from parsed slots (..., N, D): shorthand for `reset` with SLOTS in the tensordict."""
-        batch = slots.shape[: slots.ndim - len(self.slot_shape)]
-        out: TensorDict = self.reset(TensorDict({keys.SLOTS: slots.to(self.device)}, batch, device=self.device))
-        return out
 
     def _reset(self, tensordict: TensorDictBase | None, **_: Any) -> TensorDictBase:
         batch = self.batch_size if tensordict is None else tensordict.batch_size
@@ -168,7 +153,12 @@ class ImaginationEnv(ModelBasedEnvBase):
         with torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled()):
             out: TensorDictBase = super()._step(tensordict)
             if self.reward is not None:
-                out.set("reward", _rewards(self.reward, out.get(keys.SLOTS)))
+                slots = out.get(keys.SLOTS)
+                got, expected = self.reward(slots), (*slots.shape[:-2], 1)
+                if got.shape != expected:
+                    seen = f"got shape {tuple(got.shape)} of slots {tuple(slots.shape)}"
+                    raise ValueError(f"reward: {seen}, expected {expected}")
+                out.set("reward", got)
         count = tensordict.get(keys.STEP_COUNT) + 1
         out.set(keys.STEP_COUNT, count)
         out.update(self._done(count, at=self.horizon or None))
@@ -187,20 +177,10 @@ class ImaginationEnv(ModelBasedEnvBase):
             self.generator.manual_seed(seed)
 
 
-def _rewards(reward: Reward, slots: Tensor) -> Tensor:
-    got, expected = reward(slots), (*slots.shape[:-2], 1)
-    if got.shape != expected:
-        raise ValueError(f"reward: got shape {tuple(got.shape)} of slots {tuple(slots.shape)}, expected {expected}")
-    return got
-
-
 def latent_actions(world_model: WorldModel, given: npt.NDArray[Any] | Tensor, n_slots: int | None = None) -> Tensor:
     """Latent actions ([B,] P, [N,] Z) of some steps, given as they are or as integer ([B,] P, [N]) numbers of
-    prototypes; `n_slots` is N, where it is not the world model's (`ImaginationSession.keep`).
-
-    Raises:
-        TypeError: no numbers.
-        ValueError: another shape, or a prototype that does not exist.
+    prototypes; `n_slots` is N, where it is not the world model's (`ImaginationSession.keep`). A TypeError for no
+    numbers, a ValueError for another shape, or a prototype that does not exist.
     """
     values = as_numbers(given, "actions", "latent actions as floats, or prototypes by number")
     values = values.to(module_device(world_model))
@@ -244,10 +224,8 @@ class ImaginationSession:
 
     def reset(self, *, frames: Tensor | None = None, slots: Tensor | None = None) -> Tensor:
         """Start B episodes from their first frames (B, 3, H, W), uint8 [0, 255] or float [0, 1], or from slots (B, N,
-        D), such as SAVi found in the middle of an episode; returns their slots.
-
-        Raises:
-            ValueError: neither or both are given, or another shape.
+        D), such as SAVi found in the middle of an episode; returns their slots. A ValueError where neither or both are
+        given, or another shape.
         """
         if (frames is None) == (slots is None):
             raise ValueError("reset: got frames and slots, or neither, expected one of them")
@@ -272,8 +250,8 @@ class ImaginationSession:
     @property
     def slots(self) -> Tensor:
         """Present slots (B, N, D)."""
-        out: Tensor = self._present()[keys.SLOTS].clone()
-        return out
+        slots: Tensor = self._present()[keys.SLOTS]
+        return slots.clone()
 
     def restore(self, state: TensorDictBase) -> None:
         """Go back to a `state` of a session of the same world model."""
@@ -285,10 +263,7 @@ class ImaginationSession:
 
     def put(self, slots: Tensor, *, forget: bool = False) -> None:
         """Put other slots (B, N, D) in the place of the present ones, as the newest frame that the predictor sees;
-        `forget` drops the earlier frames too, which another scene would contradict.
-
-        Raises:
-            ValueError: another shape.
+        `forget` drops the earlier frames too, which another scene would contradict. A ValueError for another shape.
         """
         state = self.state
         if slots.shape != state[keys.SLOTS].shape:
@@ -303,10 +278,8 @@ class ImaginationSession:
         self._state = state
 
     def keep(self, rows: Sequence[int]) -> None:
-        """Go on with some rows of the present slots only, in that order: the others have never been there.
-
-        Raises:
-            ValueError: none, one twice, or one that is not there.
+        """Go on with some rows of the present slots only, in that order: the others have never been there. A ValueError
+        for none, one twice, or one that is not there.
         """
         state = self.state
         n = state[keys.SLOTS].shape[1]
@@ -321,10 +294,7 @@ class ImaginationSession:
 
     def step(self, latents: Tensor | None = None, *, prototypes: Sequence[int] | Tensor | None = None) -> Tensor:
         """One step of all episodes by latent actions (B, [N,] Z), or by numbers of prototypes (B, [N]), to slots (B, N,
-        D).
-
-        Raises:
-            ValueError: neither or both are given, another shape, or no such prototype.
+        D). A ValueError where neither or both are given, another shape, or no such prototype.
         """
         if (latents is None) == (prototypes is None):
             raise ValueError("step: got latents and prototypes, or neither, expected one of them")

@@ -14,32 +14,16 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import Actor
+from playslot_rl.acting.actor import Actor, put_rows
 from playslot_rl.acting.agent import imagine
-from playslot_rl.acting.planners import Cost, Planner, Search, latent_statistics, shifted
+from playslot_rl.acting.planners import Cost, Planner, Search, SearchSize, latent_statistics, shifted
 from playslot_rl.acting.planners.costs import GoalCost, NearProposal, goal_distance, parse_goal
-from playslot_rl.acting.planners.size import SearchSize
 from playslot_rl.config.planning import PlanConfig
 from playslot_rl.seeds.draws import step_generator
 from playslot_rl.world_model import Agent, action_decoder_module, frame_parser_module
 
 Goals = Callable[[Sequence[int]], Tensor]
 """Seeds of n episodes to their goal images (n, 3, H, W) uint8 [0, 255]."""
-
-_MEMORY = (
-    keys.SLOT_STATE,
-    keys.SLOT_AGE,
-    keys.SLOT_HISTORY,
-    keys.STEP_COUNT,
-    keys.EPISODE_SEED,
-    keys.GOAL_PIXELS,
-    keys.GOAL_SLOTS,
-    keys.PLANNED_LATENTS,
-    keys.PREDICTED_SLOTS,
-    keys.PLAN_COST,
-    keys.PROPOSAL_COST,
-    keys.PLAN_SECONDS,
-)
 
 
 class PlanningActor(Actor):
@@ -64,30 +48,32 @@ class PlanningActor(Actor):
         policy: bool = False,
         seed: int = 0,
     ) -> None:
-        super().__init__(_MEMORY)
+        model, one = agent.world_model, (1,)
+        slots, seen = model.slot_shape, min(plan.history, model.config.predictor.context)
+        zeros = {
+            keys.SLOT_STATE: slots,
+            keys.SLOT_HISTORY: (seen, *slots),
+            keys.GOAL_SLOTS: slots,
+            keys.PLANNED_LATENTS: (size.horizon, *model.latent_shape),
+            keys.PREDICTED_SLOTS: (size.horizon + 1, *slots),
+            **dict.fromkeys((keys.PLAN_COST, keys.PROPOSAL_COST, keys.PLAN_SECONDS), one),
+        }
+        super().__init__((*zeros, keys.SLOT_AGE, keys.STEP_COUNT, keys.EPISODE_SEED, keys.GOAL_PIXELS))
         self.agent, self.planner, self.config, self.size = agent, planner, plan, size
-        self.goals, self.policy, self.seed = goals, policy, seed
+        self.goals, self.policy, self.seed, self.frames_seen, self._zeros = goals, policy, seed, seen, zeros
         self.whitening = latent_statistics(agent)
-        self.parser = frame_parser_module(agent.world_model.savi)
+        self.parser = frame_parser_module(model.savi)
         self.decoder = action_decoder_module(agent.action_decoder)
-        self.frames_seen = min(plan.history, agent.world_model.config.predictor.context)
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
-        """Nothing seen and nothing planned; the goals are there."""
         memory, n = super().reset(seeds), len(seeds)
-        model, h = self.agent.world_model, self.size.horizon
         self.parser.module.generator = torch.Generator(self.device).manual_seed(seeds[0])
-        memory[keys.SLOT_STATE] = torch.zeros(n, *model.slot_shape)
-        memory[keys.SLOT_AGE] = torch.zeros(n, 1, dtype=torch.long)
-        memory[keys.SLOT_HISTORY] = torch.zeros(n, self.frames_seen, *model.slot_shape)
-        memory[keys.STEP_COUNT] = torch.zeros(n, 1, dtype=torch.long)
+        for key, shape in self._zeros.items():
+            memory[key] = torch.zeros(n, *shape)
+        for key in (keys.SLOT_AGE, keys.STEP_COUNT):
+            memory[key] = torch.zeros(n, 1, dtype=torch.long)
         memory[keys.EPISODE_SEED] = torch.tensor(seeds)[:, None]
         memory[keys.GOAL_PIXELS] = self.goals(seeds)
-        memory[keys.GOAL_SLOTS] = torch.zeros(n, *model.slot_shape)
-        memory[keys.PLANNED_LATENTS] = torch.zeros(n, h, *model.latent_shape)
-        memory[keys.PREDICTED_SLOTS] = torch.zeros(n, h + 1, *model.slot_shape)
-        for key in (keys.PLAN_COST, keys.PROPOSAL_COST, keys.PLAN_SECONDS):
-            memory[key] = torch.zeros(n, 1)
         return memory
 
     @torch.no_grad()
@@ -100,9 +86,8 @@ class PlanningActor(Actor):
         fresh = step.squeeze(-1) == 0
         if bool(fresh.any()):
             state, goal = tensordict.get(keys.SLOT_STATE), tensordict.get(keys.GOAL_PIXELS)
-            goal_slots = tensordict.get(keys.GOAL_SLOTS).clone()
-            goal_slots[fresh] = parse_goal(self.agent.world_model.savi, state[fresh], goal[fresh], self.config.looks)
-            tensordict.set(keys.GOAL_SLOTS, goal_slots)
+            parsed = parse_goal(self.agent.world_model.savi, state[fresh], goal[fresh], self.config.looks)
+            put_rows(tensordict, fresh, {keys.GOAL_SLOTS: parsed})
         for row in range(len(step)):
             if int(step[row]) % self.size.every == 0:
                 self._plan(tensordict, row)
@@ -136,13 +121,9 @@ class PlanningActor(Actor):
             keys.PROPOSAL_COST: torch.tensor([offered]),
             keys.PLAN_SECONDS: torch.tensor([time.perf_counter() - begin]),
         }
-        for key, value in found.items():
-            whole = tensordict.get(key).clone()  # the memory's tensors are others' too
-            whole[row] = value.to(whole.device)
-            tensordict.set(key, whole)
+        put_rows(tensordict, row, found)
 
     def _cost(self, tensordict: TensorDictBase, row: int, step: int) -> GoalCost:
-        """The cost of plans from where an episode stands."""
         model = self.agent.world_model
         seen = tensordict.get(keys.SLOT_HISTORY)[row, -min(step + 1, self.frames_seen) :]
         past = model.inverse_dynamics(seen[None]).z[0] if len(seen) > 1 else seen.new_empty(0, *model.latent_shape)
@@ -152,10 +133,9 @@ class PlanningActor(Actor):
 
     def _proposal(self, slots: Tensor) -> Tensor:
         """The policy's plan from slots (N, D): latent actions (1, H, Z), or none (0, H, Z)."""
-        h = self.size.horizon
         if not self.policy:
-            return slots.new_empty(0, h, *self.agent.world_model.latent_shape)
-        return policy_plan(self.agent, slots, h)
+            return slots.new_empty(0, self.size.horizon, *self.agent.world_model.latent_shape)
+        return policy_plan(self.agent, slots, self.size.horizon)
 
 
 def policy_plan(agent: Agent, slots: Tensor, horizon: int) -> Tensor:

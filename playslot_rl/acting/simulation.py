@@ -62,7 +62,6 @@ class SlotTransform(Transform):
         }
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds SLOTS and the recurrent state."""
         state = self._specs(observation_spec)
         observation_spec.update({keys.SLOTS: state[keys.SLOT_STATE].clone(), **state})
         return observation_spec
@@ -102,7 +101,6 @@ class ActionDecoderTransform(Transform):
         return state_spec
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
-        """LATENT_ACTION in place of ACTION."""
         spec = Unbounded((*action_spec.shape, *self.latent_shape), device=action_spec.device)
         return Composite({keys.LATENT_ACTION: spec}, shape=action_spec.shape, device=action_spec.device)
 
@@ -115,10 +113,7 @@ def latent_env(
     generator: torch.Generator | None = None,
 ) -> TransformedEnv:
     """Wrap any TorchRL environment with PIXELS uint8 (..., 3, H, W) and ACTION (..., A), batched or not; an episode is
-    truncated after `max_steps`.
-
-    Raises:
-        ValueError: the environment's frames or actions are not what the world model was made for.
+    truncated after `max_steps`. A ValueError where its frames or actions are not what the world model was made for.
     """
     _check_fits(base, world_model)
     world_model.eval()
@@ -142,15 +137,11 @@ def make_simulation_env(
     generator: torch.Generator | None = None,
     device: torch.device | str = "cpu",
 ) -> TransformedEnv:
-    """The simulated task with SLOTS as observation and LATENT_ACTION as action.
+    """The simulated task with SLOTS as observation and LATENT_ACTION as action, rendered as the training data were.
 
     The task's own keys stay (PIXELS, SUCCESS, reward, done). `action_decoder_module` on the rollout gives the real
-    actions again, in [-1, 1]. Seed by `env.set_seed(seed)` before a reset.
-
-    Args:
-        render_config: use the one of the training data.
-        generator: of sampled initial slots.
-        device: of the environment's tensors; the networks stay where they are.
+    actions again, in [-1, 1]. Seed by `env.set_seed(seed)` before a reset; `generator` is that of sampled initial
+    slots. The networks stay on their device, whatever that of the environment's tensors.
 
     Raises:
         ConfigError: unknown environment.

@@ -25,7 +25,7 @@ class PlanConfig(Checked):
     one name, several with commas, or `all`.
 
     Where a key is None the goals decide: `solved` and `ahead` each have their own setting
-    (`playslot_rl.acting.planners.size`).
+    (`playslot_rl.acting.planners`).
 
     Attributes:
         planner: `cem`, `mppi`, `gradient` (through the differentiable rollout), `prototypes` (categorical CEM); a row

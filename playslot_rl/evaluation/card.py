@@ -16,11 +16,9 @@ from playslot_rl.config import DataConfig
 from playslot_rl.data.demonstrations import probed_actions
 from playslot_rl.data.slot_cache import parse_episodes
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import spread_windows
 from playslot_rl.errors import DataError
-from playslot_rl.evaluation.card_lines import MEASURES, NO_NUMBERS, Line, line
-from playslot_rl.evaluation.card_verdict import WORDS, conclude, settle, worthless
-from playslot_rl.evaluation.effect_lines import Replayed, effect_lines
+from playslot_rl.evaluation.card_lines import MEASURES, NO_NUMBERS, WORDS, Line, conclude, line, settle, worthless
+from playslot_rl.evaluation.effects import Replayed, effect_lines
 from playslot_rl.evaluation.held_out import HeldOut, hold_out
 from playslot_rl.evaluation.latent_lines import ParsedEpisodes, action_lines, usage_lines
 from playslot_rl.evaluation.probes import infer_latents
@@ -28,7 +26,6 @@ from playslot_rl.evaluation.success import hardware
 from playslot_rl.frames import normalise
 from playslot_rl.modules.savi.health import MOVING, SlotHealth
 from playslot_rl.seeds.draws import global_seed
-from playslot_rl.storage.atomic import write_json
 from playslot_rl.training.logging import finite
 from playslot_rl.world_model import WorldModel, module_device
 
@@ -61,17 +58,9 @@ def make_card(
     most: int = DEFAULT_EPISODES,
     seed: int = 0,
 ) -> Card:
-    """Measure everything.
-
-    Args:
-        model: in evaluation mode.
-        source: frames of the model's size; actions or none.
-        metas, data: see `hold_out`.
-        most: episodes that are looked at.
-        seed: of wrong pairs, noise and partners.
-
-    Raises:
-        DataError: no episode of two frames, nothing that moves, or actions of the wrong width for mode `ground_truth`.
+    """Measure a world model in evaluation mode on at most so many episodes (`hold_out`) of the model's frame size, with
+    actions or without; the seed is that of wrong pairs, noise and partners. A DataError where no episode has two
+    frames, nothing moves, or actions have the wrong width for mode `ground_truth`.
     """
     held = hold_out(source, metas, data, most)
     chosen, tested = held.subset(source)
@@ -93,10 +82,8 @@ def make_card(
 
 
 def require_motion(source: EpisodeFrames, tested: Any) -> None:
-    """Refuse videos in which nothing moves.
-
-    Raises:
-        DataError: no pixel of a tested episode changes by `MOVING` between frames that follow each other.
+    """Refuse videos in which nothing moves, by a DataError: no pixel of a tested episode changes by `MOVING` between
+    frames that follow each other.
     """
     largest = 0
     for start, length in zip(source.starts[tested], source.lengths[tested], strict=True):
@@ -126,12 +113,9 @@ def parse(model: WorldModel, source: EpisodeFrames, tested: Any) -> ParsedEpisod
 @torch.no_grad()
 def health_lines(model: WorldModel, parsed: ParsedEpisodes) -> tuple[list[Line], dict[str, float]]:
     """Slots in use, flicker, entropy and motion explained, on clips of the tested episodes."""
-    tested = np.flatnonzero(parsed.tested_episodes)
-    lengths, device, n = parsed.source.lengths, module_device(model), model.slot_shape[0]
-    frames = min(HEALTH_FRAMES, int(lengths[tested].max()))
-    rows = spread_windows(parsed.starts, lengths, frames, HEALTH_CLIPS, tested)
-    of = np.searchsorted(parsed.starts, rows[:, 0], side="right") - 1
-    pixels = rows + (parsed.source.starts - parsed.starts)[of][:, None]
+    device, n = module_device(model), model.slot_shape[0]
+    frames = min(HEALTH_FRAMES, int(parsed.source.lengths[parsed.tested_episodes].max()))
+    rows, pixels, _ = parsed.windows(frames, HEALTH_CLIPS)
     health = SlotHealth(n)
     for some in np.array_split(np.arange(len(rows)), -(-len(rows) // CLIPS_AT_ONCE)):
         decoded = model.savi.decode(torch.from_numpy(parsed.slots[rows[some]]).to(device))
@@ -168,12 +152,3 @@ def card_json(card: Card, source: EpisodeFrames, facts: Mapping[str, Any], began
         "wall_seconds": round(time.perf_counter() - began, 2),
         "hardware": hardware(),
     }
-
-
-def write_card(out: Path, result: Mapping[str, Any]) -> None:
-    """Write `OUT/inspect/inspect.json`.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    write_json(out / RESULT, result)

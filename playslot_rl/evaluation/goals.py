@@ -29,11 +29,8 @@ Places = npt.NDArray[np.float64]
 
 @dataclass
 class Trace:
-    """What an episode went through, from its start on.
-
-    Attributes:
-        frames: T + 1 of (H, W, 3); where nobody looks they are not drawn, and the last one drawn stands for them.
-        places: T + 1 of (P, 3) metres.
+    """What an episode went through: T + 1 frames (H, W, 3), where one that is not drawn repeats the last one drawn, and
+    T + 1 places (P, 3) in metres.
     """
 
     frames: list[Frames] = field(default_factory=list)
@@ -80,11 +77,8 @@ class GoalTask:
 
 
 class GoalPool(TaskPool):
-    """Environments whose episodes begin where the expert was after so many steps.
-
-    Attributes:
-        starts: episode's seed to the expert's steps before its start; others begin at their first frame.
-        traces: what each episode went through, by its seed.
+    """Environments whose episodes begin where the expert was after so many steps: `starts` by the episode's seed, the
+    first frame where it has none. `traces` are what each episode went through, by its seed.
     """
 
     def __init__(self, env: EnvConfig, render: RenderConfig) -> None:
@@ -108,12 +102,8 @@ class GoalPool(TaskPool):
 
 @dataclass(frozen=True)
 class GoalEpisode:
-    """Something to reach.
-
-    Attributes:
-        start: agent steps of the expert before the start.
-        frames: the expert's way from start to goal (T + 1, H, W, 3), both included.
-        places: of things on that way (T + 1, P, 3), metres.
+    """Something to reach, from `start` agent steps of the expert on: frames (T + 1, H, W, 3) and places (T + 1, P, 3)
+    in metres of its way from start to goal, both included.
     """
 
     seed: int
@@ -137,21 +127,12 @@ def distance(places: Places, others: Places) -> float:
 
 
 def make_goals(pool: GoalPool, seeds: Sequence[int], goals: GoalName, plan: PlanConfig, seed: int) -> list[GoalEpisode]:
-    """Run the expert in the episodes of some seeds, and take goals from what it did.
+    """Run the expert in the episodes of some seeds, for the pool's `env.max_steps`, and take goals from what it did;
+    the draw of starts has a seed of its own.
 
     `solved`: from the first frame to the frame in which the expert solved the task. `ahead`: `plan.ahead` environment
     steps from a start drawn at random, neither solved nor already near the goal. Episodes that give no goal are left
-    out.
-
-    Args:
-        pool: the expert runs its `env.max_steps`.
-        seeds: of the episodes; those that start solved are drawn anew, as in every evaluation.
-        goals: which protocol.
-        plan: `ahead` and `near`.
-        seed: of the draw of starts.
-
-    Raises:
-        ConfigError: no episode gives a goal.
+    out, those that start solved drawn anew; a ConfigError where no goal is left.
     """
     pool.begin([], pool.env.max_steps)
     outcomes = run_episodes(pool, ExpertActor(), seeds, lambda _: None, stop=False)

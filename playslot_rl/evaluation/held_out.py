@@ -23,7 +23,7 @@ class HeldOut:
     """Episodes to measure on, and others that probes are fitted on.
 
     Attributes:
-        fitted, tested: sorted episode numbers, int64; `fitted` may be empty.
+        fitted, tested: sorted episode numbers; `fitted` may be empty.
         told_by: why the tested ones are held out, or that it cannot be told, as part of a sentence.
         known: whether it can be told that no stage was trained on the tested ones.
     """
@@ -35,8 +35,7 @@ class HeldOut:
 
     def subset(self, source: EpisodeFrames) -> tuple[EpisodeFrames, npt.NDArray[np.bool_]]:
         """The fitted episodes, then the tested ones, as a source of their own; which of its episodes are tested (E,).
-
-        Its frames are still those of the whole data set: rows are `starts` and on, no longer one after the other.
+        Its frames are those of the whole data set: rows are `starts` and on.
         """
         chosen = np.concatenate([self.fitted, self.tested])
         tested = np.arange(len(chosen)) >= len(self.fitted)
@@ -44,15 +43,12 @@ class HeldOut:
 
 
 def hold_out(source: EpisodeFrames, metas: Mapping[str, Mapping[str, Any]], config: DataConfig, most: int) -> HeldOut:
-    """Choose at most `most` episodes of two frames or more, a quarter of them at most to test on.
+    """Choose at most `most` episodes of two frames or more, a quarter of them at most to test on; a DataError where
+    there is none.
 
-    Of the world model's own videos those are tested that its validation held out; of the policy's demonstrations the
-    last ones, as many as were held out; of any other set the last `data.held_out`, or else its last quarter.
-
-    The fingerprints in the checkpoints' `metas`, by stage, tell what was trained on.
-
-    Raises:
-        DataError: no episode has two frames.
+    Of the world model's own videos, as the fingerprints in the checkpoints' `metas` by stage tell, those are tested
+    that its validation held out; of the policy's demonstrations the last ones, as many as were held out; of any other
+    set the last `data.held_out`, or else its last quarter.
     """
     usable = np.flatnonzero(source.lengths >= 2).astype(np.int64)
     if len(usable) == 0:

@@ -8,13 +8,7 @@ from statistics import NormalDist
 
 def wilson(successes: float, trials: int) -> tuple[float, float]:
     """95 % interval of a success probability; unlike the normal one it stays in [0, 1] and is not empty at 0 or 100 %.
-
-    Args:
-        successes: number of successes, from 0 to `trials`; a mean over repetitions need not be whole.
-        trials: number of episodes, at least 1.
-
-    Raises:
-        ValueError: a count is outside its range.
+    The successes may be a mean over repetitions. A ValueError where a count is outside its range.
 
     Example:
         >>> low, high = wilson(9, 10)

@@ -13,8 +13,9 @@ import numpy.typing as npt
 import torch
 
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.evaluation.card_lines import ACTIONS, MEASURES, Line, line
-from playslot_rl.evaluation.probes import codebook_usage, participation_ratio, probe_actions, repaired
+from playslot_rl.data.windows import spread_windows
+from playslot_rl.evaluation.card_lines import ACTIONS, MEASURES, NO_LATENTS, UNTOLD, Line, line
+from playslot_rl.evaluation.probes import Floats, Ints, codebook_usage, participation_ratio, probe_actions, repaired
 from playslot_rl.frames import normalise
 from playslot_rl.seeds.draws import derived_seed, step_generator
 from playslot_rl.world_model import WorldModel, module_device
@@ -24,7 +25,6 @@ NOISE = 0.02
 PAIRS_AT_ONCE = 64
 NOTHING = 0.05
 """R² that is nothing, up or down: what chance does to a probe that finds nothing."""
-UNTOLD = "no probe recovers the action from the latent"
 
 
 @dataclass(frozen=True)
@@ -32,28 +32,35 @@ class ParsedEpisodes:
     """Episodes as a world model sees them, transition by transition; whole episodes are tested.
 
     Attributes:
-        source: the episodes; an episode's rows are `starts` and on.
         slots: (F, N, D) of all their frames, in order.
-        starts: row of `slots` of each episode's first frame, int64 (E,).
-        tested_episodes: bool (E,).
+        starts: row of `slots` of each episode's first frame (E,).
+        tested_episodes: (E,).
         latents: (M, Z) or (M, N * Z).
         codes: (M, 1) or (M, N), -1 without a codebook.
-        rows: row of `slots` that a transition starts from, int64 (M,).
+        rows: row of `slots` that a transition starts from (M,).
         pixels: row of the source's frames, likewise.
-        episodes: episode of each transition, int64 (M,).
+        episodes: episode of each transition (M,).
         actions: (M, A), scaled as they are learned, or None.
     """
 
     source: EpisodeFrames
-    slots: npt.NDArray[np.float32]
-    starts: npt.NDArray[np.int64]
+    slots: Floats
+    starts: Ints
     tested_episodes: npt.NDArray[np.bool_]
-    latents: npt.NDArray[np.float32]
-    codes: npt.NDArray[np.int64]
-    rows: npt.NDArray[np.int64]
-    pixels: npt.NDArray[np.int64]
-    episodes: npt.NDArray[np.int64]
-    actions: npt.NDArray[np.float32] | None
+    latents: Floats
+    codes: Ints
+    rows: Ints
+    pixels: Ints
+    episodes: Ints
+    actions: Floats | None
+
+    def windows(self, frames: int, most: int) -> tuple[Ints, Ints, Ints]:
+        """At most so many windows of the tested episodes: rows of `slots` and of the source's frames, each (W, frames),
+        and the episode of each (W,).
+        """
+        rows = spread_windows(self.starts, self.source.lengths, frames, most, np.flatnonzero(self.tested_episodes))
+        of = np.searchsorted(self.starts, rows[:, 0], side="right") - 1
+        return rows, rows + (self.source.starts - self.starts)[of][:, None], of
 
     @property
     def tested(self) -> npt.NDArray[np.bool_]:
@@ -65,10 +72,12 @@ def usage_lines(model: WorldModel, parsed: ParsedEpisodes) -> tuple[list[Line], 
     """Codes in use, perplexity, directions; and for the page, the counts of the codes."""
     k, tested = model.inverse_dynamics.n_prototypes, parsed.tested
     width = model.inverse_dynamics.latent_dim
-    latents = parsed.latents[tested].reshape(-1, width) if width else parsed.latents[tested]
-    ratio = participation_ratio(latents) if width else None
-    within = f"of {width}, over {len(latents)} latents" if width else NO_LATENTS
-    directions = line("directions", ratio, within if ratio is not None or not width else "the latents do not vary")
+    ratio, within = None, NO_LATENTS
+    if width:
+        latents = parsed.latents[tested].reshape(-1, width)
+        ratio = participation_ratio(latents)
+        within = "the latents do not vary" if ratio is None else f"of {width}, over {len(latents)} latents"
+    directions = line("directions", ratio, within)
     if not k:
         why = f"mode {model.config.inverse_dynamics.mode} has no prototypes"
         return [line("codes_in_use", None, why), line("perplexity", None, why), directions], {}
@@ -80,42 +89,36 @@ def usage_lines(model: WorldModel, parsed: ParsedEpisodes) -> tuple[list[Line], 
     ], {"code_counts": usage["counts"]}
 
 
-NO_LATENTS = "this world model has no latent actions (mode none)"
-
-
 def action_lines(model: WorldModel, parsed: ParsedEpisodes, seed: int) -> tuple[list[Line], dict[str, Any]]:
     """Probes of the real action with their controls; all `not measured` where that cannot be. The `seed` is that of the
     wrong pairs and of the camera noise.
     """
-    fitted = parsed.tested_episodes.size - int(parsed.tested_episodes.sum())
     missing = ""
     if not model.inverse_dynamics.latent_dim:
         missing = NO_LATENTS
     elif model.config.inverse_dynamics.mode == "ground_truth":
         missing = "latents are the real actions (mode ground_truth)"
-    noisy = None if missing else noise_latents(model, parsed, seed)
-    lines = {"noise_size": line("noise_size", None, missing)}
-    if noisy is not None:
-        lines["noise_size"] = _noise_size(noisy[parsed.tested], parsed.latents[parsed.tested])
-    if not missing and parsed.actions is None:
-        missing = "no actions"
-    elif not missing and fitted == 0:
-        missing = "no other episodes to fit a probe on"
+    lines: dict[str, Line] = {}
     scores: dict[str, Any] = {}
     if not missing:
-        assert noisy is not None
-        scores = _scores(parsed, noisy, seed)
-        if scores["latent"]["linear"]["mean_r2"] is None:
-            missing, scores = "the actions do not vary", {}
-    if scores:
-        lines |= _probe_lines(scores)
+        noisy = noise_latents(model, parsed, seed)
+        lines["noise_size"] = _noise_size(noisy[parsed.tested], parsed.latents[parsed.tested])
+        if parsed.actions is None:
+            missing = "no actions"
+        elif parsed.tested_episodes.all():
+            missing = "no other episodes to fit a probe on"
+        else:
+            scores = _scores(parsed, parsed.actions, noisy, seed)
+            if scores["latent"]["linear"]["mean_r2"] is None:
+                missing, scores = "the actions do not vary", {}
+            else:
+                lines |= _probe_lines(scores)
     keys = [key for key, measure in MEASURES.items() if measure.group == ACTIONS]
     return [lines.get(key) or line(key, None, missing) for key in keys], {"probes": scores}
 
 
-def _scores(parsed: ParsedEpisodes, noisy: npt.NDArray[np.float32], seed: int) -> dict[str, Any]:
+def _scores(parsed: ParsedEpisodes, actions: Floats, noisy: Floats, seed: int) -> dict[str, Any]:
     """What is seen -> result of `probe_actions`."""
-    assert parsed.actions is not None
     wrong = repaired(np.arange(len(parsed.rows)), parsed.tested, derived_seed(seed, 0, "wrong pairs"))
     seen = {
         "latent": parsed.latents,
@@ -123,11 +126,11 @@ def _scores(parsed: ParsedEpisodes, noisy: npt.NDArray[np.float32], seed: int) -
         "frame": parsed.slots[parsed.rows].reshape(len(parsed.rows), -1),
         "noise": noisy,
     }
-    scores = {name: probe_actions(x, parsed.actions, parsed.episodes, tested=parsed.tested) for name, x in seen.items()}
+    scores = {name: probe_actions(x, actions, parsed.episodes, tested=parsed.tested) for name, x in seen.items()}
     before = np.nonzero(parsed.episodes[1:] == parsed.episodes[:-1])[0]  # an episode's last one has none after it
     episodes, tested = parsed.episodes[before], parsed.tested[before]
     if tested.any() and not tested.all():
-        late = probe_actions(parsed.latents[before + 1], parsed.actions[before], episodes, tested=tested)
+        late = probe_actions(parsed.latents[before + 1], actions[before], episodes, tested=tested)
         scores |= {"late": late} if late["linear"]["mean_r2"] is not None else {}
     return scores
 
@@ -155,7 +158,7 @@ def _probe_lines(scores: dict[str, Any]) -> dict[str, Line]:
     }
 
 
-def _noise_size(noisy: npt.NDArray[np.float32], real: npt.NDArray[np.float32]) -> Line:
+def _noise_size(noisy: Floats, real: Floats) -> Line:
     size = float(np.sqrt(np.square(real, dtype=np.float64).mean()))
     if size < 1e-9:
         return line("noise_size", None, "the latents are all zero")
@@ -164,7 +167,7 @@ def _noise_size(noisy: npt.NDArray[np.float32], real: npt.NDArray[np.float32]) -
 
 
 @torch.no_grad()
-def noise_latents(model: WorldModel, parsed: ParsedEpisodes, seed: int) -> npt.NDArray[np.float32]:
+def noise_latents(model: WorldModel, parsed: ParsedEpisodes, seed: int) -> Floats:
     """The latent (M, Z) between each transition's first frame and the same frame with camera noise, parsed after it."""
     device, savi = module_device(model), model.savi
     found = []

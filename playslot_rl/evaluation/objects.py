@@ -81,8 +81,7 @@ def parse_clips(model: WorldModel, frames: npt.NDArray[np.uint8]) -> ParsedClips
     def per_slot(values: Tensor) -> npt.NDArray[Any]:
         if not model.inverse_dynamics.per_slot:
             values = values.unsqueeze(2).expand(*values.shape[:2], slots.shape[2], *values.shape[2:])
-        array: npt.NDArray[Any] = values.cpu().numpy()
-        return array
+        return values.cpu().numpy()
 
     return ParsedClips(
         slots=slots,
@@ -159,12 +158,8 @@ def evaluate_objects(model: WorldModel, config: ExperimentConfig, clips: int, se
 
 
 def evaluate_run_objects(run: Run, model: WorldModel, config: ExperimentConfig) -> dict[str, Any]:
-    """Score a run's world model on `config.episodes` clips (100) and write `RUN/evaluation/objects/eval_info.json`.
-
-    Raises:
-        CheckpointError: the run has no finished world model.
-        ConfigError: fewer than two clips, or a training data set holds one of the seeds.
-        OutputError: the file cannot be written.
+    """Score a run's world model on `config.episodes` clips (100) and write `RUN/evaluation/objects/eval_info.json`. A
+    ConfigError for fewer than two clips, or where a training data set holds one of the seeds.
     """
     clips, began = config.episodes or DEFAULT_CLIPS, time.perf_counter()
     if clips < 2:
@@ -177,7 +172,7 @@ def evaluate_run_objects(run: Run, model: WorldModel, config: ExperimentConfig) 
         "seed": config.seed,
         "seeds": seeds,
         **evaluate_objects(model, config, clips, seeds),
-        "fingerprints": run_fingerprints(run),
+        "fingerprints": {name: stage.fingerprint for name, stage in run.world_stages.items()},
         "wall_seconds": round(time.perf_counter() - began, 2),
         "hardware": hardware(),
     }
@@ -185,28 +180,15 @@ def evaluate_run_objects(run: Run, model: WorldModel, config: ExperimentConfig) 
     return result
 
 
-def run_fingerprints(run: Run) -> dict[str, str]:
-    """Raises:
-    CheckpointError: a stage of the world model is missing or damaged.
-    """
-    return {name: stage.fingerprint for name, stage in run.world_stages.items()}
-
-
 Labels = npt.NDArray[Any]
 
 
 def adjusted_rand_index(truth: Labels, predicted: Labels, foreground: bool = False) -> float:
-    """Agreement of two labellings of the same pixels: 1 if equal up to names, about 0 for a random one.
+    """Agreement of two labellings of the same pixels, of any shape: 1 if equal up to names, about 0 for a random one.
 
-    A clip is scored as a whole, as in SAVi's paper: a slot that changes its object in mid-clip loses.
-
-    Args:
-        truth: of any shape, 0 the ground.
-        predicted: of the same shape; the names of the labels do not matter.
-        foreground: leave out the pixels of the ground (FG-ARI).
-
-    Raises:
-        ValueError: the shapes differ, or no pixel is left.
+    A clip is scored as a whole, as in SAVi's paper: a slot that changes its object in mid-clip loses. `foreground`
+    leaves out the pixels whose truth is 0, the ground (FG-ARI). A ValueError where the shapes differ, or no pixel is
+    left.
     """
     from sklearn.metrics import adjusted_rand_score
 
@@ -228,9 +210,8 @@ def overlaps(truth: Labels, predicted: Labels, objects: int, slots: int) -> npt.
 
 
 def match_slots(truth: Labels, predicted: Labels, objects: int, slots: int) -> npt.NDArray[np.int64]:
-    """The slot of each object (O,) in a clip (T, H, W), -1 where there are too few slots.
-
-    It is the assignment with the largest overlap in all, ground included. Label o + 1 of `truth` is object o.
+    """The slot of each object (O,) in a clip (T, H, W) by the largest overlap in all, ground included; -1 where there
+    are too few slots. Label o + 1 of `truth` is object o.
     """
     from scipy.optimize import linear_sum_assignment
 

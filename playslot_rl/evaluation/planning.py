@@ -20,9 +20,8 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import Actor, RandomActor
 from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.episodes import Moment, Outcome, run_episodes
-from playslot_rl.acting.planners import build_planner
+from playslot_rl.acting.planners import build_planner, search_size
 from playslot_rl.acting.planners.costs import GoalCost, goal_distance, parse_goal
-from playslot_rl.acting.planners.size import search_size
 from playslot_rl.acting.planning import PlanningActor
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.planning import CostName, GoalName
@@ -38,13 +37,12 @@ STRIDE: Final = 1
 
 @dataclass
 class Played:
-    """Episodes towards goals, as one way of acting played them.
+    """Episodes towards goals, as one way of acting played them; the lists are empty where nothing is planned.
 
     Attributes:
-        outcomes: by the task's own measure, an episode each.
-        traces: frames and places, an episode each.
-        plans: slots (H + 1, N, D) of each episode's first plan; empty where nothing is planned.
-        costs, proposals, seconds: of every decision; empty where nothing is planned.
+        outcomes, traces: an episode each, by the task's own measure.
+        plans: slots (H + 1, N, D) of each episode's first plan.
+        costs, proposals, seconds: of every decision.
         first_costs, first_proposals: of the first decision of each episode.
         wall: seconds of wall clock.
     """
@@ -64,10 +62,7 @@ def ways_of_acting(
     config: ExperimentConfig, agent: Agent, protocol: GoalName, goals: Sequence[GoalEpisode]
 ) -> dict[str, Actor]:
     """The rows of a table: random actions and the latent policy (unless `evaluation.references` is false), then each
-    planner with each proposal.
-
-    Raises:
-        ConfigError: a planner that the world model cannot serve.
+    planner with each proposal. A ConfigError for a planner that the world model cannot serve.
     """
     plan, size = config.plan, search_size(config.plan, protocol, config.env.frame_skip)
     images = {goal.seed: goal.image for goal in goals}
@@ -96,19 +91,11 @@ def play(
     every: int,
     draw: bool,
 ) -> Played:
-    """Run one actor towards each goal.
+    """Run one actor, in evaluation mode, towards each goal, for at most `max_steps`, planning anew `every` so many;
+    `draw` also frames that it does not look at.
 
     With goals `solved` an episode ends where the task says that it is solved; with `ahead` it takes all its steps,
     since what counts is where things are.
-
-    Args:
-        pool: environments.
-        actor: in evaluation mode.
-        goals: an episode each.
-        protocol: where they are from.
-        max_steps: agent steps to act in.
-        every: steps from one plan to the next.
-        draw: also frames that the actor does not look at.
     """
     pool.begin(goals, max_steps)
     played = Played()
@@ -140,12 +127,10 @@ def play(
 def results(played: Played, goals: Sequence[GoalEpisode], near: float) -> dict[str, Any]:
     """What is reported of a way of acting.
 
-    Returns:
-        `success_rate`, `ci95`, `mean_steps_to_success` by the task's own measure; `state_success_rate`, `state_ci95`:
-        everything was within `near` metres of its place in the goal at some step; `state_distance`, `state_closest`,
-        `state_distance_at_start`: metres, means over episodes at the end, at the closest step, at the start;
-        `seconds_per_decision`, `decisions`, `plan_cost`, `proposal_cost` (means; None where nothing is planned),
-        `plan_cost_first`, `proposal_cost_first` (at the first decision); `wall_seconds`, `per_episode`.
+    `success_rate`, `ci95` and `mean_steps_to_success` are by the task's own measure; by `state_success_rate` and
+    `state_ci95` everything was within `near` metres of its place in the goal at some step; `state_distance`,
+    `state_closest` and `state_distance_at_start` are metres, means over episodes at the end, at the closest step and at
+    the start. Costs are means, at the first decision with `_first`; None where nothing is planned.
     """
     ways = [[goal.distance(p) for p in trace.places] for goal, trace in zip(goals, played.traces, strict=True)]
     reached = sum(min(way) < near for way in ways)
@@ -155,8 +140,8 @@ def results(played: Played, goals: Sequence[GoalEpisode], near: float) -> dict[s
             "start": goal.start,
             "expert_steps": len(goal.frames) - 1,
             "state_distance": round(way[-1], 4),
+            "state_closest": round(min(way), 4),
         }
-        | {"state_closest": round(min(way), 4)}
         for outcome, goal, way in zip(played.outcomes, goals, ways, strict=True)
     ]
     return {
@@ -188,12 +173,7 @@ def cost_along_solution(
     agent: Agent, goals: Sequence[GoalEpisode], looks: int, match: bool | None = None
 ) -> dict[str, Any]:
     """What each distance to the goal is along the expert's own way, frame by frame: is the goal a minimum, and does the
-    way there lead downhill?
-
-    Args:
-        agent: in evaluation mode.
-        goals: the ways.
-        looks, match: as when planning.
+    way there lead downhill? `looks` and `match` are as when planning.
 
     Returns:
         For `slots`, `dynamics` and `image`: `curves` (each T + 1 values, start to goal), `goal_is_minimum` (share of

@@ -34,7 +34,6 @@ def infer_latents(
     codebook, and the episode (M,) of each transition.
 
     Args:
-        model: in evaluation mode.
         slots: (F, N, D) of all frames.
         starts, lengths: first row and number of frames of each episode.
         actions: (F, A) real actions; needed in `ground_truth` mode only.
@@ -63,10 +62,8 @@ def infer_latents(
 
 def _hold_out(groups: Ints, fraction: float, seed: int, what: str) -> tuple[npt.NDArray[np.bool_], int]:
     """Mask (M,) of the rows of some groups (M,) drawn at random, and how many groups they are: `fraction` of them, at
-    least one, and at least one is left.
-
-    Raises:
-        ValueError: there are fewer than two groups; `what` says who asks and what a group is: `probe_moves: clip`.
+    least one, and at least one is left. A ValueError where there are fewer than two; `what` says who asks and what a
+    group is: `probe_moves: clip`.
     """
     names = np.unique(groups)
     if len(names) < 2:
@@ -84,15 +81,12 @@ def probe_actions(
     codes: Ints | None = None,
     tested: npt.NDArray[np.bool_] | None = None,
 ) -> dict[str, Any]:
-    """How much of the real action can be read from the latent, on episodes the probe has not seen.
+    """How much of the real action (M, A), in [-1, 1], can be read from the latent (M, Z), on episodes that the probe
+    has not seen.
 
     Args:
-        z: (M, Z).
-        actions: (M, A) in [-1, 1].
-        episodes: (M,).
         codes: (M, C); adds the probe `code`, which sees their one-hot form only.
-        tested: (M,) transitions that the probes are tested on, whole episodes of them; None holds out a quarter of the
-            episodes, drawn by a fixed seed.
+        tested: (M,) transitions of whole episodes; None holds out a quarter of these, drawn by a fixed seed.
 
     Returns:
         `linear` (ridge), `mlp` (two layers of 64) and, with codes, `code`: each `r2` (A values; None where the held-out
@@ -147,14 +141,8 @@ def _score(kind: str, x: Floats, y: Floats, x_test: Floats, y_test: Floats) -> d
 
 
 def probe_moves(features: Floats, moves: Ints, clips: Ints, classes: int, seed: int = 0) -> dict[str, Any]:
-    """Accuracy of multinomial logistic regression on clips that it was not fitted on.
-
-    Args:
-        features: (M, D) what the probe sees, such as the prototype of the object's slot.
-        moves: (M,) labels from 0 to `classes` - 1.
-        clips: (M,); 0.3 of the clips are held out, whole.
-        classes: number of moves.
-        seed: of the split.
+    """Accuracy of multinomial logistic regression, from features (M, D) such as the prototype of the object's slot to
+    moves (M,) from 0 to `classes` - 1, on clips (M,) that it was not fitted on: 0.3 of them, drawn by the seed.
 
     Returns:
         `accuracy` (0 to 1); beside it `chance` (1 / classes) and `majority` (always the most frequent move of the
@@ -188,10 +176,7 @@ def probe_moves(features: Floats, moves: Ints, clips: Ints, classes: int, seed: 
 
 def codebook_usage(codes: Ints, n_prototypes: int) -> dict[str, Any]:
     """`counts` (K) of codes of any shape, `used` (codes chosen at least once), and `perplexity` (1 to K; K when all are
-    equally frequent).
-
-    Raises:
-        ValueError: a code is outside 0 to K - 1.
+    equally frequent). A ValueError where a code is outside 0 to K - 1.
     """
     flat = np.asarray(codes).reshape(-1)
     if flat.size == 0 or flat.min() < 0 or flat.max() >= n_prototypes:
@@ -212,15 +197,8 @@ def code_table(codes: Ints, actions: Floats, n_prototypes: int) -> list[dict[str
     rows: list[dict[str, Any]] = []
     for code in range(n_prototypes):
         chosen = actions[codes == code]
-        empty = len(chosen) == 0
-        rows.append(
-            {
-                "code": code,
-                "count": len(chosen),
-                "mean": None if empty else chosen.mean(0).tolist(),
-                "std": None if empty else chosen.std(0).tolist(),
-            }
-        )
+        mean, std = (chosen.mean(0).tolist(), chosen.std(0).tolist()) if len(chosen) else (None, None)
+        rows.append({"code": code, "count": len(chosen), "mean": mean, "std": std})
     return rows
 
 

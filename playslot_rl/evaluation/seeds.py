@@ -19,16 +19,8 @@ def first_seed(config: ExperimentConfig, seed: int) -> int:
 
 
 def held_out_seeds(config: ExperimentConfig, seed: int, episodes: int, run: Path | None = None) -> list[int]:
-    """The first evaluation seeds of `seed`.
-
-    Args:
-        config: names the data sets that were trained on; those in the `data` folder of `run` are others.
-        seed: which block of them.
-        episodes: how many.
-        run: its folder.
-
-    Raises:
-        ConfigError: a training data set holds one of them.
+    """The first evaluation seeds of `seed`; a ConfigError where a training data set that the config names, or one in
+    the run's `data` folder, holds one of them.
     """
     first = first_seed(config, seed)
     seeds = list(range(first, first + episodes))
@@ -37,10 +29,8 @@ def held_out_seeds(config: ExperimentConfig, seed: int, episodes: int, run: Path
 
 
 def recorded_seeds(root: Path) -> set[int]:
-    """Episode seeds that one of our data sets says it was collected with; empty for foreign data sets.
-
-    Raises:
-        DataError: `meta/playslot.json` is there but cannot be read.
+    """Episode seeds that one of our data sets says it was collected with; empty for foreign data sets. A DataError
+    where `meta/playslot.json` is there but cannot be read.
     """
     path = root / "meta" / "playslot.json"
     if not path.is_file():
@@ -76,11 +66,7 @@ def training_seeds(config: ExperimentConfig, run: Path | None = None) -> set[int
 
 
 def check_disjoint(seeds: Iterable[int], training: set[int]) -> None:
-    """Refuse evaluation seeds that a training data set holds.
-
-    Raises:
-        ConfigError: they overlap.
-    """
+    """Refuse evaluation seeds that a training data set holds, by a ConfigError."""
     common = sorted(set(seeds) & training)
     if common:
         raise ConfigError(

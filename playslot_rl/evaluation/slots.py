@@ -63,30 +63,20 @@ def segmented_episodes(config: ExperimentConfig, seeds: Sequence[int]) -> Iterat
 
 @torch.no_grad()
 def score_slots(savi: SAVi, episodes: Iterable[Segmented], seeds: Sequence[int]) -> dict[str, float]:
-    """Parse episodes and compare slots with objects.
-
-    Args:
-        savi: in evaluation mode.
-        episodes: E of them.
-        seeds: one for each, of the initial slots where these are drawn.
+    """Parse E episodes by a SAVi in evaluation mode and compare slots with objects; the seeds are those of the initial
+    slots where these are drawn.
 
     Returns:
-        Means over episodes: `ari`, `foreground_ari`, `psnr` of the reconstructions (dB), and `slots_per_object`, of
-        each object that is seen the number of slots that hold at least a tenth of its pixels, averaged.
+        Means over episodes: `ari`, `foreground_ari`, `psnr` of the reconstructions (dB), and `slots_per_object`.
     """
     device, scores = module_device(savi), []
     for (frames, truth), seed in zip(episodes, seeds, strict=True):
         real = to_float(frames[None], device)
         decoded = savi.decode(savi(real, generator=torch.Generator(device).manual_seed(seed))[0])
         found = owners(decoded.masks[0]).cpu().numpy()
-        scores.append(
-            (
-                adjusted_rand_index(truth, found),
-                adjusted_rand_index(truth, found, foreground=True),
-                float(psnr((decoded.frames - real).square().mean())),
-                slots_per_object(truth, found, savi.config.n_slots),
-            )
-        )
+        ari, foreground = adjusted_rand_index(truth, found), adjusted_rand_index(truth, found, foreground=True)
+        decibels = float(psnr((decoded.frames - real).square().mean()))
+        scores.append((ari, foreground, decibels, slots_per_object(truth, found, savi.config.n_slots)))
     names = ("ari", "foreground_ari", "psnr", "slots_per_object")
     return dict(zip(names, np.mean(scores, 0).tolist(), strict=True))
 
@@ -125,12 +115,8 @@ def slots_per_object(truth: npt.NDArray[np.int64], found: npt.NDArray[np.int64],
 
 
 def evaluate_slots(run: Run, out: Path, config: ExperimentConfig, device: torch.device | str) -> dict[str, Any]:
-    """Score a run's slots on `config.episodes` episodes (20) and write `OUT/evaluation/slots/eval_info.json`.
-
-    Raises:
-        CheckpointError: the run has no finished slots.
-        ConfigError: a training data set holds one of the seeds.
-        OutputError: the file cannot be written.
+    """Score a run's slots on `config.episodes` episodes (20) and write `OUT/evaluation/slots/eval_info.json`. A
+    ConfigError where a training data set holds one of the seeds.
     """
     began = time.perf_counter()
     seeds = held_out_seeds(config, config.seed, config.episodes or DEFAULT_EPISODES, run.folder)

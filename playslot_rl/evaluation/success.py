@@ -23,9 +23,8 @@ import numpy as np
 import torch
 
 from playslot_rl.acting.actor import Actor, ExpertActor, RandomActor
-from playslot_rl.acting.agent import ImaginationActor, oracle_actor, playslot_actor
+from playslot_rl.acting.agent import ImaginationActor, ReplayActor, oracle_actor, perform, playslot_actor
 from playslot_rl.acting.episodes import Outcome, TaskPool, run_episodes
-from playslot_rl.acting.expert_videos import ReplayActor, perform
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.errors import CheckpointError, ConfigError
@@ -61,10 +60,8 @@ class RunFacts:
 
 
 def run_facts(run: Path, method: str = "playslot") -> RunFacts:
-    """Read `RUN/STAGE/checkpoint/meta.json` of a method's stage.
-
-    Raises:
-        CheckpointError: the run has no trained policy, or its meta file cannot be read.
+    """Read `RUN/STAGE/checkpoint/meta.json` of a method's stage; a CheckpointError where there is no trained policy, or
+    the file cannot be read.
     """
     stage = method_stage(method)
     path = run / stage / "checkpoint" / "meta.json"
@@ -89,9 +86,7 @@ def run_facts(run: Path, method: str = "playslot") -> RunFacts:
 
 
 def check_protocol(protocol: str) -> None:
-    """Raises:
-    ConfigError: it is none of `PROTOCOLS`.
-    """
+    """Refuse what is none of `PROTOCOLS`, by a ConfigError."""
     if protocol not in PROTOCOLS:
         raise ConfigError(f"protocol: got {protocol!r}, expected one of {', '.join(PROTOCOLS)}")
 
@@ -107,17 +102,14 @@ def evaluate(
     run: Path | None = None,
     pool: TaskPool | None = None,
 ) -> dict[str, Any]:
-    """Measure an agent.
+    """Measure an agent, whose slot oracle is a reference.
 
     Args:
-        agent: its slot oracle is a reference.
         config: environment, renderer, `evaluation`, and the data sets whose seeds must not come up.
         protocol: `simulation` (closed loop) or `imagination` (open loop: one frame is parsed, policy and cOCVP unfold
             `max_steps` steps in latent space, and the decoded actions are then executed), or `replay` (open loop: the
             latents are those of the expert's video of the same episode; the policy is not asked).
-        episodes: number of seeds.
         seed: selects the block of evaluation seeds.
-        facts: of the run.
         run: its folder; what the references do is kept under `RUN/evaluation`.
         pool: environments to use and leave open; None makes and closes its own.
 
@@ -157,15 +149,8 @@ def measure(
     pool: TaskPool | None = None,
     oracle: Actor | None = None,
 ) -> dict[str, Any]:
-    """Measure any actor; see `evaluate`.
-
-    Args:
-        actor: in evaluation mode.
-        config, protocol, episodes, seed, facts, run, pool: as for `evaluate`.
-        oracle: the slot oracle among the references; None gives null values for it.
-
-    Raises:
-        ConfigError: a seed that a training data set holds.
+    """Measure any actor in evaluation mode, as `evaluate` does; without an `oracle` the slot
+    oracle's values are null.
     """
     seeds = held_out_seeds(config, seed, episodes, run)
     begin = time.perf_counter()
@@ -202,8 +187,7 @@ def measure(
 def task_facts(config: ExperimentConfig, seed: int) -> dict[str, Any]:
     """What besides weights decides a result, as JSON stores it: task, renderer, first evaluation seed."""
     values = {"env": to_dict(config.env), "render": to_dict(config.render), "first_seed": first_seed(config, seed)}
-    stored: dict[str, Any] = json.loads(json.dumps(values))
-    return stored
+    return json.loads(json.dumps(values))  # type: ignore[no-any-return]
 
 
 def _references(
@@ -224,11 +208,8 @@ def _references(
 def evaluate_run(
     run: Path, agent: Agent, config: ExperimentConfig, protocol: str, pool: TaskPool | None = None
 ) -> dict[str, Any]:
-    """Evaluate a run's agent with the config's `episodes` and `seed`; write `RUN/evaluation/PROTOCOL/eval_info.json`.
-
-    Raises:
-        CheckpointError: the run has no trained policy.
-        OutputError: the file cannot be written.
+    """Evaluate a run's agent with the config's `episodes` and `seed`; write `RUN/evaluation/PROTOCOL/eval_info.json`. A
+    CheckpointError where the run has no trained policy.
     """
     episodes = config.episodes or DEFAULT_EPISODES
     result = evaluate(agent, config, protocol, episodes, config.seed, facts=run_facts(run), run=run, pool=pool)
@@ -236,12 +217,9 @@ def evaluate_run(
 
 
 def evaluate_actor(run: Path, actor: Actor, config: ExperimentConfig, pool: TaskPool | None = None) -> dict[str, Any]:
-    """Evaluate a baseline's actor in closed loop, as `evaluate_run` does an agent; the same file, the same keys.
-
-    Raises:
-        ConfigError: protocol `imagination` or `replay`, which only PlaySlot has.
-        CheckpointError: the run has no trained policy of `config.method`.
-        OutputError: the file cannot be written.
+    """Evaluate a baseline's actor in closed loop, as `evaluate_run` does an agent; the same file, the same keys. A
+    ConfigError for protocol `imagination` or `replay`, a CheckpointError where the run has no trained policy of
+    `config.method`.
     """
     check_baseline_protocol(config)
     facts, episodes = run_facts(run, config.method), config.episodes or DEFAULT_EPISODES
@@ -249,9 +227,7 @@ def evaluate_actor(run: Path, actor: Actor, config: ExperimentConfig, pool: Task
 
 
 def check_baseline_protocol(config: ExperimentConfig) -> None:
-    """Raises:
-    ConfigError: another protocol than simulation was asked for.
-    """
+    """Refuse another protocol than simulation, by a ConfigError."""
     if config.protocol != "simulation":
         raise ConfigError(
             f"protocol: got {config.protocol} for method={config.method}, expected simulation: "
@@ -265,13 +241,13 @@ def _stored(run: Path, result: dict[str, Any]) -> dict[str, Any]:
 
 
 def hardware() -> dict[str, Any]:
-    gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
+    """Where and on what a result was measured."""
     return {
         "machine": platform.machine(),
         "system": platform.system(),
         "cores": available_cores(),
         "threads": torch.get_num_threads(),
-        "gpu": gpu,
+        "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else None,
         "python": platform.python_version(),
         "torch": torch.__version__,
     }
@@ -299,9 +275,6 @@ def run_references(
 
     Args:
         oracle: the slot oracle beside the agent; None gives null values.
-        config: of the task.
-        seeds: of the episodes.
-        pool: environments.
         oracle_fingerprint: names the weights of oracle and SAVi; empty means that the oracle's result is not cached.
         cache: JSON file that both protocols of a run share; None means no cache.
     """

@@ -1,16 +1,24 @@
 """PSNR, SSIM and LPIPS of predicted frames (paper, Table 1).
 
+    d(x, y) = sum_l mean_hw w_l (f_l(x) - f_l(y))^2,   f_l unit-normalised features of layer l
+
+is LPIPS (Zhang et al., 2018) on AlexNet, version 0.1. torchmetrics ships the linear heads w_l only. The features are
+those of torchvision's AlexNet on ImageNet, which no package holds: a file is given, or torch's cache has it, or there
+is no LPIPS. A substitute under its name there is not.
+
 Shapes: B batch, T frames, H W image height and width.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from playslot_rl.frames import psnr
+from playslot_rl.storage.tensors import pick_published, read_published
 
 BORDER: Final = 5
 """Pixels a side whose SSIM window, 11 wide, leaves the frame: not counted, as the authors' `piqa` does not."""
@@ -37,15 +45,9 @@ class VideoMetrics(NamedTuple):
 
 @torch.no_grad()
 def frame_scores(predicted: Tensor, target: Tensor, lpips: nn.Module | None = None) -> FrameScores:
-    """Compare predicted with real frames, frame by frame.
-
-    Args:
-        predicted: (B, T, 3, H, W) float; values outside [0, 1] are clamped.
-        target: (B, T, 3, H, W) float in [0, 1].
-        lpips: the network of `playslot_rl.evaluation.lpips`.
-
-    Raises:
-        ValueError: the shapes differ, are not those of clips, or frames are too small for SSIM's window.
+    """Compare predicted with real frames (B, T, 3, H, W), frame by frame: the predicted are clamped to [0, 1], in which
+    the real ones are. A ValueError where the shapes differ, are not those of clips, or frames are too small for SSIM's
+    window.
 
     Note:
         The PSNR of each frame is taken before the mean, as in the paper; that of the mean error would be lower. SSIM
@@ -73,3 +75,42 @@ def video_metrics(predicted: Tensor, target: Tensor) -> VideoMetrics:
     """Means of `frame_scores`, which says what they take and refuse."""
     decibels, ssim, _ = frame_scores(predicted, target)
     return VideoMetrics(float(decibels.mean()), float(ssim.mean()), decibels.mean(0).tolist(), ssim.mean(0).tolist())
+
+
+KEY: Final = "metrics.lpips_weights"
+
+
+class Perceptual(NamedTuple):
+    """LPIPS, or the reason why there is none. It takes two batches (B, 3, H, W), with `normalize=True` of frames in [0,
+    1], and gives (B, 1, 1, 1).
+    """
+
+    network: nn.Module | None
+    reason: str
+
+
+def open_lpips(weights: str = "") -> Perceptual:
+    """LPIPS with the backbone of a file (torchvision's AlexNet, `.pth` as published, or `.safetensors` with the same
+    names), or of torch's cache. A CheckpointError where the file is missing, damaged, or not AlexNet's.
+    """
+    path = Path(weights) if weights else cached_alexnet()
+    if not weights and not path.is_file():
+        return Perceptual(
+            None, f"AlexNet's weights are not at hand: metrics.lpips_weights=PATH, or {path.name} in cache"
+        )
+    from torchmetrics.functional.image.lpips import _LPIPS
+
+    network = _LPIPS(pretrained=True, net="alex", pnet_rand=True)
+    # `slice2.3.weight` here is `features.3.weight` there.
+    own, cure = network.net.state_dict(), "give another file, or leave it out"
+    names = {name: "features." + name.split(".", 1)[1] for name in own}
+    stored = read_published(path, KEY, "AlexNet", "leave it out")
+    network.net.load_state_dict(pick_published(stored, names, own, f"{KEY}={path}", cure))
+    return Perceptual(network.eval().requires_grad_(False), "")
+
+
+def cached_alexnet() -> Path:
+    """Where torchvision keeps AlexNet's ImageNet weights, there or not."""
+    from torchvision.models import AlexNet_Weights
+
+    return Path(torch.hub.get_dir()) / "checkpoints" / Path(AlexNet_Weights.IMAGENET1K_V1.url).name

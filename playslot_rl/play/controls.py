@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from nicegui import events, ui
 
-from playslot_rl.play.likeness import alike, in_words
-from playslot_rl.play.picture import MOST_BYTES
 from playslot_rl.play.recording import Shown, record
-from playslot_rl.play.starts import picture_start
+from playslot_rl.play.starts import MOST_BYTES, picture_start
+from playslot_rl.play.steering import alike, in_words
 from playslot_rl.play.timeline import Frame
 
 if TYPE_CHECKING:
@@ -27,14 +26,7 @@ REFUSED: Final = f"got no picture, or one above {MOST_BYTES // 1_000_000} MB, ex
 
 
 class Controls:
-    """What a player presses.
-
-    Args:
-        page: does it.
-
-    Attributes:
-        stale: the prototypes' animations no longer show what the prototypes would do.
-    """
+    """What a player presses; the page does it. `stale`: the animations no longer show what the prototypes would do."""
 
     def __init__(self, page: PlayPage) -> None:
         self.page, self.session, self.studio = page, page.session, page.studio
@@ -43,7 +35,6 @@ class Controls:
         self._showing = False  # sliders and lists that the page itself sets do nothing
 
     def build(self) -> None:
-        """Lay the column out."""
         groups = {
             "Steer": self._build_steering,
             "Who steers": self._build_drivers,
@@ -102,7 +93,6 @@ class Controls:
             speed.bind_value(page, "fps")
 
     def outdate(self) -> None:
-        """The animations no longer show what the prototypes would do."""
         self.stale, self._moved = True, time.monotonic()
         self.same.set_text("")
 
@@ -151,11 +141,7 @@ class Controls:
         self.tips = ui.select({0: "start"}, value=0, on_change=self._on_tip, label="branch").props("dense").mark("tips")
 
     def show(self, *, branches: bool) -> None:
-        """The present moment, without setting off the handlers.
-
-        Args:
-            branches: also list all branches.
-        """
+        """The present moment, without setting off the handlers; with `branches`, list all branches too."""
         timeline, self._showing = self.session.timeline, True
         branch = timeline.branch()
         self.place.props(f"max={max(1, len(branch) - 1)}")
@@ -168,11 +154,9 @@ class Controls:
         self._show_slot()
 
     async def undo(self) -> None:
-        """One moment back."""
         await self.page.work(self.session.undo)
 
     async def reset(self) -> None:
-        """Back to the start."""
         self.page.halt()
         await self.page.work(self.session.reset)
 
@@ -231,7 +215,6 @@ class Controls:
         await self._on_start()
 
     async def on_upload(self, event: events.UploadEventArguments) -> None:
-        """Begin at a picture."""
         content, name, studio = await event.file.read(), event.file.name, self.studio
         self.page.halt()
         await self.page.start(lambda: picture_start(studio.world_model, content, name, whole=studio.squeezes))

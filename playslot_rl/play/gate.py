@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 from urllib.parse import parse_qsl, urlencode
 
-from playslot_rl.play.picture import MOST_BYTES
+from playslot_rl.play.starts import MOST_BYTES
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -42,22 +42,18 @@ class Gate:
 
     @property
     def path(self) -> str:
-        """What the printed address has after host and port."""
         return f"/?{TOKEN}={self.token}"
 
     @property
     def address(self) -> str:
-        """The address to print."""
         return f"http://{HOST}:{self.port}{self.path}"
 
     @property
     def hosts(self) -> list[str]:
-        """What `Host` may be."""
         return [f"{name}:{self.port}" for name in NAMES] + (list(NAMES) if self.port == 80 else [])
 
     @property
     def origins(self) -> list[str]:
-        """What `Origin` may be."""
         return [f"http://{host}" for host in self.hosts]
 
     @property
@@ -70,11 +66,7 @@ class Gate:
         return any(hmac.compare_digest(candidate, self.token.encode()) for candidate in candidates)
 
     def refusal(self, headers: list[tuple[bytes, bytes]]) -> str:
-        """Why a request from elsewhere is refused, in one line; empty where it is not.
-
-        Args:
-            headers: of the request, with names in small letters.
-        """
+        """Why a request with these headers, names in small letters, is refused; empty where it is not."""
         hosts, origins = (_values(headers, name) for name in (b"host", b"origin"))
         if len(hosts) != 1 or hosts[0] not in self.hosts:
             return (
@@ -93,7 +85,6 @@ class GateMiddleware:
         self.app, self.gate = app, gate
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request, one WebSocket, or the server's own start and end."""
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
@@ -140,7 +131,6 @@ class GateMiddleware:
 
 
 def _values(headers: list[tuple[bytes, bytes]], name: bytes) -> list[str]:
-    """All values of a header, in small letters."""
     return [value.decode("latin-1").lower() for key, value in headers if key == name]
 
 

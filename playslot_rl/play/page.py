@@ -30,12 +30,7 @@ HELP: Final = (
 
 
 class PlayPage:
-    """The page of one client.
-
-    Args:
-        studio: what all pages share.
-        gallery: serves this page's pictures.
-    """
+    """The page of one client; the gallery serves its pictures."""
 
     def __init__(self, studio: Studio, gallery: Gallery) -> None:
         self.studio, self.gallery = studio, gallery
@@ -175,7 +170,6 @@ class PlayPage:
         return found if found in self.session.now.present else None
 
     async def _step(self) -> None:
-        """One step by whoever steers."""
         driver, session = self.driver, self.session
         if driver != ME:
             await self.work(lambda: session.drive(driver))
@@ -232,11 +226,9 @@ class PlayPage:
             self.status.set_text("nothing to start from: choose another start, upload a picture, or give data.root=")
 
     async def start(self, start: Callable[[], Start]) -> bool:
-        """Have the session begin at a start, which the worker makes."""
         return await self.work(lambda: self.session.begin(start()), begins=True)
 
     def _left(self) -> bool:
-        """Whether the client has gone meanwhile."""
         return self.closed
 
     def close(self) -> None:

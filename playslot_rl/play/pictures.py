@@ -8,17 +8,21 @@ from __future__ import annotations
 import io
 import itertools
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar, Final
 
 import numpy as np
+import torch
 from PIL import Image
 from PIL.ImageColor import getrgb
+from torch import Tensor
 
 from playslot_rl.colours import OKABE_ITO
 from playslot_rl.play.session import Look, PlaySession
+from playslot_rl.play.starts import Start
 from playslot_rl.play.timeline import Frame, SceneMoment
 from playslot_rl.visualization.grid import side_by_side
+from playslot_rl.world_model import WorldModel
 
 EDGE: Final = 0.75
 TINT: Final = 0.35
@@ -49,18 +53,16 @@ class Gallery:
         return f"/play/picture/{self.key}/{name}/{next(self._numbers)}"
 
     def get(self, name: str) -> tuple[bytes, str] | None:
-        """Content and kind of the newest picture of a name."""
         return self._newest.get(name)
 
     def close(self) -> None:
-        """Drop them."""
         self.open.pop(self.key, None)
         self._newest.clear()
 
 
-def colour_of(slot: int) -> str:
-    """A slot's colour, the same everywhere: `#rrggbb`."""
-    return OKABE_ITO[slot % len(OKABE_ITO)]
+def colour_of(slot: int) -> tuple[int, ...]:
+    """A slot's colour, the same everywhere."""
+    return getrgb(OKABE_ITO[slot % len(OKABE_ITO)])
 
 
 def encode(frame: Frame, scale: int = 1) -> bytes:
@@ -76,7 +78,7 @@ def encode(frame: Frame, scale: int = 1) -> bytes:
 def with_masks(look: Look, chosen: int | None = None) -> Frame:
     """The frame tinted by the slot that owns each pixel, with the borders drawn; the chosen slot the strongest."""
     owner = look.owner
-    colours = np.array([getrgb(colour_of(slot)) for slot in range(int(owner.max()) + 1)], np.float32)
+    colours = np.array([colour_of(slot) for slot in range(int(owner.max()) + 1)], np.float32)
     border = np.zeros(owner.shape, bool)
     border[:, :-1] |= owner[:, :-1] != owner[:, 1:]
     border[:-1] |= owner[:-1] != owner[1:]
@@ -90,12 +92,8 @@ def with_masks(look: Look, chosen: int | None = None) -> Frame:
 
 
 def strip(look: Look, session: PlaySession, chosen: int | None, gap: int) -> Frame:
-    """What each slot draws, side by side in the order of their numbers; an empty place where one was removed.
-
-    A bar above says its colour, one below that it is frozen; the chosen one has a frame.
-
-    Returns:
-        uint8 (H, N * W + (N - 1) * gap, 3).
+    """What each slot draws, side by side in the order of their numbers, uint8 (H, N * W + (N - 1) * gap, 3); an empty
+    place where one was removed. A bar above says its colour, one below that it is frozen; the chosen one has a frame.
     """
     n = session.world_model.slot_shape[0]
     height, width = look.frame.shape[:2]
@@ -106,7 +104,7 @@ def strip(look: Look, session: PlaySession, chosen: int | None, gap: int) -> Fra
             cell[:] = 232
             continue
         cell[:] = look.objects[session.now.present.index(number)]
-        colour = getrgb(colour_of(number))
+        colour = colour_of(number)
         cell[:3] = colour
         if number in session.now.frozen:
             cell[-3:] = (30, 120, 255)
@@ -127,9 +125,8 @@ def animated(frames: Frame, fps: float = ANIMATION_FPS, scale: int = 1, last_s: 
 
 
 def session_animation(path: Sequence[SceneMoment], fps: float) -> bytes:
-    """The moments of a path as an endless GIF: imagined, and beside it the simulator, or what was recorded.
-
-    Of a path of more than `MOST_PICTURES` moments, every so many-th, at the speed of the session.
+    """The moments of a path as an endless GIF: imagined, and beside it the simulator, or what was recorded. Of more
+    than `MOST_PICTURES` moments every so many-th, at the speed of the session.
     """
     stride = -(-len(path) // MOST_PICTURES)
     path = path[::stride]
@@ -148,11 +145,8 @@ def session_animation(path: Sequence[SceneMoment], fps: float) -> bytes:
 
 
 def error_curve(errors: Sequence[float | None], at: int) -> str:
-    """The error over the steps as an SVG.
-
-    Args:
-        errors: root mean squared difference of each moment, of [0, 1]; None leaves a gap.
-        at: which of them is the present one.
+    """The error over the steps as an SVG: root mean squared differences of [0, 1], None leaving a gap; `at` is the
+    present one.
     """
     width, height = CURVE
     left, bottom, top = 34, height - 18, 8
@@ -177,3 +171,24 @@ def error_curve(errors: Sequence[float | None], at: int) -> str:
         f'<text x="{width - 6}" y="{height - 4}" text-anchor="end">moment {steps}</text>'
         f'<polyline points="{line}"/>{dot}</svg>'
     )
+
+
+def game(model: WorldModel, steps: int) -> Callable[[], Tensor]:
+    """A game without a browser, from random slots, prototype after prototype: each step is predicted, decoded and
+    encoded as what the page sends. What plays one returns the mean square of the last slots.
+    """
+    session, side = PlaySession(model), model.env.image_size
+    first = Start("", np.zeros((side, side, 3), np.uint8), torch.randn(1, *model.slot_shape))
+
+    @torch.no_grad()
+    def play() -> Tensor:
+        session.begin(first)
+        for number in range(steps):
+            session.press(number % len(session.prototypes), 1.0)
+            look = session.look()
+            encode(look.frame)
+            encode(with_masks(look))
+            encode(strip(look, session, None, 4))
+        return session.slots.square().mean()
+
+    return play

@@ -35,15 +35,12 @@ REPO: Final = "playslot_rl/played"
 
 
 def record(session: PlaySession, parent: Path, shown: Shown = "imagined", camera: str = keys.FEATURE_IMAGE) -> Path:
-    """Write the path from the session's start to its present moment.
+    """Write the path from the session's start to its present moment: a new folder `recording-NNN` in `parent`, whole or
+    not there, with `session.gif`, `session.json` and the data set in `dataset`.
 
     Args:
-        parent: the recording becomes a folder `recording-NNN` in it, whole or not there.
         shown: the data set's frames: imagined, or those of the simulator.
         camera: feature that they become: the model's own, so that the recording goes with its data.
-
-    Returns:
-        The folder: `session.gif`, `session.json` and the data set in `dataset`.
 
     Raises:
         DataError: there is no step yet, or there are no true frames.
@@ -70,7 +67,6 @@ def record(session: PlaySession, parent: Path, shown: Shown = "imagined", camera
 
 
 def _free(parent: Path) -> Path:
-    """The next recording's folder."""
     taken = [int(found.name[10:]) for found in parent.glob("recording-*") if found.name[10:].isdigit()]
     return parent / f"recording-{max([0, *taken]) + 1:03d}"
 
@@ -120,7 +116,6 @@ def _features(values: dict[str, npt.NDArray[Any]], camera: str) -> dict[str, dic
 
 
 def _write_set(root: Path, session: PlaySession, path: Sequence[SceneMoment], shown: Shown, camera: str) -> None:
-    """A data set of one episode at `root`."""
     values = columns(session, path, shown, camera)
     with quiet_datasets():
         fps, robot = max(1, round(session.start.fps)), session.world_model.env.name

@@ -1,15 +1,82 @@
-"""The local web server of the page: bound to this machine, for those whom the gate lets in, nothing from outside."""
+"""The local web server of the page: bound to this machine, for those whom the gate lets in, nothing from outside.
+
+What an open page needs is made when its browser has connected, and freed when that has gone.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import socket
 from typing import Final
 
+from nicegui import app, core, ui
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+
 from playslot_rl.errors import ConfigError
 from playslot_rl.play.gate import HOST, Gate, GateMiddleware
+from playslot_rl.play.page import PlayPage
 from playslot_rl.play.pictures import PATH, Gallery
 from playslot_rl.play.studio import Studio
+from playslot_rl.visualization.document import style
+
+MOST_PAGES: Final = 8
+"""Open at a time: each has a simulator, and its moments in memory."""
+CONNECT_S: Final = 30.0
+"""Seconds after which a browser that asked for the page, and has not connected, is forgotten."""
+CLEAN: Final = "<script>history.replaceState(null, '', location.pathname)</script>"
+"""The token leaves the address bar and the history; a cookie carries it on."""
+AWAY: Final = "<script>window.addEventListener('blur', () => emitEvent('away'))</script>"
+"""A key that is let go in another window is never told of."""
+SPACE: Final = """<script>
+for (const kind of ['keydown', 'keyup']) window.addEventListener(kind, (event) => {
+  if (event.key !== ' ' || event.target.closest('input, textarea, select, [role=listbox], [contenteditable]')) return;
+  if (event.target === document) return;
+  event.preventDefault();
+  event.stopImmediatePropagation();
+  document.dispatchEvent(new KeyboardEvent(kind, event));
+}, true);
+</script>"""
+"""Space plays; it does not press the button or the switch that has the focus as well. Enter presses it."""
+
+
+class Pages:
+    """The pages of one studio."""
+
+    def __init__(self, studio: Studio) -> None:
+        self.studio = studio
+        self.open: list[PlayPage] = []
+
+    async def show(self) -> None:
+        """One client's page: nothing but HTML until its socket is there, then a session of its own."""
+        ui.page_title("playslot play")
+        ui.add_css(style())
+        ui.query("body").classes("play")
+        for script in (CLEAN, AWAY, SPACE):  # while the HTML is written: scripts that come later do not run
+            ui.add_body_html(script)
+        client = ui.context.client
+        await client.connected(CONNECT_S)
+        with ui.column() as waiting:
+            ui.label(
+                f"playslot play: {MOST_PAGES} pages are open, expected no more: close one of them, and this one begins"
+            ).mark("full")
+        waiting.set_visibility(False)
+        while len(self.open) >= MOST_PAGES and not client.is_deleted:
+            waiting.set_visibility(True)
+            await asyncio.sleep(0.5)
+        if client.is_deleted:
+            return
+        waiting.delete()
+        page = PlayPage(self.studio, Gallery())
+        self.open.append(page)
+        client.on_delete(lambda: self.leave(page))
+        page.build()
+
+    def leave(self, page: PlayPage) -> None:
+        page.close()
+        self.open.remove(page)
+
 
 DEFAULT_PORT: Final = 8080
 PATIENCE_S: Final = 10.0
@@ -19,10 +86,8 @@ TRIED: Final = 20
 
 
 def choose_port(port: int) -> int:
-    """The port to listen on; 0 takes the first free one from 8080 on.
-
-    Raises:
-        ConfigError: it is taken, or not allowed.
+    """The port to listen on; 0 takes the first free one from 8080 on. A ConfigError where it is
+    taken, or not allowed.
     """
     candidates = [port] if port else list(range(DEFAULT_PORT, DEFAULT_PORT + TRIED))
     reason = ""
@@ -44,8 +109,6 @@ def choose_port(port: int) -> int:
 
 def serve_pictures() -> None:
     """Tell the server of the galleries, once."""
-    from nicegui import app
-    from starlette.responses import Response
 
     def picture(page: str, name: str, number: int) -> Response:
         del number  # it only makes the address new
@@ -59,43 +122,22 @@ def serve_pictures() -> None:
         app.add_api_route(PATH, picture, methods=["GET"], include_in_schema=False)
 
 
-def serve_nothing_else() -> None:
-    """Answer paths that are not there with a plain 404; NiceGUI makes a page for each."""
-    from nicegui import app
-    from starlette.requests import Request
-    from starlette.responses import PlainTextResponse
+async def missing(request: Request, error: Exception) -> PlainTextResponse:  # noqa: ARG001
+    """The answer for paths that are not there; NiceGUI would make a page for each."""
+    return PlainTextResponse("playslot play: there is no such page, expected /\n", status_code=404)
 
-    async def missing(request: Request, error: Exception) -> PlainTextResponse:
-        del request, error
-        return PlainTextResponse("playslot play: there is no such page, expected /\n", status_code=404)
 
+def serve(studio: Studio, gate: Gate, show: bool) -> None:
+    """Serve the page until Ctrl-C; what is being recorded is finished, and the studio closed. A ConfigError where
+    another program has just taken the port.
+    """
+    ui.page("/")(Pages(studio).show)
+    serve_pictures()
     app.add_exception_handler(404, missing)
-
-
-def close_to_others(gate: Gate) -> None:
-    """Put the gate before everything that the server serves, its WebSocket too."""
-    from nicegui import app, core
-
     core.sio.eio.cors_allowed_origins = gate.origins
     build = app.build_middleware_stack
     # The outermost of all: behind NiceGUI's own middleware a refusal would be cached as its assets are.
     app.build_middleware_stack = lambda: GateMiddleware(build(), gate)  # type: ignore[method-assign]
-
-
-def serve(studio: Studio, gate: Gate, show: bool) -> None:
-    """Serve the page until Ctrl-C; what is being recorded is finished, and the studio closed.
-
-    Raises:
-        ConfigError: another program has just taken the port.
-    """
-    from nicegui import ui
-
-    from playslot_rl.play.pages import Pages
-
-    ui.page("/")(Pages(studio).show)
-    serve_pictures()
-    serve_nothing_else()
-    close_to_others(gate)
     try:
         with contextlib.suppress(KeyboardInterrupt):
             ui.run(

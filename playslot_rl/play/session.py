@@ -19,9 +19,8 @@ from playslot_rl import keys
 from playslot_rl.acting.imagination import ImaginationSession
 from playslot_rl.frames import to_uint8
 from playslot_rl.modules.savi.health import owners
-from playslot_rl.play.planner_driver import PlannerDriver
 from playslot_rl.play.starts import Start
-from playslot_rl.play.steering import Driver, PolicyDriver, require_prototypes, variability_directions
+from playslot_rl.play.steering import Driver, PlannerDriver, PolicyDriver, require_prototypes, variability_directions
 from playslot_rl.play.timeline import Frame, SceneMoment, Timeline
 from playslot_rl.world_model import Agent, WorldModel
 
@@ -31,12 +30,8 @@ PREVIEW: Final = 6
 
 @dataclass(frozen=True)
 class Look:
-    """The present moment, drawn.
-
-    Attributes:
-        frame: uint8 (H, W, 3).
-        owner: number of the slot that each pixel belongs to, int64 (H, W).
-        objects: what each slot draws, its colours weighted by its mask on white, uint8 (n, H, W, 3).
+    """The present moment, drawn: its frame uint8 (H, W, 3), the number of the slot that each pixel belongs to, int64
+    (H, W), and what each slot draws, its colours weighted by its mask on white, uint8 (n, H, W, 3).
     """
 
     frame: Frame
@@ -45,13 +40,10 @@ class Look:
 
 
 class PlaySession:
-    """An imagined future under a user's hand.
-
-    Not for several threads at once: a page hands every call to one worker.
+    """An imagined future under a user's hand; not for several threads at once: a page hands every call to one worker.
 
     Args:
-        world_model: put into evaluation mode.
-        agent: of that world model, for the policy and the decoded actions.
+        agent: of the world model, for the policy and the decoded actions.
         directions: (K, Z), see `variability_directions`; None takes the codebook's.
 
     Attributes:
@@ -88,7 +80,6 @@ class PlaySession:
 
     @property
     def now(self) -> SceneMoment:
-        """The present moment."""
         return self.timeline.now
 
     @property
@@ -127,14 +118,11 @@ class PlaySession:
     # --- steps -----------------------------------------------------------------------------------------------------
 
     def latent(self, prototype: int, variability: float = 0.0, slot: int | None = None) -> Tensor:
-        """The latent action ([N,] Z) of a key press: z = p + s * d (see `playslot_rl.play.steering`).
+        """The latent action ([N,] Z) of a key press: z = p + s * d (see `playslot_rl.play.steering`), s in standard
+        deviations.
 
-        Args:
-            variability: s, in standard deviations.
-            slot: that it goes to, the others staying as they are; None goes to all. Only with one latent per slot.
-
-        Raises:
-            ValueError: no such prototype, or a slot that is not there.
+        With one latent per slot, `slot` is that it goes to, the others staying as they are; None goes to all. A
+        ValueError where there is no such prototype or slot.
         """
         if not 0 <= prototype < len(self.prototypes):
             raise ValueError(f"prototype: got {prototype}, expected 0 to {len(self.prototypes) - 1}")
@@ -154,11 +142,7 @@ class PlaySession:
         return self.step(self.latent(prototype, variability, slot), f"prototype {prototype}{amount}{where}")
 
     def drive(self, name: str) -> SceneMoment:
-        """One step by who has taken over.
-
-        Raises:
-            ValueError: nobody has this name.
-        """
+        """One step by who has taken over; a ValueError where nobody has this name."""
         if name not in self.drivers:
             raise ValueError(f"driver: got {name!r}, expected one of {', '.join(self.drivers) or 'none'}")
         driver = self.drivers[name]
@@ -166,10 +150,8 @@ class PlaySession:
 
     @torch.no_grad()
     def step(self, latent: Tensor, label: str = "latent action") -> SceneMoment:
-        """One imagined step by a latent ([N,] Z), and the decoded action in the simulator where there is one.
-
-        Raises:
-            ValueError: another shape, or the timeline is full.
+        """One imagined step by a latent ([N,] Z), and the decoded action in the simulator where there is one. A
+        ValueError for another shape, or where the timeline is full.
         """
         now = self.now
         if self.timeline.full:
@@ -188,9 +170,8 @@ class PlaySession:
         return self._land(label, latent=latent.clone(), code=code.clone(), action=action, true=true)
 
     def _act(self, latent: Tensor) -> tuple[npt.NDArray[np.float32] | None, Frame | None]:
-        """The decoded action, and what the simulator shows after it.
-
-        As in imagination the latent is decoded alone: a decoder that reads slots learned from parsed ones.
+        """The decoded action, and what the simulator shows after it. As in imagination the latent is decoded alone: a
+        decoder that reads slots learned from parsed ones.
         """
         if self.agent is None:
             return None, None
@@ -235,7 +216,6 @@ class PlaySession:
         self.timeline.go(number)
 
     def reset(self) -> None:
-        """To the start."""
         self.timeline.go(0)
 
     # --- touch -----------------------------------------------------------------------------------------------------
@@ -247,22 +227,14 @@ class PlaySession:
         return self.now.present.index(slot)
 
     def freeze(self, slot: int, frozen: bool = True) -> SceneMoment:
-        """Hold a slot as it is from here on, or let it go; the others see it.
-
-        Raises:
-            ValueError: it is not there.
-        """
+        """Hold a slot as it is from here on, or let it go; the others see it. A ValueError where it is not there."""
         self._row(slot)
         self._imagination.restore(self.now.state)
         held = self.now.frozen | {slot} if frozen else self.now.frozen - {slot}
         return self._land(f"slot {slot + 1} {'frozen' if frozen else 'let go'}", frozen=held)
 
     def remove(self, slot: int) -> SceneMoment:
-        """Go on without a slot, as if it had never been there.
-
-        Raises:
-            ValueError: it is not there, or it is the last one.
-        """
+        """Go on without a slot, as if it had never been there; a ValueError where it is not there, or the last one."""
         row, present = self._row(slot), self.now.present
         if len(present) == 1:
             raise ValueError("remove: got the last slot, expected another one to stay: undo, or reset")
@@ -272,10 +244,8 @@ class PlaySession:
         return self._land(f"slot {slot + 1} removed", present=rest, frozen=self.now.frozen - {slot})
 
     def swap(self, slot: int, other: Tensor, name: str = "another scene") -> SceneMoment:
-        """Put another slot (D,) in a slot's place; what came before is forgotten, since the new one was not in it.
-
-        Raises:
-            ValueError: it is not there, or `other` has another width.
+        """Put another slot (D,) in a slot's place; what came before is forgotten, since the new one was not in it. A
+        ValueError where the slot is not there, or the other has another width.
         """
         row, slots = self._row(slot), self.slots
         if other.shape != slots[row].shape:
@@ -298,7 +268,6 @@ class PlaySession:
         return frame
 
     def look(self) -> Look:
-        """The present moment, drawn."""
         now = self.now
         if self._look is None or self._look[0] != now.number:
             self._draw(now.state, now.present, now.number)

@@ -39,9 +39,6 @@ class Studio:
         camera: feature that recordings carry.
         directions: (K, Z), see `variability_directions`.
         donors: (n, N, D), slots of other scenes for swapping; None where there are none.
-
-    Raises:
-        CheckpointError: the world model has no prototypes.
     """
 
     world_model: WorldModel
@@ -69,7 +66,6 @@ class Studio:
             self.donors = torch.cat([parse_last(model, clip[:1], 0) for clip in clips])
 
     def call[Result](self, work: Callable[[], Result]) -> Future[Result]:
-        """Hand work to the worker."""
         return self._worker.submit(work)
 
     async def do[Result](self, work: Callable[[], Result]) -> Result:
@@ -77,17 +73,13 @@ class Studio:
         return await asyncio.wrap_future(self.call(work))
 
     def session(self) -> PlaySession:
-        """A new player's session, not begun yet."""
         session = PlaySession(self.world_model, self.agent, self.directions)
         session.drivers.update(self.drivers)
         return session
 
     def start(self, source: str, number: int = 0, step: int = 0) -> Start:
-        """A start by its source, `recorded` or `simulated`; `step` is of the frame in a recorded episode.
-
-        Raises:
-            DataError: there is no such source.
-            ValueError: no such frame.
+        """A start by its source, `recorded` or `simulated`; `step` is of the frame in a recorded episode. A DataError
+        where there is no such source, a ValueError where there is no such frame.
         """
         if source == "recorded" and self.recorded is not None:
             return self.recorded.start(number, step)
@@ -98,7 +90,9 @@ class Studio:
     @property
     def sources(self) -> dict[str, str]:
         """Titles of the sources that are there, by name; the first is where a page starts."""
-        recorded = {"recorded": f"data set ({self.recorded.episodes} episodes)"} if self.recorded is not None else {}
+        recorded = (
+            {"recorded": f"data set ({self.recorded.source.episodes} episodes)"} if self.recorded is not None else {}
+        )
         return recorded | ({"simulated": "fresh simulator episode"} if self.simulated is not None else {})
 
     def close(self) -> None:

@@ -23,14 +23,13 @@ MOST: Final = 3000
 
 @dataclass(frozen=True)
 class SceneMoment:
-    """One moment: what the world model knew, what was seen, and how it came about.
+    """One moment: what the world model knew, what was seen, and how it came about. Frames are uint8 (H, W, 3).
 
     Attributes:
         number: its place in the timeline, in the order of making.
         depth: moments before it on its branch.
         state: of the imagination session, batch size [1]; never changed.
         present: numbers (from 0) of the world model's slots that are still there, n of them, in their order.
-        frame: imagined; all frames are uint8 (H, W, 3).
         latent: ([N,] Z) that led here; None at the start and after a touch.
         code: number of its prototype, int64 () or (N,).
         action: decoded, float32 (A,) in the robot's units; None without a decoder.
@@ -73,20 +72,14 @@ class Timeline:
 
     @property
     def now(self) -> SceneMoment:
-        """The present moment."""
         return self.moments[self.at]
 
     @property
     def full(self) -> bool:
-        """Whether no further moment fits."""
         return len(self.moments) >= MOST
 
     def add(self, moment: SceneMoment) -> None:
-        """Append a child of the present moment and go there.
-
-        Raises:
-            ValueError: the timeline is full.
-        """
+        """Append a child of the present moment and go there; a ValueError where the timeline is full."""
         if self.full:
             raise ValueError(f"timeline: got {MOST} moments, expected no more: record it and start anew")
         assert moment.number == len(self.moments)
@@ -103,11 +96,7 @@ class Timeline:
         return True
 
     def go(self, number: int) -> None:
-        """Go to any moment.
-
-        Raises:
-            ValueError: there is none of this number.
-        """
+        """Go to any moment; a ValueError where there is none of this number."""
         if not 0 <= number < len(self.moments):
             raise ValueError(f"timeline: got moment {number}, expected 0 to {len(self.moments) - 1}")
         if all(moment.number != number for moment in self.path(self._heading)):

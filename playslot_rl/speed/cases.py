@@ -20,7 +20,7 @@ from playslot_rl.config import (
 )
 from playslot_rl.config.compose import compose
 from playslot_rl.modules.predictors.cocvp import COCVP
-from playslot_rl.play.game import game
+from playslot_rl.play.pictures import game
 from playslot_rl.speed.steps import RandomStage, Step, precisions
 from playslot_rl.speed.timing import in_turns
 from playslot_rl.world_model import WorldModel

@@ -13,10 +13,13 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.evaluation.slots import RESULT as SLOTS_RESULT
 from playslot_rl.evaluation.success import POLICY_PROTOCOLS, PROTOCOLS, hardware
+from playslot_rl.evaluation.video import video_metrics
+from playslot_rl.frames import to_float
 from playslot_rl.storage.atomic import json_or_nothing
 from playslot_rl.visualization.charts import DARK, LIGHT, Theme, loss_chart, loss_names, success_chart
 from playslot_rl.visualization.document import Block, Missing, Picture, Section, Table, Text
-from playslot_rl.visualization.grid import png
+from playslot_rl.visualization.drawings import draw_prototypes, draw_slots, run_rollouts
+from playslot_rl.visualization.grid import animation, film_strip, png, side_by_side
 from playslot_rl.visualization.words import HELD_OUT, METRICS, metric_text
 from playslot_rl.world_model import Agent, WorldModel
 
@@ -24,16 +27,14 @@ STAGES = ("slots", "dynamics", "policy")
 HISTORIES = {"slots": "slots", "dynamics": "dynamics", "policy": "policy", "action decoder": "policy/decoder"}
 """What was trained -> folder of its `metrics.jsonl` in the run."""
 EPISODES_SHOWN = 3
+ROLLOUTS = ("imagined", "executed", "closed loop")
 
 
 @dataclass(frozen=True)
 class ReportInput:
-    """What the sections are made from.
+    """What the sections are made from; the models are None where the run has none yet.
 
     Attributes:
-        run: the run folder.
-        config: of the run.
-        world_model, agent: trained models; None where the run has none yet.
         pool: environments for the pictures.
         shown: how the run folder is written in commands: relative where that is possible.
         metas: stage -> `meta.json` of its finished checkpoint.
@@ -153,15 +154,13 @@ def rollout_section(given: ReportInput) -> Section:
     title = "Imagined and simulated rollouts"
     if given.agent is None:
         return Section(title, [Missing("There is no trained policy.", given.command("train-policy"))])
-    from playslot_rl.visualization.grid import animation
-    from playslot_rl.visualization.rollouts import draw_animation, draw_strip, run_rollouts
-
     start = given.first_seed
-    rollouts = run_rollouts(given.agent, given.pool, range(start, start + EPISODES_SHOWN))
-    pictures, metrics = draw_animation(rollouts), rollouts.metrics()
+    clips, executed, closed = run_rollouts(given.agent, given.pool, range(start, start + EPISODES_SHOWN))
+    pictures = side_by_side(clips, ROLLOUTS, [f"episode {i + 1}" for i in range(len(clips))], scale=3)
+    metrics = video_metrics(to_float(clips[:, 0, 1:]), to_float(clips[:, 1, 1:]))  # but for the first, parsed frame
     outcome = "; ".join(
         f"episode {i + 1}: {_outcome(a.steps)} from imagination, {_outcome(b.steps)} closed-loop"
-        for i, (a, b) in enumerate(zip(rollouts.executed_outcome, rollouts.closed_outcome, strict=True))
+        for i, (a, b) in enumerate(zip(executed, closed, strict=True))
     )
     moving = Picture(
         "rollouts",
@@ -178,10 +177,9 @@ def rollout_section(given: ReportInput) -> Section:
         f"step {steps}), SSIM {metrics.ssim:.3f}."
     )
     alt = "Frames of the same episodes at even distances in time, three rows an episode."
-    return Section(
-        title,
-        [moving, Text(text), Picture("rollouts_strip", png(draw_strip(rollouts)), alt, "The same, as a film strip.")],
-    )
+    labels = [f"{i + 1} {name}" for i in range(len(clips)) for name in ROLLOUTS]
+    strip = png(film_strip(clips.reshape(-1, *clips.shape[2:]), labels))
+    return Section(title, [moving, Text(text), Picture("rollouts_strip", strip, alt, "The same, as a film strip.")])
 
 
 def _outcome(steps: int | None) -> str:
@@ -196,24 +194,21 @@ def slots_section(given: ReportInput, clip: Callable[[], Any], what: str = EXPER
     title = "Slots"
     if given.world_model is None:
         return Section(title, [Missing("There is no trained SAVi.", given.command("train-slots"))])
-    from playslot_rl.visualization.slots import draw_slots
-
     alt = "Rows: frames, their reconstructions, the segmentation by slot, and the part of the frame each slot holds."
     caption = (
         f"{what} Segmentation: each pixel in the colour of the slot with the "
         "largest mask. Slot rows: the slot's colours weighted by its mask, on white."
     )
     picture = Picture("slots", png(draw_slots(given.world_model, clip())), alt, caption)
-    scored = json_or_nothing(given.run / SLOTS_RESULT)
-    return Section(title, [picture, *([Text(_slots_scored(scored))] if scored else [])])
-
-
-def _slots_scored(result: dict[str, Any]) -> str:
-    return (
-        f"On {result['episodes']} held-out episodes of the expert: FG-ARI {result['foreground_ari']:.2f} and ARI "
-        f"{result['ari']:.2f} against the simulator's segmentation (1 is perfect, 0 chance), "
-        f"{result['slots_per_object']:.1f} slots an object, reconstruction {result['psnr']:.1f} dB."
-    )
+    blocks: list[Block] = [picture]
+    if result := json_or_nothing(given.run / SLOTS_RESULT):
+        scored = (
+            f"On {result['episodes']} held-out episodes of the expert: FG-ARI {result['foreground_ari']:.2f} and ARI "
+            f"{result['ari']:.2f} against the simulator's segmentation (1 is perfect, 0 chance), "
+            f"{result['slots_per_object']:.1f} slots an object, reconstruction {result['psnr']:.1f} dB."
+        )
+        blocks.append(Text(scored))
+    return Section(title, blocks)
 
 
 def prototype_section(given: ReportInput, clip: Callable[[], Any]) -> Section:
@@ -225,8 +220,6 @@ def prototype_section(given: ReportInput, clip: Callable[[], Any]) -> Section:
     if model.inverse_dynamics.n_prototypes == 0:
         mode = model.config.inverse_dynamics.mode
         return Section(title, [Text(f"The latent-action mode is `{mode}`, which has no prototypes.")])
-    from playslot_rl.visualization.slots import draw_prototypes
-
     alt = "One row a prototype: the first frame and imagined frames up to t = 15, then a map of what changed."
     caption = (
         "Each prototype held for 15 frames with zero variability, from one parsed frame (t = 0 is real). Change: "

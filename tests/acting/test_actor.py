@@ -12,9 +12,8 @@ from torch import Tensor
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor, ExpertActor, RandomActor, ReactiveActor, latent_actor
-from playslot_rl.acting.agent import ImaginationActor, oracle_actor, playslot_actor
+from playslot_rl.acting.agent import ImaginationActor, Performance, ReplayActor, oracle_actor, playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop
-from playslot_rl.acting.expert_videos import Performance, ReplayActor
 from playslot_rl.config.compose import compose
 from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.world_model import Agent, oracle_module

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.acting.actor import ExpertActor
+from playslot_rl.acting.agent import ReplayActor, perform
 from playslot_rl.acting.episodes import TaskPool, run_episodes
-from playslot_rl.acting.expert_videos import ReplayActor, perform
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.success import evaluate
 from playslot_rl.testing import tiny_config

@@ -29,9 +29,13 @@ def slots_of(batch: tuple[int, ...], seed: int = 0) -> Tensor:
     return torch.randn(*batch, 4, 32, generator=torch.Generator().manual_seed(seed))
 
 
+def from_slots(env: ImaginationEnv, slots: Tensor) -> TensorDict:
+    return env.reset(TensorDict({keys.SLOTS: slots}, slots.shape[:-2]))
+
+
 def imagine(env: ImaginationEnv, agent: Agent, slots: Tensor, steps: int) -> TensorDict:
     policy = latent_policy_module(agent.policy)
-    return env.rollout(steps, policy, tensordict=env.reset_from_slots(slots), auto_reset=False)
+    return env.rollout(steps, policy, tensordict=from_slots(env, slots), auto_reset=False)
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 2)])
@@ -96,7 +100,7 @@ def check_against_rollout(model: WorldModel, steps: int) -> None:
     z = torch.randn(2, steps, *model.latent_shape, generator=torch.Generator().manual_seed(1))
     env = ImaginationEnv(model, batch_size=[2])
     first, got = slots_of((2,)), []
-    state = env.reset_from_slots(first)
+    state = from_slots(env, first)
     for t in range(steps):
         state = env.step(state.set(keys.LATENT_ACTION, z[:, t]))["next"]
         got.append(state[keys.SLOTS])
@@ -114,7 +118,7 @@ def check_unequal_ages(agent: Agent) -> None:
     env = ImaginationEnv(agent.world_model, batch_size=[2])
     policy = latent_policy_module(agent.policy)
     old = imagine(env, agent, slots_of((2,), 1), 3)[:, -1]["next"]
-    young = env.reset_from_slots(slots_of((2,), 2))
+    young = from_slots(env, slots_of((2,), 2))
     mixed = torch.where(torch.tensor([True, False]), old.select(*young.keys()), young)
     assert mixed[keys.HISTORY_LENGTH].flatten().tolist() == [4, 1]
     after = env.step(policy(mixed.clone()))["next", keys.SLOTS]
@@ -176,7 +180,7 @@ def test_gradients_reach_the_policy_only_when_asked(agent: Agent) -> None:
 def test_imagining_changes_neither_the_model_nor_its_input(agent: Agent) -> None:
     before = {name: tensor.clone() for name, tensor in agent.state_dict().items()}
     env = ImaginationEnv(agent.world_model, [2])
-    start = env.reset_from_slots(slots_of((2,)))
+    start = from_slots(env, slots_of((2,)))
     kept = start.clone()
     env.rollout(5, latent_policy_module(agent.policy), tensordict=start, auto_reset=False)
     for key in sorted(kept.keys()):
@@ -190,7 +194,7 @@ def test_histories_are_right_aligned_and_slide(agent: Agent) -> None:
     model = agent.world_model
     step = dynamics_module(model.inverse_dynamics, model.predictor)
     env = ImaginationEnv(model, [1])
-    state = env.reset_from_slots(slots_of((1,)))
+    state = from_slots(env, slots_of((1,)))
     seen = [state[keys.SLOTS]]
     for t in range(CONTEXT + 2):
         z = torch.full((1, 8), float(t))

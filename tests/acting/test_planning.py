@@ -13,8 +13,7 @@ from torch import Tensor
 from playslot_rl import keys
 from playslot_rl.acting.agent import imagine
 from playslot_rl.acting.closed_loop import ClosedLoop
-from playslot_rl.acting.planners import build_planner, shifted
-from playslot_rl.acting.planners.size import search_size
+from playslot_rl.acting.planners import build_planner, search_size, shifted
 from playslot_rl.acting.planning import PlanningActor
 from playslot_rl.config import PlanConfig
 from playslot_rl.config.planning import PLANNERS

@@ -16,8 +16,7 @@ from squares import videos
 
 from playslot_rl.config import DataConfig
 from playslot_rl.evaluation.card import Card, card_json, make_card
-from playslot_rl.evaluation.card_lines import MEASURES, NO_NUMBERS, Line, line
-from playslot_rl.evaluation.card_verdict import NEEDS, conclude, settle, worthless
+from playslot_rl.evaluation.card_lines import MEASURES, NEEDS, NO_NUMBERS, Line, conclude, line, settle, worthless
 from playslot_rl.evaluation.latent_lines import _probe_lines
 from playslot_rl.runs import Run
 from playslot_rl.world_model import WorldModel

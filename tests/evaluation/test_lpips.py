@@ -10,8 +10,7 @@ from torch import Tensor
 from torchvision.models import alexnet
 
 from playslot_rl.errors import CheckpointError
-from playslot_rl.evaluation.lpips import cached_alexnet, open_lpips
-from playslot_rl.evaluation.video import frame_scores
+from playslot_rl.evaluation.video import cached_alexnet, frame_scores, open_lpips
 from playslot_rl.storage.tensors import load_tensors, save_tensors
 
 pytestmark = pytest.mark.integration

@@ -10,8 +10,7 @@ from nicegui import ui
 from nicegui.testing import User, user_simulation
 
 from playslot_rl.play.page import PlayPage
-from playslot_rl.play.pages import Pages
-from playslot_rl.play.server import serve_pictures
+from playslot_rl.play.server import Pages, serve_pictures
 from playslot_rl.play.studio import Studio
 
 MOUSE: dict[str, Any] = {

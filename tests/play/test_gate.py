@@ -25,7 +25,7 @@ from picture_file import png
 from served import OUTPUT, served
 
 from playslot_rl.play.gate import MOST_BODY, Gate
-from playslot_rl.play.pages import MOST_PAGES
+from playslot_rl.play.server import MOST_PAGES
 
 pytestmark = pytest.mark.integration
 

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from playslot_rl.play.likeness import alike, in_words
 from playslot_rl.play.session import PlaySession
+from playslot_rl.play.steering import alike, in_words
 
 
 def moved(*places: int, noise: float = 0.0) -> npt.NDArray[np.uint8]:

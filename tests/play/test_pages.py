@@ -16,7 +16,7 @@ from nicegui.testing import User
 from page_script import simulate, until
 from scene import DotTask
 
-from playslot_rl.play import pages as pages_module
+from playslot_rl.play import server
 from playslot_rl.play.page import PlayPage
 from playslot_rl.play.pictures import Gallery
 from playslot_rl.play.session import PlaySession
@@ -59,7 +59,7 @@ def test_plain_requests_make_no_session_and_are_forgotten(studio: Studio, monkey
     made: list[PlaySession] = []
     session = studio.session
     monkeypatch.setattr(studio, "session", lambda: made.append(session()) or made[-1])
-    monkeypatch.setattr(pages_module, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(server, "CONNECT_S", 0.2)
 
     async def script(user: User, pages: list[PlayPage]) -> None:
         clients = len(Client.instances)
@@ -75,7 +75,7 @@ def test_plain_requests_make_no_session_and_are_forgotten(studio: Studio, monkey
 def test_a_page_too_many_says_so_and_begins_when_another_one_has_gone(
     studio: Studio, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pages_module, "MOST_PAGES", 1)
+    monkeypatch.setattr(server, "MOST_PAGES", 1)
 
     async def script(user: User, pages: list[PlayPage]) -> None:
         first = user._client

@@ -12,8 +12,8 @@ from picture_file import png
 from PIL import Image
 
 from playslot_rl.errors import DataError
-from playslot_rl.play import picture
-from playslot_rl.play.picture import MOST_BYTES, MOST_PIXELS, read_picture
+from playslot_rl.play import starts
+from playslot_rl.play.starts import MOST_BYTES, MOST_PIXELS, read_picture
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_formats_that_need_programs_or_believe_their_header_are_no_pictures(kind
         read_picture(stored(kind), "x", 64)
 
 
-@pytest.mark.parametrize("kind", picture.FORMATS)
+@pytest.mark.parametrize("kind", starts.FORMATS)
 def test_damaged_files_of_every_format_are_read_or_refused_in_one_line(kind: str) -> None:
     whole, rng = stored(kind), np.random.default_rng(0)
     assert read_picture(whole, "x", 32).shape == (32, 32, 3)

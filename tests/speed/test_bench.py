@@ -56,7 +56,7 @@ def test_a_training_step_changes_the_weights(stage: str) -> None:
 
 @pytest.mark.integration
 def test_a_game_is_the_same_every_time() -> None:
-    from playslot_rl.play.game import game
+    from playslot_rl.play.pictures import game
     from playslot_rl.runs import Run
 
     torch.manual_seed(0)

@@ -11,8 +11,8 @@ from PIL import Image
 
 from playslot_rl.frames import to_float
 from playslot_rl.testing import tiny_config
+from playslot_rl.visualization.drawings import change_map, draw_prototypes, prototype_frames, segmentation, slot_cells
 from playslot_rl.visualization.grid import GAP, animation, image_grid, side_by_side
-from playslot_rl.visualization.slots import change_map, draw_prototypes, prototype_frames, segmentation, slot_cells
 from playslot_rl.world_model import WorldModel
 
 RNG = np.random.default_rng(0)

@@ -5,13 +5,12 @@
 
 from __future__ import annotations
 
-from playslot_rl.acting.planners.cem import CEMPlanner
-from playslot_rl.acting.planners.gradient import GradientPlanner
-from playslot_rl.acting.planners.mppi import MPPIPlanner
+from dataclasses import dataclass
+
 from playslot_rl.acting.planners.planner import Cost, Plan, Planner, Search, latent_statistics, shifted
-from playslot_rl.acting.planners.prototypes import PrototypePlanner
-from playslot_rl.acting.planners.size import SearchSize
-from playslot_rl.config.planning import PlanConfig, PlannerName
+from playslot_rl.acting.planners.searches import CEMPlanner, GradientPlanner, MPPIPlanner, PrototypePlanner
+from playslot_rl.config.plain import check
+from playslot_rl.config.planning import GoalName, PlanConfig, PlannerName
 from playslot_rl.errors import ConfigError
 from playslot_rl.world_model import WorldModel
 
@@ -24,10 +23,45 @@ __all__ = [
     "Planner",
     "PrototypePlanner",
     "Search",
+    "SearchSize",
     "build_planner",
     "latent_statistics",
+    "search_size",
     "shifted",
 ]
+
+
+@dataclass(frozen=True)
+class SearchSize:
+    """The six keys of `PlanConfig` that the goals decide, with nothing left open."""
+
+    horizon: int
+    every: int
+    candidates: int
+    iterations: int
+    elites: int
+    prior: float
+
+
+def search_size(plan: PlanConfig, goals: GoalName, frame_skip: int) -> SearchSize:
+    """How large a search is, and how near to the policy it stays: what was typed, else the goals' own.
+
+    stable-worldmodel plans 5 blocks of 5 environment steps, all of them executed before the next plan, with 300
+    samples, 30 iterations and 30 elites. Our agent step is a block of `frame_skip` environment steps. A policy that was
+    cloned from the task's demonstrations means the goals `solved`, and plans from it stay near it; it does not mean the
+    goals `ahead`.
+
+    A ValueError for more elites than candidates, or more steps executed than planned.
+    """
+    blocks = max(1, round(25 / frame_skip))
+    own = SearchSize(16, 2, 64, 8, 8, 3.0) if goals == "solved" else SearchSize(blocks, blocks, 300, 30, 30, 0.0)
+    horizon = plan.horizon or own.horizon
+    candidates = plan.candidates or own.candidates
+    every, elites = plan.every or min(own.every, horizon), plan.elites or min(own.elites, candidates)
+    check(every <= horizon, "plan.every", every, f"at most plan.horizon={horizon}")
+    check(elites <= candidates, "plan.elites", elites, f"at most the {candidates} candidates")
+    prior = own.prior if plan.prior is None else plan.prior
+    return SearchSize(horizon, every, candidates, plan.iterations or own.iterations, elites, prior)
 
 
 def build_planner(name: PlannerName, plan: PlanConfig, size: SearchSize, world_model: WorldModel) -> Planner:

@@ -45,7 +45,6 @@ class SlotDistance:
         self.goal, self.match = goal, match
 
     def __call__(self, slots: Tensor) -> Tensor:
-        """Slots (..., N, D) to distances (...), differentiable."""
         if not self.match:
             return (slots - self.goal).square().mean((-2, -1))
         flat = slots.reshape(-1, *self.goal.shape)
@@ -69,10 +68,8 @@ class DynamicsDistance:
 
     A latent action is a difference of InvDyn's means, z_t = mu_{t+1} - mu_t, so mu(G) - mu(S) is the sum of the latent
     actions that lead from S to G, and W^-1 counts it in steps of a typical motion. Slots saturate: once an object is
-    out of the place where the goal has it, they no longer say how far (docs/how-to/plan.md).
-
-    Raises:
-        ValueError: InvDyn has no encoder (modes `ground_truth` and `none`).
+    out of the place where the goal has it, they no longer say how far (docs/how-to/plan.md). A ValueError where InvDyn
+    has no encoder (modes `ground_truth` and `none`).
     """
 
     def __init__(self, inverse_dynamics: InverseDynamics, whitening: Whitening, goal: Tensor) -> None:
@@ -83,7 +80,6 @@ class DynamicsDistance:
         self.goal = inverse_dynamics.scene_dynamics(goal)[0]
 
     def __call__(self, slots: Tensor) -> Tensor:
-        """Slots (..., N, D) to distances (...), differentiable."""
         here = self.inverse_dynamics.scene_dynamics(slots)[0]
         squares = self.whitening.turn(here - self.goal).square()
         return squares.flatten(slots.ndim - 2).mean(-1)
@@ -98,7 +94,6 @@ class ImageDistance:
         self.savi, self.goal = savi, normalise(goal)
 
     def __call__(self, slots: Tensor) -> Tensor:
-        """Slots (..., N, D) to distances (...), differentiable."""
         frames: Tensor = self.savi.decode(slots).frames
         return (frames - self.goal).square().mean((-3, -2, -1))
 
@@ -117,13 +112,9 @@ def goal_distance(agent: Agent, kind: CostName, goal: Tensor, image: Tensor, mat
 
 
 class GoalCost:
-    """Cost of latent actions from where an episode stands.
-
-    Args:
-        slots: (S, N, D) of the frames seen so far, the present one last; at most the predictor's context.
-        past: (S - 1, [N,] Z), the latent actions between them.
-        along: a, 0 to 1.
-        rows: candidates imagined at once, for the memory.
+    """Cost of latent actions from where an episode stands: slots (S, N, D) of the frames seen so far, the present one
+    last, at most the predictor's context, and the latent actions (S - 1, [N,] Z) between them. `along` is a, 0 to 1;
+    `rows` candidates are imagined at once, for the memory.
     """
 
     def __init__(
@@ -165,8 +156,8 @@ class NearProposal:
         J'(z) = J(z) + w / HZ sum_t |W^-1 (z_t - z^_t)|^2
 
     As in model-based offline planning (Argenson and Dulac-Arnold, ICLR 2021) the search stays where the demonstrations
-    were: latents far from the policy's lead to futures that the model guesses and to actions that the decoder guesses,
-    and a search finds the guesses that please it. The proposal itself costs what it did.
+    were: latents far from the policy's lead to futures that model and decoder guess, and a search finds the guesses
+    that please it. The proposal itself costs what it did.
 
     Examples:
         >>> near = NearProposal(lambda z: torch.zeros(len(z)), torch.zeros(2, 1), Whitening(1), 3.0)
@@ -178,7 +169,7 @@ class NearProposal:
         self.cost, self.proposal, self.whitening, self.weight = cost, proposal, whitening, weight
 
     def __call__(self, latents: Tensor) -> Tensor:
-        """Latent actions (M, H, [N,] Z) to costs (M,), differentiable."""
+        """Latent actions (M, H, [N,] Z) to costs (M,)."""
         strayed = self.whitening.turn(latents - self.proposal).square()
         return self.cost(latents) + self.weight * strayed.flatten(1).mean(1)
 
@@ -186,9 +177,8 @@ class NearProposal:
 @torch.no_grad()
 def parse_goal(savi: SAVi, state: Tensor, goal: Tensor, looks: int = 1) -> Tensor:
     """Slots (n, N, D) of goal images (n, 3, H, W) as SAVi would track them: parsed as the frame after the first one,
-    with the state (n, N, D) that it left. Parsed as a first frame they lie five times as far from the tracked ones.
-
-    `looks` is how many times the image is shown; a far goal may take the slots more than one correction to reach.
+    with the state (n, N, D) that it left. Parsed as a first frame they lie five times as far from the tracked ones. The
+    image is shown `looks` times; a far goal may take the slots more than one correction to reach.
     """
     clip = normalise(goal)[:, None].expand(-1, looks, -1, -1, -1)
     slots: Tensor = savi(clip, state)[0]

@@ -37,7 +37,6 @@ class Search:
     Attributes:
         cost: of candidates; differentiable for the gradient planner.
         shape: (H, [N,] Z) of a plan.
-        whitening: mean and scale of the latent actions.
         starts: plans (S, H, [N,] Z) to begin with, such as the shifted last plan or a policy's; S may be 0.
         bound: the search stays where every whitened coordinate is in [-bound, bound]; beyond, the model is guessing.
         seconds: of wall clock that the search may take, at least one iteration; 0: the planner's iterations decide,
@@ -60,8 +59,7 @@ class Search:
 
     def latents(self, coordinates: Tensor) -> Tensor:
         """Whitened coordinates (..., Z) to latent actions."""
-        latents: Tensor = self.whitening.inverse(coordinates)
-        return latents
+        return self.whitening.inverse(coordinates)
 
     def coordinates(self, latents: Tensor) -> Tensor:
         """Latent actions (..., Z) to whitened coordinates, inside the bound."""
@@ -69,14 +67,14 @@ class Search:
         return coordinates
 
     def first_spread(self, spread: float, start_spread: float) -> float:
-        """The first standard deviation: narrower where there are plans to begin with."""
         return start_spread if len(self.starts) else spread
 
     def around(
         self, mean: Tensor, std: Tensor | float, count: int, correlation: float, generator: torch.Generator
     ) -> Tensor:
         """Coordinates (count, H, [N,] Z) drawn round a plan's (H, [N,] Z), inside the bound; the noise of neighbouring
-        steps correlates."""
+        steps correlates.
+        """
         white = torch.randn(count, *self.shape, generator=generator, device=generator.device)
         return (mean + std * correlated(white, correlation)).clamp(-self.bound, self.bound)
 
@@ -123,7 +121,6 @@ class Best:
         return costs
 
     def note(self) -> None:
-        """An iteration is over."""
         self.costs.append(self.cost)
 
     def plan(self) -> Plan:

@@ -46,7 +46,6 @@ class GoalReward(Transform):
         return tensordict_reset  # there is no reward before the first step
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """One number."""
         reward = Unbounded((*reward_spec.shape, 1), device=reward_spec.device)
         return Composite({"reward": reward}, shape=reward_spec.shape, device=reward_spec.device)
 
@@ -70,20 +69,16 @@ class ReturnAdvantage(TensorDictModuleBase):
 def planning_env(
     world_model: WorldModel, distance: Distance, whitening: Whitening, horizon: int, along: float = 0.5
 ) -> TransformedEnv:
-    """The imagination environment for `CEMPlanner` and `MPPIPlanner` (with `ReturnAdvantage`), batch size ().
-
-    The whitening's axes are left out: TorchRL's normalisation is a number for each latent dimension.
-
-    Raises:
-        ValueError: one latent action a slot, which TorchRL's planners cannot hold.
+    """The imagination environment for `CEMPlanner` and `MPPIPlanner` (with `ReturnAdvantage`), batch size (). The
+    whitening's axes are left out: TorchRL's normalisation is a number for each latent dimension. A ValueError for one
+    latent action a slot, which TorchRL's planners cannot hold.
     """
     if len(world_model.latent_shape) > 1:
         raise ValueError("planning_env: got one latent action per slot, expected one a step: use our own planners")
-    deviation = (whitening.basis * whitening.scale).square().sum(-1).sqrt()
     env = ImaginationEnv(world_model, horizon=horizon)
     scaled = ObservationNorm(
         loc=whitening.mean,
-        scale=deviation,
+        scale=_deviation(whitening),
         in_keys=[],
         out_keys=[],
         in_keys_inv=[keys.LATENT_ACTION],
@@ -103,8 +98,8 @@ def planning_start(env: TransformedEnv, slots: Tensor) -> TensorDictBase:
 
 def latent_of(whitening: Whitening, action: Tensor) -> Tensor:
     """A planner's action (..., Z), which is in standard units, as the latent action (..., Z)."""
-    deviation = (whitening.basis * whitening.scale).square().sum(-1).sqrt()
-    return whitening.mean + deviation * action
+    return whitening.mean + _deviation(whitening) * action
 
 
-__all__ = ["GoalReward", "ReturnAdvantage", "latent_of", "planning_env", "planning_start"]
+def _deviation(whitening: Whitening) -> Tensor:
+    return (whitening.basis * whitening.scale).square().sum(-1).sqrt()

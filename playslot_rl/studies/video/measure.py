@@ -17,7 +17,7 @@ import numpy.typing as npt
 from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.envs import RECORDED
 from playslot_rl.errors import ConfigError, PlaySlotError
-from playslot_rl.evaluation.lpips import open_lpips
+from playslot_rl.evaluation.video import open_lpips
 from playslot_rl.methods.video.scores import bootstrap
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing, write_json, write_text

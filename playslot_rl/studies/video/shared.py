@@ -23,7 +23,7 @@ from playslot_rl.data.weighted import open_configured
 from playslot_rl.data.windows import Clips, IntArray, spread_windows
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import ConfigError, DataError
-from playslot_rl.evaluation.lpips import open_lpips
+from playslot_rl.evaluation.video import open_lpips
 from playslot_rl.methods.training import check_method
 from playslot_rl.methods.video.predictor import LastFrame, Reconstruction
 from playslot_rl.methods.video.scores import as_function, score_clips

@@ -19,7 +19,7 @@ from playslot_rl.config import ExperimentConfig, plugins, to_dict
 from playslot_rl.config.compare_video import CompareVideoConfig, method_of
 from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import CheckpointError, TrainingError
-from playslot_rl.evaluation.lpips import open_lpips
+from playslot_rl.evaluation.video import open_lpips
 from playslot_rl.methods.video.scores import method_rows, score_clips
 from playslot_rl.runs import Run
 from playslot_rl.runtime.devices import open_device

@@ -19,8 +19,8 @@ from playslot_rl.acting.planners import (
     Search,
     shifted,
 )
-from playslot_rl.acting.planners.mppi import path_weights
 from playslot_rl.acting.planners.planner import correlated, latent_statistics, unfaded
+from playslot_rl.acting.planners.searches import path_weights
 from playslot_rl.config import ActionDecoderConfig, PolicyConfig
 from playslot_rl.modules.whitening import Whitening
 from playslot_rl.testing import tiny_agent, tiny_config

@@ -1,19 +1,26 @@
-"""What the parts of a world model hold: slots as masks and objects, action prototypes by what they do.
+"""What the parts of a world model hold: slots as masks and objects, action prototypes by what they do; and imagined
+futures beside what happens when their actions are executed.
 
-Shapes: T frames, N slots, K prototypes, P predicted frames, H W image height and width.
+Shapes: E episodes, T frames or agent steps, N slots, K prototypes, P predicted frames, H W image height and width.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from PIL import Image
+from torch import Tensor
 
+from playslot_rl import keys
+from playslot_rl.acting.agent import ImaginationActor, playslot_actor
+from playslot_rl.acting.episodes import Moment, Outcome, TaskPool, record
 from playslot_rl.colours import segmentation
 from playslot_rl.frames import to_float, to_uint8
 from playslot_rl.visualization.grid import film_strip, image_grid
-from playslot_rl.world_model import WorldModel
+from playslot_rl.world_model import Agent, WorldModel
 
 Frames = npt.NDArray[np.uint8]
 
@@ -84,3 +91,20 @@ def change_map(before: Frames, after: Frames) -> Frames:
     colour = np.where(difference[..., None] > 0, orange, blue)
     picture: Frames = (255 * (1 - strength) + colour * strength).astype(np.uint8)
     return picture
+
+
+@torch.no_grad()
+def run_rollouts(agent: Agent, pool: TaskPool, seeds: Sequence[int]) -> tuple[Frames, list[Outcome], list[Outcome]]:
+    """The same episodes as frames (E, 3, T + 1, H, W, 3), decoded from the unfolded slots, of the imagined actions in
+    the simulator, and of the agent observing every frame; and how the last two ended.
+    """
+    unfolded: list[Tensor] = []
+
+    def keep_imagined(moment: Moment) -> None:
+        if moment.step == 0 and moment.seen is not None:
+            unfolded.append(moment.seen.get(keys.PREDICTED_SLOTS))
+
+    executed, executed_outcome = record(pool, ImaginationActor(agent, pool.env.max_steps), seeds, keep_imagined)
+    imagined = np.stack([to_uint8(agent.world_model.savi.decode(s).frames) for s in torch.cat(unfolded)])
+    closed, closed_outcome = record(pool, playslot_actor(agent), seeds)
+    return np.stack([imagined, executed, closed], 1), executed_outcome, closed_outcome
