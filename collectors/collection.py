@@ -9,8 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from playslot_rl.collectors.export import META_NAME, export
-from playslot_rl.collectors.journal import SPEC_NAME, Journal, journal_path, read_spec, remove_leftover
-from playslot_rl.collectors.spec import CollectionSpec
+from playslot_rl.collectors.journal import SPEC_NAME, CollectionSpec, Journal, journal_path, read_spec, remove_leftover
 from playslot_rl.config import CollectorConfig, DataConfig, ExperimentConfig
 from playslot_rl.data.metadata import INFO_NAME, json_content
 from playslot_rl.envs import PROCEDURAL

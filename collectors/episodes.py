@@ -22,8 +22,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from playslot_rl import keys
-from playslot_rl.collectors.journal import RecordedEpisode
-from playslot_rl.collectors.spec import CollectionSpec
+from playslot_rl.collectors.journal import CollectionSpec, RecordedEpisode
 from playslot_rl.envs import make_env, task_env
 from playslot_rl.envs.torchrl import TensorView, View, wrap
 from playslot_rl.errors import ConfigError

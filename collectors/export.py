@@ -17,8 +17,7 @@ import numpy.typing as npt
 
 from playslot_rl import keys
 from playslot_rl.collectors.image_set import ImageSetWriter, feature, finalising, new_set
-from playslot_rl.collectors.journal import Journal, RecordedEpisode
-from playslot_rl.collectors.spec import CollectionSpec
+from playslot_rl.collectors.journal import CollectionSpec, Journal, RecordedEpisode
 from playslot_rl.envs import PROCEDURAL, task_metadata
 from playslot_rl.envs.grid_shapes import METADATA
 from playslot_rl.errors import OutputError

@@ -20,8 +20,7 @@ import numpy as np
 import torch
 
 from playslot_rl.collectors.episodes import EpisodeCollector, record
-from playslot_rl.collectors.journal import Journal, RecordedEpisode
-from playslot_rl.collectors.spec import CollectionSpec
+from playslot_rl.collectors.journal import CollectionSpec, Journal, RecordedEpisode
 from playslot_rl.config import CollectorConfig
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.envs.grid_shapes import generate

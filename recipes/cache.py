@@ -27,7 +27,7 @@ ACTIONS: Final[dict[str, Action]] = {
         "what is there: data set, size, last use, and whether a process uses it",
         "One line an entry, the least recently used first: those make room where data.cache_limit= is reached.",
         ("playslot cache list", "playslot cache list --json --cache data/cache"),
-        "playslot_rl.data.cache_entries:listing",
+        "playslot_rl.data.cache:listing",
         (CACHE, JSON),
     ),
     "clear": Action(
@@ -35,7 +35,7 @@ ACTIONS: Final[dict[str, Action]] = {
         "Removes all entries, or those named (the beginning of a name will do). What a process has open or makes "
         "stays.",
         ("playslot cache clear", "playslot cache clear 3f9a01 --cache data/cache"),
-        "playslot_rl.data.cache_entries:clear",
+        "playslot_rl.data.cache:clear",
         (NAMES, CACHE, JSON),
     ),
 }

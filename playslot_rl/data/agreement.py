@@ -17,8 +17,7 @@ import numpy as np
 from playslot_rl.config.weights import is_remote
 from playslot_rl.data.contents import Contents, Span, episode_files, read_contents
 from playslot_rl.data.metadata import EPISODES_PATH, INFO_NAME, NUMBERS, OTHERS
-from playslot_rl.data.places import CLUTTER, OUTSIDE, filled, is_clutter, parquet_files
-from playslot_rl.data.problems import SHOWN, Problems
+from playslot_rl.data.places import CLUTTER, OUTSIDE, SHOWN, Problems, filled, is_clutter, parquet_files
 from playslot_rl.data.tables import TASKS_NAME, UNREADABLE, WRONG_COLUMN, Episode
 from playslot_rl.errors import DataError
 from playslot_rl.runtime.processes import here

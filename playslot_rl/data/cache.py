@@ -3,31 +3,41 @@
 CACHE/frames/KEY   CACHE/slots/KEY      entries; what is in use is held by a lock in them
 CACHE/remote/NAME-COMMIT                metadata of a data set on the Hub: small, neither listed nor limited
 CACHE/frames/.KEY.part                  one that is being made, or that a kill has left: the next use goes on there
+
+Room is made by what was used least recently, never by what a process uses.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
 import mmap
 import os
 import shutil
+import time
 import weakref
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from filelock import FileLock, Timeout
 
-from playslot_rl.config.sizes import bytes_of
+from playslot_rl.config.sizes import bytes_of, shown
 from playslot_rl.errors import DataError, PlaySlotError
 from playslot_rl.storage.atomic import explain_write_errors, replace_dir
 from playslot_rl.storage.locks import locked
-from playslot_rl.storage.sharing_locks import release_with, share
+from playslot_rl.storage.sharing_locks import alone, last_use, release_with, remove_unused, share
 
 if TYPE_CHECKING:
     from playslot_rl.config import DataConfig
 
+KINDS: Final = ("frames", "slots")
+LEFT: Final = ".tmp-"
+"""In the name of a folder that is being made or removed, or that a kill has left (`playslot_rl.storage.folders`)."""
+ENTRY_NAME: Final = "meta.json"
 RELEASE_EVERY: Final = 2**28  # bytes that are read from memory maps before their pages are given back
 
 
@@ -166,3 +176,188 @@ class ArrayWriter:
 
     def close(self) -> None:
         self._file.close()
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry of a cache.
+
+    Attributes:
+        data: folder of the data set it was made from, as it was named then; empty where an older version made it.
+        in_use: whether a process has it open, or makes it.
+        part: whether it is not finished: it is being made, or a kill has left it.
+    """
+
+    path: str
+    kind: str
+    data: str
+    bytes: int
+    used: float
+    in_use: bool
+    part: bool
+
+    @property
+    def name(self) -> str:
+        """What `playslot cache clear` calls it."""
+        folder = Path(self.path)
+        return _key(folder) if self.part else folder.name
+
+    def line(self) -> str:
+        when = time.strftime("%Y-%m-%d %H:%M", time.localtime(self.used))
+        state = "in use" if self.in_use else "unfinished" if self.part else "free"
+        return f"{self.name}  {self.kind:6}  {shown(self.bytes):>8}  {when}  {state:10}  {self.data or '-'}"
+
+
+def entries(cache: CachePlace = "") -> list[Entry]:
+    """All entries, those first that were used longest ago."""
+    found = []
+    for kind in KINDS:
+        for folder in (cache_folder(cache) / kind).glob("*"):
+            part = folder.name.startswith(".") and (folder.name.endswith(".part") or LEFT in folder.name)
+            if folder.is_dir() and (part or not folder.name.startswith(".")):
+                with contextlib.suppress(FileNotFoundError):  # removed meanwhile
+                    found.append(_entry(folder, kind, part))
+    return sorted(found, key=lambda entry: entry.used)
+
+
+def _entry(folder: Path, kind: str, part: bool) -> Entry:
+    used, files = last_use(folder), [path for path in folder.rglob("*") if path.is_file()]
+    try:
+        data = str(json.loads((folder / ENTRY_NAME).read_text()).get("name", ""))
+    except (OSError, ValueError, AttributeError):
+        data = ""
+    with _unmade(folder) if part else alone(folder) as free:
+        # What is being made will fill its holes; what a kill has left will not.
+        size = sum(path.stat().st_size if part and not free else _stored(path) for path in files)
+        return Entry(str(folder), kind, data, size, used, not free, part)
+
+
+def _key(part: Path) -> str:
+    """Name of the entry that a folder was to become."""
+    return part.name.removeprefix(".").removesuffix(".part").partition(LEFT)[0]
+
+
+def _stored(path: Path) -> int:
+    """Bytes on disk: an array that was being made has holes."""
+    status = path.stat()
+    return min(status.st_size, status.st_blocks * 512) if hasattr(status, "st_blocks") else status.st_size
+
+
+@contextlib.contextmanager
+def _unmade(part: Path) -> Iterator[bool]:
+    """Whether nobody makes the entry; inside the block nobody begins to."""
+    lock = FileLock(lock_file(part.with_name(_key(part))), timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        lock.release()
+
+
+def remove(entry: Entry) -> bool:
+    """Remove an entry that nobody uses; whether it is gone."""
+    folder = Path(entry.path)
+    if not entry.part:
+        return remove_unused(folder)
+    with _unmade(folder) as free:
+        if free:
+            shutil.rmtree(folder, ignore_errors=True)
+        return free and not folder.exists()
+
+
+@contextlib.contextmanager
+def room(cache: CachePlace, needed: int, key: str) -> Iterator[None]:
+    """Make room, and begin an entry in the block, by making its file as large as it will be: two processes do not both
+    take the same room. Arguments and errors: see `make_room`."""
+    with locked(cache_folder(cache) / ".room.lock") if settings(cache).limit is not None else contextlib.nullcontext():
+        make_room(cache, needed, key)
+        yield
+
+
+def make_room(cache: CachePlace, needed: int, key: str) -> None:
+    """Remove entries, the least recently used first, until `needed` more bytes fit below the cache's limit.
+
+    What a killed process has left of the entry `key`, which is to be made, does not count.
+
+    Raises:
+        DataError: it does not fit beside what is in use; then nothing is removed.
+    """
+    limit = settings(cache).limit
+    if limit is None:
+        return
+    there = [entry for entry in entries(cache) if entry.name != key]
+    total, kept = sum(entry.bytes for entry in there), sum(entry.bytes for entry in there if entry.in_use)
+    if kept + needed > limit:
+        raise DataError(
+            f"data.cache_limit={shown(limit)}: got {shown(needed)} to store beside {shown(kept)} in use, expected "
+            "less: raise it, wait for the other processes, or read without a frame cache by data.stream=true"
+        )
+    for entry in there:
+        if total + needed <= limit:
+            return
+        if not entry.in_use and remove(entry):
+            total -= entry.bytes
+
+
+@dataclass(frozen=True)
+class Listing:
+    """What `playslot cache list` says."""
+
+    folder: str
+    entries: Sequence[Entry]
+
+    def to_json(self) -> str:
+        rows = [{"name": entry.name, **asdict(entry)} for entry in self.entries]
+        return json.dumps({"folder": self.folder, "entries": rows}, indent=2)
+
+    def lines(self) -> list[str]:
+        total = f"{self.folder}: {len(self.entries)} entries, {shown(sum(entry.bytes for entry in self.entries))}"
+        return [*(entry.line() for entry in self.entries), total]
+
+
+def listing(cache: Path | None = None) -> Listing:
+    """What a cache holds; None means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`."""
+    folder = cache_folder(cache or "")
+    return Listing(str(folder), entries(folder))
+
+
+@dataclass(frozen=True)
+class Cleared:
+    """What `playslot cache clear` says."""
+
+    folder: str
+    removed: Sequence[Entry]
+    kept: Sequence[Entry]
+
+    def to_json(self) -> str:
+        names = {"removed": [entry.name for entry in self.removed], "in_use": [entry.name for entry in self.kept]}
+        return json.dumps({"folder": self.folder, **names, "bytes": self._freed()}, indent=2)
+
+    def lines(self) -> list[str]:
+        lines = [f"{entry.name}: in use, left" for entry in self.kept]
+        return [*lines, f"{self.folder}: {len(self.removed)} entries removed, {shown(self._freed())} free again"]
+
+    def _freed(self) -> int:
+        return sum(entry.bytes for entry in self.removed)
+
+
+def clear(names: Sequence[str] = (), cache: Path | None = None) -> Cleared:
+    """Remove entries that nobody uses: all of them, or those of some names (their beginnings will do).
+
+    Raises:
+        DataError: no entry of such a name.
+    """
+    folder = cache_folder(cache or "")
+    there = entries(folder)
+    for name in names:
+        if not any(entry.name.startswith(name) for entry in there):
+            raise DataError(f"{folder}: got no entry {name}, expected one of `playslot cache list`")
+    chosen = [entry for entry in there if not names or entry.name.startswith(tuple(names))]
+    gone = {entry.path: remove(entry) for entry in chosen}
+    return Cleared(
+        str(folder), [e for e in chosen if gone[e.path]], [entry for entry in chosen if not gone[entry.path]]
+    )

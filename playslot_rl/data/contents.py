@@ -21,8 +21,7 @@ import numpy as np
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.metadata import CAMERAS, DATA_PATH, INFO_NAME, VIDEO_PATH, read_info
-from playslot_rl.data.places import filled, inside, note_odd_files, parquet_files
-from playslot_rl.data.problems import Problems
+from playslot_rl.data.places import Problems, filled, inside, note_odd_files, parquet_files
 from playslot_rl.data.tables import Array, Episode, episodes_of, holds_numbers, read_columns, read_table, read_tasks
 from playslot_rl.errors import DataError
 

@@ -21,8 +21,7 @@ import numpy.typing as npt
 
 from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.metadata import LARGEST_PICTURE, stated_size
-from playslot_rl.data.places import inside, is_plain_path
-from playslot_rl.data.problems import Problems
+from playslot_rl.data.places import Problems, inside, is_plain_path
 from playslot_rl.data.tables import WRONG_COLUMN, Array
 from playslot_rl.errors import DataError
 

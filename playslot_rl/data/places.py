@@ -1,4 +1,4 @@
-"""Where a data set's files may lie: paths made from metadata stay below its folder, and what lies there is sorted.
+"""What is wrong with a data set, and where its files may lie: paths made from metadata stay below its folder.
 
 LeRobot's own paths are `str.format` templates. A format can ask for a width of ten digits or for the attributes of what
 it is given; here a template has the known fields only, and a path made from it has no way out of the folder.
@@ -13,8 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, TypeGuard
 
-from playslot_rl.data.problems import Problems
-
+SHOWN: Final = 5  # messages of one kind before the rest is only counted
 OUTSIDE: Final = "outside"  # kind of problem: a link out of the data set
 CLUTTER: Final = "clutter"  # kind of warning: files of another file system that LeRobot takes for rows
 FARTHEST: Final = 10**9  # the highest number of a folder or a file
@@ -22,6 +21,45 @@ _FIELD: Final = re.compile(r"\{(chunk_index|file_index|video_key)(?::0?(\d)d?)?\
 _CLUTTER: Final = (".DS_Store", "Thumbs.db", "desktop.ini")
 _LONGEST_PATH: Final = 1024
 _LONGEST_NAME: Final = 255
+
+
+class Problems:
+    """Errors and warnings by kind, in the order the kinds first appeared."""
+
+    def __init__(self) -> None:
+        self._errors: dict[str, list[str]] = {}
+        self._warnings: dict[str, list[str]] = {}
+
+    def error(self, kind: str, message: str) -> None:
+        """The data set is not what it says it is."""
+        self._errors.setdefault(kind, []).append(message)
+
+    def warning(self, kind: str, message: str) -> None:
+        """Untidy, but every frame and number can be trusted."""
+        self._warnings.setdefault(kind, []).append(message)
+
+    def of(self, kind: str) -> list[str]:
+        return self._errors.get(kind, [])
+
+    def warnings_of(self, kind: str) -> list[str]:
+        return self._warnings.get(kind, [])
+
+    @property
+    def errors(self) -> list[str]:
+        return _lines(self._errors)
+
+    @property
+    def warnings(self) -> list[str]:
+        return _lines(self._warnings)
+
+
+def _lines(found: dict[str, list[str]]) -> list[str]:
+    lines: list[str] = []
+    for kind, messages in found.items():
+        lines += messages[:SHOWN]
+        if len(messages) > SHOWN:
+            lines.append(f"{kind}: and {len(messages) - SHOWN} more of this kind")
+    return lines
 
 
 def is_plain(name: str) -> bool:

@@ -24,8 +24,7 @@ from playslot_rl.data.cache import build_once
 from playslot_rl.data.contents import Contents, read_metadata
 from playslot_rl.data.hub_faults import Asked, one_line
 from playslot_rl.data.metadata import DATA_PATH, FORMAT_TAG, INFO_NAME
-from playslot_rl.data.places import filled, is_plain_path
-from playslot_rl.data.problems import Problems
+from playslot_rl.data.places import Problems, filled, is_plain_path
 from playslot_rl.data.tables import MOST_ROWS, Array, Episode, read_columns
 from playslot_rl.errors import DataError
 from playslot_rl.runtime.processes import here

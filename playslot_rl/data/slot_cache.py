@@ -16,11 +16,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from playslot_rl.data.cache import ArrayWriter, CachePlace, build_once, cache_folder, load_cached
-from playslot_rl.data.cache_entries import ENTRY_NAME, room
-from playslot_rl.data.rows import RowView
+from playslot_rl.data.cache import ENTRY_NAME, ArrayWriter, CachePlace, build_once, cache_folder, load_cached, room
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.stream import streams_of
+from playslot_rl.data.views import RowView
 from playslot_rl.frames import normalise
 from playslot_rl.seeds.draws import step_generator
 from playslot_rl.storage.atomic import write_json

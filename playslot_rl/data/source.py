@@ -22,15 +22,22 @@ from playslot_rl import keys
 from playslot_rl.config.weights import is_remote
 from playslot_rl.data.action_limits import ActionLimits, limits_of
 from playslot_rl.data.agreement import open_files
-from playslot_rl.data.cache import CachePlace, build_once, cache_folder, load_cached, note_read, settings
-from playslot_rl.data.cache_entries import ENTRY_NAME, room
+from playslot_rl.data.cache import (
+    ENTRY_NAME,
+    CachePlace,
+    build_once,
+    cache_folder,
+    load_cached,
+    note_read,
+    room,
+    settings,
+)
 from playslot_rl.data.contents import Contents
 from playslot_rl.data.frame_build import FrameArray, build_frames
 from playslot_rl.data.metadata import stated_size
 from playslot_rl.data.remote import open_remote
-from playslot_rl.data.rows import FrameRows, Frames
 from playslot_rl.data.stream import FrameStream
-from playslot_rl.data.views import concatenate
+from playslot_rl.data.views import FrameRows, Frames, concatenate
 from playslot_rl.errors import DataError
 from playslot_rl.storage.atomic import write_json
 

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.frames import rgb_frames, sized
 from playslot_rl.data.metadata import stated_size
-from playslot_rl.data.rows import FrameRows, Frames, IntArray, RowView, row_numbers
+from playslot_rl.data.views import FrameRows, Frames, IntArray, RowView, row_numbers
 from playslot_rl.runtime import processes
 
 BLOCKS: Final = 16  # of a full buffer

@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.data.metadata import CAMERAS, MOST, NUMBERS, OTHERS, WHOLE, damaged, whole
-from playslot_rl.data.places import inside
-from playslot_rl.data.problems import Problems
+from playslot_rl.data.places import Problems, inside
 
 TASKS_NAME: Final = "meta/tasks.parquet"
 EPISODES_AT_ONCE: Final = 64  # of the metadata with statistics, some 150 columns

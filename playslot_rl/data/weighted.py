@@ -20,9 +20,8 @@ import numpy.typing as npt
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import DataRoot, data_roots
 from playslot_rl.data.cache import Cache
-from playslot_rl.data.rows import IntArray
 from playslot_rl.data.source import EpisodeFrames, open_sources
-from playslot_rl.data.views import concatenate, every, text_hash
+from playslot_rl.data.views import IntArray, concatenate, every, text_hash
 from playslot_rl.errors import DataError
 
 

@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.data.rows import IntArray as IntArray
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.stream import ShuffleBuffer, streams_of
+from playslot_rl.data.views import IntArray as IntArray
 from playslot_rl.data.weighted import draw_episodes
 from playslot_rl.errors import DataError
 

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from playslot_rl.data.contents import Contents, Span, read_contents
 from playslot_rl.data.frames import Decoded, decoded_frames, to_rgb
 from playslot_rl.data.metadata import PLACE, is_depth
-from playslot_rl.data.problems import Problems
+from playslot_rl.data.places import Problems
 from playslot_rl.data.tables import Array
 from playslot_rl.datasets.statistics import of_frames, rounded, sampled, thinned
 from playslot_rl.errors import DataError

@@ -15,7 +15,7 @@ from typing import Any
 
 from playslot_rl.data.agreement import length_fault, row_faults
 from playslot_rl.data.contents import Contents, Span, read_contents
-from playslot_rl.data.problems import Problems
+from playslot_rl.data.places import Problems
 from playslot_rl.data.tables import UNREADABLE, Episode, Stats
 from playslot_rl.datasets.assemble import Choice, assemble
 from playslot_rl.datasets.fingerprint import CameraScan, scan_frames

@@ -13,8 +13,7 @@ import numpy as np
 from playslot_rl.data.agreement import check_rows
 from playslot_rl.data.contents import Contents, Span, episode_files, read_contents
 from playslot_rl.data.metadata import PLACE, RECORD_NAME, REQUIRED, STATS_NAME, damaged, is_depth, json_content
-from playslot_rl.data.places import inside
-from playslot_rl.data.problems import Problems
+from playslot_rl.data.places import Problems, inside
 from playslot_rl.data.tables import Array, Stats, stored_episodes
 from playslot_rl.datasets.fingerprint import CameraScan, fingerprint_of, scan_frames
 from playslot_rl.datasets.statistics import Aggregate, differing, of_numbers, reduced, rounded, rows_of

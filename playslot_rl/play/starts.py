@@ -20,8 +20,8 @@ from torch import Tensor
 from playslot_rl.acting.episodes import Task, start_episode
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.data.frames import resize_frames
-from playslot_rl.data.rows import FrameRows
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.views import FrameRows
 from playslot_rl.data.windows import spread_evenly
 from playslot_rl.errors import DataError, RenderError
 from playslot_rl.frames import to_float

@@ -17,8 +17,7 @@ import numpy as np
 from torch import Tensor
 
 from playslot_rl.collectors.export import export
-from playslot_rl.collectors.journal import Journal, RecordedEpisode
-from playslot_rl.collectors.spec import CollectionSpec
+from playslot_rl.collectors.journal import CollectionSpec, Journal, RecordedEpisode
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.data.slot_cache import parse_episodes
 from playslot_rl.data.source import open_source

@@ -19,8 +19,8 @@ from torch import Tensor, nn
 
 from playslot_rl.config import Precision
 from playslot_rl.data.demonstrations import Transitions, real_actions
-from playslot_rl.data.rows import shift_frames
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.views import shift_frames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread

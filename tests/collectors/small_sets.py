@@ -10,8 +10,7 @@ from typing import Any
 import pyarrow.parquet as parquet
 
 from playslot_rl.collectors import collect
-from playslot_rl.collectors.journal import Journal, journal_path
-from playslot_rl.collectors.spec import CollectionSpec
+from playslot_rl.collectors.journal import CollectionSpec, Journal, journal_path
 from playslot_rl.config import ExperimentConfig, from_dict
 
 STEPS = 3

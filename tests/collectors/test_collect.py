@@ -18,8 +18,7 @@ import pytest
 from playslot_rl import keys
 from playslot_rl.collectors import collect
 from playslot_rl.collectors.collection import begun_episodes
-from playslot_rl.collectors.journal import Journal, journal_path
-from playslot_rl.collectors.spec import CollectionSpec
+from playslot_rl.collectors.journal import CollectionSpec, Journal, journal_path
 from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.errors import ConfigError, DataError, OutputError
 

@@ -12,8 +12,7 @@ import pytest
 
 from playslot_rl import keys
 from playslot_rl.collectors import export
-from playslot_rl.collectors.journal import Journal, RecordedEpisode
-from playslot_rl.collectors.spec import CollectionSpec
+from playslot_rl.collectors.journal import CollectionSpec, Journal, RecordedEpisode
 from playslot_rl.config import ExperimentConfig, from_dict
 
 EPISODES, STEPS, SIDE = 5, 4, 32

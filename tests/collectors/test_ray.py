@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from playslot_rl.collectors.episodes import record
-from playslot_rl.collectors.journal import ARRAYS, Journal
+from playslot_rl.collectors.journal import ARRAYS, CollectionSpec, Journal
 from playslot_rl.collectors.recording import record_into
-from playslot_rl.collectors.spec import CollectionSpec
 from playslot_rl.config import CollectorConfig, ExperimentConfig, from_dict
 from playslot_rl.errors import PlaySlotError
 

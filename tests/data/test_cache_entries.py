@@ -16,8 +16,17 @@ import pytest
 from playslot_rl.cli import main
 from playslot_rl.config import DataConfig
 from playslot_rl.config.sizes import bytes_of
-from playslot_rl.data.cache import ArrayWriter, Cache, build_once, load_cached, part_folder
-from playslot_rl.data.cache_entries import clear, entries, make_room, room
+from playslot_rl.data.cache import (
+    ArrayWriter,
+    Cache,
+    build_once,
+    clear,
+    entries,
+    load_cached,
+    make_room,
+    part_folder,
+    room,
+)
 from playslot_rl.data.source import open_source
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.storage.atomic import temporary_name

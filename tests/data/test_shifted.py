@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from playslot_rl.data.demonstrations import Demonstrations, transitions
-from playslot_rl.data.labels import with_copies
-from playslot_rl.data.rows import shift_frames
+from playslot_rl.data.demonstrations import Demonstrations, transitions, with_copies
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames, open_source
-from playslot_rl.data.views import DIRECTIONS, concatenate, first_demonstrations, shifted, shifted_copies
+from playslot_rl.data.views import DIRECTIONS, concatenate, first_demonstrations, shift_frames, shifted, shifted_copies
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.testing import tiny_config
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from playslot_rl.data import slot_cache as module
-from playslot_rl.data.cache_entries import entries
+from playslot_rl.data.cache import entries
 from playslot_rl.data.slot_cache import parse_episodes, slot_cache
 from playslot_rl.data.source import EpisodeFrames, open_source
 from playslot_rl.modules.savi import SAVi

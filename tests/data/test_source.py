@@ -19,8 +19,8 @@ import torch
 from foreign import LENGTHS, foreign_frames, write_foreign
 
 from playslot_rl.data.cache import build_once, cache_folder
-from playslot_rl.data.rows import RowView
 from playslot_rl.data.source import open_source, open_sources
+from playslot_rl.data.views import RowView
 from playslot_rl.errors import DataError, OutputError
 
 

@@ -11,13 +11,14 @@ from torch import Tensor
 
 from playslot_rl.data.demonstrations import (
     Demonstrations,
+    label_demonstrations,
     moving_frames,
     moving_rows,
     moving_slots,
     slot_motion,
     transitions,
+    with_copies,
 )
-from playslot_rl.data.labels import label_demonstrations, with_copies
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.errors import DataError
 from playslot_rl.testing import tiny_agent
@@ -122,7 +123,7 @@ def test_shifted_copies_are_trimmed_each_by_its_own_motion() -> None:
 def test_labels_are_filled_in_whatever_the_lengths_and_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     source = video([[1, 1, 0], [0, 1, 0, 0, 1], [1, 0, 1], [1]])
     whole = labels(source, 0.01)
-    monkeypatch.setattr("playslot_rl.data.labels.BATCH", 1)
+    monkeypatch.setattr("playslot_rl.data.demonstrations.BATCH", 1)
     monkeypatch.setattr("playslot_rl.data.demonstrations.FRAMES_AT_ONCE", 2)
     alone = labels(source, 0.01)
     for name in ("slots", "imagined", "latents"):

@@ -17,7 +17,7 @@ from damage import CAMERA, ROWS, edit_json, frames_of, keep_rows
 
 from playslot_rl import cli
 from playslot_rl.data.contents import read_contents
-from playslot_rl.data.problems import Problems
+from playslot_rl.data.places import Problems
 from playslot_rl.datasets.split import split
 from playslot_rl.datasets.viz import episode_frames, spread
 from playslot_rl.errors import ConfigError

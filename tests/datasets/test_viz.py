@@ -11,7 +11,7 @@ from damage import CAMERA, edit_json
 
 from playslot_rl import keys
 from playslot_rl.data.contents import read_contents
-from playslot_rl.data.problems import Problems
+from playslot_rl.data.places import Problems
 from playslot_rl.datasets import viz
 from playslot_rl.visualization.charts import LIGHT, curve_chart, curve_figure
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from clips import moving_square
 
-from playslot_rl.data.rows import shift_frames
+from playslot_rl.data.views import shift_frames
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.training.stage_regression import FrameInputs
 

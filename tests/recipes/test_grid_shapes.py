@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from commands import ONE_CORE, playslot, refused
 
-from playslot_rl.collectors.spec import CollectionSpec
+from playslot_rl.collectors.journal import CollectionSpec
 from playslot_rl.config import EnvConfig, GridConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.data.source import open_source

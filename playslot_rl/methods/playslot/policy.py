@@ -6,8 +6,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from playslot_rl.config import BehaviourStageConfig, DynamicsStageConfig, ExperimentConfig, ModelConfig
-from playslot_rl.data.demonstrations import Demonstrations, require_finite, require_labelled
-from playslot_rl.data.labels import label_demonstrations, with_copies
+from playslot_rl.data.demonstrations import (
+    Demonstrations,
+    label_demonstrations,
+    require_finite,
+    require_labelled,
+    with_copies,
+)
 from playslot_rl.data.slot_cache import SlotRows
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.seeds.draws import global_seed
