@@ -123,7 +123,7 @@ def test_shifted_copies_are_trimmed_each_by_its_own_motion() -> None:
 def test_labels_are_filled_in_whatever_the_lengths_and_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     source = video([[1, 1, 0], [0, 1, 0, 0, 1], [1, 0, 1], [1]])
     whole = labels(source, 0.01)
-    monkeypatch.setattr("playslot_rl.data.demonstrations.BATCH", 1)
+    monkeypatch.setattr("playslot_rl.data.demonstrations.EPISODES_AT_ONCE", 1)
     monkeypatch.setattr("playslot_rl.data.demonstrations.FRAMES_AT_ONCE", 2)
     alone = labels(source, 0.01)
     for name in ("slots", "imagined", "latents"):
