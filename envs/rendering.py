@@ -195,13 +195,17 @@ class FrameRenderer:
 
 
 def check_rendering() -> npt.NDArray[np.uint8]:
-    """Draw one frame of an empty scene, uint8 (64, 64, 3); a RenderError where there is no working GL backend."""
+    """Draw a red ball, uint8 (64, 64, 3); a RenderError where there is no working GL backend, or nothing is drawn."""
     mj = import_mujoco()
-    model = mj.MjModel.from_xml_string("<mujoco/>")
+    ball = "<light pos='0 0 3'/><geom type='sphere' size='.3' rgba='1 0 0 1'/>"
+    model = mj.MjModel.from_xml_string(f"<mujoco><worldbody>{ball}</worldbody></mujoco>")
     data = mj.MjData(model)
     mj.mj_forward(model, data)
-    renderer = FrameRenderer(model, Camera(1.0, 0.0, 0.0, (0.0, 0.0, 0.0)), 64, RenderConfig())
+    renderer = FrameRenderer(model, Camera(2.0, 90.0, -20.0, (0.0, 0.0, 0.0)), 64, RenderConfig())
     try:
-        return renderer(data)
+        frame = renderer(data)
     finally:
         renderer.close()
+    if frame.max() <= 60:
+        raise RenderError(_message(ValueError(f"an empty frame, brightest value {frame.max()}")))
+    return frame

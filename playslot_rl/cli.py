@@ -96,9 +96,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name in {*COMMANDS, *GROUPS} - {*SEVERAL} and (code := _alone(name)):
         return code
     if name in GROUPS:
-        group = importlib.import_module(f"playslot_rl.recipes.{name}")
-        options = group.parser(_Parser).parse_args(arguments[1:])
-        return _guarded(f"{name} {options.action}", lambda: group.run(options))
+        from playslot_rl.recipes.actions import make_parser, run_action
+
+        actions, parser = make_parser(name, _Parser)
+        options = parser.parse_args(arguments[1:])
+        return _guarded(f"{name} {options.action}", lambda: run_action(actions, options))
     if name not in COMMANDS:
         # Ends here unless it is --help or --version: the rest of the line belongs to no known command.
         _top_parser().parse_args(arguments[:1])

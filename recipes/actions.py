@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import pkgutil
 import re
 import textwrap
@@ -18,12 +19,10 @@ Argument = tuple[str, dict[str, Any]]
 
 
 def argument(name: str, metavar: str, says: str, **settings: Any) -> Argument:
-    """An argument with a value, and what `--help` says of it."""
     return name, {"metavar": metavar, "help": says, **settings}
 
 
 def flag(name: str, says: str) -> Argument:
-    """An option without a value."""
     return name, {"action": "store_true", "help": says}
 
 
@@ -47,16 +46,18 @@ class Action:
 
 
 def make_parser(
-    actions: Mapping[str, Action], command: str, usage: str, description: str, kind: type[argparse.ArgumentParser]
-) -> argparse.ArgumentParser:
-    """The parser of `playslot COMMAND`; `usage` is what follows that, `kind` says how bad arguments end."""
+    command: str, kind: type[argparse.ArgumentParser] = argparse.ArgumentParser
+) -> tuple[dict[str, Action], argparse.ArgumentParser]:
+    """The actions and the parser of `playslot COMMAND`, a module beside this one; `kind` says how bad arguments end."""
+    module = importlib.import_module(f"playslot_rl.recipes.{command}")
+    actions: dict[str, Action] = module.ACTIONS
     width = max(map(len, actions))
     lines = "\n".join(f"  {name:<{width}}  {action.summary}" for name, action in actions.items())
     prog = f"playslot {command}"
     top = kind(
         prog=prog,
-        usage=f"{prog} {usage}",
-        description=description,
+        usage=f"{prog} {module.USAGE}",
+        description=module.DESCRIPTION,
         epilog=f"actions:\n{lines}\n\n`{prog} ACTION --help` explains one of them.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -75,15 +76,12 @@ def make_parser(
             group = sub.add_mutually_exclusive_group()
             for key, settings in action.either:
                 group.add_argument(key, **settings)
-    return top
+    return actions, top
 
 
 def run_action(actions: Mapping[str, Action], options: argparse.Namespace) -> int:
-    """Do what the parsed arguments ask for; the exit code is 0, or 1 for a data set that is not sound.
-
-    Raises:
-        OutputError: it would write into the data set that it reads, or into another.
-        KeyboardInterrupt: with a line about what that leaves.
+    """Do what the parsed arguments ask for; the exit code is 0, or 1 for a data set that is not sound. An OutputError
+    where it would write into the data set that it reads, or into another.
     """
     values = dict(vars(options))
     action, as_json = actions[values.pop("action")], values.pop("json", False)

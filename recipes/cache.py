@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Final
 
-from playslot_rl.recipes.actions import JSON, Action, argument, make_parser, run_action
+from playslot_rl.recipes.actions import JSON, Action, argument
 
-
-def parser(kind: type[argparse.ArgumentParser] = argparse.ArgumentParser) -> argparse.ArgumentParser:
-    """The parser of `playslot cache`; `kind` says how bad arguments end."""
-    said = "Look after the caches of decoded frames and parsed slots. What is removed is made again when it is needed."
-    return make_parser(ACTIONS, "cache", "ACTION [options]", said, kind)
-
-
-def run(options: argparse.Namespace) -> int:
-    """Do what the parsed arguments ask for (`run_action`)."""
-    return run_action(ACTIONS, options)
-
-
+USAGE: Final = "ACTION [options]"
+DESCRIPTION: Final = (
+    "Look after the caches of decoded frames and parsed slots. What is removed is made again when it is needed."
+)
 CACHE: Final = argument("--cache", "DIR", "the cache (default $PLAYSLOT_CACHE or ~/.cache/playslot_rl)", type=Path)
 NAMES: Final = argument("names", "NAME", "entries of `playslot cache list`; none means all", nargs="*")
 ACTIONS: Final[dict[str, Action]] = {

@@ -23,11 +23,8 @@ if TYPE_CHECKING:
 
 
 def main(file: Path) -> Status:
-    """Run the job of a file, after any other process that works on it.
-
-    Returns:
-        How it ended: `done`, or `failed` with one line of error. A crash of a method is a row of the table, so every
-        error ends here.
+    """Run the job of a file, after any other process that works on it. How it ended is `done`, or `failed` with one
+    line: a crash of a method is a row of the table, so every error ends here.
     """
     job = json.loads(file.read_text())
     with job_lock(file):

@@ -6,19 +6,11 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from playslot_rl.recipes.actions import JSON, Action, Argument, argument, flag, make_parser, run_action, whole
+from playslot_rl.recipes.actions import JSON, Action, Argument, argument, flag, whole
 from playslot_rl.seeds.episodes import LARGEST_DRAW
 
-
-def parser(kind: type[argparse.ArgumentParser] = argparse.ArgumentParser) -> argparse.ArgumentParser:
-    """The parser of `playslot dataset`; `kind` says how bad arguments end."""
-    said = "Look after LeRobot v3.0 data sets, ours or others', image or video."
-    return make_parser(ACTIONS, "dataset", "ACTION PATH [options]", said, kind)
-
-
-def run(options: argparse.Namespace) -> int:
-    """Do what the parsed arguments ask for (`run_action`)."""
-    return run_action(ACTIONS, options)
+USAGE: Final = "ACTION PATH [options]"
+DESCRIPTION: Final = "Look after LeRobot v3.0 data sets, ours or others', image or video."
 
 
 def fractions(text: str) -> dict[str, float]:

@@ -11,9 +11,7 @@ from playslot_rl.runtime import checks
 
 
 def main(config: ExperimentConfig) -> int:
-    """Print one finding after the other; `device`, `out` and `data.cache` are looked at. Returns 0 if everything
-    essential works, otherwise 1.
-    """
+    """Print one finding after the other; 0 if everything essential works, otherwise 1."""
     asked: list[Callable[[], checks.Check]] = [
         checks.check_python,
         checks.check_packages,

@@ -24,16 +24,7 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
 
     A pretrained policy (`run=pretrained/ENV`) is copied into `out`, which becomes a run like any other. A baseline's
     run (`method` in its config) is evaluated in simulation only. Where there is no simulator (GridShapes) its slots and
-    latent actions are scored instead: see `recipes.objects`.
-
-    Args:
-        config: `run`, `protocol`, `episodes` (50 if None), `seed`, `device`, `env`, `render`, `evaluation`.
-        report: renew the run's report afterwards.
-
-    Raises:
-        ConfigError: no run was named, or `out` names another folder.
-        CheckpointError: the run does not exist, has no trained policy, or was made for another frame size.
-        OutputError: the result cannot be written.
+    latent actions are scored instead: see `recipes.objects`. With `report` the run's report is renewed afterwards.
     """
     run = run_with_policy(config)
     if run.pretrained:
@@ -65,12 +56,7 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
 
 
 def evaluate_baseline(config: ExperimentConfig, run: Run) -> None:
-    """Evaluate the baseline of `run` in simulation, write `RUN/evaluation/simulation/eval_info.json`, print the result.
-
-    Raises:
-        ConfigError: protocol `imagination`, or an environment other than the run's.
-        CheckpointError: the run has no trained policy, or a damaged one.
-    """
+    """Evaluate the baseline of `run` in simulation, write `evaluation/simulation/eval_info.json` there, print the result."""
     from playslot_rl.acting.episodes import TaskPool
     from playslot_rl.evaluation.success import check_baseline_protocol, evaluate_actor, run_facts
 
@@ -110,10 +96,8 @@ def renewed(run: Run) -> bool:
 
 
 def once(config: ExperimentConfig) -> bool:
-    """Evaluate under `config.protocol`, without a report, unless the same policy was measured so before.
-
-    Returns:
-        Whether it was measured now.
+    """Evaluate under `config.protocol`, without a report, unless the same policy was measured so before; whether it was
+    measured now.
     """
     from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts, task_facts
 
@@ -133,12 +117,7 @@ def once(config: ExperimentConfig) -> bool:
 
 
 def run_with_policy(config: ExperimentConfig, command: str = "evaluate") -> Run:
-    """The run of a command that needs a policy.
-
-    Raises:
-        ConfigError: none was named, or `out` names another folder.
-        CheckpointError: there is no such run, or it is a pretrained world model without a policy.
-    """
+    """The run of a command that needs a policy (`run_to_read`), which is no pretrained world model without one."""
     run = run_to_read(config, command, "the folder of a run with a trained policy, such as run=runs/demo")
     if run.pretrained and config.protocol != "slots" and not run.has("policy"):
         raise CheckpointError(f"run={config.run} is a world model without a policy; run `playslot train-policy`")

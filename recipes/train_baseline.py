@@ -12,13 +12,7 @@ from playslot_rl.runtime.processes import here
 
 
 def main(config: ExperimentConfig) -> None:
-    """Train `config.method` into `out`; killed, the same command carries on; finished, it says so.
-
-    Raises:
-        ConfigError: no `out`, or the folder of the world model in `run`; a method on slots without `run`; one
-            that acts, and an environment without a simulator.
-        PlaySlotError: see `playslot_rl.methods.training.train`.
-    """
+    """Train `config.method` into `out`; killed, the same command carries on; finished, it says so."""
     if not config.out:
         raise ConfigError("out: got nothing, expected the folder of the baseline's run, such as out=runs/oracle")
     if config.run and Path(config.run).resolve() == Path(config.out).resolve():

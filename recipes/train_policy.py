@@ -9,13 +9,7 @@ from playslot_rl.config import ExperimentConfig
 
 
 def main(config: ExperimentConfig) -> None:
-    """Train policy, oracle and decoder into `RUN/policy`; killed, the same command carries on.
-
-    Raises:
-        CheckpointError: no finished world model, or the run was begun otherwise.
-        DataError: no demonstrations, none with actions, or fewer than `demos` or `behaviour.labelled_demos`.
-        OutputError, TrainingError: see `playslot_rl.errors`.
-    """
+    """Train policy, oracle and decoder into `RUN/policy`; killed, the same command carries on."""
     from playslot_rl.methods.playslot.method import POLICY
     from playslot_rl.methods.training import train_stage
     from playslot_rl.runs.opening import run_to_write

@@ -13,8 +13,7 @@ import pytest
 
 from playslot_rl import cli
 from playslot_rl.config.compose import compose
-from playslot_rl.recipes.cache import parser as cache_parser
-from playslot_rl.recipes.dataset import parser as dataset_parser
+from playslot_rl.recipes.actions import make_parser
 
 pytestmark = pytest.mark.integration
 
@@ -72,7 +71,7 @@ def test_a_documented_command_is_accepted(page: str, command: str) -> None:
     elif program == "playslot":
         name = rest[0]
         if name in cli.GROUPS:
-            assert {"cache": cache_parser, "dataset": dataset_parser}[name]().parse_args(rest[1:])
+            assert make_parser(name)[1].parse_args(rest[1:])
             return
         assert name in cli.COMMANDS, f"{page}: no such command"
         typed = [word for word in rest[1:] if not word.startswith("--") and "=" in word]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
@@ -76,6 +77,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             uri = PAGES[path]
         elif path.startswith("docs/"):
             uri = path.removeprefix("docs/")
+        elif path.endswith(".md"):
+            raise PluginError(f"{source}: got a link to {path}, expected a page: add it to PAGES of hooks.py")
         else:
             uri = f"files/{path}"
             if files.get_file_from_path(uri) is None:

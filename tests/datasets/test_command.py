@@ -22,6 +22,7 @@ from playslot_rl.datasets.split import split
 from playslot_rl.datasets.viz import episode_frames, spread
 from playslot_rl.errors import ConfigError
 from playslot_rl.recipes import dataset as command
+from playslot_rl.recipes.actions import make_parser
 
 pytestmark = pytest.mark.slow  # together they take a minute; make test-all runs them
 
@@ -48,7 +49,7 @@ def test_help_explains_with_examples_that_are_accepted(action: str, capsys: pyte
     assert text.startswith(f"usage: playslot dataset {action} ")
     for example in command.ACTIONS[action].examples:
         assert example in text
-        assert command.parser().parse_args(example.split()[2:]).action == action
+        assert make_parser("dataset")[1].parse_args(example.split()[2:]).action == action
 
 
 @pytest.mark.parametrize(
