@@ -56,7 +56,7 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
 
 
 def evaluate_baseline(config: ExperimentConfig, run: Run) -> None:
-    """Evaluate the baseline of `run` in simulation, write `evaluation/simulation/eval_info.json` there, print the result."""
+    """Evaluate the baseline of `run` in simulation, write `evaluation/simulation/eval_info.json`, print the result."""
     from playslot_rl.acting.episodes import TaskPool
     from playslot_rl.evaluation.success import check_baseline_protocol, evaluate_actor, run_facts
 
