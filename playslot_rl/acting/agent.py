@@ -8,7 +8,6 @@ width.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -20,7 +19,6 @@ from playslot_rl.acting.actor import ExpertActor, PlannedActor, SlotActor, put_r
 from playslot_rl.acting.episodes import Moment, TaskPool, record
 from playslot_rl.acting.imagination import ImaginationEnv
 from playslot_rl.frames import normalise
-from playslot_rl.runs import Run
 from playslot_rl.world_model import Agent, action_decoder_module, latent_policy_module, oracle_module
 
 
@@ -30,10 +28,6 @@ def playslot_actor(agent: Agent) -> SlotActor:
     """
     heads = (latent_policy_module(agent.policy), action_decoder_module(agent.action_decoder))
     return SlotActor(agent.world_model.savi, *heads)
-
-
-def load_actor(run: Path, device: torch.device | str = "cpu") -> SlotActor:
-    return playslot_actor(Run.open(run).load_agent(device))
 
 
 def oracle_actor(agent: Agent) -> SlotActor:

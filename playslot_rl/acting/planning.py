@@ -30,12 +30,11 @@ class PlanningActor(Actor):
     """Plans every few steps towards goal images, and executes the plan's latent actions by the action decoder.
 
     A plan begins where the last one ends: shifted by what was executed, the mean latent action at its end. With
-    `policy` the latent policy's imagined rollout from the present slots is a plan to begin with too, so that what is
-    found costs no more in imagination than what the policy would do.
+    `policy` the latent policy's imagined rollout from the present slots is a plan to begin with too. Candidates are
+    drawn by `seed`, the episode's seed and the step, so that episodes side by side do not touch each other.
 
     The plan, its imagined slots PREDICTED_SLOTS (n, H + 1, N, D), its cost and the seconds it took stay in the memory,
-    for who looks on. Candidates are drawn by `seed`, the episode's seed and the step, so that episodes side by side do
-    not touch each other.
+    for who looks on.
     """
 
     def __init__(

@@ -115,7 +115,13 @@ def latent_env(
     """Wrap any TorchRL environment with PIXELS uint8 (..., 3, H, W) and ACTION (..., A), batched or not; an episode is
     truncated after `max_steps`. A ValueError where its frames or actions are not what the world model was made for.
     """
-    _check_fits(base, world_model)
+    side, width = world_model.env.image_size, world_model.env.action_dim
+    frame = tuple(base.observation_spec[keys.PIXELS].shape[-3:])
+    if frame != (3, side, side):
+        raise ValueError(f"frames: got {frame}, expected {(3, side, side)}; set env.image_size to the world model's")
+    action = base.full_action_spec[keys.ACTION].shape[-1]
+    if action != width:
+        raise ValueError(f"actions: got width {action}, expected {width}; set env.action_dim to the world model's")
     world_model.eval()
     action_decoder.eval()
     return TransformedEnv(
@@ -141,12 +147,9 @@ def make_simulation_env(
 
     The task's own keys stay (PIXELS, SUCCESS, reward, done). `action_decoder_module` on the rollout gives the real
     actions again, in [-1, 1]. Seed by `env.set_seed(seed)` before a reset; `generator` is that of sampled initial
-    slots. The networks stay on their device, whatever that of the environment's tensors.
-
-    Raises:
-        ConfigError: unknown environment.
-        RenderError: there is no GL backend.
-        ValueError: frame size or action width differ from the world model's.
+    slots. The networks stay on their device, whatever that of the environment's tensors. A ConfigError for an unknown
+    environment, a RenderError without a GL backend, a ValueError for another frame size or action width than the world
+    model's.
 
     Examples:
         >>> from playslot_rl.testing import tiny_agent, tiny_config
@@ -165,13 +168,3 @@ def make_simulation_env(
     if torch.device(device).type != "cpu":
         base = base.to(device)
     return latent_env(base, world_model, action_decoder, env_config.max_steps, generator)
-
-
-def _check_fits(base: EnvBase, world_model: WorldModel) -> None:
-    side, width = world_model.env.image_size, world_model.env.action_dim
-    frame = tuple(base.observation_spec[keys.PIXELS].shape[-3:])
-    if frame != (3, side, side):
-        raise ValueError(f"frames: got {frame}, expected {(3, side, side)}; set env.image_size to the world model's")
-    action = base.full_action_spec[keys.ACTION].shape[-1]
-    if action != width:
-        raise ValueError(f"actions: got width {action}, expected {width}; set env.action_dim to the world model's")

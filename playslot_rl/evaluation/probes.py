@@ -30,16 +30,9 @@ def infer_latents(
     lengths: Sequence[int] | Ints,
     actions: npt.NDArray[np.float32] | None = None,
 ) -> tuple[Floats, Ints, Ints]:
-    """Latent actions of whole episodes: z (M, Z), codes (M, 1), or (M, N) with one latent per slot, -1 without a
-    codebook, and the episode (M,) of each transition.
-
-    Args:
-        slots: (F, N, D) of all frames.
-        starts, lengths: first row and number of frames of each episode.
-        actions: (F, A) real actions; needed in `ground_truth` mode only.
-
-    Raises:
-        ValueError: no episode has two frames.
+    """Latent actions of whole episodes, given by first row and number of frames of slots (F, N, D), and by real actions
+    (F, A) in `ground_truth` mode: z (M, Z), codes (M, 1), or (M, N) with one latent per slot, -1 without a codebook,
+    and the episode (M,) of each transition. A ValueError where no episode has two frames.
     """
     device = next(iter(model.parameters()), torch.zeros(())).device
     z, codes, episodes = [], [], []
@@ -144,12 +137,8 @@ def probe_moves(features: Floats, moves: Ints, clips: Ints, classes: int, seed: 
     """Accuracy of multinomial logistic regression, from features (M, D) such as the prototype of the object's slot to
     moves (M,) from 0 to `classes` - 1, on clips (M,) that it was not fitted on: 0.3 of them, drawn by the seed.
 
-    Returns:
-        `accuracy` (0 to 1); beside it `chance` (1 / classes) and `majority` (always the most frequent move of the
-        fitted clips); `train` and `test` count transitions, `test_clips` clips.
-
-    Raises:
-        ValueError: sizes differ, or there are fewer than two clips.
+    `chance` is 1 / classes, `majority` always the most frequent move of the fitted clips; `train` and `test` count
+    transitions, `test_clips` clips. A ValueError where sizes differ, or there are fewer than two clips.
     """
     if not len(features) == len(moves) == len(clips):
         raise ValueError(f"probe_moves: got {len(features)}, {len(moves)} and {len(clips)} rows, expected as many each")

@@ -63,11 +63,9 @@ def segmented_episodes(config: ExperimentConfig, seeds: Sequence[int]) -> Iterat
 
 @torch.no_grad()
 def score_slots(savi: SAVi, episodes: Iterable[Segmented], seeds: Sequence[int]) -> dict[str, float]:
-    """Parse E episodes by a SAVi in evaluation mode and compare slots with objects; the seeds are those of the initial
-    slots where these are drawn.
-
-    Returns:
-        Means over episodes: `ari`, `foreground_ari`, `psnr` of the reconstructions (dB), and `slots_per_object`.
+    """Parse E episodes by a SAVi in evaluation mode and compare slots with objects: means over episodes of `ari`,
+    `foreground_ari`, `psnr` of the reconstructions (dB) and `slots_per_object`. The seeds are of initial slots that are
+    drawn.
     """
     device, scores = module_device(savi), []
     for (frames, truth), seed in zip(episodes, seeds, strict=True):

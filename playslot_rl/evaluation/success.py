@@ -11,12 +11,14 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import platform
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -28,7 +30,6 @@ from playslot_rl.acting.episodes import Outcome, TaskPool, run_episodes
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.seeds import check_disjoint, first_seed, held_out_seeds, training_seeds
 from playslot_rl.runtime.threads import available_cores
 from playslot_rl.storage.atomic import write_json
@@ -36,6 +37,7 @@ from playslot_rl.world_model import Agent
 
 POLICY_PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")
 PROTOCOLS = (*POLICY_PROTOCOLS, "replay")
+REFERENCES = ("random", "expert", "slot_oracle")
 DEFAULT_EPISODES = 50
 
 
@@ -47,7 +49,6 @@ class RunFacts:
         demos, labelled_demos: demonstrations whose videos, and whose real actions, the policy was trained on; None if
             the run does not say.
         fingerprints: weights by stage.
-        commit: that the policy was trained from.
         extra: what the method's checkpoint says of its own (`pretraining`, `env_steps`).
     """
 
@@ -157,7 +158,12 @@ def measure(
     with TaskPool(config.env, config.render) if pool is None else contextlib.nullcontext(pool) as used:
         outcome = run_episodes(used, actor, seeds)
         wall = time.perf_counter() - begin
-        references = _references(oracle, config, seeds, used, facts, run)
+        references: dict[str, dict[str, Any]] = {n: {"success_rate": None, "ci95": None} for n in REFERENCES}
+        if config.evaluation.references:
+            prints = facts.fingerprints if "policy" in facts.fingerprints else {}
+            weights = "-".join(prints[k] for k in ("slots", "policy") if prints.get(k))
+            cache = None if run is None else run / "evaluation" / "references.json"
+            references = run_references(oracle, config, seeds, used, weights, cache)
     played = [e.seed for e in outcome]
     check_disjoint(played, training_seeds(config, run))  # a redrawn episode has another seed
     return {
@@ -188,21 +194,6 @@ def task_facts(config: ExperimentConfig, seed: int) -> dict[str, Any]:
     """What besides weights decides a result, as JSON stores it: task, renderer, first evaluation seed."""
     values = {"env": to_dict(config.env), "render": to_dict(config.render), "first_seed": first_seed(config, seed)}
     return json.loads(json.dumps(values))  # type: ignore[no-any-return]
-
-
-def _references(
-    oracle: Actor | None,
-    config: ExperimentConfig,
-    seeds: list[int],
-    pool: TaskPool,
-    facts: RunFacts,
-    run: Path | None,
-) -> dict[str, dict[str, Any]]:
-    if not config.evaluation.references:
-        return {n: {"success_rate": None, "ci95": None} for n in ("random", "expert", "slot_oracle")}
-    cache = None if run is None else run / "evaluation" / "references.json"
-    weights = "-".join(facts.fingerprints[k] for k in ("slots", "policy") if facts.fingerprints.get(k))
-    return run_references(oracle, config, seeds, pool, weights if "policy" in facts.fingerprints else "", cache)
 
 
 def evaluate_run(
@@ -253,6 +244,28 @@ def hardware() -> dict[str, Any]:
     }
 
 
+def wilson(successes: float, trials: int) -> tuple[float, float]:
+    """95 % interval of a success probability (E. B. Wilson, 1927); unlike the normal one it stays in [0, 1] and is not
+    empty at 0 or 100 %. The successes may be a mean over repetitions. A ValueError where a count is outside its range.
+
+    Example:
+        >>> low, high = wilson(9, 10)
+        >>> round(low, 3), round(high, 3)
+        (0.596, 0.982)
+    """
+    if trials < 1 or not 0 <= successes <= trials:
+        raise ValueError(f"wilson: got {successes} of {trials}, expected 0 <= successes <= trials and trials >= 1")
+    z = NormalDist().inv_cdf(0.975)
+    rate = successes / trials
+    scale = 1 + z * z / trials
+    centre = (rate + z * z / (2 * trials)) / scale
+    half = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials)) / scale
+    # The ends at 0 and at 100 % are exact in theory; rounding would leave 1e-17.
+    low = 0.0 if successes == 0 else max(0.0, centre - half)
+    high = 1.0 if successes == trials else min(1.0, centre + half)
+    return low, high
+
+
 def summary(episodes: Sequence[Outcome]) -> dict[str, Any]:
     """`success_rate` (0 to 1), `ci95` (Wilson) and `mean_steps_to_success` (agent steps; None without a success)."""
     steps = [e.steps for e in episodes if e.steps is not None]
@@ -271,12 +284,10 @@ def run_references(
     oracle_fingerprint: str = "",
     cache: Path | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Results of `random`, `expert` and `slot_oracle`, always closed-loop.
+    """Results of `random`, `expert` and `slot_oracle`, always closed-loop; null values without an oracle.
 
-    Args:
-        oracle: the slot oracle beside the agent; None gives null values.
-        oracle_fingerprint: names the weights of oracle and SAVi; empty means that the oracle's result is not cached.
-        cache: JSON file that both protocols of a run share; None means no cache.
+    `cache` is a JSON file that both protocols of a run share. The oracle's result is in it by the weights of oracle and
+    SAVi that `oracle_fingerprint` names; empty, it is not cached.
     """
     actors: dict[str, Actor] = {
         "random": RandomActor(config.env.max_steps, config.env.action_dim),

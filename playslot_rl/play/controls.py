@@ -49,8 +49,6 @@ class Controls:
                     ui.label(title).classes("title").props("role=heading aria-level=2")
                     build()
 
-    # --- steering --------------------------------------------------------------------------------------------------
-
     def _build_steering(self) -> None:
         page = self.page
         self._previews: list[Any] = []
@@ -112,8 +110,6 @@ class Controls:
             picture.set_source(self.page.gallery.put(f"prototype-{number}", made[1], "image/gif"))
         self.same.set_text(in_words(alike(np.stack(seen))))
 
-    # --- the chosen slot -------------------------------------------------------------------------------------------
-
     def _build_touch(self) -> None:
         self.which = ui.label("").mark("which")
         with ui.element("div").classes("line"):
@@ -127,8 +123,6 @@ class Controls:
         none = "None: click one in a picture" + ("; actions go to all" if self.session.per_slot else "")
         self.which.set_text(none if slot is None else f"Slot {slot + 1}{', frozen' if slot in frozen else ''}")
         self.freezing.set_text("Let go" if slot in frozen else "Freeze")
-
-    # --- time ------------------------------------------------------------------------------------------------------
 
     def _build_time(self) -> None:
         with ui.element("div").classes("line"):
@@ -172,8 +166,6 @@ class Controls:
             return None
         return self.page.work(lambda: self.session.go(int(event.value)))
 
-    # --- where to start --------------------------------------------------------------------------------------------
-
     def _build_starts(self) -> None:
         sources = self.studio.sources
         # The web framework remembers a few thousand upload routes of pages that are gone, and what they can reach.
@@ -200,11 +192,6 @@ class Controls:
             on_rejected=lambda: ui.notify(REFUSED, type="warning"),
         ).props("accept=image/* flat bordered").mark("upload")
 
-    async def first(self) -> bool:
-        """Begin at the first frame of the first source; False where there is none to begin at, or it cannot be read."""
-        source = next(iter(self.studio.sources), "")
-        return bool(source) and await self.page.start(lambda: self.studio.start(source))
-
     async def _on_start(self) -> None:
         key = (str(self.source.value), int(self.number.value or 0), int(self.step.value or 0))
         self.page.halt()
@@ -218,8 +205,6 @@ class Controls:
         content, name, studio = await event.file.read(), event.file.name, self.studio
         self.page.halt()
         await self.page.start(lambda: picture_start(studio.world_model, content, name, whole=studio.squeezes))
-
-    # --- recordings ------------------------------------------------------------------------------------------------
 
     def _build_record(self) -> None:
         with ui.element("div").classes("line"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -47,8 +47,6 @@ class PlayPage:
         self._lock = asyncio.Lock()
         self.controls = Controls(self)
 
-    # --- layout ----------------------------------------------------------------------------------------------------
-
     def build(self) -> None:
         """Lay the page out; the session begins when it is there."""
         with ui.element("div").classes("layout"):
@@ -76,7 +74,9 @@ class PlayPage:
             with ui.element("figure") as self.true_column:
                 self.true = ui.interactive_image(size=(side, side)).classes("pixels")
                 self.true_title = ui.label("").classes("soft").mark("beside")
-        ui.switch("Colour the slots", on_change=self._on_masks).props("dense").mark("masks").bind_value(self, "masks")
+        ui.switch("Colour the slots", on_change=lambda: self.work(lambda: None)).props("dense").mark(
+            "masks"
+        ).bind_value(self, "masks")
         width = n * side + (n - 1) * GAP
         self.strip = ui.interactive_image(size=(width, side), on_mouse=self._on_strip, events=["mousedown"])
         self.strip.classes("pixels").mark("strip")
@@ -84,8 +84,6 @@ class PlayPage:
         self.curve = ui.html("", sanitize=False).classes("curve").mark("curve")
         self.curve_title = ui.label("Difference of the two pictures at each moment (RMS, of 1)").classes("soft")
         ui.label(HELP).classes("soft keys")
-
-    # --- doing -----------------------------------------------------------------------------------------------------
 
     async def work(self, work: Callable[[], Any], *, begins: bool = False) -> bool:
         """Have the worker do something with the session and show what came of it; an error is told in one line."""
@@ -222,7 +220,8 @@ class PlayPage:
         await self.controls.refresh(animate)
 
     async def _begin(self) -> None:
-        if not await self.controls.first():
+        source = next(iter(self.studio.sources), "")
+        if not source or not await self.start(lambda: self.studio.start(source)):  # or it cannot be read
             self.status.set_text("nothing to start from: choose another start, upload a picture, or give data.root=")
 
     async def start(self, start: Callable[[], Start]) -> bool:
@@ -239,22 +238,19 @@ class PlayPage:
             self.gallery.close()
             self.studio.call(self.session.close)
 
-    # --- events ----------------------------------------------------------------------------------------------------
-
     async def _on_key(self, event: events.KeyEventArguments) -> None:
-        number = event.key.number
+        number, name = event.key.number, str(event.key.name).lower()
         if number is not None and number < len(self.session.prototypes):
             if event.action.keydown:
                 await self.down(number)
             elif event.action.keyup:
                 self.up()
-        elif event.action.keydown:
-            await self._on_letter(str(event.key.name).lower())
-
-    async def _on_letter(self, name: str) -> None:
-        actions: dict[str, Callable[[], Awaitable[None]]] = {"u": self.controls.undo, "r": self.controls.reset}
-        if name in actions:
-            await actions[name]()
+        elif not event.action.keydown:
+            return
+        elif name == "u":
+            await self.controls.undo()
+        elif name == "r":
+            await self.controls.reset()
         elif name == "m":
             self.masks = not self.masks
         elif name in (" ", "space"):
@@ -291,9 +287,6 @@ class PlayPage:
         session, planner = self.session, self.session.planner
         if planner is not None and await self.work(lambda: planner.aim(session)):
             ui.notify(f"goal: moment {session.now.depth}; go back, then let the planner steer")
-
-    async def _on_masks(self) -> None:
-        await self.work(lambda: None)
 
     async def _on_scene(self, event: events.MouseEventArguments) -> None:
         if self._owner is None:

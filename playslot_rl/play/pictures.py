@@ -65,13 +65,10 @@ def colour_of(slot: int) -> tuple[int, ...]:
     return getrgb(OKABE_ITO[slot % len(OKABE_ITO)])
 
 
-def encode(frame: Frame, scale: int = 1) -> bytes:
-    """PNG of a frame (H, W, 3), enlarged without interpolation."""
-    picture = Image.fromarray(frame)
-    if scale > 1:
-        picture = picture.resize((picture.width * scale, picture.height * scale), Image.Resampling.NEAREST)
+def encode(frame: Frame) -> bytes:
+    """PNG of a frame (H, W, 3), quickly."""
     buffer = io.BytesIO()
-    picture.save(buffer, format="PNG", compress_level=1)
+    Image.fromarray(frame).save(buffer, format="PNG", compress_level=1)
     return buffer.getvalue()
 
 
@@ -113,14 +110,12 @@ def strip(look: Look, session: PlaySession, chosen: int | None, gap: int) -> Fra
     return picture
 
 
-def animated(frames: Frame, fps: float = ANIMATION_FPS, scale: int = 1, last_s: float = 0.6) -> bytes:
+def animated(frames: Frame, fps: float = ANIMATION_FPS) -> bytes:
     """Endless GIF of frames (T, H, W, 3), whose last one stays a little longer."""
-    pictures = [Image.fromarray(frame) for frame in frames]
-    size = (pictures[0].width * scale, pictures[0].height * scale)
-    large = [picture.resize(size, Image.Resampling.NEAREST) for picture in pictures]
-    times = [round(1000 / fps)] * (len(large) - 1) + [round(1000 * last_s)]
+    first, *others = (Image.fromarray(frame) for frame in frames)
+    times = [round(1000 / fps)] * len(others) + [600]
     buffer = io.BytesIO()
-    large[0].save(buffer, format="GIF", save_all=True, append_images=large[1:], duration=times, loop=0)
+    first.save(buffer, format="GIF", save_all=True, append_images=others, duration=times, loop=0)
     return buffer.getvalue()
 
 

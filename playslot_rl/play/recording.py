@@ -36,15 +36,10 @@ REPO: Final = "playslot_rl/played"
 
 def record(session: PlaySession, parent: Path, shown: Shown = "imagined", camera: str = keys.FEATURE_IMAGE) -> Path:
     """Write the path from the session's start to its present moment: a new folder `recording-NNN` in `parent`, whole or
-    not there, with `session.gif`, `session.json` and the data set in `dataset`.
+    not there, with `session.gif`, `session.json` and the data set in `dataset`. Its frames are the imagined ones or
+    those of the simulator; `camera` is the model's own feature, so that the recording goes with its data.
 
-    Args:
-        shown: the data set's frames: imagined, or those of the simulator.
-        camera: feature that they become: the model's own, so that the recording goes with its data.
-
-    Raises:
-        DataError: there is no step yet, or there are no true frames.
-        OutputError: the folder cannot be written.
+    A DataError where there is no step yet, or there are no true frames.
     """
     path = session.timeline.path()
     if not any(moment.latent is not None for moment in path):
@@ -110,16 +105,13 @@ def _padded(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return np.concatenate([rows, np.zeros_like(rows[:1])])
 
 
-def _features(values: dict[str, npt.NDArray[Any]], camera: str) -> dict[str, dict[str, Any]]:
-    kinds = {name: "image" if name == camera else str(column.dtype) for name, column in values.items()}
-    return {name: feature(kinds[name], *column.shape[1:]) for name, column in values.items()}
-
-
 def _write_set(root: Path, session: PlaySession, path: Sequence[SceneMoment], shown: Shown, camera: str) -> None:
     values = columns(session, path, shown, camera)
+    kinds = {name: "image" if name == camera else str(column.dtype) for name, column in values.items()}
+    features = {name: feature(kinds[name], *column.shape[1:]) for name, column in values.items()}
     with quiet_datasets():
         fps, robot = max(1, round(session.start.fps)), session.world_model.env.name
-        dataset = new_set(REPO, root, fps, robot, _features(values, camera))
+        dataset = new_set(REPO, root, fps, robot, features)
         frames = values.pop(camera)
         with (
             finalising(dataset),

@@ -42,15 +42,9 @@ class Look:
 class PlaySession:
     """An imagined future under a user's hand; not for several threads at once: a page hands every call to one worker.
 
-    Args:
-        agent: of the world model, for the policy and the decoded actions.
-        directions: (K, Z), see `variability_directions`; None takes the codebook's.
-
-    Attributes:
-        drivers: who may take over, by name.
-
-    Raises:
-        CheckpointError: the world model has no prototypes.
+    The agent, of the world model, is for the policy and the decoded actions; `directions` (K, Z) are those of
+    `variability_directions`, None takes the codebook's. `drivers` may take over, by name. A CheckpointError where the
+    world model has no prototypes.
     """
 
     start: Start
@@ -88,8 +82,6 @@ class PlaySession:
         out: Tensor = self.now.state[keys.SLOTS][0].clone()
         return out
 
-    # --- begin -----------------------------------------------------------------------------------------------------
-
     def begin(self, start: Start) -> None:
         """Start a new timeline; the simulator of the one before is closed."""
         before = getattr(self, "start", None)
@@ -115,13 +107,9 @@ class PlaySession:
         self._look = None
         self._imagination = ImaginationSession(self.world_model)
 
-    # --- steps -----------------------------------------------------------------------------------------------------
-
     def latent(self, prototype: int, variability: float = 0.0, slot: int | None = None) -> Tensor:
         """The latent action ([N,] Z) of a key press: z = p + s * d (see `playslot_rl.play.steering`), s in standard
-        deviations.
-
-        With one latent per slot, `slot` is that it goes to, the others staying as they are; None goes to all. A
+        deviations. With one latent per slot it goes to `slot`, the others staying as they are; None goes to all. A
         ValueError where there is no such prototype or slot.
         """
         if not 0 <= prototype < len(self.prototypes):
@@ -187,7 +175,6 @@ class PlaySession:
         return None if self.start.recorded is None else self.start.recorded.at(step)
 
     def _land(self, label: str, **found: Any) -> SceneMoment:
-        """Add the imagination's present state to the timeline."""
         now, state = self.now, self._imagination.state
         whole = {"present": now.present, "frozen": now.frozen, "true": now.true, **found}
         steps = now.steps + ("latent" in found)
@@ -205,8 +192,6 @@ class PlaySession:
         self.timeline.add(moment)
         return moment
 
-    # --- time ------------------------------------------------------------------------------------------------------
-
     def undo(self) -> bool:
         """Back by one moment; False at the start. What was undone stays in the timeline, as a branch."""
         return self.timeline.back()
@@ -217,8 +202,6 @@ class PlaySession:
 
     def reset(self) -> None:
         self.timeline.go(0)
-
-    # --- touch -----------------------------------------------------------------------------------------------------
 
     def _row(self, slot: int) -> int:
         if slot not in self.now.present:
@@ -254,8 +237,6 @@ class PlaySession:
         self._imagination.restore(self.now.state)
         self._imagination.put(slots[None], forget=True)
         return self._land(f"slot {slot + 1} swapped with that of {name}")
-
-    # --- pictures --------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
     def _draw(self, state: Any, present: Sequence[int], number: int = 0) -> Frame:

@@ -85,11 +85,8 @@ class Twin:
 
     Not all simulators have a state that can be kept and put back, but an episode is a function of its seed and its
     actions: where the wanted actions do not go on from those that were executed, it is run again from its start.
-
-    Args:
-        task: the twin's alone.
-        lead: actions (A,) from the episode's first frame to where playing starts.
-        stride: distance to the seed tried next where the episode starts solved; 0 never tries another.
+    Actions (A,) `lead` to where playing starts; `stride` is the distance to the seed tried next where the episode
+    starts solved, 0 never tries another.
     """
 
     def __init__(self, task: Task, seed: int, lead: Sequence[Action] = (), stride: int = 0) -> None:
@@ -273,9 +270,7 @@ def task_maker(env: EnvConfig, render: RenderConfig) -> Callable[[], Task]:
     return make
 
 
-def picture_start(
-    model: WorldModel, content: bytes, name: str = "picture", seed: int = 0, whole: bool = False
-) -> Start:
+def picture_start(model: WorldModel, content: bytes, name: str = "picture", whole: bool = False) -> Start:
     """Start from a picture of any size (`read_picture`); `whole` is for a model trained with `data.resize`."""
     frame = read_picture(content, name, model.env.image_size, whole)
-    return Start(name, frame, parse_last(model, frame[None], seed))
+    return Start(name, frame, parse_last(model, frame[None], 0))

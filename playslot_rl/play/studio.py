@@ -27,16 +27,13 @@ from playslot_rl.world_model import Agent, WorldModel
 
 @dataclass(eq=False)
 class Studio:
-    """A model to play with.
+    """A model to play with: for its agent's policy, and in the simulator beside.
 
     Attributes:
-        agent: for the policy and the simulator beside.
         out: folder that recordings go to.
-        fps: of free play, at first.
         drivers: further ones that may take over, by name.
         squeezes: the model's frames were squeezed into squares (`data.resize`), and uploaded pictures are likewise.
         horizon: steps that the model was trained to predict; 0 where that is not known.
-        camera: feature that recordings carry.
         directions: (K, Z), see `variability_directions`.
         donors: (n, N, D), slots of other scenes for swapping; None where there are none.
     """

@@ -122,6 +122,5 @@ class Timeline:
         return found
 
     def tips(self) -> list[SceneMoment]:
-        """The last moment of each branch, in the order of making."""
         parents = {moment.parent for moment in self.moments}
         return [moment for moment in self.moments if moment.number not in parents]

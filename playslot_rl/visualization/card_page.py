@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from playslot_rl.evaluation.card import RESULT, Card
-from playslot_rl.evaluation.card_lines import concluded
+from playslot_rl.evaluation.card_lines import EFFECTS, LATENTS, SLOTS, concluded
 from playslot_rl.evaluation.effects import Replayed
 from playslot_rl.storage.atomic import json_or_nothing
 from playslot_rl.visualization.charts import usage_chart
@@ -65,8 +65,6 @@ def card_document(result: Mapping[str, Any], card: Card, model: WorldModel) -> D
 
 def _pictures(card: Card, model: WorldModel) -> dict[str, list[Block]]:
     """Pictures by the group that they belong to."""
-    from playslot_rl.evaluation.card_lines import EFFECTS, LATENTS, SLOTS
-
     found: dict[str, list[Block]] = {LATENTS: [], EFFECTS: [], SLOTS: []}
     counts = card.details.get("code_counts")
     if counts:
@@ -93,16 +91,15 @@ def _replay_pictures(shown: Replayed) -> list[Block]:
         columns = [windows.frames[rows, 0], windows.frames[rows, -1], shown.own.frames[rows]]
         columns += [windows.frames[others, 0], shown.taken.frames[rows]]
         names = ["frame", f"true, t = {steps}", "imagined", "elsewhere", "same latents"]
-        blocks.append(
-            Picture(
-                "transfer",
-                png(image_grid(np.stack(columns, 1), labels, names)),
-                "Rows are windows: frame, true and imagined frames later, a frame of another episode, and what the "
-                "same latents make of it.",
-                f"Latents of {steps} steps in their own episode, and replayed from a frame of another. Windows are "
-                "spread evenly, not chosen.",
-            )
+        alt = (
+            "Rows are windows: frame, true and imagined frames later, a frame of another episode, and what the same "
+            "latents make of it."
         )
+        caption = (
+            f"Latents of {steps} steps in their own episode, and replayed from a frame of another. Windows are spread "
+            "evenly, not chosen."
+        )
+        blocks.append(_grid("transfer", columns, labels, names, alt, caption))
     if shown.swapped is not None:
         own, swapped = shown.own.frames[rows], shown.swapped.frames[rows]
         columns = [windows.frames[rows, 0], own, swapped, change_map(own, swapped)]
@@ -110,48 +107,41 @@ def _replay_pictures(shown: Replayed) -> list[Block]:
         if shown.region is not None:
             where = np.where(shown.region[rows][..., None], own, (own * 0.15).astype(np.uint8))
             columns, names = [*columns, where], [*names, "moving slots"]
-        blocks.append(
-            Picture(
-                "sensitivity",
-                png(image_grid(np.stack(columns, 1), labels, names)),
-                "Rows are windows: frame, imagined under its own latents and under another window's, the difference, "
-                "and where the slots that move are.",
-                f"What exchanging the latents changes after {steps} steps: orange where the others make it brighter, "
-                "blue where darker.",
-            )
+        alt = (
+            "Rows are windows: frame, imagined under its own latents and under another window's, the difference, and "
+            "where the slots that move are."
         )
-    return [*blocks, *_held_picture(shown)]
+        caption = (
+            f"What exchanging the latents changes after {steps} steps: orange where the others make it brighter, blue "
+            "where darker."
+        )
+        blocks.append(_grid("sensitivity", columns, labels, names, alt, caption))
+    if shown.held is not None:
+        columns = []
+        for place, window in enumerate((0, len(shown.start.frames) - 1)):
+            before = np.broadcast_to(shown.start.frames[window], shown.held[:, place].shape)
+            columns += [before, shown.held[:, place], change_map(before, shown.held[:, place])]
+        names = ["first place", f"t = {steps}", "change", "last place", f"t = {steps}", "change"]
+        alt = (
+            "Rows are prototypes: a frame, the frame imagined while the prototype is held, the change; from two places."
+        )
+        caption = f"Each prototype in use, held for {steps} steps from two held-out frames."
+        blocks.append(_grid("held", columns, [f"code {code}" for code in shown.codes], names, alt, caption))
+    return blocks
 
 
-def _held_picture(shown: Replayed) -> list[Block]:
-    if shown.held is None:
-        return []
-    steps, cells = shown.windows.latents.shape[1], []
-    for place, window in enumerate((0, len(shown.start.frames) - 1)):
-        before = np.broadcast_to(shown.start.frames[window], shown.held[:, place].shape)
-        cells += [before, shown.held[:, place], change_map(before, shown.held[:, place])]
-    names = ["first place", f"t = {steps}", "change", "last place", f"t = {steps}", "change"]
-    drawn = image_grid(np.stack(cells, 1), [f"code {code}" for code in shown.codes], names)
-    alt = "Rows are prototypes: a frame, the frame imagined while the prototype is held, the change; from two places."
-    return [
-        Picture("held", png(drawn), alt, f"Each prototype in use, held for {steps} steps from two held-out frames.")
-    ]
+def _grid(name: str, columns: list[Any], rows: list[str], names: list[str], alt: str, caption: str) -> Picture:
+    return Picture(name, png(image_grid(np.stack(columns, 1), rows, names)), alt, caption)
 
 
 def _prototype_table(table: Sequence[Mapping[str, Any]]) -> list[Block]:
-    if not table:
-        return []
-    rows = [
-        [
-            f"code {row['code']}",
-            f"slot {row['slot'] + 1}",
-            f"{row['pixels'][0]:+.1f} right, {row['pixels'][1]:+.1f} down",
-            f"{row['spread']:.1f}",
-        ]
-        for row in table
-    ]
+    rows = []
+    for row in table:
+        moved = f"{row['pixels'][0]:+.1f} right, {row['pixels'][1]:+.1f} down"
+        rows.append([f"code {row['code']}", f"slot {row['slot'] + 1}", moved, f"{row['spread']:.1f}"])
     caption = "The slot that a held prototype moves most on average, how far (pixels), and how far places differ."
-    return [Table(["prototype", "moves most", "mean displacement", "standard deviation"], rows, caption)]
+    headers = ["prototype", "moves most", "mean displacement", "standard deviation"]
+    return [Table(headers, rows, caption)] if rows else []
 
 
 def _videos(given: ReportInput) -> str:

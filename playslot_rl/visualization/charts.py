@@ -134,10 +134,7 @@ def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], str]], t
 
 def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Theme) -> bytes:
     """PNG of the loss over the optimiser step, one panel a stage and loss term, logarithmic, from the rows of each
-    stage's `metrics.jsonl`.
-
-    Raises:
-        ValueError: there is nothing to draw.
+    stage's `metrics.jsonl`; a ValueError where there is nothing to draw.
     """
     panels = [(stage, name) for stage, rows in histories.items() for name in loss_names(rows)]
     if not panels:
@@ -164,15 +161,8 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
 
 
 def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Mapping[str, Any], theme: Theme) -> bytes:
-    """PNG of two panels: mean return with its standard error, and success rate with its 95 % interval.
-
-    Args:
-        curves: points by method.
-        random: the random policy's point.
-        theme: of the page.
-
-    Raises:
-        ValueError: there is no point.
+    """PNG of two panels, mean return with its standard error and success rate with its 95 % interval: points by method,
+    and the random policy's. A ValueError where there is no point.
     """
     if not any(curves.values()):
         raise ValueError("learning_chart: got no points, expected at least one")
@@ -206,10 +196,8 @@ def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Ma
 
 
 def curve_chart(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[Any, Any]]], theme: Theme) -> bytes:
-    """PNG of numbers over the frames of an episode: feature -> component -> one value a frame.
-
-    Raises:
-        ValueError: there is nothing to draw.
+    """PNG of numbers over the frames of an episode: feature -> component -> one value a frame. A ValueError where there
+    is nothing to draw.
     """
     return figure_bytes(curve_figure(panels, theme), theme)
 

@@ -23,8 +23,6 @@ VERDICTS: Final = ("good", "fair", "BAD")
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph."""
-
     text: str
 
 
@@ -39,14 +37,11 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG (or animated PNG).
+    """A PNG (or animated PNG) for a light page, or for any where there is no `dark` one.
 
     Attributes:
         name: file name without its ending, in the run's `figures` folder.
-        light: PNG for a light page, or for any page.
         alt: what it shows, for those who do not see it.
-        caption: one line under it.
-        dark: PNG for a dark page; None means that `light` suits both.
         still: picture to show instead where the reader asks for less motion.
         width: in CSS pixels, of a small picture that HTML shows enlarged, pixel for pixel; 0 shows its own.
     """
@@ -70,8 +65,6 @@ class Linked:
 
 @dataclass(frozen=True)
 class Notes:
-    """A list of sentences."""
-
     lines: Sequence[str]
 
 
@@ -88,22 +81,13 @@ Block = Text | Table | Picture | Linked | Notes | Missing
 
 @dataclass(frozen=True)
 class Section:
-    """A titled part."""
-
     title: str
     blocks: Sequence[Block]
 
 
 @dataclass(frozen=True)
 class Document:
-    """A whole report.
-
-    Attributes:
-        title: of the page.
-        lead: what was run, in a sentence or two.
-        sections: in reading order.
-        opening: blocks before the first of them.
-    """
+    """A whole report; `lead` says what was run, in a sentence or two, `opening` comes before the first section."""
 
     title: str
     lead: str
@@ -120,11 +104,7 @@ def to_markdown(document: Document) -> str:
 
 
 def write_document(document: Document, folder: Path, name: str) -> Path:
-    """Write `FOLDER/NAME.md`, `FOLDER/NAME.html` and `FOLDER/figures/*.png`; returns the path of the HTML file.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
+    """Write `FOLDER/NAME.md`, `FOLDER/NAME.html` and `FOLDER/figures/*.png`; returns the path of the HTML file."""
     for section in document.sections:
         for block in section.blocks:
             if isinstance(block, Picture):
@@ -163,8 +143,10 @@ def style() -> str:
 
 
 def to_html(document: Document) -> str:
-    """The whole file."""
-    sections = "\n".join(_section(i, section) for i, section in enumerate(document.sections))
+    sections = "\n".join(
+        f'<section id="s{i}">\n<h2>{escape(s.title)}</h2>\n{"\n".join(map(_html_block, s.blocks))}\n</section>'
+        for i, s in enumerate(document.sections)
+    )
     opening = "\n".join(map(_html_block, document.opening))
     links = "\n".join(f'<a href="#s{i}">{escape(s.title)}</a>' for i, s in enumerate(document.sections))
     return (
@@ -174,11 +156,6 @@ def to_html(document: Document) -> str:
         f"<header><h1>{escape(document.title)}</h1>\n<p class='lead'>{_inline(document.lead)}</p>\n"
         f"<nav aria-label='Sections'>{links}</nav></header>\n<main>\n{opening}{sections}\n</main>\n</body>\n</html>\n"
     )
-
-
-def _section(index: int, section: Section) -> str:
-    blocks = "\n".join(_html_block(block) for block in section.blocks)
-    return f'<section id="s{index}">\n<h2>{escape(section.title)}</h2>\n{blocks}\n</section>'
 
 
 def _inline(text: str) -> str:

@@ -39,20 +39,17 @@ def slot_cells(model: WorldModel, frames: Frames) -> Frames:
     return np.stack(rows)
 
 
-def draw_slots(model: WorldModel, frames: Frames, columns: int = 6) -> Image.Image:
-    """Grid for `columns` frames spread evenly over a clip (T, H, W, 3)."""
+def draw_slots(model: WorldModel, frames: Frames) -> Image.Image:
+    """Grid for six frames spread evenly over a clip (T, H, W, 3)."""
     cells = slot_cells(model, frames)
     labels = ["frame", "reconstruction", "segmentation", *(f"slot {n + 1}" for n in range(cells.shape[0] - 3))]
-    return film_strip(cells, labels, columns)
+    return film_strip(cells, labels, columns=6)
 
 
 @torch.no_grad()
 def prototype_frames(model: WorldModel, frame: Frames, steps: int = 15) -> Frames:
     """Frames (K, P, H, W, 3) imagined from a frame (H, W, 3) while each prototype is held for P steps, by every slot,
-    with zero variability.
-
-    Raises:
-        ValueError: the latent-action mode has no prototypes.
+    with zero variability; a ValueError where the latent-action mode has no prototypes.
     """
     mode = model.config.inverse_dynamics.mode
     if mode not in ("hybrid", "discrete"):
@@ -69,12 +66,12 @@ def prototype_frames(model: WorldModel, frame: Frames, steps: int = 15) -> Frame
     return to_uint8(model.savi.decode(predicted).frames)
 
 
-def draw_prototypes(model: WorldModel, frame: Frames, steps: int = 15, columns: int = 8) -> Image.Image:
+def draw_prototypes(model: WorldModel, frame: Frames, steps: int = 15) -> Image.Image:
     """Rows are prototypes, columns the first frame and imagined frames up to `steps`; last, the change since t = 0."""
     imagined = prototype_frames(model, frame, steps)
     first = np.broadcast_to(frame, (len(imagined), 1, *frame.shape))
     clips = np.concatenate([first, imagined], 1)
-    shown = np.unique(np.linspace(0, steps, min(columns, steps + 1)).round().astype(int))
+    shown = np.unique(np.linspace(0, steps, min(8, steps + 1)).round().astype(int))
     change = change_map(clips[:, 1], clips[:, -1])[:, None]
     cells = np.concatenate([clips[:, shown], change], 1)
     return image_grid(cells, [f"code {k}" for k in range(len(cells))], [*(f"t = {t}" for t in shown), "change"])

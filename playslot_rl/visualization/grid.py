@@ -19,18 +19,9 @@ GAP = 4
 
 
 def image_grid(cells: Frames, rows: Sequence[str] = (), columns: Sequence[str] = (), scale: int = 2) -> Image.Image:
-    """One picture of R times C frames with row labels on the left and column labels above.
-
-    Args:
-        cells: (R, C, H, W, 3).
-        rows, columns: R and C labels, or none.
-        scale: enlargement without interpolation; frames are small, blurring would hide their pixels.
-
-    Returns:
-        RGBA picture with a transparent ground, so that it suits light and dark pages.
-
-    Raises:
-        ValueError: wrong shape or number of labels.
+    """One RGBA picture of frames (R, C, H, W, 3) with R row labels on the left and C column labels above, or none; its
+    transparent ground suits light and dark pages. They are enlarged without interpolation: frames are small, blurring
+    would hide their pixels. A ValueError for another shape or number of labels.
     """
     if cells.ndim != 5 or cells.shape[-1] != 3:
         raise ValueError(f"image_grid: got cells {cells.shape}, expected (R, C, H, W, 3)")
@@ -66,22 +57,15 @@ def png(picture: Image.Image) -> bytes:
     return buffer.getvalue()
 
 
-def animation(pictures: list[Image.Image], fps: float = 6.0, pause: float = 1.2) -> bytes:
-    """Endless APNG.
-
-    Args:
-        pictures: its frames, of one size.
-        fps: frames per second, more than 0.
-        pause: seconds that the last frame stays.
-
-    Raises:
-        ValueError: no pictures, or a rate that is not positive.
+def animation(pictures: list[Image.Image], fps: float = 6.0) -> bytes:
+    """Endless APNG of pictures of one size, whose last one stays a little longer; a ValueError where there are none, or
+    for a rate that is not positive.
     """
     if not pictures or fps <= 0:
         raise ValueError(
             f"animation: got {len(pictures)} frames at {fps} fps, expected at least one and a positive rate"
         )
-    times = [1000.0 / fps] * (len(pictures) - 1) + [1000.0 * pause]
+    times = [1000.0 / fps] * (len(pictures) - 1) + [1200.0]
     buffer = io.BytesIO()
     pictures[0].save(
         buffer,
@@ -97,11 +81,5 @@ def animation(pictures: list[Image.Image], fps: float = 6.0, pause: float = 1.2)
 
 
 def side_by_side(clips: Frames, columns: Sequence[str], rows: Sequence[str], scale: int = 2) -> list[Image.Image]:
-    """Pictures of an animation of clips (E, C, T, H, W, 3): one row an episode, one column a way of running it.
-
-    Raises:
-        ValueError: wrong shape or number of labels.
-    """
-    if clips.ndim != 6:
-        raise ValueError(f"side_by_side: got clips {clips.shape}, expected (E, C, T, H, W, 3)")
+    """Pictures of an animation of clips (E, C, T, H, W, 3): one row an episode, one column a way of running it."""
     return [image_grid(clips[:, :, t], rows, columns, scale) for t in range(clips.shape[2])]

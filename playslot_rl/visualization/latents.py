@@ -17,16 +17,13 @@ from playslot_rl.visualization.document import Block, Missing, Section, Table, T
 from playslot_rl.visualization.sections import ReportInput, chart
 from playslot_rl.world_model import WorldModel, module_device
 
+MOST = 200
+
 
 @dataclass(frozen=True)
 class LatentData:
-    """Latent actions of a data set.
-
-    Attributes:
-        name: of the data set.
-        codes: (M, 1) or (M, N) int64.
-        actions: (M, A) as they were recorded; None for a data set without actions.
-        probe: result of `probe_actions`; None without actions that are numbers.
+    """Latent actions of a data set: codes int64 (M, 1) or (M, N), actions (M, A) as they were recorded, None where
+    there are none, and the result of `probe_actions`, None without actions that are numbers.
     """
 
     name: str
@@ -41,8 +38,8 @@ def data_roots(given: ReportInput) -> list[Path]:
     return list({p.resolve(): p for p in found}.values())
 
 
-def read_latents(model: WorldModel, root: Path, given: ReportInput, most_episodes: int = 200) -> LatentData:
-    """Latent actions of up to `most_episodes` episodes of a data set, with the probe where it has actions."""
+def read_latents(model: WorldModel, root: Path, given: ReportInput) -> LatentData:
+    """Latent actions of up to `MOST` episodes of a data set, with the probe where it has actions."""
     from playslot_rl.data.cache import Cache
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.data.weighted import open_configured
@@ -51,7 +48,7 @@ def read_latents(model: WorldModel, root: Path, given: ReportInput, most_episode
     source = open_configured(given.config, [root])
     prints = str(given.metas.get("slots", {}).get("fingerprint", ""))
     slots = slot_cache(source, model.savi, prints, Cache.of(data), module_device(model))
-    starts, lengths = source.starts[:most_episodes], source.lengths[:most_episodes]
+    starts, lengths = source.starts[:MOST], source.lengths[:MOST]
     z, codes, episodes = infer_latents(model.inverse_dynamics, slots, starts, lengths, source.actions)
     if source.actions is None:
         return LatentData(root.name, codes, None, None)

@@ -80,12 +80,9 @@ def _solution(found: Mapping[str, Any]) -> list[Text | Table]:
 
 
 def plan_sheet(goals: Sequence[Frames], plans: Sequence[Frames], executed: Sequence[Frames]) -> Image.Image:
-    """Two rows an episode: start and goal, then the first plan as it was imagined over what was executed.
-
-    Args:
-        goals: the expert's way to each goal (T + 1, H, W, 3).
-        plans: imagined frames (H + 1, H, W, 3), an episode each.
-        executed: frames (T' + 1, H, W, 3); where an episode ended before the horizon its last one is repeated.
+    """Two rows an episode: start and goal, then the first plan as it was imagined over what was executed. `goals` are
+    the expert's ways (T + 1, H, W, 3), plans (H + 1, H, W, 3), executed frames (T' + 1, H, W, 3); where an episode
+    ended before the horizon its last one is repeated.
     """
     cells, rows = [], []
     shown = np.unique(np.linspace(1, len(plans[0]) - 1, COLUMNS).round().astype(int))

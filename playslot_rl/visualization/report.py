@@ -39,21 +39,13 @@ def write_report(
     world_model: WorldModel | None = None,
     pool: TaskPool | None = None,
 ) -> Path:
-    """Write `RUN/report.md`, `RUN/report.html` and `RUN/figures/*.png` from what the run has so far.
+    """Write `RUN/report.md`, `RUN/report.html` and `RUN/figures/*.png` from what the run has so far; returns the path
+    of the HTML.
 
     Args:
-        run: its folder.
-        config: None reads `RUN/config.json`.
-        agent: None where there is no policy yet.
+        config: None reads `RUN/config.json`; a ConfigError where there is none, or not one of this version.
         world_model: None means the agent's.
         pool: environments to use and leave open; None makes and closes its own.
-
-    Returns:
-        Path of `report.html`.
-
-    Raises:
-        ConfigError: no config was given and the run has none, or it is not one of this version.
-        OutputError: a file cannot be written.
     """
     config = config or Run(run).config
     model = world_model or (agent.world_model if agent is not None else None)
@@ -189,7 +181,6 @@ def build_objects(given: ReportInput) -> Document:
 
 
 def scores_section(given: ReportInput, result: dict[str, Any] | None) -> Section:
-    """ARI and probes."""
     title = "Objects and moves"
     if result is None:
         return Section(title, [Missing("Nothing has been scored yet.", given.command("evaluate"))])
@@ -217,7 +208,6 @@ def scores_section(given: ReportInput, result: dict[str, Any] | None) -> Section
 
 
 def prediction_section(given: ReportInput, frames: Any, result: dict[str, Any] | None) -> Section:
-    """Predicted beside true frames."""
     title = "Prediction"
     if given.world_model is None:
         return Section(title, [Missing("There is no trained dynamics model.", given.command("train-dynamics"))])
@@ -254,7 +244,6 @@ def code_section(result: dict[str, Any] | None) -> Section:
 
 
 def object_settings(given: ReportInput, result: dict[str, Any] | None) -> Section:
-    """Settings and sizes."""
     env, grid = given.config.env, given.config.env.grid
     task = [
         ["frames", f"{env.image_size} x {env.image_size} pixels, drawn from seeds"],

@@ -90,8 +90,6 @@ def read_evaluations(run: Path) -> dict[str, dict[str, Any]]:
     return {protocol: result for protocol, result in found.items() if result}
 
 
-# --- success ------------------------------------------------------------------------------------------------------
-
 WAYS = {
     "simulation": "PlaySlot, in simulation",
     "imagination": "PlaySlot, in imagination",
@@ -101,12 +99,15 @@ REFERENCES = {"slot_oracle": "slot oracle", "expert": "scripted expert", "random
 
 
 def success_section(given: ReportInput) -> Section:
-    """Success table and chart."""
     results = read_evaluations(given.run)
     blocks: list[Block] = []
     if results:
         rows = _success_rows(results)
-        cells = [[n, percent(r["success_rate"]), interval(r["ci95"]), _steps(r), e] for n, r, _, e in rows]
+        cells = []
+        for name, result, _, count in rows:
+            steps = result.get("mean_steps_to_success")
+            taken = "–" if steps is None else f"{steps:.1f}"
+            cells.append([name, percent(result["success_rate"]), interval(result["ci95"]), taken, count])
         headers = ["", "success rate", "95 % interval", "mean steps to success", "episodes"]
         blocks.append(Table(headers, cells, "Wilson intervals. References run closed-loop on the same seeds."))
         drawn = [
@@ -132,11 +133,6 @@ def success_section(given: ReportInput) -> Section:
     return Section("Success", blocks)
 
 
-def _steps(result: dict[str, Any]) -> str:
-    value = result.get("mean_steps_to_success")
-    return "–" if value is None else f"{value:.1f}"
-
-
 def _success_rows(results: dict[str, dict[str, Any]]) -> list[tuple[str, dict[str, Any], str, str]]:
     rows = [(WAYS[p], results[p], "playslot", str(results[p]["episodes"])) for p in PROTOCOLS if p in results]
     last = next(iter(results.values()))
@@ -144,9 +140,6 @@ def _success_rows(results: dict[str, dict[str, Any]]) -> list[tuple[str, dict[st
         if name in last.get("references", {}):
             rows.append((label, last["references"][name], name, str(last["episodes"])))
     return rows
-
-
-# --- pictures -----------------------------------------------------------------------------------------------------
 
 
 def rollout_section(given: ReportInput) -> Section:
@@ -228,9 +221,6 @@ def prototype_section(given: ReportInput, clip: Callable[[], Any]) -> Section:
     return Section(title, [Picture("prototypes", png(draw_prototypes(model, clip()[0])), alt, caption)])
 
 
-# --- training -----------------------------------------------------------------------------------------------------
-
-
 def read_history(path: Path) -> list[dict[str, Any]]:
     """Rows of a `metrics.jsonl`; a line that a kill cut off is left out."""
     rows = []
@@ -251,7 +241,6 @@ def _unexplained(metrics: dict[str, Any]) -> list[Block]:
 
 
 def training_section(given: ReportInput, stages: Sequence[str] = STAGES) -> Section:
-    """Stage table and loss curves."""
     blocks: list[Block] = []
     rows = []
     for stage in stages:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from playslot_rl.evaluation.intervals import wilson
+from playslot_rl.evaluation.success import wilson
 
 
 def test_interval_equals_published_values() -> None:

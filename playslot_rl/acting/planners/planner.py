@@ -2,12 +2,10 @@
 
     z*_{1:H} = argmin_z  cost(rollout(S, z_{1:H}))
 
-It sees a `Search` alone: what a plan costs, and how latent actions are distributed. So the same planner serves the
-world model, a toy cost in a test, and any other model.
-
-All planners but the categorical one search in whitened coordinates c of the latents (`playslot_rl.modules.whitening`),
-where the training latents have unit scale: a standard deviation of 1 in the latents themselves, where theirs is a
-tenth, draws futures that the model has never seen.
+It sees a `Search` alone, so it serves the world model, a toy cost in a test, and any other model. All planners but the
+categorical one search in whitened coordinates c of the latents (`playslot_rl.modules.whitening`), where the training
+latents have unit scale: a standard deviation of 1 in the latents themselves, where theirs is a tenth, draws futures
+that the model has never seen.
 
 Shapes: M candidates, H horizon, Z latent-action width. "[N,]" is there with one latent action per slot.
 """
@@ -151,15 +149,7 @@ def shifted(plan: Tensor, steps: int, fill: Tensor) -> Tensor:
 
 @torch.no_grad()
 def unfaded(whitening: Whitening) -> Whitening:
-    """The same mean and directions with the data's own deviations, at least a thousandth of the first one's.
-
-    Examples:
-        >>> z = torch.randn(1000, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 0.01])
-        >>> whitening = Whitening(2)
-        >>> whitening.fit(z)
-        >>> [round(float(s), 2) for s in unfaded(whitening)(z).std(dim=0)]
-        [1.0, 1.0]
-    """
+    """The same mean and directions with the data's own deviations, at least a thousandth of the first one's."""
     plain = copy.deepcopy(whitening)
     squares = whitening.scale.double().square()
     first = squares[0] / (1 + FADE)
@@ -172,8 +162,7 @@ def latent_statistics(agent: Agent) -> Whitening:
     (the demonstrations' inferred latents), else its action decoder's whitening, else that one's mean and scale.
 
     Note: networks take coordinates in which directions of next to no variance fade out. A search must draw in these
-    directions what the data have there, next to nothing, or most of a plan is noise that the model has never seen; so
-    the fading is taken back.
+    what the data have there, or most of a plan is noise that the model has never seen; so the fading is taken back.
     """
     found = agent.policy.whitening or agent.action_decoder.whitening
     if found is not None:

@@ -25,8 +25,7 @@ class CEMPlanner:
 
         c ~ N(mu, sigma^2),   mu, sigma <- mean and deviation of the K elites,   sigma >= floor
 
-    As in iCEM (Pinneri et al., 2020) the elites stay among the candidates of the next iteration, so the best cost never
-    rises.
+    As in iCEM (Pinneri et al., 2020) the elites stay candidates of the next iteration, so the best cost never rises.
 
     Examples:
         >>> from playslot_rl.modules.whitening import Whitening
@@ -73,9 +72,9 @@ class MPPIPlanner:
 
         w_i = softmax(-(J_i - min J) / (temperature * scale)),   mu <- sum_i w_i c_i
 
-    The exponent is shifted by the least cost and measured in the standard deviation of the candidates' costs, so it
-    neither underflows nor depends on the unit of the cost; a small temperature follows the best alone. The noise's
-    deviation falls by `decay` from iteration to iteration.
+    The exponent is in the standard deviation of the candidates' costs, so it neither underflows nor depends on their
+    unit; a small temperature follows the best alone. The noise's deviation falls by `decay` from iteration to
+    iteration.
     """
 
     candidates: int = 64
