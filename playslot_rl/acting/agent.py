@@ -95,14 +95,7 @@ class ImaginationActor(PlannedActor):
         return super().forward(tensordict)
 
 
-class Performance(NamedTuple):
-    """Whole episodes of the expert: frames (n, T + 1, 3, H, W) uint8 [0, 255] and actions (n, T, A) in [-1, 1]."""
-
-    frames: Tensor
-    actions: Tensor
-
-
-def perform(pool: TaskPool, seeds: Sequence[int]) -> Performance:
+def perform(pool: TaskPool, seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
     """Film the scripted expert in episodes, none of which starts solved, to their last step: frames (E, T + 1, 3, H, W)
     uint8 [0, 255] and actions (E, T, A) in [-1, 1].
     """
@@ -113,7 +106,7 @@ def perform(pool: TaskPool, seeds: Sequence[int]) -> Performance:
             actions[list(moment.episodes), moment.step] = moment.seen[keys.ACTION].float().cpu()
 
     frames, _ = record(pool, ExpertActor(), seeds, note)
-    return Performance(torch.from_numpy(frames).movedim(-1, -3), actions.clamp(-1, 1))
+    return torch.from_numpy(frames).movedim(-1, -3), actions.clamp(-1, 1)
 
 
 class ReplayActor(PlannedActor):
@@ -125,7 +118,7 @@ class ReplayActor(PlannedActor):
     here: what fails is lost between a motion that was seen and the actions that made it.
     """
 
-    def __init__(self, agent: Agent, performed: Callable[[Sequence[int]], Performance]) -> None:
+    def __init__(self, agent: Agent, performed: Callable[[Sequence[int]], tuple[Tensor, Tensor]]) -> None:
         env = agent.world_model.env
         super().__init__(env.max_steps, env.action_dim)
         self.agent, self.performed = agent, performed

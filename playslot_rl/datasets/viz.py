@@ -25,11 +25,22 @@ from playslot_rl.datasets.verify import require_sound
 from playslot_rl.errors import ConfigError
 from playslot_rl.storage.atomic import write_text
 from playslot_rl.storage.folders import require_outside
-from playslot_rl.visualization.charts import DARK, LIGHT, curve_chart
+from playslot_rl.visualization.charts import DARK, LIGHT, curve_figure, figure_bytes
 from playslot_rl.visualization.document import Block, Document, Picture, Section, Table, Text, to_html
 from playslot_rl.visualization.grid import animation, image_grid, png
-from playslot_rl.visualization.words import feature_text
 
+FEATURES: Final = {
+    keys.FEATURE_STATE: "state of the robot",
+    keys.FEATURE_ACTION: "action",
+    keys.FEATURE_LATENT: "latent action",
+    keys.FEATURE_CODE: "number of the latent action's prototype",
+    keys.FEATURE_REWARD: "reward",
+    keys.FEATURE_SUCCESS: "success",
+    keys.FEATURE_DONE: "end of the episode",
+    keys.FEATURE_SEED: "seed of the episode",
+    keys.FEATURE_LAST: "last observation",
+}
+CAMERA: Final = "observation.images."
 STRIP: Final = 8  # frames of the strip: the first, the last, and some between
 SHOWN_SIDE: Final = 128  # frames are stored about this large: small ones enlarged pixel for pixel, large ones reduced
 ENLARGED: Final = 3  # how many times larger the page shows an animation
@@ -194,6 +205,13 @@ def _camera_pictures(contents: Contents, clip: Clip, camera: str, frames: npt.ND
     ]
 
 
+def feature_text(name: str) -> str:
+    """A data set's feature in words, or its name where we do not know it."""
+    if name.startswith(CAMERA):
+        return f"camera {name.removeprefix(CAMERA)}"
+    return FEATURES.get(name, name)
+
+
 def _curve_pictures(contents: Contents, clip: Clip) -> list[Picture]:
     rows = slice(clip.span.start, clip.span.stop)
     panels: dict[str, dict[str, Array]] = {}
@@ -206,5 +224,5 @@ def _curve_pictures(contents: Contents, clip: Clip) -> list[Picture]:
     if not panels:
         return []
     alt = f"{', '.join(panels)} of episode {clip.span.index} over its frames"
-    light, dark = (curve_chart(panels, theme) for theme in (LIGHT, DARK))
+    light, dark = (figure_bytes(curve_figure(panels, theme), theme) for theme in (LIGHT, DARK))
     return [Picture(f"episode-{clip.span.index}-curves", light, alt, "Over the numbers of the frames", dark=dark)]

@@ -116,13 +116,9 @@ class GoalEpisode:
         """The goal image (3, H, W) uint8 [0, 255]."""
         return torch.from_numpy(self.frames[-1]).movedim(-1, 0)
 
-    def distance(self, places: Places) -> float:
-        """Metres by which the thing furthest from its place in the goal is away from it; places (P, 3)."""
-        return distance(places, self.places[-1])
-
 
 def distance(places: Places, others: Places) -> float:
-    """The largest of the distances between things (P, 3) and (P, 3)."""
+    """The largest of the distances between things (P, 3) and (P, 3), in metres."""
     return float(np.linalg.norm(places - others, axis=-1).max())
 
 

@@ -25,7 +25,7 @@ from playslot_rl.acting.planners.costs import GoalCost, goal_distance, parse_goa
 from playslot_rl.acting.planning import PlanningActor
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.planning import CostName, GoalName
-from playslot_rl.evaluation.goals import Frames, GoalEpisode, GoalPool, Trace
+from playslot_rl.evaluation.goals import Frames, GoalEpisode, GoalPool, Trace, distance
 from playslot_rl.evaluation.success import summary, wilson
 from playslot_rl.frames import normalise, to_uint8
 from playslot_rl.world_model import Agent, module_device
@@ -131,7 +131,9 @@ def results(played: Played, goals: Sequence[GoalEpisode], near: float) -> dict[s
     `state_closest` and `state_distance_at_start` are metres, means over episodes at the end, at the closest step and at
     the start. Costs are means, at the first decision with `_first`; None where nothing is planned.
     """
-    ways = [[goal.distance(p) for p in trace.places] for goal, trace in zip(goals, played.traces, strict=True)]
+    ways = [
+        [distance(p, goal.places[-1]) for p in trace.places] for goal, trace in zip(goals, played.traces, strict=True)
+    ]
     reached = sum(min(way) < near for way in ways)
     episodes = [
         {

@@ -27,11 +27,7 @@ from playslot_rl.storage.locks import locked
 
 Shown = Literal["imagined", "true"]
 
-ANIMATION: Final = "session.gif"
-DATA_SET: Final = "dataset"
-ABOUT: Final = "session.json"
 LOCK: Final = ".lock"
-REPO: Final = "playslot_rl/played"
 
 
 def record(session: PlaySession, parent: Path, shown: Shown = "imagined", camera: str = keys.FEATURE_IMAGE) -> Path:
@@ -50,14 +46,14 @@ def record(session: PlaySession, parent: Path, shown: Shown = "imagined", camera
         parent.mkdir(parents=True, exist_ok=True)
     # Another `playslot play` may record into the same folder: one after the other, each its number.
     with locked(parent / LOCK), new_folder(final := _free(parent)) as folder:
-        write_bytes(folder / ANIMATION, session_animation(path, session.start.fps))
-        _write_set(folder / DATA_SET, session, path, shown, camera)
+        write_bytes(folder / "session.gif", session_animation(path, session.start.fps))
+        _write_set(folder / "dataset", session, path, shown, camera)
         about = {
             "start": session.start.title,
             "frames": shown,
             "moments": [{"label": moment.label, "error": moment.error} for moment in path],
         }
-        write_json(folder / ABOUT, about)
+        write_json(folder / "session.json", about)
     return final
 
 
@@ -111,7 +107,7 @@ def _write_set(root: Path, session: PlaySession, path: Sequence[SceneMoment], sh
     features = {name: feature(kinds[name], *column.shape[1:]) for name, column in values.items()}
     with quiet_datasets():
         fps, robot = max(1, round(session.start.fps)), session.world_model.env.name
-        dataset = new_set(REPO, root, fps, robot, features)
+        dataset = new_set("playslot_rl/played", root, fps, robot, features)
         frames = values.pop(camera)
         with (
             finalising(dataset),

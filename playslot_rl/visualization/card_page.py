@@ -46,8 +46,9 @@ def verdict_text(result: Mapping[str, Any]) -> str:
 def told_text(result: Mapping[str, Any]) -> str:
     """Which episodes were measured, as sentences."""
     known = "" if result["held_out_known"] else " It is not known whether the world model has seen them."
+    count = len(result["episodes_tested"])
     return (
-        f"Measured on {len(result['episodes_tested'])} episodes of `{result['data']}`: {result['held_out']}.{known} "
+        f"Measured on {count} episode{'' if count == 1 else 's'} of `{result['data']}`: {result['held_out']}.{known} "
         f"Probes are fitted on {result['episodes_fitted']} others."
     )
 

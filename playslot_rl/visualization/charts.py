@@ -195,17 +195,12 @@ def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Ma
     return figure_bytes(figure, theme)
 
 
-def curve_chart(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[Any, Any]]], theme: Theme) -> bytes:
-    """PNG of numbers over the frames of an episode: feature -> component -> one value a frame. A ValueError where there
-    is nothing to draw.
-    """
-    return figure_bytes(curve_figure(panels, theme), theme)
-
-
 def curve_figure(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[Any, Any]]], theme: Theme) -> Figure:
-    """The figure of `curve_chart`: at most three panels in a row, legends beside them."""
+    """Numbers over the frames of an episode, feature -> component -> one value a frame: at most three panels in a row,
+    legends beside them. A ValueError where there is nothing to draw.
+    """
     if not panels:
-        raise ValueError("curve_chart: got no feature, expected at least one")
+        raise ValueError("curve_figure: got no feature, expected at least one")
     columns = min(3, len(panels))
     rows = -(-len(panels) // columns)
     figure = new_figure(3.9 * columns, 2.2 * rows)

@@ -18,6 +18,7 @@ from playslot_rl.visualization.sections import ReportInput, chart
 from playslot_rl.world_model import WorldModel, module_device
 
 MOST = 200
+COLLECT = "playslot collect out=DIR policy=random"
 
 
 @dataclass(frozen=True)
@@ -30,12 +31,6 @@ class LatentData:
     codes: Any
     actions: Any
     probe: dict[str, Any] | None
-
-
-def data_roots(given: ReportInput) -> list[Path]:
-    """Data sets of the run: those its config names, then those in its `data` folder."""
-    found = [p for p in data_folders(given.config, given.run) if (p / "meta" / "info.json").is_file()]
-    return list({p.resolve(): p for p in found}.values())
 
 
 def read_latents(model: WorldModel, root: Path, given: ReportInput) -> LatentData:
@@ -64,18 +59,16 @@ def latent_section(given: ReportInput) -> Section:
     title = "Latent actions"
     if given.world_model is None:
         return Section(title, [Missing("There is no trained dynamics model.", given.command("train-dynamics"))])
-    roots = data_roots(given)
-    if not roots:
-        return Section(
-            title, [Missing("The run names no data set on this machine.", "playslot collect out=DIR policy=random")]
-        )
+    found = [p for p in data_folders(given.config, given.run) if (p / "meta" / "info.json").is_file()]
+    if not found:
+        return Section(title, [Missing("The run names no data set on this machine.", COLLECT)])
     model = given.world_model
     sets, blocks = [], list[Block]()
-    for root in roots:
+    for root in {p.resolve(): p for p in found}.values():
         try:
             sets.append(read_latents(model, root, given))
         except DataError as error:  # the rest of the report does not depend on it
-            blocks.append(Missing(f"A data set cannot be read: {error}.", "playslot collect out=DIR policy=random"))
+            blocks.append(Missing(f"A data set cannot be read: {error}.", COLLECT))
     if not sets:
         return Section(title, blocks)
     k = model.inverse_dynamics.n_prototypes

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig
@@ -20,13 +20,35 @@ from playslot_rl.visualization.charts import DARK, LIGHT, Theme, loss_chart, los
 from playslot_rl.visualization.document import Block, Missing, Picture, Section, Table, Text
 from playslot_rl.visualization.drawings import draw_prototypes, draw_slots, run_rollouts
 from playslot_rl.visualization.grid import animation, film_strip, png, side_by_side
-from playslot_rl.visualization.words import HELD_OUT, METRICS, metric_text
 from playslot_rl.world_model import Agent, WorldModel
 
 STAGES = ("slots", "dynamics", "policy")
 HISTORIES = {"slots": "slots", "dynamics": "dynamics", "policy": "policy", "action decoder": "policy/decoder"}
 """What was trained -> folder of its `metrics.jsonl` in the run."""
 EPISODES_SHOWN = 3
+SHARE: Final = "{:.0%}"
+NUMBER: Final = "{:.3g}"
+METRICS: Final = {
+    "mse": ("mean squared image error", NUMBER),
+    "mse_image": ("mean squared image error", NUMBER),
+    "mse_slot": ("mean squared slot error", NUMBER),
+    "psnr": ("PSNR", "{:.1f} dB"),
+    "slots_in_use": ("slots in use", NUMBER),
+    "largest_slot": ("the largest slot's share of the pixels", SHARE),
+    "flicker": ("exchanges of slots a transition", NUMBER),
+    "mask_entropy": ("entropy of the masks", "{:.2f} nats"),
+    "moving_explained": ("share of the moving pixels' change that is drawn", SHARE),
+    "usage": ("prototypes in use", SHARE),
+    "perplexity": ("perplexity of the codes", NUMBER),
+    "unexplained_parsed": ("policy, from parsed slots", SHARE),
+    "unexplained_imagined": ("policy, from imagined slots", SHARE),
+    "oracle_unexplained": ("slot oracle", SHARE),
+    "decoder_trial_unexplained": ("trial of an action decoder that reads slots", SHARE),
+    "decoder_unexplained": ("action decoder", SHARE),
+    "finetune_unexplained": ("policy and decoder tuned together", SHARE),
+}
+"""Key of a stage's metric: its words, and how its value is written. Those of `unexplained` are variances."""
+HELD_OUT: Final = "_held_out"
 ROLLOUTS = ("imagined", "executed", "closed loop")
 
 
@@ -230,6 +252,19 @@ def read_history(path: Path) -> list[dict[str, Any]]:
         except json.JSONDecodeError:
             break
     return rows
+
+
+def metric_text(metrics: Mapping[str, Any]) -> str:
+    """The numbers among a stage's metrics that no column of the report has; a dash where there are none."""
+    found = []
+    for key, value in metrics.items():
+        name = key.removesuffix(HELD_OUT)
+        if not isinstance(value, (int, float)) or "unexplained" in name:
+            continue
+        words, form = METRICS.get(name, (name.replace("_", " "), NUMBER))
+        held = " on held-out episodes" if key != name else ""
+        found.append(f"{words}{held} {form.format(value).replace('%', ' %')}")
+    return "; ".join(found) or "–"
 
 
 def _unexplained(metrics: dict[str, Any]) -> list[Block]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor, ExpertActor, RandomActor, ReactiveActor, latent_actor
-from playslot_rl.acting.agent import ImaginationActor, Performance, ReplayActor, oracle_actor, playslot_actor
+from playslot_rl.acting.agent import ImaginationActor, ReplayActor, oracle_actor, playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config.compose import compose
 from playslot_rl.testing import tiny_agent, tiny_config
@@ -71,11 +71,11 @@ def sold() -> Actor:
     return SOLDActor(savi, SOLDNetworks(config, savi.config.slot_dim, 4, 5).actor, window=2, action_dim=4)
 
 
-def performance(seeds: Sequence[int]) -> Performance:
+def performance(seeds: Sequence[int]) -> tuple[torch.Tensor, torch.Tensor]:
     """Videos that hang on their seed alone."""
     drawn = [torch.Generator().manual_seed(seed) for seed in seeds]
     frames = [torch.randint(256, (21, 3, 64, 64), generator=g, dtype=torch.uint8) for g in drawn]
-    return Performance(torch.stack(frames), torch.zeros(len(seeds), 20, 4))
+    return torch.stack(frames), torch.zeros(len(seeds), 20, 4)
 
 
 ACTORS: dict[str, Callable[[], Actor]] = {

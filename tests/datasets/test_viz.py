@@ -13,7 +13,7 @@ from playslot_rl import keys
 from playslot_rl.data.contents import read_contents
 from playslot_rl.data.places import Problems
 from playslot_rl.datasets import viz
-from playslot_rl.visualization.charts import LIGHT, curve_chart, curve_figure
+from playslot_rl.visualization.charts import LIGHT, curve_figure, figure_bytes
 
 pytestmark = pytest.mark.integration
 
@@ -70,7 +70,8 @@ def test_no_legend_covers_a_curve() -> None:
 
 
 def test_names_with_dollar_signs_are_names(images: Path, tmp_path: Path) -> None:
-    assert curve_chart({r"$\nothing{": {"$": [0.0, 1.0], r"$\frac": [1.0, 0.0]}}, LIGHT).startswith(b"\x89PNG")
+    figure = curve_figure({r"$\nothing{": {"$": [0.0, 1.0], r"$\frac": [1.0, 0.0]}}, LIGHT)
+    assert figure_bytes(figure, LIGHT).startswith(b"\x89PNG")
     root = Path(shutil.copytree(images, tmp_path / "set"))
     edit_json(root, "meta/info.json", lambda info: info["features"]["action"].update(names=[r"$\nothing{", "<b>"]))
     text = viz.write_page(root, tmp_path / "page.html").read_text()
