@@ -26,7 +26,7 @@ from playslot_rl.envs import PROCEDURAL
 from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.envs.rendering import check_rendering
 from playslot_rl.errors import PlaySlotError
-from playslot_rl.runtime.children import begin_worker, worker_context
+from playslot_rl.runtime.processes import begin_worker, worker_context
 
 AHEAD = 2  # episodes in a worker's hands: while it records one, the next is there already
 POLL_S = 1.0

@@ -70,8 +70,7 @@ FALLEN_Z: Final = 0.38
 
 @dataclass(frozen=True)
 class Scene:
-    """What an expert knows: grip, opening of the fingers beyond closed, centres (n, 3), the task's object, goal
-    (3,)."""
+    """What an expert knows: grip, opening of the fingers, centres (n, 3), the task's object, goal (3,)."""
 
     grip: Vector
     opening: float

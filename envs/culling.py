@@ -71,8 +71,7 @@ class FrustumCuller:
 
 @dataclass(frozen=True)
 class Still:
-    """Parts at rest, as `data` has them: mesh geoms, each the only user of its mesh, and a box geom that may hide
-    them."""
+    """Parts at rest, as `data` has them: mesh geoms, each the only user of its mesh, and a box that may hide them."""
 
     data: mujoco.MjData
     geoms: tuple[str, ...]

@@ -25,21 +25,8 @@ DISPLACEMENTS: Final[npt.NDArray[np.int64]] = np.array([[0, -1], [0, 1], [-1, 0]
 REVERSED: Final[npt.NDArray[np.int64]] = np.array([1, 0, 3, 2, 4])
 """The move that undoes each move."""
 SHAPES: Final = ("ball", "triangle", "square")
-PALETTE: Final[npt.NDArray[np.uint8]] = np.array(
-    [
-        (228, 26, 28),
-        (55, 126, 184),
-        (77, 175, 74),
-        (255, 221, 51),
-        (152, 78, 163),
-        (255, 127, 0),
-        (0, 206, 209),
-        (247, 129, 191),
-        (30, 30, 30),
-        (245, 245, 245),
-    ],
-    np.uint8,
-)
+_HEX: Final = "e41a1c 377eb8 4daf4a ffdd33 984ea3 ff7f00 00ced1 f781bf 1e1e1e f5f5f5"
+PALETTE: Final[npt.NDArray[np.uint8]] = np.frombuffer(bytes.fromhex(_HEX), np.uint8).reshape(-1, 3)
 """Colours of shapes and ground. More colours than shapes, so that one is always left for the ground."""
 METADATA: Final[dict[str, Any]] = {"control_hz": 10, "task": "Shapes move on a plane."}
 """Frames a second and task of a data set of clips."""

@@ -133,7 +133,7 @@ class PlaySlot:
         require_type(seed, "seed", SupportsIndex, expected="a number")
         folder, target = Path(name), probed(named_device(device))
         if not folder.is_dir():
-            from playslot_rl.hub.policy import pull_policy
+            from playslot_rl.hub.pull import pull_policy
 
             folder = pull_policy(str(name), revision, token=token)
         agent, policy = load_pretrained(folder, target)

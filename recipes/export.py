@@ -31,7 +31,7 @@ def main(config: ExperimentConfig) -> None:
         export_run(run, folder, config, source)
         print(f"policy: {folder}", flush=True)
     if config.export.repo:
-        from playslot_rl.hub.policy import push_policy
+        from playslot_rl.hub.push import push_policy
 
         want = config.export
         result = push_policy(folder, want.repo, private=want.private, branch=want.branch or None, tag=want.tag or None)

@@ -22,8 +22,7 @@ _HIDDEN: Final = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def require_plain(key: str, argument: str) -> None:
-    """Refuse interpolation, which could bring an environment variable into a message or a file, and characters that
-    nobody sees. Neither the argument nor what it names is repeated.
+    """Refuse interpolation, which could bring an environment variable into a message, and characters that nobody sees.
 
     Examples:
         >>> require_plain("out", "out=runs/$HOME")

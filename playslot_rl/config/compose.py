@@ -13,7 +13,6 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -63,13 +62,9 @@ def near_run(run: str) -> str:
 
 def choices(group: str) -> list[str]:
     """Names of the YAML files of a group (`env` or `preset`), sorted; then the tasks that other packages bring."""
-    folder = resources.files(f"{CONF_MODULE}.{group}")
-    brought = sorted(plugins.brought(TASKS_GROUP)) if group == "env" else []
-    return [*_files(folder), *brought]
-
-
-def _files(folder: Traversable) -> list[str]:
-    return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    names = [entry.name for entry in resources.files(f"{CONF_MODULE}.{group}").iterdir()]
+    files = sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml"))
+    return files + (sorted(plugins.brought(TASKS_GROUP)) if group == "env" else [])
 
 
 def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfig:

@@ -22,9 +22,7 @@ _CHOSEN: Final = {"env": "the task", "preset": "sizes and schedule"}
 
 
 def explained(command: str, keys: Sequence[str]) -> str:
-    """The keys of a command as text.
-
-    `keys` are single ones, `seed` or `data.root`, and groups, `slots`; `env` means both.
+    """The keys of a command as text: single ones, `seed` or `data.root`, and groups, `slots`; `env` means both.
 
     Examples:
         >>> print(explained("bench", ["threads"]))
@@ -33,7 +31,8 @@ def explained(command: str, keys: Sequence[str]) -> str:
     """
     names = dict.fromkeys(keys)
     single = [key for key in names if key in GROUPS or not _is_group(key)]
-    lines = ["keys:", *(_line(f"{key}={_shown(key)}", _words(key)) for key in sorted(single, key=_depth))]
+    single.sort(key=lambda key: key.count("."))
+    lines = ["keys:", *(_line(f"{key}={_shown(key)}", _words(key)) for key in single)]
     rows = [row for key in names if _is_group(key) for row in _rows(command, key)]
     if rows:
         lines += ["", "keys of groups, as in slots.steps=100 (the preset decides their defaults):"]
@@ -65,10 +64,6 @@ def fields_of(cls: Any) -> dict[str, Any]:
     """The fields of a config class, with their types."""
     hints = type_hints(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
-
-
-def _depth(key: str) -> int:
-    return key.count(".")
 
 
 def _is_group(key: str) -> bool:

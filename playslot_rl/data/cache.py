@@ -28,8 +28,7 @@ from filelock import FileLock, Timeout
 from playslot_rl.config.sizes import bytes_of, shown
 from playslot_rl.errors import DataError, PlaySlotError
 from playslot_rl.storage.atomic import explain_write_errors, replace_dir
-from playslot_rl.storage.locks import locked
-from playslot_rl.storage.sharing_locks import alone, last_use, release_with, remove_unused, share
+from playslot_rl.storage.locks import alone, last_use, locked, release_with, remove_unused, share
 
 if TYPE_CHECKING:
     from playslot_rl.config import DataConfig

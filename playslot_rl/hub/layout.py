@@ -60,11 +60,9 @@ def require_plain(paths: Iterable[str], name: str) -> None:
 
 
 def local_files(root: Path) -> tuple[list[str], list[str]]:
-    """Paths of the files below `root` that a push uploads, and of those that it leaves, in order.
-
-    Left are caches, journals, lock and temporary files, images/ that LeRobot did not clean up, hidden files, and the
-    two records this package writes itself. Links out of the folder are not even named. The card and the record are made
-    by the push.
+    """Paths of the files below `root` that a push uploads, and of those that it leaves, in order: caches, journals,
+    lock and temporary files, images/ that LeRobot did not clean up, hidden files. Neither has links out of the folder,
+    nor the card and the records, which a push makes.
     """
     files = [file for file in root.rglob("*") if file.is_file()]
     paths = sorted(file.relative_to(root).as_posix() for file in files if inside(root, file))
@@ -74,9 +72,8 @@ def local_files(root: Path) -> tuple[list[str], list[str]]:
 
 
 def same_content(item: Path | bytes, remote: RepoFile) -> bool:
-    """Whether a file, or bytes, has the size and the hash that the Hub names.
-
-    Those are the SHA-256 of the content in large-file storage, and git's object id of other files.
+    """Whether a file, or bytes, has the size and the hash that the Hub names: the SHA-256 of the content in large-file
+    storage, and git's object id of other files.
     """
     if isinstance(item, Path) and not item.is_file():
         return False

@@ -10,11 +10,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from playslot_rl.data.cache import build_once, cache_folder
 from playslot_rl.data.metadata import FORMAT_TAG, INFO_NAME, read_info
 from playslot_rl.datasets.verify import verify
-from playslot_rl.errors import DataError, HubError, OutputError
+from playslot_rl.errors import CheckpointError, DataError, HubError, OutputError
 from playslot_rl.hub.layout import LOCAL_RECORD, SCHEME, HubRecord, is_pulled, read_record, require_plain
-from playslot_rl.hub.session import Repository, open_repository
+from playslot_rl.hub.session import MAIN, Repository, open_repository
 from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing, replace_dir, write_json
 from playslot_rl.storage.locks import locked
 
@@ -148,9 +149,8 @@ def _check_room(root: Path, partial: Path, wanted: Mapping[str, RepoFile]) -> No
 
 
 def _check_content(hub: Repository, partial: Path, commit: str) -> tuple[HubRecord, bool]:
-    """What has arrived; and whether the Hub named a fingerprint to compare it with.
-
-    What is whole and wrong is removed: fetching it again would not help.
+    """What has arrived, which is removed if it is wrong: fetching it again would not help; and whether the Hub named a
+    fingerprint to compare it with.
     """
     shutil.rmtree(partial / ".cache", ignore_errors=True)
     try:
@@ -189,3 +189,27 @@ def _finish(partial: Path, root: Path, result: PullResult, endpoint: str) -> Non
     for old in root.parent.iterdir():  # of commits that have been superseded
         if re.fullmatch(re.escape(f".{root.name}.pull-") + "[0-9a-f]{16}", old.name):
             shutil.rmtree(old, ignore_errors=True)
+
+
+def pull_policy(repo_id: str, revision: str = "", cache: str | Path = "", token: str | None = None) -> Path:
+    """Download a policy, unless that commit of it is in the cache, and return the model folder.
+
+    Raises:
+        CheckpointError: the repository holds no policy.
+        HubError: no such repository or revision, a bad token, offline, no network, damaged files, an error of the Hub.
+    """
+    from playslot_rl.sharing.folder import CONFIG, FILES, RANGE, WEIGHTS
+
+    home = cache_folder(cache) / "policies" / repo_id.replace("/", "--")
+    with open_repository(repo_id, home, token=token, writing=False, revision=revision, kind="model") as hub:
+        commit = hub.commit_of(revision or MAIN)
+
+        def fetch(folder: Path) -> None:
+            wanted = {path: file for path, file in hub.tree(commit).items() if path in (*FILES, RANGE)}
+            for name in (CONFIG, WEIGHTS):
+                if name not in wanted:
+                    raise CheckpointError(f"{hub.name}: got no {name}, expected a PlaySlot policy: check the name")
+            hub.download(wanted, commit, folder)
+            shutil.rmtree(folder / ".cache", ignore_errors=True)
+
+        return build_once(home / commit, fetch)

@@ -1,7 +1,6 @@
-"""A data set to the Hub: checked first, sent in one commit, compared with what the Hub then lists.
+"""A data set or a policy to the Hub: checked first, sent in one commit, compared with what the Hub then lists.
 
-With it goes its card, what the Hub shows about a data set, and LeRobot's tags by which it is found. It is made anew by
-every push unless somebody wrote one by hand, in the data set's folder or on the Hub.
+A card is made anew by every push unless somebody wrote one by hand, in the folder or on the Hub.
 """
 
 from __future__ import annotations
@@ -19,7 +18,9 @@ from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, HubError
 from playslot_rl.hub.layout import CARD_NAME, REMOTE_RECORD, HubRecord, is_data, local_files
 from playslot_rl.hub.session import MAIN, Pushed, few, open_repository, send
+from playslot_rl.sharing.card import MARK as POLICY_MARK
 from playslot_rl.sharing.card import facts_table, front_matter
+from playslot_rl.sharing.folder import files_of, require_whole
 
 MARK = "<!-- made by `playslot dataset push`; remove this line to keep your own text -->"
 """A card with this line was made here and not edited by hand."""
@@ -166,3 +167,32 @@ def _check_names(branch: str, tag: str | None, version: str) -> None:
             raise HubError(
                 f"{key}={name}: got the name of a format version, expected another: LeRobot would load it as that{cure}"
             )
+
+
+@dataclass(frozen=True)
+class PolicyPushResult(Pushed):
+    fingerprint: str
+
+    def lines(self) -> list[str]:
+        return self.report(f"{self.size / 1e6:.1f} MB, weights {self.fingerprint}")
+
+
+def push_policy(
+    folder: Path,
+    repo_id: str,
+    *,
+    private: bool,
+    branch: str | None = None,
+    tag: str | None = None,
+    token: str | None = None,
+) -> PolicyPushResult:
+    """Upload the folder of a policy; other files of the repository, such as videos, stay as they are. Otherwise as
+    `push`, with a CheckpointError where the folder is not whole.
+    """
+    config = require_whole(folder)
+    files: dict[str, Path | bytes] = {name: folder / name for name in files_of(config)}
+    message = f"PlaySlot policy, weights {config.fingerprint}"
+    target = branch or MAIN
+    with open_repository(repo_id, folder, token=token, writing=True, revision=target, kind="model") as hub:
+        sent = send(hub, folder, files, mark=POLICY_MARK, message=message, private=private, branch=target, tag=tag)
+    return PolicyPushResult(**vars(sent), fingerprint=config.fingerprint)

@@ -1,7 +1,5 @@
 """One conversation with the Hub: checked before it starts, retried while it lasts, its errors translated.
 
-What every push does in it: one commit, compared with what the Hub then lists; cards by hand stay, and tags never move.
-
 Everything of `huggingface_hub` that this package uses is called here; it is imported when a conversation starts, not
 before, because it reads HF_ENDPOINT, HF_HOME, HF_TOKEN and HF_HUB_OFFLINE when it is imported.
 """
@@ -53,10 +51,7 @@ class Repository(Asked):
         return f"{self.endpoint}/{'datasets/' if self.kind == 'dataset' else ''}{self.name}"
 
     def call(self, function: Callable[..., Any], **arguments: Any) -> Any:
-        """Call the Hub, again after a server error or a broken connection (not where there is none).
-
-        The client itself retries some of its requests, not all.
-        """
+        """Call the Hub, again after a server error or a broken connection: the client retries only some requests."""
         for wait in (*WAITS, None):
             _limit_silence()
             try:

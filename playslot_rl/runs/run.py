@@ -205,12 +205,10 @@ class Run:
 
     def require_room(self, checkpoint: StageCheckpoint) -> None:
         """Check that the run has no checkpoint of that stage, or this one; else a CheckpointError."""
-        if not self.has(checkpoint.stage):
-            return
-        own = self.own(checkpoint.stage)
-        if own.fingerprint != checkpoint.fingerprint:
+        stage = checkpoint.stage
+        if self.has(stage) and self.own(stage).fingerprint != checkpoint.fingerprint:
             raise CheckpointError(
-                f"{self.folder} has {checkpoint.stage} {own.fingerprint} of its own, got {checkpoint.stage} "
+                f"{self.folder} has {stage} {self.own(stage).fingerprint} of its own, got {stage} "
                 f"{checkpoint.fingerprint} from {checkpoint.path}: leave run= out to build on its own, or use "
                 "another out="
             )
@@ -223,10 +221,8 @@ class Run:
             _copy_files(checkpoint.path, target)
 
     def take_training(self, source: str, stage: str, steps: int) -> None:
-        """Copy the last checkpoint of another run's training of a stage, where this run has none of its own.
-
-        The training that carries on from it refuses it unless it is the same one. Nothing is copied from a training
-        that has not reached `steps`: this run then trains for itself, to the same weights.
+        """Copy the checkpoint at `steps` of another run's training of a stage, if it has reached them and this run has
+        none of its own. The training that carries on from it refuses it unless it is the same one.
         """
         name = f"step_{steps:08d}"
         there, target = Path(source) / stage / "checkpoints" / name, self.folder / stage / "checkpoints" / name

@@ -2,9 +2,9 @@
 
     rows of share i of n:   B i/n  to  B (i+1)/n
 
-Everything that is random, rows and noise alike, is drawn for the whole batch and then sliced, and everything that is a
-property of the batch (codes, BatchNorm, information) is computed from all of it: so the result does not depend on the
-number of shares. Outside of `sharing` there is one share, and all functions here give back what they were given.
+Everything random is drawn for the whole batch and then sliced, and every property of the batch (codes, BatchNorm,
+information) is computed from all of it: so the result does not depend on the number of shares. Outside of `sharing`
+there is one share, and all functions here give back what they were given.
 
 Shapes: B rows of the global batch, n shares, b = B / n rows of one, W processes.
 """

@@ -60,7 +60,6 @@ def read_source(run: Run) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of this package and of the libraries it stands on."""
     from playslot_rl import __version__
 
     return {"playslot_rl": __version__, **{name: importlib.metadata.version(name) for name in LIBRARIES}}

@@ -156,8 +156,7 @@ def json_or_nothing(path: Path) -> dict[str, Any]:
 
 
 def replace_dir(tmp: Path, final: Path) -> None:
-    """Rename the finished folder `tmp` to `final`, after an fsync of everything in it; errors as of
-    `explain_write_errors`.
+    """Rename the finished folder `tmp` to `final`, after an fsync of everything in it.
 
     Where `final` exists it is set aside first and removed afterwards. That is two renames: a kill between them leaves
     no `final`, but both contents on disk; callers can make `final` again.

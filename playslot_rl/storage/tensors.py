@@ -78,9 +78,7 @@ def _check_header(path: Path) -> None:
 
 
 def load_modules(modules: Mapping[str, nn.Module], tensors: Mapping[str, Tensor], where: str) -> None:
-    """Copy `MODULE.NAME` tensors into the modules as `load_into` does; parts that are `SometimesStored` learn whether
-    they were.
-    """
+    """Copy `MODULE.NAME` tensors into the modules (`load_into`); those that are `SometimesStored` learn if they were."""
     expected, parts = module_tensors(modules), dict[SometimesStored, bool]()
     for name, module in modules.items():
         for path, part in module.named_modules(prefix=name):
@@ -95,10 +93,8 @@ def load_modules(modules: Mapping[str, nn.Module], tensors: Mapping[str, Tensor]
 
 
 def load_into(expected: Mapping[str, Tensor], tensors: Mapping[str, Tensor], where: str) -> None:
-    """Copy tensors into others of the same names and shapes; nothing is changed unless everything fits.
-
-    Raises:
-        CheckpointError: a tensor is missing, unexpected, of another shape, or holds what is no number.
+    """Copy tensors into others of the same names and shapes; nothing is changed unless everything fits, else a
+    CheckpointError.
     """
     missing, unexpected = sorted(set(expected) - set(tensors)), sorted(set(tensors) - set(expected))
     if missing or unexpected:

@@ -14,8 +14,7 @@ from statistics import median
 from ranks import launcher_variables
 from variants import Variant, build_step
 
-from playslot_rl.runtime.children import begin_worker, worker_context
-from playslot_rl.runtime.processes import free_port, start
+from playslot_rl.runtime.processes import begin_worker, free_port, start, worker_context
 from playslot_rl.runtime.threads import set_threads, tune_allocator
 from playslot_rl.speed.cases import Sizes
 from playslot_rl.speed.steps import Step

@@ -30,7 +30,7 @@ from playslot_rl.data.cache import (
 from playslot_rl.data.source import open_source
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.storage.atomic import temporary_name
-from playslot_rl.storage.sharing_locks import NAME
+from playslot_rl.storage.locks import NAME
 
 SIZE = 10_000
 

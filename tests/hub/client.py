@@ -87,9 +87,8 @@ def _stream(root: str, cache: str) -> dict[str, Any]:
 
 
 def _run(request: dict[str, Any]) -> dict[str, Any]:
-    from playslot_rl.hub.policy import pull_policy, push_policy
-    from playslot_rl.hub.pull import pull
-    from playslot_rl.hub.push import push
+    from playslot_rl.hub.pull import pull, pull_policy
+    from playslot_rl.hub.push import push, push_policy
 
     arguments = dict(request["arguments"])
     if request["call"] == "command":

@@ -30,7 +30,7 @@ from playslot_rl.config import CollectorConfig
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.methods.online.acting import Learner, PlayedEpisodes, play
 from playslot_rl.methods.online.replay import whole_episodes
-from playslot_rl.runtime.children import begin_worker, worker_context
+from playslot_rl.runtime.processes import begin_worker, worker_context
 from playslot_rl.runtime.ray_cluster import RayCluster, worker_cannot_start
 from playslot_rl.seeds.draws import global_seed, step_generator
 from playslot_rl.storage.tensors import load_modules, module_tensors, tensor_bytes
