@@ -78,7 +78,7 @@ def _check_header(path: Path) -> None:
 
 
 def load_modules(modules: Mapping[str, nn.Module], tensors: Mapping[str, Tensor], where: str) -> None:
-    """Copy `MODULE.NAME` tensors into the modules (`load_into`); those that are `SometimesStored` learn if they were."""
+    """Copy `MODULE.NAME` tensors into the modules (`load_into`); those `SometimesStored` learn if they were."""
     expected, parts = module_tensors(modules), dict[SometimesStored, bool]()
     for name, module in modules.items():
         for path, part in module.named_modules(prefix=name):
