@@ -76,9 +76,13 @@ class ImageSetWriter:
 
     def add(self, values: dict[str, npt.NDArray[Any]], frames: npt.NDArray[np.uint8], images: list[bytes]) -> None:
         """Append an episode of T frames; `values` (T, ...) are neither the image nor LeRobot's own index."""
+        from lerobot.datasets.utils import update_chunk_file_indices
+
         size = sum(map(len, images))
         if self._bytes and self._bytes + size > self.meta.data_files_size_in_mb * 2**20:
-            self._next_file()
+            self.close()
+            self._chunk, self._number = update_chunk_file_indices(self._chunk, self._number, self.meta.chunks_size)
+            self._bytes = 0
         self._bytes += size
         count, first, episode = len(images), self.meta.total_frames, self.meta.total_episodes
         index = np.arange(count)
@@ -109,13 +113,6 @@ class ImageSetWriter:
             file, self._file = self._file, None
             if file is not None:
                 file.close()
-
-    def _next_file(self) -> None:
-        from lerobot.datasets.utils import update_chunk_file_indices
-
-        self.close()
-        self._chunk, self._number = update_chunk_file_indices(self._chunk, self._number, self.meta.chunks_size)
-        self._bytes = 0
 
     def _flush(self) -> None:
         import pyarrow

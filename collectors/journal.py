@@ -172,13 +172,6 @@ def encode(episode: RecordedEpisode) -> bytes:
     return buffer.getvalue()
 
 
-def _pixels(content: bytes) -> npt.NDArray[np.uint8]:
-    from PIL import Image
-
-    with Image.open(io.BytesIO(content)) as image:
-        return np.asarray(image)
-
-
 def journal_path(out: Path) -> Path:
     """Folder of the journal of the data set `out`."""
     return out.with_name(f"{out.name}.journal")
@@ -233,11 +226,7 @@ class Journal:
 
     def add(self, episode: RecordedEpisode) -> None:
         """Store an episode; when this returns it survives a kill and a power cut. An OutputError for a full disk."""
-        self.add_encoded(episode.index, encode(episode))
-
-    def add_encoded(self, index: int, content: bytes) -> None:
-        """Store an episode that was encoded elsewhere (see `add`)."""
-        write_bytes(self.path(index), content)
+        write_bytes(self.path(episode.index), encode(episode))
 
     def read(self, index: int) -> RecordedEpisode:
         return self.read_with_images(index)[0]
@@ -248,6 +237,8 @@ class Journal:
         Raises:
             OutputError: its file is missing or damaged, or holds another episode.
         """
+        from PIL import Image
+
         path = self.path(index)
         try:
             with np.load(path, allow_pickle=False) as file:
@@ -260,7 +251,8 @@ class Journal:
                     ends = np.cumsum(file["image_sizes"]).tolist()
                     content = file["images"].tobytes()
                     images = [content[start:end] for start, end in zip([0, *ends], ends, strict=False)]
-                    frames = np.stack([_pixels(i) for i in images]) if decode else np.zeros(0, np.uint8)
+                    read = [np.asarray(Image.open(io.BytesIO(image))) for image in images] if decode else []
+                    frames = np.stack(read) if decode else np.zeros(0, np.uint8)
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise OutputError(
                 f"{path}: got a damaged file ({error}), expected an episode; delete it and run the same command again"

@@ -15,6 +15,7 @@ from playslot_rl.collectors.journal import Journal, encode
 from playslot_rl.collectors.recording import Report
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.runtime.ray_cluster import RayCluster, worker_cannot_start
+from playslot_rl.storage.atomic import write_bytes
 
 
 class RemoteEpisodeCollector(EpisodeCollector):
@@ -79,7 +80,7 @@ class RayWorkers:
         except ray.exceptions.RayError as error:
             self.kill(slot)
             return Report(slot, dead=f"on Ray was lost ({type(error).__name__})")
-        self.journal.add_encoded(index, content)
+        write_bytes(self.journal.path(index), content)
         return Report(slot, index=index)
 
     def kill(self, slot: int) -> None:

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from playslot_rl.config.weights import is_remote
-from playslot_rl.data.contents import Contents, Span, episode_files, read_contents
+from playslot_rl.data.contents import Contents, Span, read_contents
 from playslot_rl.data.metadata import EPISODES_PATH, INFO_NAME, NUMBERS, OTHERS
 from playslot_rl.data.places import CLUTTER, OUTSIDE, SHOWN, Problems, filled, is_clutter, parquet_files
 from playslot_rl.data.tables import TASKS_NAME, UNREADABLE, WRONG_COLUMN, Episode
@@ -228,7 +228,7 @@ def open_files(root: str | Path) -> Contents:
     )
     if problems.of(OUTSIDE):
         raise DataError(problems.of(OUTSIDE)[0])
-    if not parquet_files(folder, "data") or not episode_files(folder):
+    if not parquet_files(folder, "data") or not parquet_files(folder, "meta/episodes"):
         raise DataError(f"{root}: got no rows under data/ and meta/episodes/, expected parquet files; {unfinished}")
     if problems.of(UNREADABLE):
         raise DataError(f"{problems.of(UNREADABLE)[0]}; {unfinished}")

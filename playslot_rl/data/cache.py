@@ -23,11 +23,10 @@ from typing import IO, TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from filelock import FileLock, Timeout
 
 from playslot_rl.config.sizes import bytes_of, shown
-from playslot_rl.errors import DataError, PlaySlotError
-from playslot_rl.storage.atomic import explain_write_errors, replace_dir
+from playslot_rl.errors import DataError, OutputError, PlaySlotError
+from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing, replace_dir
 from playslot_rl.storage.locks import alone, last_use, locked, release_with, remove_unused, share
 
 if TYPE_CHECKING:
@@ -221,10 +220,7 @@ def entries(cache: CachePlace = "") -> list[Entry]:
 
 def _entry(folder: Path, kind: str, part: bool) -> Entry:
     used, files = last_use(folder), [path for path in folder.rglob("*") if path.is_file()]
-    try:
-        data = str(json.loads((folder / ENTRY_NAME).read_text()).get("name", ""))
-    except (OSError, ValueError, AttributeError):
-        data = ""
+    data = str(json_or_nothing(folder / ENTRY_NAME).get("name", ""))
     with _unmade(folder) if part else alone(folder) as free:
         # What is being made will fill its holes; what a kill has left will not.
         size = sum(path.stat().st_size if part and not free else _stored(path) for path in files)
@@ -245,16 +241,13 @@ def _stored(path: Path) -> int:
 @contextlib.contextmanager
 def _unmade(part: Path) -> Iterator[bool]:
     """Whether nobody makes the entry; inside the block nobody begins to."""
-    lock = FileLock(lock_file(part.with_name(_key(part))), timeout=0)
-    try:
-        lock.acquire()
-    except Timeout:
-        yield False
-        return
-    try:
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(locked(lock_file(part.with_name(_key(part))), busy="it is being made"))
+        except OutputError:
+            yield False
+            return
         yield True
-    finally:
-        lock.release()
 
 
 def remove(entry: Entry) -> bool:
@@ -356,7 +349,5 @@ def clear(names: Sequence[str] = (), cache: Path | None = None) -> Cleared:
         if not any(entry.name.startswith(name) for entry in there):
             raise DataError(f"{folder}: got no entry {name}, expected one of `playslot cache list`")
     chosen = [entry for entry in there if not names or entry.name.startswith(tuple(names))]
-    gone = {entry.path: remove(entry) for entry in chosen}
-    return Cleared(
-        str(folder), [e for e in chosen if gone[e.path]], [entry for entry in chosen if not gone[entry.path]]
-    )
+    removed = [entry for entry in chosen if remove(entry)]
+    return Cleared(str(folder), removed, [entry for entry in chosen if entry not in removed])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -43,6 +43,16 @@ class Span:
     @property
     def length(self) -> int:
         return self.stop - self.start
+
+
+def in_runs(spans: Sequence[Span], full: Callable[[Sequence[Span], Span], bool]) -> list[list[Span]]:
+    """Episodes in order, in runs; the next one begins where one is full."""
+    found: list[list[Span]] = []
+    for span in spans:
+        if not found or full(found[-1], span):
+            found.append([])
+        found[-1].append(span)
+    return found
 
 
 @dataclass(frozen=True)
@@ -148,7 +158,7 @@ class Contents:
     def file_hash(self, camera: str) -> str:
         """Hash of the metadata, the rows and the camera's videos as they are stored: 16 hex digits."""
         digest = hashlib.sha256()
-        paths = [self.root / INFO_NAME, *episode_files(self.root), *parquet_files(self.root, "data")]
+        paths = [self.root / INFO_NAME, *parquet_files(self.root, "meta/episodes"), *parquet_files(self.root, "data")]
         paths += sorted((self.root / "videos" / camera).rglob("*.mp4"))
         for path in paths:
             digest.update(str(path.relative_to(self.root)).encode())
@@ -156,11 +166,6 @@ class Contents:
                 while piece := file.read(8 << 20):
                     digest.update(piece)
         return digest.hexdigest()[:16]
-
-
-def episode_files(root: Path) -> list[Path]:
-    """Parquet files of the episodes' metadata, in order."""
-    return parquet_files(root, "meta/episodes")
 
 
 def read_contents(root: str | Path, problems: Problems, *, statistics: bool = True) -> Contents:
@@ -184,7 +189,7 @@ def read_metadata(
     info = read_info(folder)
     tasks = read_tasks(folder, problems)
     episodes: list[Episode] = []
-    for path in episode_files(folder):
+    for path in parquet_files(folder, "meta/episodes"):
         table = read_table(path, problems, lambda name: statistics or not name.startswith("stats/"))
         if table is not None:
             episodes += episodes_of(path, table, problems)

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.data.cache import ArrayWriter
-from playslot_rl.data.contents import Contents, Span
+from playslot_rl.data.contents import Contents, Span, in_runs
 from playslot_rl.data.frames import rgb_frames, sized
 from playslot_rl.data.metadata import stated_size
 from playslot_rl.errors import PlaySlotError
@@ -122,15 +122,14 @@ def build_frames(contents: Contents, camera: str, size: int | None, folder: Path
 def units(contents: Contents, camera: str) -> list[list[Span]]:
     """Episodes in order, in runs of about `UNIT_FRAMES` frames; none crosses a file."""
     rows = {episode.index: episode.row for episode in contents.episodes}
-    found: list[list[Span]] = []
-    last: object = None
-    for span in contents.spans:
-        place = contents.video_file(camera, rows.get(span.index, {})) if camera in contents.videos else span.file
-        if not found or place != last or sum(s.length for s in found[-1]) + span.length > UNIT_FRAMES:
-            found.append([])
-        found[-1].append(span)
-        last = place
-    return found
+
+    def place(span: Span) -> object:
+        return contents.video_file(camera, rows.get(span.index, {})) if camera in contents.videos else span.file
+
+    def full(run: Sequence[Span], span: Span) -> bool:
+        return place(span) != place(run[-1]) or sum(s.length for s in run) + span.length > UNIT_FRAMES
+
+    return in_runs(contents.spans, full)
 
 
 def _decoded(array: FrameArray, missing: dict[int, list[Span]], workers: int) -> Iterator[tuple[int, str]]:

@@ -123,7 +123,9 @@ def _stored_images(
     import pyarrow.parquet as pq
 
     with pq.ParquetFile(contents.opened(path)) as file:
-        if file.schema_arrow.names.count(camera) != 1 or not is_image_type(file.schema_arrow.field(camera).type):
+        column = file.schema_arrow.field(camera).type if file.schema_arrow.names.count(camera) == 1 else None
+        # As LeRobot stores images: bytes, or the path of a file.
+        if column is None or not {"bytes", "path"} & {column.field(i).name for i in range(column.num_fields)}:
             problems.error(WRONG_COLUMN, f"{path}: got no column {camera} of images, expected the camera's frames")
             return
         counts = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
@@ -137,14 +139,6 @@ def _stored_images(
             for batch in file.iter_batches(ROWS_A_PIECE, row_groups=groups, columns=[camera]):
                 yield first, batch.column(0)
                 first += len(batch)
-
-
-def is_image_type(stored: Any) -> bool:
-    """Whether a column holds images as LeRobot stores them: bytes, or the path of a file."""
-    import pyarrow as pa
-
-    names = {stored.field(number).name for number in range(stored.num_fields)} if pa.types.is_struct(stored) else set()
-    return bool(names & {"bytes", "path"})
 
 
 def _decode_image(root: Path, size: tuple[int, int], cell: dict[str, Any] | None) -> Array | str:

@@ -24,7 +24,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.data.contents import Contents, Span
+from playslot_rl.data.contents import Contents, Span, in_runs
 from playslot_rl.data.frames import rgb_frames, sized
 from playslot_rl.data.metadata import stated_size
 from playslot_rl.data.views import FrameRows, Frames, IntArray, RowView, row_numbers
@@ -49,7 +49,11 @@ class FrameStream:
         height, width = stated_size(contents.features[camera])
         self.shape = (contents.rows, size or height, size or width, 3)
         self.dtype = np.dtype(np.uint8)
-        self.blocks = _blocks(self._spans, max(1, buffer // BLOCKS))
+        most = max(1, buffer // BLOCKS)
+        # None crosses a file, so that each file is opened once.
+        self.blocks = in_runs(
+            self._spans, lambda run, span: run[-1].file != span.file or sum(s.length for s in run) >= most
+        )
         self._first = np.array([block[0].start for block in self.blocks], np.int64)
         self._starts = np.array([span.start for span in self._spans], np.int64)
         self._held: dict[int, Frames | None] = {}
@@ -132,16 +136,6 @@ class FrameStream:
         for row, frame in rgb_frames(self._contents, self.camera, spans):
             frames[place[row]] = sized(frame, self.size)
         return frames
-
-
-def _blocks(spans: Sequence[Span], frames: int) -> list[list[Span]]:
-    """Episodes in order, in runs of about so many frames; none crosses a file, so that each file is opened once."""
-    found: list[list[Span]] = []
-    for span in spans:
-        if not found or found[-1][-1].file != span.file or sum(s.length for s in found[-1]) >= frames:
-            found.append([])
-        found[-1].append(span)
-    return found
 
 
 def streams_of(frames: FrameRows) -> list[FrameStream]:

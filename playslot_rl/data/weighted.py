@@ -63,7 +63,16 @@ def weighted(sources: Sequence[EpisodeFrames], weights: Sequence[float | None], 
     if not given:
         return concatenate(sources)
     for source, name in zip(sources[1:], names[1:], strict=True):
-        for what, got, want in _facts(source, sources[0]):
+        size, expected = ("x".join(map(str, each.image_size)) for each in (source, sources[0]))
+        facts: list[tuple[str, object, object]] = [
+            ("frames of", size, expected),
+            ("frames a second", f"{source.fps:g}", f"{sources[0].fps:g}"),
+        ]
+        if source.robot and sources[0].robot:
+            facts.append(("recordings of", source.robot, sources[0].robot))
+        if source.actions is not None and sources[0].actions is not None:
+            facts.append(("actions of width", source.actions.shape[1], sources[0].actions.shape[1]))
+        for what, got, want in facts:
             if got != want:
                 raise DataError(f"{name}: got {what} {got}, expected {want} as in {names[0]}: read sets of one kind")
     joined = concatenate(sources)
@@ -71,19 +80,6 @@ def weighted(sources: Sequence[EpisodeFrames], weights: Sequence[float | None], 
     ends = np.cumsum([len(source.frames) for source in sources]).astype(np.int64)
     shares = Shares(ends, np.asarray(given, np.float64), tuple(sources), fingerprint)
     return replace(joined, fingerprint=fingerprint, shares=shares)
-
-
-def _facts(source: EpisodeFrames, other: EpisodeFrames) -> list[tuple[str, object, object]]:
-    size, expected = ("x".join(map(str, each.image_size)) for each in (source, other))
-    facts: list[tuple[str, object, object]] = [
-        ("frames of", size, expected),
-        ("frames a second", f"{source.fps:g}", f"{other.fps:g}"),
-    ]
-    if source.robot and other.robot:
-        facts.append(("recordings of", source.robot, other.robot))
-    if source.actions is not None and other.actions is not None:
-        facts.append(("actions of width", source.actions.shape[1], other.actions.shape[1]))
-    return facts
 
 
 def draw_episodes(

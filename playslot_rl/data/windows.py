@@ -14,7 +14,7 @@ import numpy.typing as npt
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.stream import ShuffleBuffer, streams_of
 from playslot_rl.data.views import IntArray as IntArray
-from playslot_rl.data.weighted import draw_episodes
+from playslot_rl.data.weighted import Shares, draw_episodes
 from playslot_rl.errors import DataError
 
 
@@ -25,9 +25,10 @@ def sample_windows(
     batch: int,
     generator: np.random.Generator,
     episodes: Sequence[int] | IntArray | None = None,
+    shares: Shares | None = None,
 ) -> IntArray:
-    """Draw windows (B, T) of rows: every valid first frame is equally likely, so long episodes count for more. A
-    DataError where no episode has `window` frames.
+    """Draw windows (B, T) of rows: every valid first frame is equally likely, so long episodes count for more; with
+    `shares`, in a set that was drawn by its weight. A DataError where no episode has `window` frames.
 
     Example:
         >>> sample_windows([0, 3], [3, 2], 3, 2, np.random.default_rng(0))
@@ -35,10 +36,13 @@ def sample_windows(
                [0, 1, 2]])
     """
     first, valid = _valid_starts(starts, lengths, window, episodes)
-    cumulative = np.cumsum(valid)
-    drawn = generator.integers(0, cumulative[-1], size=batch)
-    episode = np.searchsorted(cumulative, drawn, side="right")
-    offset = drawn - (cumulative[episode] - valid[episode])
+    if shares is not None:
+        episode, offset = draw_episodes(shares, first, valid, batch, generator)
+    else:
+        cumulative = np.cumsum(valid)
+        drawn = generator.integers(0, cumulative[-1], size=batch)
+        episode = np.searchsorted(cumulative, drawn, side="right")
+        offset = drawn - (cumulative[episode] - valid[episode])
     rows: IntArray = (first[episode] + offset)[:, None] + np.arange(window)
     return rows
 
@@ -113,12 +117,7 @@ class Clips:
         (`playslot_rl.data.stream`), from the shuffle buffer of the step that the generator belongs to.
         """
         source, chosen = self.source, self._near(batch, generator)
-        if source.shares is None:
-            return sample_windows(source.starts, source.lengths, self.frames, batch, generator, chosen)
-        first, valid = _valid_starts(source.starts, source.lengths, self.frames, chosen)
-        episode, offset = draw_episodes(source.shares, first, valid, batch, generator)
-        rows: IntArray = (first[episode] + offset)[:, None] + np.arange(self.frames)
-        return rows
+        return sample_windows(source.starts, source.lengths, self.frames, batch, generator, chosen, source.shares)
 
     def sample_first(self, batch: int, generator: np.random.Generator) -> IntArray:
         """First rows (batch,) of training episodes in which a clip fits, drawn as `sample` draws windows."""

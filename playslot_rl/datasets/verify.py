@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from playslot_rl.data.agreement import check_rows
-from playslot_rl.data.contents import Contents, Span, episode_files, read_contents
+from playslot_rl.data.contents import Contents, Span, read_contents
 from playslot_rl.data.metadata import PLACE, RECORD_NAME, REQUIRED, STATS_NAME, damaged, is_depth, json_content
-from playslot_rl.data.places import Problems, inside
+from playslot_rl.data.places import Problems, inside, parquet_files
 from playslot_rl.data.tables import Array, Stats, stored_episodes
 from playslot_rl.datasets.fingerprint import CameraScan, fingerprint_of, scan_frames
 from playslot_rl.datasets.statistics import Aggregate, differing, of_numbers, reduced, rounded, rows_of
@@ -108,7 +108,7 @@ def check_statistics(contents: Contents, scans: Mapping[str, CameraScan], proble
         return exact, theirs
 
     # One episode after the other, as they are stored: those of all at once are some 40 KB each.
-    for episode in stored_episodes(episode_files(contents.root), problems):
+    for episode in stored_episodes(parquet_files(contents.root, "meta/episodes"), problems):
         number = numbers.get(episode.index)
         if number not in left:
             continue
