@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import os
 import shutil
 import zipfile
@@ -24,11 +23,11 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, ExperimentConfig, RenderConfig, from_dict
-from playslot_rl.config.plain import nearest
+from playslot_rl.config.plain import flatten, nearest
 from playslot_rl.envs import PROCEDURAL, gym_id
-from playslot_rl.errors import ConfigError, OutputError
+from playslot_rl.errors import CheckpointError, ConfigError, OutputError
 from playslot_rl.seeds.episodes import EPISODES, LARGEST_SEED, episode_seed
-from playslot_rl.storage.atomic import explain_write_errors, write_bytes, write_json
+from playslot_rl.storage.atomic import explain_write_errors, read_json, write_bytes, write_json
 from playslot_rl.storage.locks import locked
 
 FORMAT = 1
@@ -112,20 +111,11 @@ class CollectionSpec:
                 found = from_dict(CollectionSpec, stored).to_dict()
             except (TypeError, ValueError):
                 found = stored  # the difference names what is foreign in it
-        return difference(found, self.to_dict())
-
-
-def difference(got: dict[str, Any], expected: dict[str, Any]) -> str:
-    """First setting in which two records differ, as `name: got X, expected Y`; empty if none does."""
-    for name in sorted(set(got) | set(expected)):
-        a, b = got.get(name), expected.get(name)
-        if isinstance(a, dict) and isinstance(b, dict):
-            inner = difference(a, b)
-            if inner:
-                return f"{name}.{inner}"
-        elif a != b:
-            return f"{name}: got {a!r}, expected {b!r}"
-    return ""
+        got, expected = flatten(found), flatten(self.to_dict())
+        for name in sorted(got.keys() | expected.keys()):
+            if got.get(name) != expected.get(name):
+                return f"{name}: got {got.get(name)!r}, expected {expected.get(name)!r}"
+        return ""
 
 
 @dataclass(frozen=True)
@@ -286,9 +276,6 @@ def remove_leftover(folder: Path, spec: CollectionSpec) -> None:
 def read_spec(path: Path) -> dict[str, Any]:
     """Read a stored specification; an OutputError where it is not JSON of ours."""
     try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise OutputError(f"{path}: got {error}, expected JSON; delete the folder or choose another out=") from error
-    if not isinstance(found, dict):
-        raise OutputError(f"{path}: got {type(found).__name__}, expected a record; choose another out=")
-    return found
+        return read_json(path, "delete the folder or choose another out=")
+    except CheckpointError as error:
+        raise OutputError(str(error)) from error

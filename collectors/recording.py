@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -27,6 +27,9 @@ from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.envs.rendering import check_rendering
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.runtime.processes import begin_worker, worker_context
+
+if TYPE_CHECKING:
+    from playslot_rl.collectors.ray_workers import RayWorkers
 
 AHEAD = 2  # episodes in a worker's hands: while it records one, the next is there already
 POLL_S = 1.0
@@ -42,25 +45,6 @@ class Report:
     index: int | None = None
     error: Exception | None = None
     dead: str = ""
-
-
-class Workers(Protocol):
-    """Places (slots) where episodes are recorded."""
-
-    def start(self, slot: int) -> None:
-        """Start the worker of a place, empty or left by a dead one."""
-
-    def submit(self, slot: int, index: int) -> None:
-        """Hand an episode to a worker, which records its episodes in the order they come."""
-
-    def reports(self, timeout: float) -> list[Report]:
-        """What the workers say; empty after `timeout` seconds of silence."""
-
-    def kill(self, slot: int) -> None:
-        """End a worker at once, also one that hangs."""
-
-    def close(self) -> None:
-        """End all of them."""
 
 
 def serve(pipe: Connection[Any, Any], journal: Journal) -> None:
@@ -82,36 +66,35 @@ def serve(pipe: Connection[Any, Any], journal: Journal) -> None:
 
 
 class LocalWorkers:
-    """Worker processes."""
+    """Worker processes, each in a place (slot) where episodes are recorded."""
 
     def __init__(self, journal: Journal, count: int) -> None:
         self.journal = journal
         self._context = worker_context()
-        self._processes: list[ForkServerProcess | None] = [None] * count
-        self._pipes: list[Connection[Any, Any] | None] = [None] * count
+        self._workers: list[tuple[ForkServerProcess, Connection[Any, Any]] | None] = [None] * count
 
     def start(self, slot: int) -> None:
+        """Start the worker of a place, empty or left by a dead one."""
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=serve, args=(theirs, self.journal), daemon=True)
         process.start()
         theirs.close()
-        self._processes[slot], self._pipes[slot] = process, ours
+        self._workers[slot] = process, ours
 
     def submit(self, slot: int, index: int) -> None:
-        pipe = self._pipes[slot]
-        assert pipe is not None
+        """Hand an episode to a worker, which records its episodes in the order they come."""
+        worker = self._workers[slot]
+        assert worker is not None
         with contextlib.suppress(ConnectionError):  # `reports` says that it died
-            pipe.send(index)
+            worker[1].send(index)
 
     def reports(self, timeout: float) -> list[Report]:
-        open_pipes = [pipe for pipe in self._pipes if pipe is not None]
-        ready = wait(open_pipes, timeout)
-        return [report for slot, pipe in enumerate(self._pipes) if pipe in ready for report in self._read(slot)]
+        """What the workers say; empty after `timeout` seconds of silence."""
+        ready = wait([worker[1] for worker in self._workers if worker is not None], timeout)
+        there = [(slot, *worker) for slot, worker in enumerate(self._workers) if worker is not None]
+        return [report for slot, process, pipe in there if pipe in ready for report in self._read(slot, process, pipe)]
 
-    def _read(self, slot: int) -> Iterator[Report]:
-        pipe, process = self._pipes[slot], self._processes[slot]
-        assert pipe is not None
-        assert process is not None
+    def _read(self, slot: int, process: ForkServerProcess, pipe: Connection[Any, Any]) -> Iterator[Report]:
         try:
             while pipe.poll():
                 said = pipe.recv()
@@ -127,17 +110,16 @@ class LocalWorkers:
             yield Report(slot, dead=f"ended with {ending}")
 
     def kill(self, slot: int) -> None:
-        process, pipe = self._processes[slot], self._pipes[slot]
-        self._processes[slot] = self._pipes[slot] = None
-        if pipe is not None:
-            pipe.close()
-        if process is not None:
-            process.kill()  # SIGKILL: also ends one that is stopped
-            process.join()
+        """End a worker at once, also one that hangs."""
+        worker, self._workers[slot] = self._workers[slot], None
+        if worker is not None:
+            worker[1].close()
+            worker[0].kill()  # SIGKILL: also ends one that is stopped
+            worker[0].join()
 
     def close(self) -> None:
-        """See `Workers`. Episodes in hand are lost: a file is whole or not there, so nothing else is."""
-        for slot in range(len(self._processes)):
+        """End all. Episodes in hand are lost: a file is whole or not there, so nothing else is."""
+        for slot in range(len(self._workers)):
             self.kill(slot)
 
 
@@ -170,7 +152,7 @@ def record_into(
             journal.add(episode)
             yield episode.index
         return
-    pool: Workers
+    pool: LocalWorkers | RayWorkers
     if settings.backend == "ray":
         from playslot_rl.collectors.ray_workers import RayWorkers
 
@@ -211,7 +193,7 @@ class _Dispatch:
 
     def __init__(
         self,
-        pool: Workers,
+        pool: LocalWorkers | RayWorkers,
         journal: Journal,
         indices: Sequence[int],
         workers: int,

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from playslot_rl.data.hub_faults import Asked, one_line
 from playslot_rl.data.places import inside
+from playslot_rl.data.remote import Asked, one_line
 from playslot_rl.errors import HubError
 from playslot_rl.hub.layout import CARD_NAME, same_content, size_of
 from playslot_rl.storage.secrets import checked_token, mask
