@@ -165,7 +165,6 @@ def judge(value: float | None, borders: tuple[float, float]) -> Verdict:
 
 
 def line(key: str, value: float | None, note: str = "") -> Line:
-    """The line of a measure."""
     m = MEASURES[key]
     if value is not None and not math.isfinite(value):
         value, note = None, NO_NUMBERS
@@ -212,8 +211,6 @@ COLLAPSED: Final = 0.98
 
 @dataclass(frozen=True)
 class Conclusion:
-    """Whether a world model is usable, with the reason that decides it."""
-
     usable: bool
     reason: str
 

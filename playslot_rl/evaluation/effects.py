@@ -42,7 +42,6 @@ class Drawn:
 
 @torch.no_grad()
 def draw(model: WorldModel, slots: Tensor) -> Drawn:
-    """Decode slots (M, N, D)."""
     frames, labels = [], []
     for some in slots.split(AT_ONCE):
         decoded = model.savi.decode(some)

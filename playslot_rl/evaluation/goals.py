@@ -46,7 +46,6 @@ class GoalTask:
         self.draw_steps = True
 
     def reset(self, *, seed: int | None = None) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """Begin the episode of `seed`, at the step where it is to start."""
         assert seed is not None
         self._task.draw_steps = True
         observation, info = self._task.reset(seed=seed)

@@ -43,7 +43,6 @@ class ParsedClips:
     """What a world model makes of clips.
 
     Attributes:
-        slots: (C, T + 1, N, D).
         labels: int64 (C, T + 1, H, W), slot with the largest mask.
         reconstructed: (C, T + 1, 3, H, W) float.
         prototypes, latents: (C, T, N, Z); with one latent a step (InvDyn_S) every slot has the same.
@@ -51,7 +50,6 @@ class ParsedClips:
         predicted: (C, P, 3, H, W), the frames that follow the seed frames.
     """
 
-    slots: Tensor
     labels: npt.NDArray[np.int64]
     reconstructed: Tensor
     prototypes: npt.NDArray[np.float32]
@@ -84,7 +82,6 @@ def parse_clips(model: WorldModel, frames: npt.NDArray[np.uint8]) -> ParsedClips
         return values.cpu().numpy()
 
     return ParsedClips(
-        slots=slots,
         labels=owners(decoded.masks).cpu().numpy(),
         reconstructed=decoded.frames,
         prototypes=per_slot(latent.prototype),
@@ -101,7 +98,7 @@ def _score(
     scores: list[tuple[float, ...]] = []
     transitions: list[tuple[npt.NDArray[Any], ...]] = []
     parsed = parse_clips(model, clips.frames)
-    objects, slots = clips.moves.shape[2], parsed.slots.shape[2]
+    objects, slots = clips.moves.shape[2], model.slot_shape[0]
     real = to_float(clips.frames, parsed.predicted.device)
     seed = seed_frames(clips.moves.shape[1])
     again = video_metrics(parsed.reconstructed, real)

@@ -205,7 +205,6 @@ def cost_along_solution(
 
 
 def shape(ways: list[list[float]]) -> dict[str, Any]:
-    """What curves from start to goal look like."""
     steps = [after < before for way in ways for before, after in itertools.pairwise(way)]
     return {
         "goal_is_minimum": float(np.mean([min(way) == way[-1] for way in ways])),

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 from urllib.parse import parse_qsl, urlencode
 
+from starlette.responses import PlainTextResponse
+
 from playslot_rl.play.starts import MOST_BYTES
 
 if TYPE_CHECKING:
@@ -25,11 +27,11 @@ TOKEN: Final = "token"
 """The part of the printed address that holds the token."""
 MOST_BODY: Final = MOST_BYTES + 100_000
 """Of a request: a picture, and what a form puts round it."""
-HEADERS: Final = [
-    (b"referrer-policy", b"no-referrer"),
-    (b"x-frame-options", b"DENY"),
-    (b"cross-origin-resource-policy", b"same-origin"),
-]
+HEADERS: Final = {
+    "referrer-policy": "no-referrer",
+    "x-frame-options": "DENY",
+    "cross-origin-resource-policy": "same-origin",
+}
 """Of every answer: the address goes nowhere, and no other page shows this one or its pictures."""
 
 
@@ -94,7 +96,7 @@ class GateMiddleware:
         fresh = self.gate.is_token(named)
         status, line = self._refusal(headers, fresh)
         if status:
-            await _refuse(scope, send, status, line)
+            await _refuse(scope, receive, send, status, line)
             return
         if named:
             rest = urlencode([pair for pair in query if pair[0] != TOKEN])
@@ -116,8 +118,7 @@ class GateMiddleware:
         return 0, ""
 
     def _answering(self, send: Send, fresh: bool) -> Send:
-        """Adds the headers to an answer, and the cookie to the first one."""
-        extra = list(HEADERS)
+        extra = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
         if fresh:
             cookie = f"{self.gate.cookie}={self.gate.token}; Path=/; HttpOnly; SameSite=Strict"
             extra.append((b"set-cookie", cookie.encode()))
@@ -140,17 +141,10 @@ def _cookies(headers: list[tuple[bytes, bytes]], name: str) -> list[bytes]:
     return [value for key, _, value in pairs if key == name.encode()]
 
 
-async def _refuse(scope: Scope, send: Send, status: int, line: str) -> None:
+async def _refuse(scope: Scope, receive: Receive, send: Send, status: int, line: str) -> None:
     """Answer with one plain line; a WebSocket is closed before it opens, which is a 403."""
     if scope["type"] == "websocket":
         await send({"type": "websocket.close", "code": 1008, "reason": line[:120]})
         return
-    content = f"playslot play: {line}\n".encode()
-    plain = [
-        (b"content-type", b"text/plain; charset=utf-8"),
-        (b"content-length", str(len(content)).encode()),
-        (b"cache-control", b"no-store"),
-        (b"connection", b"close"),  # what is still being sent is not read
-    ]
-    await send({"type": "http.response.start", "status": status, "headers": [*plain, *HEADERS]})
-    await send({"type": "http.response.body", "body": content})
+    closing = {"cache-control": "no-store", "connection": "close"}  # what is still being sent is not read
+    await PlainTextResponse(f"playslot play: {line}\n", status, {**closing, **HEADERS})(scope, receive, send)

@@ -187,7 +187,6 @@ class PlayPage:
             await self._step()
 
     def _run(self) -> None:
-        """Run the timer if there is something to run for."""
         playing = self.free and (self.driver != ME or self.pressed is not None)
         self.ticker.active = playing or (self.hold and self.pressed is not None)
 
@@ -198,7 +197,6 @@ class PlayPage:
         self._run()
 
     async def _refresh_previews(self) -> None:
-        """The prototypes' animations, when the player has paused."""
         if self.closed or not self.begun or self.ticker.active or not self.controls.due:
             return
         self.controls.show(branches=True)

@@ -42,8 +42,6 @@ for (const kind of ['keydown', 'keyup']) window.addEventListener(kind, (event) =
 
 
 class Pages:
-    """The pages of one studio."""
-
     def __init__(self, studio: Studio) -> None:
         self.studio = studio
         self.open: list[PlayPage] = []
@@ -108,8 +106,6 @@ def choose_port(port: int) -> int:
 
 
 def serve_pictures() -> None:
-    """Tell the server of the galleries, once."""
-
     def picture(page: str, name: str, number: int) -> Response:
         del number  # it only makes the address new
         gallery = Gallery.open.get(page)

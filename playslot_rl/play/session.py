@@ -124,7 +124,6 @@ class PlaySession:
         return out
 
     def press(self, prototype: int, variability: float = 0.0, slot: int | None = None) -> SceneMoment:
-        """One step by a prototype; arguments of `latent`."""
         amount = f" {variability:+.1f}" if variability else ""
         where = f", slot {slot + 1}" if self.per_slot and slot is not None else ""
         return self.step(self.latent(prototype, variability, slot), f"prototype {prototype}{amount}{where}")
@@ -197,7 +196,6 @@ class PlaySession:
         return self.timeline.back()
 
     def go(self, number: int) -> None:
-        """To any moment; the next step makes a branch there."""
         self.timeline.go(number)
 
     def reset(self) -> None:

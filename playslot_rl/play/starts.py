@@ -177,9 +177,6 @@ class RecordedStarts:
         self, model: WorldModel, source: EpisodeFrames, make_task: Callable[[], Task] | None = None, seed: int = 0
     ) -> None:
         self.model, self.source, self.make_task, self.seed = model, source, make_task, seed
-        actions = source.actions
-        usable = source.seeds is not None and actions is not None and actions.shape[1] == model.env.action_dim
-        self._simulated = make_task is not None and usable
 
     def start(self, episode: int, step: int) -> Start:
         """Start at a frame of an episode; with the simulator where it runs the recorded episode again, else with what
@@ -201,13 +198,12 @@ class RecordedStarts:
 
     def _twin(self, episode: int, rows: npt.NDArray[np.int64], seen: Frame) -> Twin | None:
         """The episode run again to this frame, if it can be drawn and shows what was recorded."""
-        if not self._simulated or self.make_task is None:
+        seeds, actions = self.source.seeds, self.source.actions
+        if self.make_task is None or seeds is None or actions is None or actions.shape[1] != self.model.env.action_dim:
             return None
-        assert self.source.seeds is not None
-        assert self.source.actions is not None
         task = self.make_task()
         try:
-            twin = Twin(task, int(self.source.seeds[episode]), list(self.source.actions[rows[:-1]]))
+            twin = Twin(task, int(seeds[episode]), list(actions[rows[:-1]]))
         except RenderError:
             task.close()
             return None
@@ -259,8 +255,6 @@ class SimulatedStarts:
 
 
 def task_maker(env: EnvConfig, render: RenderConfig) -> Callable[[], Task]:
-    """Makes environments of a task."""
-
     def make() -> Task:
         from playslot_rl.envs import make_env
 

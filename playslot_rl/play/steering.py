@@ -58,7 +58,6 @@ class PolicyDriver:
 
     @torch.no_grad()
     def choose(self, session: PlaySession) -> Tensor:
-        """The policy's latent action (Z,) at the present slots."""
         chosen: Tensor = self.policy(session.slots[None])[0]
         return chosen
 

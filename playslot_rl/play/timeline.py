@@ -105,13 +105,10 @@ class Timeline:
 
     def path(self, number: int | None = None) -> list[SceneMoment]:
         """The moments from the start to one of them, by default the present one, both included."""
-        found, at = [], self.at if number is None else number
-        while True:
-            found.append(self.moments[at])
-            parent = self.moments[at].parent
-            if parent is None:
-                return found[::-1]
-            at = parent
+        found = [self.moments[self.at if number is None else number]]
+        while (parent := found[-1].parent) is not None:
+            found.append(self.moments[parent])
+        return found[::-1]
 
     def branch(self) -> list[SceneMoment]:
         """The present branch: the path to the furthest moment visited on it, and on by the newest child of each."""

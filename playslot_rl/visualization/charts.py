@@ -60,6 +60,14 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def panel_grid(count: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure of panels of so many inches, at most three in a row."""
+    columns = min(3, count)
+    rows = -(-count // columns)
+    figure = new_figure(width * columns, height * rows)
+    return figure, [figure.add_subplot(rows, columns, index + 1) for index in range(count)]
+
+
 def figure_bytes(figure: Figure, theme: Theme, kind: str = "png", facts: Mapping[str, str] | None = None) -> bytes:
     """A figure as `png` or `svg`, the same bytes for the same figure; `facts` are stored as a PNG's text."""
     import matplotlib as mpl
@@ -109,20 +117,13 @@ def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], str]], t
     axes = figure.add_subplot()
     for y, (_, rate, (low, high), method) in enumerate(rows):
         style = style_of(method)
-        colour = theme.series[7 if style is None else style.colour]
+        colour, marker, size = theme.series[7], "D", 7
+        if style is not None:
+            colour, marker, size = theme.series[style.colour], style.marker, 9
         axes.plot([100 * low, 100 * high], [y, y], color=colour, linewidth=3, solid_capstyle="round", alpha=0.6)
-        axes.plot(
-            [100 * rate],
-            [y],
-            "D" if style is None else style.marker,
-            color=colour,
-            markersize=7 if style is None else 9,
-        )
-        right = rate <= 0.5
-        x = 100 * high + 2 if right else 100 * low - 2
-        axes.text(
-            x, y, f"{100 * rate:.0f} %", color=theme.text, ha="left" if right else "right", va="center", fontsize=10
-        )
+        axes.plot([100 * rate], [y], marker, color=colour, markersize=size)
+        x, side = (100 * high + 2, "left") if rate <= 0.5 else (100 * low - 2, "right")
+        axes.text(x, y, f"{100 * rate:.0f} %", color=theme.text, ha=side, va="center", fontsize=10)
     axes.set_yticks(range(len(rows)), [label for label, *_ in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlim(-3, 103)
@@ -139,11 +140,8 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
     panels = [(stage, name) for stage, rows in histories.items() for name in loss_names(rows)]
     if not panels:
         raise ValueError("loss_chart: got no loss in the histories, expected at least one")
-    columns = min(3, len(panels))
-    height = -(-len(panels) // columns)
-    figure = new_figure(3.1 * columns, 2.3 * height)
-    for index, (stage, name) in enumerate(panels):
-        axes = figure.add_subplot(height, columns, index + 1)
+    figure, grid = panel_grid(len(panels), 3.1, 2.3)
+    for axes, (stage, name) in zip(grid, panels, strict=True):
         for split, colour, marker in (("train", theme.series[0], ""), ("validation", theme.series[1], "o")):
             rows = [r for r in histories[stage] if r.get("split", "train") == split and name in r]
             if not rows:
@@ -172,15 +170,13 @@ def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Ma
         style = style_of(method)
         colour = theme.series[6] if style is None else theme.series[style.colour]
         name = METHODS[method].title if method in METHODS else method
-        steps = np.array([row["env_steps"] for row in rows])
-        mean = np.array([row["return_mean"] for row in rows])
-        error = np.array([row["return_error"] for row in rows])
-        left.plot(steps, mean, color=colour, marker="o", markersize=3.5, linewidth=1.5, label=name)
-        left.fill_between(steps, mean - error, mean + error, color=colour, alpha=0.2, linewidth=0)
-        low, high = (100 * np.array([row["ci95"][side] for row in rows]) for side in (0, 1))
-        rate = 100 * np.array([row["success_rate"] for row in rows])
-        right.plot(steps, rate, color=colour, marker="o", markersize=3.5, linewidth=1.5)
-        right.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
+        keys = ("env_steps", "return_mean", "return_error", "success_rate")
+        steps, mean, error, rate = (np.array([row[key] for row in rows]) for key in keys)
+        low, high = 100 * np.array([row["ci95"] for row in rows]).reshape(-1, 2).T
+        for axes, values, lower, upper in ((left, mean, mean - error, mean + error), (right, 100 * rate, low, high)):
+            label = name if axes is left else None
+            axes.plot(steps, values, color=colour, marker="o", markersize=3.5, linewidth=1.5, label=label)
+            axes.fill_between(steps, lower, upper, color=colour, alpha=0.2, linewidth=0)
     grey = theme.series[-1]
     left.axhline(random["return_mean"], color=grey, linestyle="--", linewidth=1.3, label="random policy")
     right.axhline(100 * random["success_rate"], color=grey, linestyle="--", linewidth=1.3)
@@ -201,11 +197,8 @@ def curve_figure(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[
     """
     if not panels:
         raise ValueError("curve_figure: got no feature, expected at least one")
-    columns = min(3, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = new_figure(3.9 * columns, 2.2 * rows)
-    for index, (name, lines) in enumerate(panels.items()):
-        axes = figure.add_subplot(rows, columns, index + 1)
+    figure, grid = panel_grid(len(panels), 3.9, 2.2)
+    for axes, (name, lines) in zip(grid, panels.items(), strict=True):
         for number, (label, values) in enumerate(lines.items()):
             colour = theme.series[number % len(theme.series)]
             axes.plot(np.arange(len(values)), values, color=colour, linewidth=1.3, label=_literal(label))
@@ -238,13 +231,8 @@ def usage_chart(counts: Mapping[str, Sequence[int]], theme: Theme) -> bytes:
     width = 0.8 / len(counts)
     for i, (name, values) in enumerate(counts.items()):
         share = 100 * np.array(values) / max(1, sum(values))
-        axes.bar(
-            np.arange(len(values)) + (i - (len(counts) - 1) / 2) * width,
-            share,
-            width * 0.92,
-            color=theme.series[i],
-            label=name,
-        )
+        x = np.arange(len(values)) + (i - (len(counts) - 1) / 2) * width
+        axes.bar(x, share, width * 0.92, color=theme.series[i], label=name)
     axes.set_xticks(range(k))
     axes.set_xlabel("code")
     axes.set_ylabel("transitions, %")

@@ -55,7 +55,6 @@ def read_latents(model: WorldModel, root: Path, given: ReportInput) -> LatentDat
 
 
 def latent_section(given: ReportInput) -> Section:
-    """Codebook usage, probes, and a table of codes."""
     title = "Latent actions"
     if given.world_model is None:
         return Section(title, [Missing("There is no trained dynamics model.", given.command("train-dynamics"))])

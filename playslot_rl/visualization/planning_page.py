@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from playslot_rl.evaluation.goals import Frames
-from playslot_rl.visualization.charts import Theme, figure_bytes, legend, new_figure, style_axes
+from playslot_rl.visualization.charts import Theme, figure_bytes, legend, panel_grid, style_axes
 from playslot_rl.visualization.document import Document, Section, Table, Text
 from playslot_rl.visualization.grid import image_grid
 
@@ -28,7 +28,6 @@ DISTANCES = ("slots", "dynamics", "image")
 
 
 def planning_page(report: Mapping[str, Any]) -> Document:
-    """The page of what `planning.json` holds."""
     sections = []
     for name, part in report["goals"].items():
         size = ", ".join(f"{key} {value}" for key, value in part["size"].items())
@@ -96,22 +95,18 @@ def plan_sheet(goals: Sequence[Frames], plans: Sequence[Frames], executed: Seque
 
 def solution_chart(found: Mapping[str, Any], theme: Theme) -> bytes:
     """PNG of each distance to the goal along the expert's way, in units of its value at the start: a panel each."""
-    figure = new_figure(3.1 * len(DISTANCES), 2.5)
-    for index, name in enumerate(DISTANCES):
-        axes = figure.add_subplot(1, len(DISTANCES), index + 1)
+    figure, grid = panel_grid(len(DISTANCES), 3.1, 2.5)
+    for axes, name in zip(grid, DISTANCES, strict=True):
         ways = [np.array(way) / max(way[0], 1e-12) for way in found[name]["curves"]]
         for number, way in enumerate(ways):
-            label = "one episode" if number == 0 else None
-            axes.plot(
-                np.arange(len(way)) - len(way) + 1, way, color=theme.series[-1], linewidth=0.8, alpha=0.6, label=label
-            )
+            label, steps = "one episode" if number == 0 else None, np.arange(len(way)) - len(way) + 1
+            axes.plot(steps, way, color=theme.series[-1], linewidth=0.8, alpha=0.6, label=label)
         longest = max(map(len, ways))
         padded = np.full((len(ways), longest), np.nan)
         for row, way in zip(padded, ways, strict=True):
             row[longest - len(way) :] = way
-        axes.plot(
-            np.arange(longest) - longest + 1, np.nanmean(padded, 0), color=theme.series[0], linewidth=2.2, label="mean"
-        )
+        steps = np.arange(longest) - longest + 1
+        axes.plot(steps, np.nanmean(padded, 0), color=theme.series[0], linewidth=2.2, label="mean")
         axes.axhline(1, color=theme.text, linewidth=0.7, linestyle="--")
         axes.set_title(f"{name}: goal is the minimum in {100 * found[name]['goal_is_minimum']:.0f} %", fontsize=10)
         axes.set_xlabel("steps to the goal along the expert's way", fontsize=9)

@@ -72,8 +72,6 @@ def read_metas(run: Path) -> dict[str, dict[str, Any]]:
 
 
 def build(given: ReportInput) -> Document:
-    """All sections, success first."""
-
     @cache
     def clip() -> Any:
         return record(given.pool, ExpertActor(), [given.first_seed])[0][0]
@@ -99,7 +97,6 @@ def build(given: ReportInput) -> Document:
 
 
 def settings_section(given: ReportInput) -> Section:
-    """Settings, sizes and what a reader should know before quoting a number."""
     env, model = given.config.env, given.world_model
     task = [
         ["frames", f"{env.image_size} x {env.image_size} pixels, rendering `{given.config.render.quality}`"],
@@ -231,7 +228,6 @@ def prediction_section(given: ReportInput, frames: Any, result: dict[str, Any] |
 
 
 def code_section(result: dict[str, Any] | None) -> Section:
-    """What the objects did, by prototype."""
     title = "Prototypes and moves"
     if result is None or result["codes"] is None:
         return Section(title, [Text("No prototypes have been scored.")])

@@ -78,7 +78,6 @@ class ReportInput:
         return int(seeds[0]) if seeds else first_seed(self.config, self.config.seed)
 
     def command(self, name: str, rest: str = "") -> str:
-        """A `playslot` command on this run."""
         return f"playslot {name} run={self.shown}{' ' + rest if rest else ''}"
 
 
@@ -165,7 +164,6 @@ def _success_rows(results: dict[str, dict[str, Any]]) -> list[tuple[str, dict[st
 
 
 def rollout_section(given: ReportInput) -> Section:
-    """Imagined beside simulated rollouts: animation, film strip and their agreement."""
     title = "Imagined and simulated rollouts"
     if given.agent is None:
         return Section(title, [Missing("There is no trained policy.", given.command("train-policy"))])

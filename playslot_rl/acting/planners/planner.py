@@ -88,8 +88,6 @@ class Plan(NamedTuple):
 
 
 class Planner(Protocol):
-    """A way of searching."""
-
     def __call__(self, search: Search, generator: torch.Generator) -> Plan:
         """Search; the generator, on the device of the search, draws all candidates. A ValueError where no cost is
         finite.
