@@ -40,9 +40,8 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
         slots.main(config, run)
         return
     from playslot_rl.acting.episodes import TaskPool
-    from playslot_rl.evaluation.success import check_protocol, evaluate_run, run_facts
+    from playslot_rl.evaluation.success import evaluate_run, run_facts
 
-    check_protocol(config.protocol)
     run_facts(run.folder)  # a run without a policy is refused before anything is loaded
     require_task(config, run.own("policy").group(EnvConfig, "env"))
     agent = run.load_agent(open_device(config.device, config.threads))

@@ -16,18 +16,18 @@ from playslot_rl.runtime.devices import open_device
 
 def main(config: ExperimentConfig, run: Run) -> None:
     """Score the slots of `run` on the scripted expert's episodes and print the result."""
-    from playslot_rl.evaluation.slots import RESULT, evaluate_slots
+    from playslot_rl.evaluation.objects import SLOTS_RESULT, evaluate_slots
 
     device = open_device(config.device, config.threads)
-    print(describe(evaluate_slots(run, run.folder, config, device), run.folder / RESULT), flush=True)
+    print(describe(evaluate_slots(run, run.folder, config, device), run.folder / SLOTS_RESULT), flush=True)
 
 
 def main_if_needed(config: ExperimentConfig, run: Run) -> None:
     """As `main` with the default number of episodes, unless these slots were scored with this seed before."""
-    from playslot_rl.evaluation.slots import RESULT
+    from playslot_rl.evaluation.objects import SLOTS_RESULT
 
     facts = {"seed": config.seed, "fingerprints": {"slots": run.stage("slots").fingerprint}}
-    stored = run.result(RESULT, facts)
+    stored = run.result(SLOTS_RESULT, facts)
     if stored is not None:
         print(f"slots: scored before, FG-ARI {stored['foreground_ari']:.2f}, skipped", flush=True)
         return

@@ -86,12 +86,6 @@ def run_facts(run: Path, method: str = "playslot") -> RunFacts:
     )
 
 
-def check_protocol(protocol: str) -> None:
-    """Refuse what is none of `PROTOCOLS`, by a ConfigError."""
-    if protocol not in PROTOCOLS:
-        raise ConfigError(f"protocol: got {protocol!r}, expected one of {', '.join(PROTOCOLS)}")
-
-
 def evaluate(
     agent: Agent,
     config: ExperimentConfig,
@@ -121,7 +115,8 @@ def evaluate(
     Raises:
         ConfigError: unknown protocol, or a seed that a training data set holds.
     """
-    check_protocol(protocol)
+    if protocol not in PROTOCOLS:
+        raise ConfigError(f"protocol: got {protocol!r}, expected one of {', '.join(PROTOCOLS)}")
     agent.eval()
     oracle = None if agent.oracle is None else oracle_actor(agent)
     # The expert plays an episode while the pool's own environments wait at its first frame.

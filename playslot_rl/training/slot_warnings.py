@@ -28,7 +28,7 @@ MOTION: Final = 30
 
 def slot_warnings(values: Mapping[str, float], savi: SAViConfig, stage: SlotsStageConfig) -> dict[str, str]:
     """Kind -> one line, for each thing that is wrong with the values of `SlotHealth` and of
-    `playslot_rl.evaluation.slots`; what is not among them is not judged. No cure is named that is in use already, or
+    `playslot_rl.evaluation.objects`; what is not among them is not judged. No cure is named that is in use already, or
     takes longer than the stage.
     """
     found: dict[str, str] = {}

@@ -11,8 +11,7 @@ import torch
 
 from playslot_rl.config.compose import compose
 from playslot_rl.envs import make_env
-from playslot_rl.evaluation.seeds import first_seed
-from playslot_rl.evaluation.slots import (
+from playslot_rl.evaluation.objects import (
     RESULT,
     evaluate_slots,
     score_slots,
@@ -21,6 +20,7 @@ from playslot_rl.evaluation.slots import (
     slots_per_object,
     validation_scores,
 )
+from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runs import Run
 from playslot_rl.seeds.episodes import episode_seed
@@ -103,7 +103,7 @@ def test_a_machine_that_cannot_draw_trains_without(
     def fail(*_: object) -> None:
         raise RuntimeError("no EGL display\nand more")
 
-    monkeypatch.setattr("playslot_rl.evaluation.slots.make_env", fail)
+    monkeypatch.setattr("playslot_rl.evaluation.objects.make_env", fail)
     assert validation_scores(compose(["env=button_press", "preset=compact"])) is None
     assert capsys.readouterr().out == (
         "slots: warning: no FG-ARI while training, since button_press cannot be drawn here (no EGL display)\n"

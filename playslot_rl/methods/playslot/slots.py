@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.evaluation.slots import validation_scores
+from playslot_rl.evaluation.objects import validation_scores
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runs import Run
 from playslot_rl.runtime.processes import here
