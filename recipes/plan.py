@@ -83,8 +83,8 @@ def _measure(
 ) -> dict[str, Any]:
     """All ways of acting towards one kind of goal: a part of the report."""
     from playslot_rl.evaluation.goals import make_goals
+    from playslot_rl.evaluation.held_out import check_disjoint, first_seed, training_seeds
     from playslot_rl.evaluation.planning import cost_along_solution, play, results, ways_of_acting
-    from playslot_rl.evaluation.seeds import check_disjoint, first_seed, training_seeds
     from playslot_rl.storage.atomic import write_bytes, write_json
     from playslot_rl.visualization.charts import LIGHT
     from playslot_rl.visualization.planning_page import solution_chart

@@ -79,7 +79,7 @@ def run_camera(config: ExperimentConfig, recorded: RecordedStarts | None) -> str
 def simulated_starts(config: ExperimentConfig, world: WorldModel) -> SimulatedStarts | None:
     """Fresh episodes of the run's task, where it has a simulator."""
     from playslot_rl.envs import ENVIRONMENTS, task_metadata
-    from playslot_rl.evaluation.seeds import first_seed
+    from playslot_rl.evaluation.held_out import first_seed
     from playslot_rl.play.starts import SimulatedStarts, task_maker
 
     if config.env.name not in ENVIRONMENTS:
@@ -97,7 +97,7 @@ def recorded_starts(
     """Frames of `data.root`, or of the data sets that the run names and that are on this machine."""
     from playslot_rl.data.weighted import open_configured
     from playslot_rl.envs import ENVIRONMENTS
-    from playslot_rl.evaluation.seeds import data_folders
+    from playslot_rl.evaluation.held_out import data_folders
     from playslot_rl.play.starts import RecordedStarts, task_maker
 
     known = bool(run.pretrained)

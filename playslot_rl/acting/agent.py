@@ -1,8 +1,7 @@
 """The agent as an actor: closed loop (simulation), open loop (imagination, or the expert's videos), and its slot
 oracle.
 
-Shapes: E episodes, T agent steps, N slots, D slot width, Z latent-action width, A action width, H W image height and
-width.
+Shapes: E episodes, T agent steps, N slots, D slot width, Z latent-action width, A action width, H W image size.
 """
 
 from __future__ import annotations

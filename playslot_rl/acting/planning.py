@@ -47,7 +47,7 @@ class PlanningActor(Actor):
         policy: bool = False,
         seed: int = 0,
     ) -> None:
-        model, one = agent.world_model, (1,)
+        model = agent.world_model
         slots, seen = model.slot_shape, min(plan.history, model.config.predictor.context)
         zeros = {
             keys.SLOT_STATE: slots,
@@ -55,7 +55,7 @@ class PlanningActor(Actor):
             keys.GOAL_SLOTS: slots,
             keys.PLANNED_LATENTS: (size.horizon, *model.latent_shape),
             keys.PREDICTED_SLOTS: (size.horizon + 1, *slots),
-            **dict.fromkeys((keys.PLAN_COST, keys.PROPOSAL_COST, keys.PLAN_SECONDS), one),
+            **dict.fromkeys((keys.PLAN_COST, keys.PROPOSAL_COST, keys.PLAN_SECONDS), (1,)),
         }
         super().__init__((*zeros, keys.SLOT_AGE, keys.STEP_COUNT, keys.EPISODE_SEED, keys.GOAL_PIXELS))
         self.agent, self.planner, self.config, self.size = agent, planner, plan, size

@@ -97,10 +97,9 @@ def same_mover(one: Floats, other: Floats) -> float | None:
 
 
 def explained_by_group(effects: Floats) -> float | None:
-    """Share of the variance of effects (K, S, ...) that lies between the K groups, adjusted for their number.
-
-    1 - (within / (K S - K)) / (total / (K S - 1)): 1 where a group has one effect, about 0 where groups say nothing (it
-    may be below); None where nothing varies, or there is one group or place.
+    """Share of the variance of effects (K, S, ...) that lies between the K groups, adjusted for their number: 1 -
+    (within / (K S - K)) / (total / (K S - 1)). 1 where a group has one effect, about 0 where groups say nothing (it may
+    be below); None where nothing varies, or there is one group or place.
     """
     k, s = effects.shape[:2]
     flat = effects.reshape(k, s, -1)

@@ -24,8 +24,8 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs import PROCEDURAL, RECORDED, make_env
 from playslot_rl.envs.grid_shapes import MOVES, Clips, generate
 from playslot_rl.errors import ConfigError
+from playslot_rl.evaluation.held_out import held_out_seeds
 from playslot_rl.evaluation.probes import probe_moves
-from playslot_rl.evaluation.seeds import held_out_seeds
 from playslot_rl.evaluation.success import hardware
 from playslot_rl.evaluation.video import video_metrics
 from playslot_rl.frames import psnr, to_float

@@ -36,14 +36,9 @@ STRIDE: Final = 1
 
 @dataclass
 class Played:
-    """Episodes towards goals, as one way of acting played them; the lists are empty where nothing is planned.
-
-    Attributes:
-        outcomes, traces: an episode each, by the task's own measure.
-        plans: slots (H + 1, N, D) of each episode's first plan.
-        costs, proposals, seconds: of every decision.
-        first_costs, first_proposals: of the first decision of each episode.
-        wall: seconds of wall clock.
+    """Episodes towards goals, as one way of acting played them: outcomes, by the task's own measure, and traces, an
+    episode each; `wall` seconds of wall clock. The lists are empty where nothing is planned: slots (H + 1, N, D) of
+    each episode's first plan; costs, proposals and seconds of every decision, and of the first one of each episode.
     """
 
     outcomes: list[Outcome] = field(default_factory=list)
@@ -127,9 +122,9 @@ def results(played: Played, goals: Sequence[GoalEpisode], near: float) -> dict[s
     """What is reported of a way of acting.
 
     `success_rate`, `ci95` and `mean_steps_to_success` are by the task's own measure; by `state_success_rate` and
-    `state_ci95` everything was within `near` metres of its place in the goal at some step; `state_distance`,
+    `state_ci95` everything was within `near` metres of its place in the goal at some step. `state_distance`,
     `state_closest` and `state_distance_at_start` are metres, means over episodes at the end, at the closest step and at
-    the start. Costs are means, at the first decision with `_first`; None where nothing is planned.
+    the start. Costs are means, with `_first` at the first decision; None where nothing is planned.
     """
     ways = [
         [distance(p, goal.places[-1]) for p in trace.places] for goal, trace in zip(goals, played.traces, strict=True)

@@ -1,6 +1,5 @@
-"""What the latent actions carry: probes of real actions and of known moves, codebook usage, one row per code.
-
-Probes are tested on whole episodes or clips held out: transitions of one are too alike to stand on both sides.
+"""What the latent actions carry: probes of real actions and of known moves, codebook usage, one row per code. Probes
+are tested on whole episodes or clips held out: transitions of one are too alike to stand on both sides.
 
 Shapes: M transitions, Z latent-action dim (N * Z with one latent per slot), A action dim, K prototypes, D width of what
 a probe sees.
@@ -68,11 +67,7 @@ def _hold_out(groups: Ints, fraction: float, seed: int, what: str) -> tuple[npt.
 
 
 def probe_actions(
-    z: Floats,
-    actions: Floats,
-    episodes: Ints,
-    codes: Ints | None = None,
-    tested: npt.NDArray[np.bool_] | None = None,
+    z: Floats, actions: Floats, episodes: Ints, codes: Ints | None = None, tested: npt.NDArray[np.bool_] | None = None
 ) -> dict[str, Any]:
     """How much of the real action (M, A), in [-1, 1], can be read from the latent (M, Z), on episodes that the probe
     has not seen.

@@ -30,7 +30,7 @@ from playslot_rl.acting.episodes import Outcome, TaskPool, run_episodes
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.evaluation.seeds import check_disjoint, first_seed, held_out_seeds, training_seeds
+from playslot_rl.evaluation.held_out import check_disjoint, first_seed, held_out_seeds, training_seeds
 from playslot_rl.runtime.threads import available_cores
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.world_model import Agent

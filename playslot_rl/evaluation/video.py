@@ -25,9 +25,7 @@ BORDER: Final = 5
 
 
 class FrameScores(NamedTuple):
-    """Scores of single frames, each (B, T): PSNR in dB, 80 for equal frames; SSIM up to 1; LPIPS from 0 on, lower is
-    better, None without a network.
-    """
+    """Scores of frames, each (B, T): PSNR in dB, 80 for equal ones; SSIM up to 1; LPIPS, lower is better, or None."""
 
     psnr: Tensor
     ssim: Tensor

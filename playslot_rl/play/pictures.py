@@ -36,10 +36,11 @@ CURVE: Final = (400, 96)
 
 
 class Gallery:
-    """The newest pictures of one page, served to its browser; a slow browser skips some."""
+    """The newest pictures of one page, served to its browser; a slow browser skips some. `open` are those of all open
+    pages, by their key.
+    """
 
     open: ClassVar[dict[str, Gallery]] = {}
-    """Of all pages that are open, by their key."""
 
     def __init__(self) -> None:
         self.key = uuid.uuid4().hex

@@ -90,10 +90,9 @@ class Timeline:
     def back(self) -> bool:
         """Go to the moment before; False at the start."""
         parent = self.now.parent
-        if parent is None:
-            return False
-        self.at = parent
-        return True
+        if parent is not None:
+            self.at = parent
+        return parent is not None
 
     def go(self, number: int) -> None:
         """Go to any moment; a ValueError where there is none of this number."""

@@ -110,8 +110,8 @@ def legend(figure: Figure, theme: Theme, **options: Any) -> None:
 
 
 def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], str]], theme: Theme) -> bytes:
-    """PNG of success rates: rows of a label, rate and 95 % interval (0 to 1), and the method, in whose colour it is
-    drawn (others are grey).
+    """PNG of success rates: rows of a label, rate, 95 % interval (0 to 1), and the method whose
+    colour it has, or grey.
     """
     figure = new_figure(6.4, 0.6 + 0.42 * len(rows))
     axes = figure.add_subplot()

@@ -10,8 +10,8 @@ import numpy as np
 
 from playslot_rl.data.demonstrations import probed_actions
 from playslot_rl.errors import DataError
+from playslot_rl.evaluation.held_out import data_folders
 from playslot_rl.evaluation.probes import code_table, codebook_usage, infer_latents, probe_actions
-from playslot_rl.evaluation.seeds import data_folders
 from playslot_rl.visualization.charts import usage_chart
 from playslot_rl.visualization.document import Block, Missing, Section, Table, Text
 from playslot_rl.visualization.sections import ReportInput, chart
@@ -23,8 +23,8 @@ COLLECT = "playslot collect out=DIR policy=random"
 
 @dataclass(frozen=True)
 class LatentData:
-    """Latent actions of a data set: codes int64 (M, 1) or (M, N), actions (M, A) as they were recorded, None where
-    there are none, and the result of `probe_actions`, None without actions that are numbers.
+    """Latent actions of a data set: codes int64 (M, 1) or (M, N), actions (M, A) as they were recorded, if there are
+    any, and the result of `probe_actions`, None without actions that are numbers.
     """
 
     name: str

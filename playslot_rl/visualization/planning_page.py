@@ -1,5 +1,5 @@
-"""The page of `playslot plan`, and its pictures: start, goal, what the first plan imagined and what was executed; the
-cost along solutions.
+"""The page of `playslot plan`, and its pictures: start, goal, first plan and what was executed; the cost along
+solutions.
 
 Shapes: T steps, H horizon, H W image height and width.
 """

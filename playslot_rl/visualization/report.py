@@ -16,8 +16,8 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.errors import CheckpointError
+from playslot_rl.evaluation.held_out import first_seed
 from playslot_rl.evaluation.objects import RESULT, parse_clips, seed_frames
-from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.frames import to_uint8
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing
@@ -181,10 +181,7 @@ def scores_section(given: ReportInput, result: dict[str, Any] | None) -> Section
     title = "Objects and moves"
     if result is None:
         return Section(title, [Missing("Nothing has been scored yet.", given.command("evaluate"))])
-    ari = [
-        ["all pixels", f"{result['ari']:.3f}"],
-        ["pixels of objects (FG-ARI)", f"{result['foreground_ari']:.3f}"],
-    ]
+    ari = [["all pixels", f"{result['ari']:.3f}"], ["pixels of objects (FG-ARI)", f"{result['foreground_ari']:.3f}"]]
     caption = (
         f"Slot masks against the true masks, {result['episodes']} held-out clips scored as wholes; 1 is perfect, 0 is "
         "chance. Each pixel belongs to the slot with the largest mask."

@@ -10,8 +10,8 @@ from typing import Any, Final
 
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig
+from playslot_rl.evaluation.held_out import first_seed
 from playslot_rl.evaluation.objects import SLOTS_RESULT
-from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.evaluation.success import POLICY_PROTOCOLS, PROTOCOLS, hardware
 from playslot_rl.evaluation.video import video_metrics
 from playslot_rl.frames import to_float

@@ -163,7 +163,7 @@ def test_episodes_that_start_solved_are_redrawn(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_any_seed_is_taken_and_its_data_are_whole(tmp_path: Path) -> None:
-    from playslot_rl.evaluation.seeds import recorded_seeds
+    from playslot_rl.evaluation.held_out import recorded_seeds
 
     seed = 2**32 - 1
     out = collect(config(), "random", 2, STEPS, tmp_path / "data", seed=seed, workers=1)

@@ -10,7 +10,7 @@ import pytest
 
 from playslot_rl.config import DataConfig, EvaluationConfig, ExperimentConfig
 from playslot_rl.errors import ConfigError, DataError
-from playslot_rl.evaluation.seeds import check_disjoint, first_seed, recorded_seeds, training_seeds
+from playslot_rl.evaluation.held_out import check_disjoint, first_seed, recorded_seeds, training_seeds
 from playslot_rl.seeds.episodes import episode_seed
 
 

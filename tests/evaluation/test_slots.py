@@ -11,6 +11,7 @@ import torch
 
 from playslot_rl.config.compose import compose
 from playslot_rl.envs import make_env
+from playslot_rl.evaluation.held_out import first_seed
 from playslot_rl.evaluation.objects import (
     RESULT,
     evaluate_slots,
@@ -20,7 +21,6 @@ from playslot_rl.evaluation.objects import (
     slots_per_object,
     validation_scores,
 )
-from playslot_rl.evaluation.seeds import first_seed
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runs import Run
 from playslot_rl.seeds.episodes import episode_seed

@@ -2,8 +2,8 @@
 
     J(z_{1:H}) = (1 - a) d(S^_H, G) + a / H sum_t d(S^_t, G),   d(S, G) = min_pi 1/ND sum_n |S_n - G_pi(n)|^2
 
-with the weight a of the way (`along`): 0 asks where the plan ends, 1 also how soon it is there. The futures come from
-the cached rollout, all candidates at once; what was seen before the plan begins may be given as seed frames.
+with the weight a of the way (`along`): 0 asks where the plan ends, 1 also how soon it is there. All candidates' futures
+come from the cached rollout at once; what was seen before the plan begins may be given as seed frames.
 
 Shapes: M candidates, H horizon, S seed frames, N slots, D slot width, Z latent-action width, W H image size. "[N,]" is
 there with one latent action per slot.

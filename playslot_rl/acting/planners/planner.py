@@ -79,7 +79,7 @@ class Search:
 
 class Plan(NamedTuple):
     """The best latents (H, [N,] Z) of all candidates whose cost was computed, their cost, and the best cost known after
-    each iteration, which never rises.
+    each iteration.
     """
 
     latents: Tensor
@@ -89,9 +89,7 @@ class Plan(NamedTuple):
 
 class Planner(Protocol):
     def __call__(self, search: Search, generator: torch.Generator) -> Plan:
-        """Search; the generator, on the device of the search, draws all candidates. A ValueError where no cost is
-        finite.
-        """
+        """Search; the generator draws all candidates, on its device. A ValueError where no cost is finite."""
 
 
 class Best:

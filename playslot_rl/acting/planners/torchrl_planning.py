@@ -89,8 +89,8 @@ def planning_env(
 
 
 def planning_start(env: TransformedEnv, slots: Tensor) -> TensorDictBase:
-    """What the planners take: the start from slots (..., N, D). The transformed environment's own reset would drop them
-    without a word and start from a grey frame.
+    """What the planners take: the start from slots (..., N, D), which the transformed environment's own reset would
+    drop.
     """
     start: TensorDictBase = env.base_env.reset(TensorDict({keys.SLOTS: slots}, slots.shape[:-2]))
     return start

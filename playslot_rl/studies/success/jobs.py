@@ -18,7 +18,7 @@ from playslot_rl.config.weights import data_roots
 from playslot_rl.data.agreement import open_files
 from playslot_rl.data.views import first_demonstrations
 from playslot_rl.errors import ConfigError
-from playslot_rl.evaluation.seeds import held_out_seeds
+from playslot_rl.evaluation.held_out import held_out_seeds
 from playslot_rl.runs import Run
 from playslot_rl.studies.launch import Commands
 from playslot_rl.studies.study import Job, absolute, absolute_roots, fingerprint_of

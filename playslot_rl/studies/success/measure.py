@@ -11,7 +11,7 @@ from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError
-from playslot_rl.evaluation.seeds import held_out_seeds
+from playslot_rl.evaluation.held_out import held_out_seeds
 from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_references, wilson
 from playslot_rl.methods.training import check_method
 from playslot_rl.runs import Run
