@@ -17,23 +17,18 @@ from playslot_rl.config.env import COLOURS, Rgb
 Variant = Literal["reach", "push", "pick"]
 
 TABLE_TOP: Final = 0.4
-CUBE: Final = 0.045
-"""Half the side of the cubes of Reach and Push."""
+CUBE: Final = 0.045  # half the side of the cubes of Reach and Push
 SMALL_CUBE: Final = 0.03
 """Half the side of Pick's cubes. Note: the gripper opens 0.10 m, which leaves no play round a cube of 0.09 m."""
-SPREAD: Final = 0.15
-"""Objects and goal lie at most this far from the grip's start, in x and in y."""
-APART: Final = 0.127
-"""Least distance between two objects."""
+SPREAD: Final = 0.15  # objects and goal lie at most this far from the grip's start, in x and in y
+APART: Final = 0.127  # least distance between two objects
 GOAL_APART: Final = 0.104
 """Least distance in the plane from the goal to every object (Reach: in space from the target to the grip), so that no
 episode starts solved."""
-LIFT: Final = (0.10, 0.20)
-"""How far Pick's goal is above a cube on the table."""
+LIFT: Final = (0.10, 0.20)  # how far Pick's goal is above a cube on the table
 TRIES: Final = 256
 """Layouts drawn at once; the first that fits is taken. One in some hundred does with four distractors."""
-REACH_Z: Final = (TABLE_TOP + 0.045, TABLE_TOP + 0.245)
-"""Heights of Reach's spheres."""
+REACH_Z: Final = (TABLE_TOP + 0.045, TABLE_TOP + 0.245)  # heights of Reach's spheres
 
 REDNESS: Final = (
     "red", "saddlebrown", "mediumvioletred", "orange", "thistle", "magenta", "darkkhaki", "darkslategrey", "dodgerblue",

@@ -1,9 +1,8 @@
 """The blocks family: a Fetch arm that reaches for spheres, pushes cubes or picks them up.
 
 `BlockPush` is Push with the task `odd` and three distractors. Written anew after the multi-object-fetch tasks, on
-gymnasium-robotics' `MujocoFetchEnv`; see docs/reference/environments.md.
-
-The scripted experts are proportional control of the grip, a function of the present state alone.
+gymnasium-robotics' `MujocoFetchEnv`. The scripted experts are proportional control of the grip, a function of the
+present state alone.
 
 Shapes: A = 4, S = 4, H = W = `EnvConfig.image_size`. Lengths in metres, world coordinates.
 """
@@ -25,8 +24,7 @@ from playslot_rl.envs.culling import Still
 from playslot_rl.envs.pixel_task import Action, PixelTask
 from playslot_rl.envs.rendering import FrameRenderer, import_mujoco
 
-SUCCESS: Final = 0.05
-"""Distance in metres, in space, under which the task is solved."""
+SUCCESS: Final = 0.05  # distance in metres, in space, under which the task is solved
 SENTENCES: Final[dict[Variant, str]] = {
     "push": "Push the {} cube onto the red sphere.",
     "reach": "Reach for the {} sphere.",
@@ -36,36 +34,25 @@ WHICH: Final = {"red": "red", "reddest": "reddest", "odd": "odd", "odd_groups": 
 
 # The experts' numbers.
 GAIN: Final = 14.0
-TRAVEL_Z: Final = 0.540
-"""Height at which the closed gripper passes over the cubes."""
+TRAVEL_Z: Final = 0.540  # height at which the closed gripper passes over the cubes
 PUSH_Z: Final = 0.452
-LOW_Z: Final = 0.480
-"""Under it the fingers meet the cubes."""
-BEHIND: Final = 0.115
-"""Distance behind the cube's centre at which the gripper comes down."""
+LOW_Z: Final = 0.480  # under it the fingers meet the cubes
+BEHIND: Final = 0.115  # distance behind the cube's centre at which the gripper comes down
 CLEAR: Final = 0.095
 """Least distance at which the fingers come down beside a cube, whichever way it is turned."""
-LATERAL: Final = 0.03
-"""How far from the line through goal and cube the pusher may be."""
+LATERAL: Final = 0.03  # how far from the line through goal and cube the pusher may be
 STEP: Final = 0.06
 SLOW: Final = 0.7
 """Longest way ahead that the pusher aims at, and the part of the remaining way: a cube that is hit slides on."""
-REST: Final = 0.02
-"""A cube that is being pushed is left at this distance from the goal."""
-NEAR: Final = 0.045
-"""Any other cube that is this near is left alone: the task is solved under 0.05."""
-PICK_TRAVEL_Z: Final = 0.52
-"""Height at which the open gripper passes over the small cubes."""
-AROUND: Final = 0.02
-"""How near the grip is to the centre of a cube that its fingers can close on."""
-OVER: Final = 0.012
-"""How far aside the open gripper may come down."""
-GRASP: Final = 0.064
-"""The fingers rest on a small cube at an opening of less than this."""
+REST: Final = 0.02  # a cube that is being pushed is left at this distance from the goal
+NEAR: Final = 0.045  # any other cube that is this near is left alone: the task is solved under 0.05
+PICK_TRAVEL_Z: Final = 0.52  # height at which the open gripper passes over the small cubes
+AROUND: Final = 0.02  # how near the grip is to the centre of a cube that its fingers can close on
+OVER: Final = 0.012  # how far aside the open gripper may come down
+GRASP: Final = 0.064  # the fingers rest on a small cube at an opening of less than this
 OPEN: Final = 1.0
 CLOSE: Final = -1.0
-FALLEN_Z: Final = 0.38
-"""A cube under it has fallen off the table."""
+FALLEN_Z: Final = 0.38  # a cube under it has fallen off the table
 
 
 @dataclass(frozen=True)

@@ -27,10 +27,8 @@ CAMERA: Final = "frontview"
 CAMERA_PLACE: Final = (1.9, 0.75, 0.8)
 CAMERA_EULER: Final = (0.0, 1.0, 1.571)
 """Radians about x, y, z, each turning the next one's axes; a camera looks along its own -z."""
-SPHERE: Final = 0.04
-"""Radius of the goal, and of Reach's spheres."""
-PARKING_X: Final = 4.0
-"""Where cubes rest that the episode does not use: on the floor, behind the camera."""
+SPHERE: Final = 0.04  # radius of the goal, and of Reach's spheres
+PARKING_X: Final = 4.0  # where cubes rest that the episode does not use: on the floor, behind the camera
 
 STILL: Final = ("robot0:base_link", "robot0:torso_lift_link", "robot0:torso_fixed_link")
 """Parts of the robot that never move, mostly behind the table."""
@@ -40,8 +38,7 @@ UNSEEN: Final = ("estop_link", "laser_link", "head_pan_link", "head_tilt_link")
 _FINGER: Final = (0.05775, 0.021, 0.02025)
 _DARK_GREY: Final = (0.2, 0.2, 0.2, 1.0)
 _INVISIBLE: Final = (0.0, 0.0, 0.0, 0.0)
-SUBSTEPS: Final = 20
-"""Simulation steps of 2 ms in an environment step: 25 Hz."""
+SUBSTEPS: Final = 20  # simulation steps of 2 ms in an environment step: 25 Hz
 ROBOT_START: Final = {"robot0:slide0": 0.405, "robot0:slide1": 0.48, "robot0:slide2": 0.0}
 
 

@@ -22,14 +22,11 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     import mujoco
 
-HIDDEN_GROUP = 5
-"""A geom group that MuJoCo's default visualisation options do not draw."""
-SLACK: Final = 1e-4
-"""Metres by which boxes are taken to be larger: the scene is drawn in single precision."""
+HIDDEN_GROUP = 5  # a geom group that MuJoCo's default visualisation options do not draw
+SLACK: Final = 1e-4  # metres by which boxes are taken to be larger: the scene is drawn in single precision
 GRAZING: Final = 0.02
 """Facets seen under a smaller sine are kept whichever way they face: joints give way by micrometres."""
-SHRINK: Final = 0.002
-"""Metres by which the screen is taken to be smaller."""
+SHRINK: Final = 0.002  # metres by which the screen is taken to be smaller
 
 Vector = npt.NDArray[np.float64]
 

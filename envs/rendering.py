@@ -44,10 +44,9 @@ class Camera:
 def import_mujoco() -> Any:
     """Import mujoco with a GL backend that works without a display.
 
-    MuJoCo reads `MUJOCO_GL` once, when it is first imported, and torchrl.envs imports it too. On Linux the variable is
-    set to `egl` where it is not set, with or without a display, so that every machine and every worker process draws by
-    the same path; where mujoco was imported before that, its choice of context is replaced. A RenderError where that
-    backend does not work.
+    MuJoCo reads `MUJOCO_GL` once, when it is first imported, and torchrl.envs imports it too. On Linux it is `egl`
+    where it is not set, so that every machine and process draws by the same path; where mujoco was imported before
+    that, its choice of context is replaced. A RenderError where that backend does not work.
     """
     linux = sys.platform.startswith("linux")
     imported_before = "mujoco" in sys.modules
@@ -175,10 +174,7 @@ class FrameRenderer:
         return box_mean(frame, self._factor)
 
     def parts(self, data: mujoco.MjData) -> npt.NDArray[np.int32]:
-        """Which part of the model each pixel shows: int32 (H, W, 2), its number and its `mjtObj` type; -1 where none.
-
-        Of the pixels that `__call__` averages, the one at the centre.
-        """
+        """Part of the model at the centre of each pixel: int32 (H, W, 2), its number and `mjtObj` type; -1 where none."""
         self._renderer.enable_segmentation_rendering()
         try:
             self._renderer.update_scene(data, self._camera)

@@ -27,9 +27,6 @@ from playslot_rl.modules.savi import SAVi
 class WorldModel(nn.Module):
     """SAVi, InvDyn and the predictor: parse, infer latent actions, predict (paper, Figure "PlaySlot").
 
-    Raises:
-        ConfigError: a predictor that cannot take the latent actions.
-
     Examples:
         >>> from playslot_rl.testing import tiny_config
         >>> config = tiny_config()
@@ -81,16 +78,11 @@ class Agent(nn.Module):
 
     @classmethod
     def untrained(cls, world_model: WorldModel, oracle: bool = True) -> Agent:
-        """Fresh networks of the sizes in `world_model.config`.
-
-        Raises:
-            ConfigError: the world model has one latent action per slot, the policy gives one per step.
-        """
+        """Fresh networks of the sizes in `world_model.config`, whose latent actions must be one per step."""
         if world_model.inverse_dynamics.per_slot:
             raise ConfigError(
                 "model.inverse_dynamics.variant: got multi, expected single: the policy gives one latent action a "
-                "step; "
-                "train dynamics with variant=single"
+                "step; train dynamics with variant=single"
             )
         config, env = world_model.config, world_model.env
         slot_dim, width = config.savi.slot_dim, world_model.inverse_dynamics.latent_dim

@@ -9,12 +9,7 @@ from playslot_rl.config import ExperimentConfig
 
 
 def main(config: ExperimentConfig) -> None:
-    """Run what is missing, reuse what is done, write `OUT/comparison.json`, `.md`, `.png` and `.svg`.
-
-    Raises:
-        PlaySlotError: as `playslot_rl.studies.study.run_study`.
-        KeyboardInterrupt: Ctrl-C; the same command carries on.
-    """
+    """Run what is missing, reuse what is done, write `OUT/comparison.json`, `.md`, `.png` and `.svg`."""
     from playslot_rl.recipes.compare_job import commands
     from playslot_rl.runs import Run
     from playslot_rl.studies.study import run_study

@@ -11,10 +11,6 @@ def main(config: ExperimentConfig) -> None:
     """Run what is missing, reuse what is done, write `OUT/video.json`, `.md`, `.png`, `.svg` and sheets of frames.
 
     With `objects=` this is done for each number of them, in `OUT/objects_N`, and `OUT` gets the table of all.
-
-    Raises:
-        PlaySlotError: as `playslot_rl.studies.study.run_study`.
-        KeyboardInterrupt: Ctrl-C; the same command carries on.
     """
     from playslot_rl.studies.video.measure import each_number
 
@@ -26,7 +22,6 @@ def main(config: ExperimentConfig) -> None:
 
 
 def compare(config: ExperimentConfig) -> None:
-    """One comparison, into `config.out`; raises as `main` does."""
     from playslot_rl.recipes.compare_job import commands
     from playslot_rl.runs import Run
     from playslot_rl.studies.study import run_study

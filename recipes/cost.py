@@ -1,10 +1,9 @@
 """The tables of `playslot bench` about a training step, for any config: `python -m playslot_rl.recipes.cost
 preset=paper`.
 
-Operations of one step of each stage are counted on this CPU, with the memory and time that they mean on 1, 8 and 32
-devices of *assumed* speed (`playslot_rl.speed.cost.Machine`). With `device=` steps are also *measured* there, in fp32
-and, where the processor multiplies it, in bf16: `device=cuda preset=paper` takes a minute on an H100, `device=cpu`
-many. Stages of which the setting `compile` is on are measured without and with torch.compile. Nothing is written.
+Operations of a step are counted on this CPU, with the memory and time that they mean on devices of *assumed* speed
+(`playslot_rl.speed.cost.Machine`). With `device=` steps are also *measured* there, in fp32 and bf16, with and without
+torch.compile where the setting `compile` is on: `device=cuda` takes a minute on an H100, `device=cpu` many.
 """
 
 from __future__ import annotations

@@ -2,9 +2,7 @@
 
     make animation
 
-The episode goes to playslot_rl/pretrained/ENV.png (`playslot_rl.pretrained.episode`), the animation and a picture of
-each task to docs/images. The imagined frames follow from the first frame alone, under the latent actions that were
-inferred from the recorded video.
+The imagined frames follow from the first one alone, under the latent actions inferred from the recorded video.
 """
 
 from __future__ import annotations

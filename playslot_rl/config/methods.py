@@ -143,10 +143,8 @@ def canonical_method(text: str, acting: bool = False) -> str:
     """The method that somebody names, by its name, title or alias; case, spaces, `-` and `_` do not matter.
 
     CADDY is two methods: `caddy` predicts videos, and `caddy_policy`, of the title CADDY, acts. With `acting` a word
-    that
-    names two means the one that acts; else a name comes before a title. A ConfigError where there is none, or the
-    package
-    that brings it fails.
+    that names two means the one that acts; else a name comes before a title. A ConfigError where there is none, or the
+    package that brings it fails.
 
     Examples:
         >>> canonical_method("DreamerV3"), canonical_method("slot-oracle")

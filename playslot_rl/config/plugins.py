@@ -48,12 +48,8 @@ def load(group: str, name: str, kind: type, built_in: str = "") -> Any:
 
 
 class Registry[Kind](Mapping[str, Kind]):
-    """By name, imported when they are asked for; those of packages that cannot be imported are left out of the list.
-
-    Args:
-        group: of the entry points.
-        kind: what they give.
-        ours: `module:object` of built-in ones.
+    """What entry points of a group give, and our own as `module:object`, by name: imported when they are asked for.
+    Those of packages that cannot be imported are left out of the list.
     """
 
     def __init__(self, group: str, kind: type[Kind], ours: Mapping[str, str] = MappingProxyType({})) -> None:

@@ -34,8 +34,7 @@ class DataRoot(NamedTuple):
 
 
 def data_roots(text: str, key: str = "data.root") -> list[DataRoot]:
-    """The data sets that a text such as `a`, `a,b` or `a:2,b:1` names; where only some have a weight, the others have
-    1.
+    """The data sets that a text such as `a`, `a,b` or `a:2,b` names; where only some have a weight, the others have 1.
 
     What follows a part's last colon is its weight if it is a number, unless a folder has the whole part as its name.
     Windows' `C:/sets/a` has no weight. A ConfigError where a weight is not above 0.

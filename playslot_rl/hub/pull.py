@@ -62,8 +62,7 @@ def pull(repo_id: str, root: Path, *, revision: str | None = None, token: str | 
         revision: branch, tag or commit; None means the tag of LeRobot's format version, or main where there is none.
 
     Raises:
-        HubError: no such repository or revision, a bad token, offline, no network, an error of the Hub, or a data set
-            whose rows, counts or fingerprint differ from what the Hub says.
+        HubError: whatever the Hub says, or a data set that differs from what it lists.
         DataError: it is no LeRobot data set, or of another format version.
         OutputError: `root` holds something, another pull into it is running, or the disk is full.
     """
@@ -192,11 +191,8 @@ def _finish(partial: Path, root: Path, result: PullResult, endpoint: str) -> Non
 
 
 def pull_policy(repo_id: str, revision: str = "", cache: str | Path = "", token: str | None = None) -> Path:
-    """Download a policy, unless that commit of it is in the cache, and return the model folder.
-
-    Raises:
-        CheckpointError: the repository holds no policy.
-        HubError: no such repository or revision, a bad token, offline, no network, damaged files, an error of the Hub.
+    """Download a policy, unless that commit of it is in the cache, and return the model folder. A CheckpointError where
+    the repository holds none, a HubError for whatever the Hub says.
     """
     from playslot_rl.sharing.folder import CONFIG, FILES, RANGE, WEIGHTS
 

@@ -126,16 +126,13 @@ def push(
     root: Path, repo_id: str, *, private: bool, branch: str | None = None, tag: str | None = None,
     token: str | None = None,
 ) -> PushResult:  # fmt: skip
-    """Upload a LeRobot data set. An interrupted push changes nothing there; the same command carries on.
+    """Upload a LeRobot data set. An interrupted push changes nothing there; the same command carries on. A DataError
+    where it is not whole, a HubError for whatever the Hub says.
 
     Args:
         branch: made from main if it is not there; None means main. The version tag moves with main only.
         tag: one more tag for the commit; never moved.
         token: None takes HF_TOKEN or what `hf auth login` stored.
-
-    Raises:
-        DataError: the data set is not whole.
-        HubError: bad names, no or bad token, offline, no network, an error of the Hub, or a tag that is taken.
     """
     root = Path(root).expanduser()
     result = verify(root)  # all of it: others will build on the data set

@@ -166,11 +166,8 @@ def _limit_silence() -> None:
 def open_repository(
     repo_id: str, root: Path, *, token: str | None, writing: bool, revision: str = "", kind: Kind = "dataset"
 ) -> Iterator[Repository]:
-    """Talk to the Hub about one data set or model; without a token by HF_TOKEN or what `hf auth login` stored.
-
-    Raises:
-        HubError: a bad name, offline mode, no token, or anything that goes wrong inside, in one line without tokens.
-        PlaySlotError: another error from inside, its message without tokens.
+    """Talk to the Hub about one data set or model; without a token by HF_TOKEN or what `hf auth login` stored. Whatever
+    goes wrong inside is a HubError, or an error of ours, in one line without tokens.
     """
     from huggingface_hub import HfApi, constants, errors, get_token, is_offline_mode
 

@@ -14,11 +14,8 @@ KINDS: Final = ("cpu", "cuda", "mps", "xpu")
 
 
 def named_device(name: str | torch.device = "") -> torch.device:
-    """The device of a name such as `cuda:1`, which need not be there (`probed`); empty means a GPU if there is one.
-
-    Raises:
-        TypeError: no text.
-        ConfigError: no such kind of device, or one that computes nothing.
+    """The device of a name such as `cuda:1`, which need not be there (`probed`); empty means a GPU if there is one. A
+    TypeError for no text, a ConfigError for no such kind of device, or one that computes nothing.
 
     Examples:
         >>> named_device("cuda:1").index

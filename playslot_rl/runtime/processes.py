@@ -78,13 +78,8 @@ def free_port() -> int:
 def start(device: str = "") -> None:
     """Meet the other processes. From then on only the first one prints to standard output.
 
-    Args:
-        device: `cpu` keeps off a GPU that there is, as the key of the same name; else each process of a machine has a
-            GPU of its own, where there are some.
-
-    Raises:
-        ConfigError: this machine has fewer GPUs than processes.
-        RuntimeError: they cannot be reached.
+    Each process of a machine has a GPU of its own, where there are some and `device` is not `cpu`; a ConfigError where
+    there are fewer.
     """
     global _here
     if launched().world == 1:

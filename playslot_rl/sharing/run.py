@@ -129,12 +129,9 @@ def _result(info: dict[str, Any]) -> Result:
 def export_run(
     run: Run, folder: Path, config: ExperimentConfig, source: dict[str, Any] | None = None
 ) -> SharedPolicyConfig:
-    """Write the policy of a run to a new folder. `source` is `read_source(run)`, if it has been read.
-
-    Raises:
-        CheckpointError: no policy, or damaged checkpoints.
-        ConfigError: the policy was trained on several cameras, and `data.camera` does not choose one.
-        OutputError: `folder` exists, or cannot be written.
+    """Write the policy of a run to a new folder. `source` is `read_source(run)`, if it has been read. A ConfigError
+    where the policy was trained on several cameras and `data.camera` does not choose one; an OutputError where the
+    folder exists.
     """
     source = source or read_source(run)
     roots = data_roots(",".join(text for text in (config.data.root, config.data.demos) if text))

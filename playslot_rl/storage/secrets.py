@@ -18,10 +18,8 @@ _CHARACTERS = re.compile(r"[A-Za-z0-9._~+/=-]+")
 
 
 def checked_token(token: str | None) -> str | None:
-    """A token as it can be sent: stripped, and of characters that stand for themselves in every message.
-
-    Raises:
-        HubError: it has spaces, line breaks or other characters inside; a library would print it in its complaint.
+    """A token as it can be sent: stripped, and of characters that stand for themselves in every message; a HubError for
+    others inside: a library would print it in its complaint.
     """
     token = (token or "").strip()
     if token and not _CHARACTERS.fullmatch(token):

@@ -30,7 +30,6 @@ class PlaySlotEnv(EnvConfig):
         episode_length: longest episode in agent steps; None takes the task's own.
         frame_skip: environment steps of an agent step; None takes the task's own. A policy that was trained on one
             frame in three acts at a third of the rate: three times as many.
-        image_size: side of the square frames.
         quality: `fast` or `full`, as `render.quality` of the commands.
     """
 
