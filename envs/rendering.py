@@ -174,7 +174,7 @@ class FrameRenderer:
         return box_mean(frame, self._factor)
 
     def parts(self, data: mujoco.MjData) -> npt.NDArray[np.int32]:
-        """Part of the model at the centre of each pixel: int32 (H, W, 2), its number and `mjtObj` type; -1 where none."""
+        """The part at the centre of each pixel: int32 (H, W, 2), its number and `mjtObj` type; -1 where none."""
         self._renderer.enable_segmentation_rendering()
         try:
             self._renderer.update_scene(data, self._camera)
