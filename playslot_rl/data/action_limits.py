@@ -59,10 +59,6 @@ class ActionLimits:
 
         known.take(torch.from_numpy(self.low), torch.from_numpy(self.high))
 
-    def said(self) -> str:
-        """Names and ends, for people."""
-        return said(self.plain())
-
     def plain(self) -> dict[str, Any]:
         """Plain values, for checkpoints and policies."""
         outliers = [name for name, cut in zip(self.names, self.quantiles, strict=True) if cut]
@@ -76,7 +72,7 @@ class ActionLimits:
             outside = 100 * float(np.mean((actions[:, i] < self.low[i]) | (actions[:, i] > self.high[i])))
             seen = f"{self.smallest[i]:.6g}..{self.largest[i]:.6g}"
             cut.append(f"{self.names[i]} by quantiles (all: {seen}), {outside:.2g} % of its values clipped")
-        return "; ".join([f"actions: {self.said()}", *cut])
+        return "; ".join([f"actions: {said(self.plain())}", *cut])
 
 
 def said(plain: dict[str, Any] | None) -> str:

@@ -21,7 +21,7 @@ from playslot_rl.datasets.assemble import Choice, assemble
 from playslot_rl.datasets.fingerprint import CameraScan, scan_frames
 from playslot_rl.datasets.statistics import differing
 from playslot_rl.datasets.verify import LOOSE_CAMERA, Verification, episode_statistics, verify
-from playslot_rl.datasets.video_copy import frame_count
+from playslot_rl.datasets.video_copy import frame_count, video_place
 from playslot_rl.errors import DataError, OutputError
 from playslot_rl.storage.atomic import explain_write_errors, fsync_folder
 from playslot_rl.storage.folders import held, new_folder, require_free
@@ -205,12 +205,8 @@ def _stale_files(contents: Contents) -> set[int]:
     """Data files that no episode names although all of their episodes have metadata that name others."""
     named = {contents.data_file(episode.row) for episode in contents.episodes}
     known = {episode.index for episode in contents.episodes}
-    stale = set()
-    for number, path in enumerate(contents.data_files):
-        indices = {span.index for span in contents.spans if span.file == number}
-        if path not in named and indices <= known:
-            stale.add(number)
-    return stale
+    held = [{span.index for span in contents.spans if span.file == n} for n in range(len(contents.data_files))]
+    return {n for n, path in enumerate(contents.data_files) if path not in named and held[n] <= known}
 
 
 def _locate_videos(contents: Contents, spans: list[Span], known: Mapping[int, Episode]) -> dict[int, Episode]:
@@ -264,9 +260,5 @@ def _next_place(
         number, frame = number + 1, 0
     if number >= len(files) or frame + length > files[number][2]:
         return {}
-    return {
-        f"videos/{camera}/chunk_index": files[number][0],
-        f"videos/{camera}/file_index": files[number][1],
-        f"videos/{camera}/from_timestamp": frame / contents.fps,
-        f"videos/{camera}/to_timestamp": (frame + length) / contents.fps,
-    }
+    begin, end = frame / contents.fps, (frame + length) / contents.fps
+    return video_place(camera, *files[number][:2], begin, end)

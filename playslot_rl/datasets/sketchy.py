@@ -187,14 +187,11 @@ def _write(root: Path, episodes: Sequence[SketchyEpisode], cameras: Sequence[str
     again = LeRobotDataset(name, root=root, video_backend="pyav")
     if (again.num_episodes, len(again)) != (len(episodes), sum(lengths)):
         raise OutputError(f"{root}: got {len(again)} frames, expected {sum(lengths)}; run the same command again")
-    record = {
-        "cameras": list(cameras),
-        "episodes": [
-            {"id": episode.identity, "file": episode.path.name, "task": episode.task, "length": length}
-            for episode, length in zip(episodes, lengths, strict=True)
-        ],
-    }
-    write_json(root / META_NAME, record)
+    records = [
+        {"id": episode.identity, "file": episode.path.name, "task": episode.task, "length": length}
+        for episode, length in zip(episodes, lengths, strict=True)
+    ]
+    write_json(root / META_NAME, {"cameras": list(cameras), "episodes": records})
 
 
 def convert_sketchy(

@@ -79,8 +79,5 @@ def draw(episodes: int, fractions: Mapping[str, float], seed: int) -> dict[str, 
             "episode in each part; use a larger share"
         )
     order = np.random.default_rng(seed).permutation(episodes)
-    parts, begin = {}, 0
-    for name, size in sizes.items():
-        parts[name] = sorted(int(i) for i in order[begin : begin + size])
-        begin += size
-    return parts
+    parts = np.split(order, np.cumsum(list(sizes.values()))[:-1])
+    return {name: sorted(part.tolist()) for name, part in zip(sizes, parts, strict=True)}

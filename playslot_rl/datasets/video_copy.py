@@ -22,6 +22,12 @@ from playslot_rl.data.metadata import VIDEO_PATH
 from playslot_rl.errors import DataError
 
 
+def video_place(camera: str, chunk: int, file: int, begin: float, end: float) -> dict[str, Any]:
+    """Where an episode's video lies, seconds, as in `meta/episodes`."""
+    values = {"chunk_index": chunk, "file_index": file, "from_timestamp": begin, "to_timestamp": end}
+    return {f"videos/{camera}/{name}": value for name, value in values.items()}
+
+
 class VideoCopier:
     """Writes the files of one camera of a new data set; after `limit` bytes the next one begins."""
 
@@ -131,12 +137,7 @@ class VideoCopier:
 
     def _place(self, start: float, length: int, number: int | None = None) -> dict[str, Any]:
         chunk, file = divmod(self._number if number is None else number, self.files)
-        return {
-            f"videos/{self.camera}/chunk_index": chunk,
-            f"videos/{self.camera}/file_index": file,
-            f"videos/{self.camera}/from_timestamp": start,
-            f"videos/{self.camera}/to_timestamp": start + length / self.fps,
-        }
+        return video_place(self.camera, chunk, file, start, start + length / self.fps)
 
 
 class _Source:
