@@ -22,12 +22,7 @@ if TYPE_CHECKING:
 
 
 def tiny_savi(seed: int = 0, **changes: object) -> SAVi:
-    """SAVi for frames of 32x32: N 3 slots of D 16, seeded weights, and `changes` of fields of `SAViConfig`.
-
-    Examples:
-        >>> tiny_savi(n_slots=2).config.n_slots
-        2
-    """
+    """SAVi for frames of 32x32: N 3 slots of D 16, seeded weights, and `changes` of fields of `SAViConfig`."""
     import torch
 
     from playslot_rl.modules.savi import SAVi
@@ -56,10 +51,6 @@ def tiny_config(
 ) -> ExperimentConfig:
     """Frames of 64x64, N 4 slots of D 32, Z 8, K 5, networks of one or two layers of 32; with `multi` one latent action
     per slot (InvDyn_M), not one per step (InvDyn_S).
-
-    Examples:
-        >>> tiny_config().model.savi.slot_dim
-        32
     """
     savi = SAViConfig(
         slot_dim=32,

@@ -13,7 +13,7 @@ from playslot_rl.config import EnvConfig, ExperimentConfig, plugins
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import CheckpointError
-from playslot_rl.recipes import objects, slots
+from playslot_rl.recipes import objects
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import require_task, run_of_pretrained, run_to_read
 from playslot_rl.runtime.devices import open_device
@@ -37,7 +37,7 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
         objects.main(config, run)
         return
     if config.protocol == "slots":
-        slots.main(config, run)
+        objects.score_slots(config, run)
         return
     from playslot_rl.acting.episodes import TaskPool
     from playslot_rl.evaluation.success import evaluate_run, run_facts

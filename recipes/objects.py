@@ -1,10 +1,12 @@
-"""What `playslot evaluate` does where nothing can be acted on (GridShapes): slots against known objects and moves.
+"""What `playslot evaluate` does where nothing can be acted on (GridShapes), slots against known objects and moves, and
+by `protocol=slots`: slots against the simulator's own segmentation.
 
-Writes `RUN/evaluation/objects/eval_info.json` and renews `RUN/report.md` and `RUN/report.html`.
+Writes `RUN/evaluation/objects/eval_info.json`, or `slots/` beside it, and renews `RUN/report.md` and `RUN/report.html`.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,3 +62,29 @@ def describe(result: dict[str, Any], run: Path) -> str:
             f"{probe['test_clips']} held-out clips (most frequent move {100 * probe['majority']:.0f} %)"
         )
     return "\n".join([*lines, f"{result['episodes']} clips, {result['wall_seconds']:.0f} s; written to {run / RESULT}"])
+
+
+def score_slots(config: ExperimentConfig, run: Run) -> None:
+    """Score the slots of `run` on the scripted expert's episodes and print the result."""
+    from playslot_rl.evaluation.objects import SLOTS_RESULT, evaluate_slots
+
+    result = evaluate_slots(run, run.folder, config, open_device(config.device, config.threads))
+    print(
+        f"{'slots':>22}: FG-ARI {result['foreground_ari']:.2f}, ARI {result['ari']:.2f}, "
+        f"{result['slots_per_object']:.1f} slots an object, reconstruction {result['psnr']:.1f} dB\n"
+        f"{result['episodes']} episodes of the expert, {result['wall_seconds']:.0f} s; written to "
+        f"{run.folder / SLOTS_RESULT}",
+        flush=True,
+    )
+
+
+def score_slots_if_needed(config: ExperimentConfig, run: Run) -> None:
+    """As `score_slots` with the default number of episodes, unless these slots were scored with this seed before."""
+    from playslot_rl.evaluation.objects import SLOTS_RESULT
+
+    facts = {"seed": config.seed, "fingerprints": {"slots": run.stage("slots").fingerprint}}
+    stored = run.result(SLOTS_RESULT, facts)
+    if stored is not None:
+        print(f"slots: scored before, FG-ARI {stored['foreground_ari']:.2f}, skipped", flush=True)
+        return
+    score_slots(replace(config, episodes=None), run)

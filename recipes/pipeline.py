@@ -8,7 +8,7 @@ from pathlib import Path
 
 from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.envs import PROCEDURAL, gym_id
-from playslot_rl.recipes import evaluate, inspect, slots, train_dynamics, train_policy, train_slots
+from playslot_rl.recipes import evaluate, inspect, objects, train_dynamics, train_policy, train_slots
 from playslot_rl.runs.opening import run_to_write
 
 
@@ -35,7 +35,7 @@ def main(config: ExperimentConfig) -> None:
         print(f"{stage.__name__.rsplit('.', 1)[-1]}: {time.monotonic() - since:.0f} s", flush=True)
     inspect.main_if_needed(replace(config, run=name, out="", episodes=None))
     if behaves:
-        slots.main_if_needed(config, run_to_write(config))
+        objects.score_slots_if_needed(config, run_to_write(config))
     evaluate.main_if_needed(replace(config, run=name, out=""))
     print(f"pipeline: {time.monotonic() - began:.0f} s, report {folder / 'report.html'}", flush=True)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from playslot_rl.config.compose import compose
-from playslot_rl.recipes import evaluate, slots
+from playslot_rl.recipes import evaluate, objects
 from playslot_rl.runs import Run
 from playslot_rl.runtime.devices import open_device
 
@@ -24,5 +24,5 @@ def test_slots_are_scored_once(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "FG-ARI 0." in capsys.readouterr().out
     stored = json.loads((tmp_path / "evaluation" / "slots" / "eval_info.json").read_text())
     assert (stored["protocol"], stored["episodes"], len(stored["seeds"])) == ("slots", 2, 2)
-    slots.main_if_needed(config, Run(tmp_path))
+    objects.score_slots_if_needed(config, Run(tmp_path))
     assert f"scored before, FG-ARI {stored['foreground_ari']:.2f}, skipped" in capsys.readouterr().out
