@@ -74,11 +74,7 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
     """
     for argument in overrides:
         require_plain(argument.partition("=")[0].strip().lstrip("+"), argument)
-    if command in COMPARISONS:
-        overrides = _compare_keys(overrides, command)
-    elif command in NAMES:
-        overrides = _named_keys(overrides, command)
-    pairs = _parse(overrides)
+    pairs = _parse(_short_keys(overrides, command))
     for group in GROUPS:
         if group in pairs:
             _check_choice(group, pairs[group])
@@ -141,47 +137,32 @@ def _method_names(key: str, value: str) -> str:
     return f"[{names}]" if text.startswith("[") else names
 
 
-def _compare_keys(overrides: Sequence[str], command: str) -> list[str]:
-    """The short keys of a comparison as those of its group in the config: `demos=10,50` as `compare.demos=[10,50]`,
-    `hydra.launcher=joblib` as `compare.launcher=joblib`; other `hydra.` keys are gathered, as they are, in
-    `compare.hydra`.
+def _short_keys(overrides: Sequence[str], command: str) -> list[str]:
+    """The short keys of a command as those of its group in the config: `demos=10,50` as `compare.demos=[10,50]`,
+    `planner=all` as `plan.planner=[cem,...]`, `hydra.launcher=joblib` as `compare.launcher=joblib`; other `hydra.` keys
+    of a comparison are gathered, as they are, in `compare.hydra`.
     """
     kept, hydra = [], []
-    group, lists = command.replace("-", "_"), COMPARISONS[command]
+    group, lists, named = command.replace("-", "_"), COMPARISONS.get(command, ()), NAMES.get(command, {})
     for argument in overrides:
         key, equals, value = argument.partition("=")
         name = key.strip().lstrip("+")
-        if equals and name in lists:
-            inside = _unquote(value.strip()).removeprefix("[").removesuffix("]")
-            if name in ("vary", "processes"):  # one value, no list
-                kept.append(f"{group}.{name}={inside}")
-                continue
+        own, inside = name.removeprefix(f"{group}."), _unquote(value.strip()).removeprefix("[").removesuffix("]")
+        if equals and own in named:
+            kept.append(f"{group}.{own}=[{','.join(named[own]) if inside == 'all' else inside}]")
+        elif equals and name in lists:
             if name == "values":  # of whatever kind the setting is: text until then
                 inside = ",".join(quoted(_unquote(part.strip())) for part in inside.split(",") if part.strip())
-            kept.append(f"{group}.{name}=[{inside}]")
-        elif equals and name == "hydra.launcher":
+            kept.append(f"{group}.{name}={inside if name in ('vary', 'processes') else f'[{inside}]'}")
+        elif equals and lists and name == "hydra.launcher":
             kept.append(f"{group}.launcher={value}")
-        elif equals and name.startswith("hydra."):
+        elif equals and lists and name.startswith("hydra."):
             hydra.append(argument.strip())
         else:
             kept.append(argument)
     require_once([argument.partition("=")[0].strip().lstrip("+") for argument in hydra])
     inside = ",".join(quoted(argument) for argument in hydra)
     return [*kept, f"{group}.hydra=[{inside}]"] if hydra else kept
-
-
-def _named_keys(overrides: Sequence[str], command: str) -> list[str]:
-    """`planner=cem,mppi` as `plan.planner=[cem,mppi]`, and `all` as all there are."""
-    kept = []
-    for argument in overrides:
-        key, equals, value = argument.partition("=")
-        name = key.strip().removeprefix("+").removeprefix(f"{command}.")
-        if equals and name in NAMES[command]:
-            inside = _unquote(value.strip()).removeprefix("[").removesuffix("]")
-            inside = ",".join(NAMES[command][name]) if inside == "all" else inside
-            argument = f"{command}.{name}=[{inside}]"
-        kept.append(argument)
-    return kept
 
 
 def quoted(text: str) -> str:
