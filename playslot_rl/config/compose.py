@@ -317,3 +317,31 @@ def _merge(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
         else:
             merged[key] = value
     return merged
+
+
+def spelled(config: ExperimentConfig, command: str) -> list[str]:
+    """The way back from `compose`: arguments with which `playslot COMMAND`, no comparison, gets exactly this config; a
+    ConfigError where none do: `run` is of another preset or task, and the command takes its config.
+    """
+    continues = command in CONTINUES and config.run != "" and not is_pretrained(config.run)
+    base = [] if continues else [f"env={config.env.name}", f"preset={config.preset}"]
+    base += [f"{key}={value}" for key, value in (("run", config.run), ("out", config.out)) if value]
+    known, wanted = flatten(to_dict(compose(base, command))), flatten(to_dict(config))
+    changed = [f"{key}={_text(value)}" for key, value in wanted.items() if known.get(key) != value]
+    arguments = [*base, *(word for word in changed if not word.startswith(("preset=", "env.name=")))]
+    if compose(arguments, command) != config:
+        raise ConfigError(
+            f"run={config.run}: got a run of another preset or task than {config.preset}, {config.env.name}, expected "
+            f"the same with processes above 1 ({command} goes on from its config): use processes=1"
+        )
+    return arguments
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return "[" + ",".join(quoted(part) if isinstance(part, str) else _text(part) for part in value) + "]"
+    return str(value)

@@ -22,8 +22,8 @@ from typing import IO, Final, Literal
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compare import LAUNCHERS
+from playslot_rl.config.compose import spelled
 from playslot_rl.config.plain import from_dict
-from playslot_rl.config.spelling import spelled
 from playslot_rl.errors import ConfigError, OutputError, PlaySlotError
 from playslot_rl.runtime.processes import end_with_parent
 from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing, write_json

@@ -14,9 +14,8 @@ from pathlib import Path
 import pytest
 
 from playslot_rl.config import CompareConfig, ExperimentConfig, to_dict
-from playslot_rl.config.compose import compose
+from playslot_rl.config.compose import compose, spelled
 from playslot_rl.config.methods import METHODS
-from playslot_rl.config.spelling import spelled
 from playslot_rl.errors import ConfigError, PlaySlotError
 from playslot_rl.studies import launch
 from playslot_rl.studies.launch import train_on_several, training_command
