@@ -22,9 +22,7 @@ from playslot_rl.world_model import Agent, action_decoder_module, latent_policy_
 
 
 def playslot_actor(agent: Agent) -> SlotActor:
-    """Observe, parse with SAVi's recurrent state, choose a latent action, decode it (paper, section "Learning
-    behaviours").
-    """
+    """Parse with SAVi's recurrent state, choose a latent action, decode it (paper, section "Learning behaviours")."""
     heads = (latent_policy_module(agent.policy), action_decoder_module(agent.action_decoder))
     return SlotActor(agent.world_model.savi, *heads)
 
@@ -37,8 +35,8 @@ def oracle_actor(agent: Agent) -> SlotActor:
 
 
 class Imagination(NamedTuple):
-    """An imagined rollout: slots (E, T + 1, N, D), the first given or parsed; the policy's latents (E, T, Z); and
-    decoded actions (E, T, A) in [-1, 1].
+    """An imagined rollout: slots (E, T + 1, N, D), the policy's latents (E, T, Z), decoded actions (E, T, A) in [-1,
+    1].
     """
 
     slots: Tensor

@@ -236,9 +236,7 @@ class ImaginationSession:
 
     @property
     def state(self) -> TensorDictBase:
-        """A copy of where the session stands, batch size [B]: SLOTS, the histories and their length; a ValueError
-        before `reset`.
-        """
+        """A copy of where the session stands, batch size [B]: SLOTS, the histories and their length."""
         return self._present().clone()
 
     def _present(self) -> TensorDictBase:

@@ -82,9 +82,7 @@ def make_card(
 
 
 def require_motion(source: EpisodeFrames, tested: Any) -> None:
-    """Refuse videos in which nothing moves, by a DataError: no pixel of a tested episode changes by `MOVING` between
-    frames that follow each other.
-    """
+    """A DataError where no pixel of a tested episode changes by `MOVING` between frames that follow each other."""
     largest = 0
     for start, length in zip(source.starts[tested], source.lengths[tested], strict=True):
         frames = np.asarray(source.frames[start : start + length]).astype(np.int16)

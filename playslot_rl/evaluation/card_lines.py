@@ -261,9 +261,7 @@ def concluded(result: Mapping[str, Any]) -> Conclusion:
 
 
 def conclude(lines: Sequence[Mapping[str, Any]], code_counts: Sequence[int] = ()) -> Conclusion:
-    """The verdict on a world model, from settled lines as plain values (`Line.plain`), and how many transitions each
-    prototype has; empty without prototypes.
-    """
+    """The verdict, from settled lines as plain values (`Line.plain`), and how many transitions each prototype has."""
     values = {str(one["key"]): one["value"] for one in lines}
     notes = {str(one["key"]): str(one["note"]) for one in lines}
     if NO_NUMBERS in notes.values():

@@ -86,8 +86,8 @@ def agreement(one: Floats, other: Floats) -> float | None:
 
 
 def same_mover(one: Floats, other: Floats) -> float | None:
-    """Share of the windows in which the same slot moves most in both (W, N, 2), of those in which one moves by `MOVES`
-    pixels in `one`; None if none does.
+    """Share of the windows (W, N, 2) in which one slot moves most in both, of those in which one moves by `MOVES` in
+    `one`.
     """
     a, b = np.linalg.norm(one, axis=-1), np.linalg.norm(other, axis=-1)
     moving = a.max(1) >= MOVES

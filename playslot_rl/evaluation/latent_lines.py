@@ -55,8 +55,8 @@ class ParsedEpisodes:
     actions: Floats | None
 
     def windows(self, frames: int, most: int) -> tuple[Ints, Ints, Ints]:
-        """At most so many windows of the tested episodes: rows of `slots` and of the source's frames, each (W, frames),
-        and the episode of each (W,).
+        """At most so many windows of the tested episodes: rows of `slots` and of the source's frames, and the episode
+        (W,).
         """
         rows = spread_windows(self.starts, self.source.lengths, frames, most, np.flatnonzero(self.tested_episodes))
         of = np.searchsorted(self.starts, rows[:, 0], side="right") - 1
@@ -90,9 +90,7 @@ def usage_lines(model: WorldModel, parsed: ParsedEpisodes) -> tuple[list[Line], 
 
 
 def action_lines(model: WorldModel, parsed: ParsedEpisodes, seed: int) -> tuple[list[Line], dict[str, Any]]:
-    """Probes of the real action with their controls; all `not measured` where that cannot be. The `seed` is that of the
-    wrong pairs and of the camera noise.
-    """
+    """Probes of the real action with their controls; all `not measured` where that cannot be."""
     missing = ""
     if not model.inverse_dynamics.latent_dim:
         missing = NO_LATENTS

@@ -175,8 +175,8 @@ def codebook_usage(codes: Ints, n_prototypes: int) -> dict[str, Any]:
 
 
 def code_table(codes: Ints, actions: Floats, n_prototypes: int) -> list[dict[str, Any]]:
-    """Of codes (M,) and real actions (M, A), K rows: `code`, `count`, and `mean` (A) and `std` (A) of the action, None
-    for a code that was never chosen.
+    """A row for each prototype: `code`, `count`, and `mean` (A) and `std` (A) of the real actions (M, A), if it was
+    chosen.
     """
     rows: list[dict[str, Any]] = []
     for code in range(n_prototypes):

@@ -61,8 +61,8 @@ class RunFacts:
 
 
 def run_facts(run: Path, method: str = "playslot") -> RunFacts:
-    """Read `RUN/STAGE/checkpoint/meta.json` of a method's stage; a CheckpointError where there is no trained policy, or
-    the file cannot be read.
+    """Read the meta file of a method's stage; a CheckpointError where there is no trained policy,
+    or it cannot be read.
     """
     stage = method_stage(method)
     path = run / stage / "checkpoint" / "meta.json"
@@ -145,9 +145,7 @@ def measure(
     pool: TaskPool | None = None,
     oracle: Actor | None = None,
 ) -> dict[str, Any]:
-    """Measure any actor in evaluation mode, as `evaluate` does; without an `oracle` the slot
-    oracle's values are null.
-    """
+    """Measure any actor in evaluation mode, as `evaluate` does; null values of the slot oracle without an `oracle`."""
     seeds = held_out_seeds(config, seed, episodes, run)
     begin = time.perf_counter()
     with TaskPool(config.env, config.render) if pool is None else contextlib.nullcontext(pool) as used:

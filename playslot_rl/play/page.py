@@ -43,7 +43,7 @@ class PlayPage:
         self.pressed: int | None = None  # the prototype that is held, or that free play goes on with
         self.free, self.variability, self.fps = False, 0.0, studio.fps
         self.donor = 0
-        self._due = self._moved = 0.0
+        self._due = 0.0
         self._lock = asyncio.Lock()
         self.controls = Controls(self)
 
@@ -74,9 +74,8 @@ class PlayPage:
             with ui.element("figure") as self.true_column:
                 self.true = ui.interactive_image(size=(side, side)).classes("pixels")
                 self.true_title = ui.label("").classes("soft").mark("beside")
-        ui.switch("Colour the slots", on_change=lambda: self.work(lambda: None)).props("dense").mark(
-            "masks"
-        ).bind_value(self, "masks")
+        masks = ui.switch("Colour the slots", on_change=lambda: self.work(lambda: None)).props("dense")
+        masks.mark("masks").bind_value(self, "masks")
         width = n * side + (n - 1) * GAP
         self.strip = ui.interactive_image(size=(width, side), on_mouse=self._on_strip, events=["mousedown"])
         self.strip.classes("pixels").mark("strip")

@@ -36,8 +36,8 @@ CURVE: Final = (400, 96)
 
 
 class Gallery:
-    """The newest pictures of one page, served to its browser; a slow browser skips some. `open` are those of all open
-    pages, by their key.
+    """The newest pictures of one page, served to its browser, which may skip some; `open` are those
+    of all open pages.
     """
 
     open: ClassVar[dict[str, Gallery]] = {}
@@ -141,9 +141,7 @@ def session_animation(path: Sequence[SceneMoment], fps: float) -> bytes:
 
 
 def error_curve(errors: Sequence[float | None], at: int) -> str:
-    """The error over the steps as an SVG: root mean squared differences of [0, 1], None leaving a gap; `at` is the
-    present one.
-    """
+    """The error over the steps as an SVG: RMS differences of [0, 1], None leaving a gap; `at` is the present one."""
     width, height = CURVE
     left, bottom, top = 34, height - 18, 8
     known = [error for error in errors if error is not None]

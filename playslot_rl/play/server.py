@@ -84,9 +84,7 @@ TRIED: Final = 20
 
 
 def choose_port(port: int) -> int:
-    """The port to listen on; 0 takes the first free one from 8080 on. A ConfigError where it is
-    taken, or not allowed.
-    """
+    """The port to listen on, 0: the first free one from 8080 on; a ConfigError where it is taken, or not allowed."""
     candidates = [port] if port else list(range(DEFAULT_PORT, DEFAULT_PORT + TRIED))
     reason = ""
     for candidate in candidates:
@@ -124,9 +122,7 @@ async def missing(request: Request, error: Exception) -> PlainTextResponse:  # n
 
 
 def serve(studio: Studio, gate: Gate, show: bool) -> None:
-    """Serve the page until Ctrl-C; what is being recorded is finished, and the studio closed. A ConfigError where
-    another program has just taken the port.
-    """
+    """Serve the page until Ctrl-C, then finish what is recorded; a ConfigError where the port has just been taken."""
     ui.page("/")(Pages(studio).show)
     serve_pictures()
     app.add_exception_handler(404, missing)

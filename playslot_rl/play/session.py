@@ -140,21 +140,25 @@ class PlaySession:
         """One imagined step by a latent ([N,] Z), and the decoded action in the simulator where there is one. A
         ValueError for another shape, or where the timeline is full.
         """
-        now = self.now
         if self.timeline.full:
             raise ValueError("step: got a full timeline, expected room: record it and start anew")
         if latent.shape != self.world_model.latent_shape:
             raise ValueError(f"step: got a latent of {tuple(latent.shape)}, expected {self.world_model.latent_shape}")
-        rows = list(now.present)
-        self._imagination.restore(now.state)
-        after = self._imagination.step((latent[rows] if self.per_slot else latent)[None])
-        held = [row for row, number in enumerate(rows) if number in now.frozen]
-        if held:
-            after[:, held] = now.state[keys.SLOTS][:, held]
-            self._imagination.put(after)
+        self._imagination.restore(self.now.state)
+        self._advance(self._imagination, latent[None])
         action, true = self._act(latent)
         code = self.world_model.inverse_dynamics.quantizer(latent)[1]
         return self._land(label, latent=latent.clone(), code=code.clone(), action=action, true=true)
+
+    def _advance(self, imagination: ImaginationSession, latents: Tensor) -> Tensor:
+        """One step from the present slots by latents (B, [N,] Z), in which the frozen ones stay: slots (B, n, D)."""
+        now, rows = self.now, list(self.now.present)
+        after = imagination.step(latents[:, rows] if self.per_slot else latents)
+        held = [row for row, number in enumerate(rows) if number in now.frozen]
+        if held:
+            after[:, held] = now.state[keys.SLOTS][:, held]
+            imagination.put(after)
+        return after
 
     def _act(self, latent: Tensor) -> tuple[npt.NDArray[np.float32] | None, Frame | None]:
         """The decoded action, and what the simulator shows after it. As in imagination the latent is decoded alone: a
@@ -267,14 +271,8 @@ class PlaySession:
         ahead = ImaginationSession(self.world_model)
         ahead.restore(now.state)
         ahead.branch(k)
-        rows = list(now.present)
         latents = torch.stack([self.latent(number, variability, slot) for number in numbers])
-        held = [row for row, number in enumerate(rows) if number in now.frozen]
         frames = [np.broadcast_to(now.frame, (k, *now.frame.shape))]
         for _ in range(steps):
-            after = ahead.step(latents[:, rows] if self.per_slot else latents)
-            if held:
-                after[:, held] = now.state[keys.SLOTS][:, held]
-                ahead.put(after)
-            frames.append(to_uint8(self.world_model.savi.decode(after).frames))
+            frames.append(to_uint8(self.world_model.savi.decode(self._advance(ahead, latents)).frames))
         return np.stack(frames, 1)

@@ -99,8 +99,8 @@ class Twin:
         return self._task.reset(seed=seed)[0]["pixels"]
 
     def follow(self, actions: Sequence[Action]) -> Frame:
-        """Bring the simulator to where these actions (A,), clipped to [-1, 1], lead from the start; returns what is
-        seen there, uint8 (H, W, 3), the caller's own.
+        """Bring the simulator to where actions (A,), clipped to [-1, 1], lead from the start: a frame uint8 (H, W, 3)
+        to keep.
         """
         wanted = [*self._lead, *(np.clip(np.asarray(action, np.float32), -1, 1) for action in actions)]
         known = [action.tobytes() for action in wanted]
@@ -169,8 +169,8 @@ def parse_last(model: WorldModel, frames: Frame, seed: int) -> Tensor:
 
 
 class RecordedStarts:
-    """Frames of a data set of the model's frame size; `make_task` makes the simulator of its episodes, `seed` is that
-    of sampled initial slots.
+    """Frames of a data set of the model's frame size; `make_task` makes its simulator, `seed` is of sampled initial
+    slots.
     """
 
     def __init__(

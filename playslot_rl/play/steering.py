@@ -97,9 +97,7 @@ def variability_directions(model: WorldModel, clips: npt.NDArray[np.uint8] | Non
 
 
 def _principal(rows: Tensor) -> Tensor:
-    """First principal direction of rows (M, Z), times their standard deviation along it; its largest number is
-    positive.
-    """
+    """First principal direction of rows (M, Z), one deviation long; its largest number is positive."""
     centred = rows - rows.mean(dim=0)
     _, strength, directions = torch.linalg.svd(centred.double(), full_matrices=False)
     first = directions[0] * strength[0] / max(1, len(rows) - 1) ** 0.5
@@ -143,9 +141,7 @@ class PlannerDriver:
 
     @torch.no_grad()
     def choose(self, session: PlaySession) -> Tensor:
-        """The plan's first latent action (Z,) at the present slots; a ValueError where no goal is marked, or a slot was
-        removed.
-        """
+        """The plan's first latent action (Z,) at the present slots; a ValueError where no goal is marked."""
         if self.goal is None:
             raise ValueError("planner: got no goal, expected a marked moment: go to one and press Goal, then go back")
         slots, model = _whole(session), self.agent.world_model

@@ -87,10 +87,12 @@ class Studio:
     @property
     def sources(self) -> dict[str, str]:
         """Titles of the sources that are there, by name; the first is where a page starts."""
-        recorded = (
-            {"recorded": f"data set ({self.recorded.source.episodes} episodes)"} if self.recorded is not None else {}
-        )
-        return recorded | ({"simulated": "fresh simulator episode"} if self.simulated is not None else {})
+        found = {}
+        if self.recorded is not None:
+            found["recorded"] = f"data set ({self.recorded.source.episodes} episodes)"
+        if self.simulated is not None:
+            found["simulated"] = "fresh simulator episode"
+        return found
 
     def close(self) -> None:
         """End the worker when it has finished what it does."""

@@ -110,7 +110,7 @@ def legend(figure: Figure, theme: Theme, **options: Any) -> None:
 
 
 def success_chart(rows: Sequence[tuple[str, float, tuple[float, float], str]], theme: Theme) -> bytes:
-    """PNG of success rates: rows of a label, rate, 95 % interval (0 to 1), and the method whose
+    """PNG of success rates: rows of label, rate, 95 % interval (0 to 1), and the method whose
     colour it has, or grey.
     """
     figure = new_figure(6.4, 0.6 + 0.42 * len(rows))

@@ -58,9 +58,7 @@ def png(picture: Image.Image) -> bytes:
 
 
 def animation(pictures: list[Image.Image], fps: float = 6.0) -> bytes:
-    """Endless APNG of pictures of one size, whose last one stays a little longer; a ValueError where there are none, or
-    for a rate that is not positive.
-    """
+    """Endless APNG of pictures of one size, whose last one stays a little longer; a ValueError for none, or no rate."""
     if not pictures or fps <= 0:
         raise ValueError(
             f"animation: got {len(pictures)} frames at {fps} fps, expected at least one and a positive rate"

@@ -13,7 +13,7 @@ from playslot_rl.config.compose import compose
 from playslot_rl.envs import make_env
 from playslot_rl.evaluation.held_out import first_seed
 from playslot_rl.evaluation.objects import (
-    RESULT,
+    SLOTS_RESULT,
     evaluate_slots,
     score_slots,
     segmented_episode,
@@ -74,7 +74,7 @@ def test_a_shipped_models_slots_are_scored_and_written(tmp_path: Path) -> None:
     config = compose(["env=block_push_easy", "preset=compact", "episodes=1"])
     assert Run.open("pretrained/block_push_easy").load_savi().config.n_slots == 5
     result = evaluate_slots(Run.open("pretrained/block_push_easy"), tmp_path, config, torch.device("cpu"))
-    assert json.loads((tmp_path / RESULT).read_text()) == result
+    assert json.loads((tmp_path / SLOTS_RESULT).read_text()) == result
     assert result["foreground_ari"] > 0.4
     assert result["psnr"] > 22
 

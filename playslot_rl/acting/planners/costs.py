@@ -86,9 +86,7 @@ class DynamicsDistance:
 
 
 class ImageDistance:
-    """Mean squared difference of decoded frames to the goal image (3, H, W), uint8 [0, 255] or float [0, 1]: dearer,
-    and blind to what is hidden.
-    """
+    """Mean squared difference of decoded frames to the goal image (3, H, W): dearer, and blind to what is hidden."""
 
     def __init__(self, savi: SAVi, goal: Tensor) -> None:
         self.savi, self.goal = savi, normalise(goal)

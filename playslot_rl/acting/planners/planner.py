@@ -70,16 +70,14 @@ class Search:
     def around(
         self, mean: Tensor, std: Tensor | float, count: int, correlation: float, generator: torch.Generator
     ) -> Tensor:
-        """Coordinates (count, H, [N,] Z) drawn round a plan's (H, [N,] Z), inside the bound; the noise of neighbouring
-        steps correlates.
-        """
+        """Coordinates (count, H, [N,] Z) drawn round a plan's (H, [N,] Z), inside the bound, with correlated noise."""
         white = torch.randn(count, *self.shape, generator=generator, device=generator.device)
         return (mean + std * correlated(white, correlation)).clamp(-self.bound, self.bound)
 
 
 class Plan(NamedTuple):
-    """The best latents (H, [N,] Z) of all candidates whose cost was computed, their cost, and the best cost known after
-    each iteration.
+    """The best latents (H, [N,] Z) of all whose cost was computed, their cost, and the best known
+    after each iteration.
     """
 
     latents: Tensor

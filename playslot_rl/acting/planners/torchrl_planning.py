@@ -89,9 +89,7 @@ def planning_env(
 
 
 def planning_start(env: TransformedEnv, slots: Tensor) -> TensorDictBase:
-    """What the planners take: the start from slots (..., N, D), which the transformed environment's own reset would
-    drop.
-    """
+    """The planners' start from slots (..., N, D), which the transformed environment's own reset would drop."""
     start: TensorDictBase = env.base_env.reset(TensorDict({keys.SLOTS: slots}, slots.shape[:-2]))
     return start
 
