@@ -10,11 +10,10 @@ from playslot_rl.config import ExperimentConfig
 
 def main(config: ExperimentConfig) -> None:
     """Run what is missing, reuse what is done, write `OUT/comparison.json`, `.md`, `.png` and `.svg`."""
-    from playslot_rl.recipes.compare_job import commands
     from playslot_rl.runs import Run
     from playslot_rl.studies.study import run_study
     from playslot_rl.studies.success.measure import SuccessMeasure
 
     out = config.out or f"runs/compare_{config.env.name}_{config.preset}"
     run = Run.of(config).name if config.run else ""  # `pretrained` is the task's own
-    run_study(SuccessMeasure(replace(config, out=str(Path(out)), run=run), commands()))
+    run_study(SuccessMeasure(replace(config, out=str(Path(out)), run=run)))

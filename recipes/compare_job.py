@@ -17,7 +17,6 @@ from playslot_rl.errors import explain
 from playslot_rl.studies.launch import Status, job_lock, read_status, write_status
 
 if TYPE_CHECKING:
-    from playslot_rl.studies.launch import Commands
     from playslot_rl.studies.success.measure import SuccessMeasure
     from playslot_rl.studies.video.measure import VideoMeasure
 
@@ -34,7 +33,9 @@ def main(file: Path) -> Status:
         began = time.monotonic()
         write_status(file, Status("running", job["fingerprint"]))
         try:
-            _measure(job).run(job, commands())
+            from playslot_rl.recipes import evaluate
+
+            _measure(job).run(job, evaluate.once)
         except Exception as error:  # noqa: BLE001  whatever a method dies of is its row's business
             failed = Status("failed", job["fingerprint"], explain(error), round(time.monotonic() - began, 1))
             write_status(file, failed)
@@ -53,19 +54,6 @@ def _measure(job: dict[str, Any]) -> type[SuccessMeasure | VideoMeasure]:
     from playslot_rl.studies.success.measure import SuccessMeasure
 
     return SuccessMeasure
-
-
-def commands() -> Commands:
-    """The commands that jobs, and what they share, are made by."""
-    from playslot_rl.recipes import evaluate, train_baseline, train_dynamics, train_slots
-
-    return {
-        "train-slots": train_slots.main,
-        "train-dynamics": train_dynamics.main,
-        "train-baseline": train_baseline.main,
-        "train-videos": train_baseline.train_videos,
-        "evaluate": evaluate.once,
-    }
 
 
 if __name__ == "__main__":

@@ -12,20 +12,13 @@ def main(config: ExperimentConfig) -> None:
 
     With `objects=` this is done for each number of them, in `OUT/objects_N`, and `OUT` gets the table of all.
     """
-    from playslot_rl.studies.video.measure import each_number
-
-    config = replace(config, out=config.out or f"runs/video_{config.env.name}_{config.preset}")
-    if config.compare_video.objects:
-        each_number(config, compare)
-    else:
-        compare(config)
-
-
-def compare(config: ExperimentConfig) -> None:
-    from playslot_rl.recipes.compare_job import commands
     from playslot_rl.runs import Run
     from playslot_rl.studies.study import run_study
-    from playslot_rl.studies.video.measure import VideoMeasure
+    from playslot_rl.studies.video.measure import VideoMeasure, each_number
 
     run = Run.of(config).name if config.run else ""  # `pretrained` is the task's own
-    run_study(VideoMeasure(replace(config, run=run), commands()))
+    config = replace(config, out=config.out or f"runs/video_{config.env.name}_{config.preset}", run=run)
+    if config.compare_video.objects:
+        each_number(config)
+    else:
+        run_study(VideoMeasure(config))

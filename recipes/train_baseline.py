@@ -8,7 +8,6 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.methods import METHODS
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import ConfigError
-from playslot_rl.runtime.processes import here
 
 
 def main(config: ExperimentConfig) -> None:
@@ -28,27 +27,6 @@ def main(config: ExperimentConfig) -> None:
     if method.acts:
         gym_id(config.env.name)
     from playslot_rl.methods.training import train
+    from playslot_rl.visualization.charts import draw_curve
 
-    done = train(config)
-    curve = done.path.parent / "curve.json"
-    if curve.is_file() and here().first:
-        _draw_curve(curve, method.name)
-
-
-def _draw_curve(path: Path, name: str) -> None:
-    from playslot_rl.storage.atomic import read_json, write_bytes
-    from playslot_rl.visualization.charts import DARK, LIGHT, learning_chart
-
-    curve = read_json(path)
-    for theme in (LIGHT, DARK):
-        chart = learning_chart({name: curve["rows"]}, curve["random"], theme)
-        write_bytes(path.with_name(f"curve_{theme.name}.png"), chart)
-
-
-def train_videos(config: ExperimentConfig) -> None:
-    """Train the model of unlabelled videos that `config.method` builds on into `out`."""
-    from playslot_rl.methods.training import train_model
-
-    model = METHODS[config.method].model
-    assert model is not None
-    train_model(config, model, Path(config.out))
+    draw_curve(train(config).path.parent, method.name)

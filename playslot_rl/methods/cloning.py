@@ -12,7 +12,7 @@ Shapes: M transitions, Z latent-action width, A action dim.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig, StageConfig
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, labelled_rows, moving_frames
 from playslot_rl.data.source import EpisodeFrames
@@ -125,8 +126,7 @@ class LatentCloning(ABC):
         )
 
     def _seen(self, source: EpisodeFrames, shift: int = 0) -> Seen:
-        moves = moving_frames(source, self.config.behaviour.trim_pixels, self.config.behaviour.trim_margin)
-        frames, actions = demonstrated_frames(source, moves, self.config.env.action_dim, self.device, shift)
+        moves, frames, actions = moving_examples(self.config, source, self.device, shift)
         return Seen(self.observe(frames), self.infer(source, moves), actions, moves.episode)
 
     def _decoded(self, seen: Seen, rows: Tensor) -> tuple[TensorInputs, Tensor]:
@@ -137,6 +137,45 @@ class LatentCloning(ABC):
             self.policy.eval()
             inputs.append(self.chosen(apply_rows(self.policy, seen.inputs, rows)))
         return TensorInputs(torch.cat(inputs)), seen.actions[rows].repeat(len(inputs), 1)
+
+
+def moving_examples(
+    config: ExperimentConfig, source: EpisodeFrames, device: torch.device, shift: int = 0
+) -> tuple[Transitions, FrameInputs, Tensor]:
+    """The transitions in which something moves, the frames before them, and their real actions (M, A) in [-1, 1]."""
+    moves = moving_frames(source, config.behaviour.trim_pixels, config.behaviour.trim_margin)
+    return moves, *demonstrated_frames(source, moves, config.env.action_dim, device, shift)
+
+
+def action_stage(
+    name: str,
+    network: nn.Module,
+    key: str,
+    observe: Callable[[FrameInputs], Inputs],
+    config: ExperimentConfig,
+    demos: DemonstrationSplit,
+    device: torch.device,
+    shift: int,
+    schedule: StageConfig,
+    validated: int,
+) -> RegressionStage:
+    """A network clones the real actions of all demonstrations; it reads what `observe` makes of frames, as `key`."""
+
+    def examples(source: EpisodeFrames, shift: int = 0) -> tuple[Inputs, Tensor]:
+        _, frames, actions = moving_examples(config, source, device, shift)
+        return observe(frames), actions
+
+    criterion = BehaviourLoss(network, config.behaviour.loss)
+    criterion.set_keys(observation=key, action=keys.ACTION)
+    return RegressionStage(
+        name,
+        criterion,
+        *examples(demos.trained, shift),
+        schedule.batch_size,
+        held_out=None if demos.held_out is None else examples(demos.held_out),
+        validated=validated,
+        precision=schedule.precision,
+    )
 
 
 def cloning(

@@ -13,7 +13,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -25,9 +25,11 @@ from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import spelled
 from playslot_rl.config.plain import from_dict
 from playslot_rl.errors import ConfigError, OutputError, PlaySlotError
+from playslot_rl.runs.opening import run_to_write
 from playslot_rl.runtime.processes import end_with_parent
 from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing, write_json
 from playslot_rl.storage.locks import locked
+from playslot_rl.visualization.charts import draw_curve
 
 LOCK: Final = "comparison.lock"
 JOB_MODULE: Final = "playslot_rl.recipes.compare_job"
@@ -164,19 +166,24 @@ def run_sweep(files: Sequence[Path], launcher: str, overrides: Sequence[str]) ->
         )
 
 
-Commands = Mapping[str, Callable[[ExperimentConfig], object]]
-"""The `playslot` commands that a study has run, by name: `train-slots`, `train-dynamics`, `train-baseline`, `evaluate`,
-and `train-videos` for a model of unlabelled videos. They lie above it in the layers."""
 PATIENCE_S: Final = 30.0
 """What torchrun is given to end its processes when the job is interrupted."""
 ERROR: Final = re.compile(r"playslot [a-z-]+(?: \(rank \d+\))?: error: (.*)")
 
 
-def train(command: str, config: ExperimentConfig, processes: int, commands: Commands) -> None:
+def train(command: str, config: ExperimentConfig, processes: int = 1) -> None:
+    """Do what `train-slots`, `train-dynamics` or `train-baseline` does, here or on several processes."""
     if processes > 1:
         train_on_several(command, config, processes)
+        return
+    from playslot_rl.methods import training
+    from playslot_rl.methods.playslot.method import DYNAMICS, SLOTS
+
+    stage = {"train-slots": SLOTS, "train-dynamics": DYNAMICS}.get(command)
+    if stage is not None:
+        training.train_stage(stage, config, run_to_write(config))
     else:
-        commands[command](config)
+        draw_curve(training.train(config).path.parent, config.method)
 
 
 def training_command(command: str, config: ExperimentConfig, processes: int) -> list[str]:

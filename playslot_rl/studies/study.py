@@ -13,11 +13,13 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import is_pretrained
+from playslot_rl.config.methods import METHODS
 from playslot_rl.config.weights import data_roots, is_remote
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.evaluation.success import hardware
@@ -25,7 +27,6 @@ from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing, write_bytes, write_json, write_text
 from playslot_rl.storage.checkpoints import provenance
 from playslot_rl.studies import launch
-from playslot_rl.studies.launch import Commands
 from playslot_rl.visualization.charts import LIGHT, Theme, figure_bytes
 from playslot_rl.visualization.document import Document, to_markdown
 
@@ -91,6 +92,22 @@ def absolute_roots(text: str) -> str:
     return ",".join(root._replace(path=absolute(root.path)).text for root in data_roots(text))
 
 
+def job_config(config: ExperimentConfig, job: Job, method: str, world: str, **data: Any) -> ExperimentConfig:
+    """What any job trains with: paths are absolute, so that it runs from any folder; `world` is the run that methods on
+    slots build on, `data` are changes of that group.
+    """
+    own = config.data
+    return replace(
+        config,
+        method=method,
+        seed=job.seed,
+        data=replace(own, root=absolute_roots(own.root), cache=absolute(own.cache), **data),
+        out=absolute(str(job.run)),
+        run=absolute(world) if METHODS[method].slots else "",
+        logging=replace(config.logging, progress=False),
+    )
+
+
 def count_parameters(run: Run, stage: str) -> int:
     """Floating-point numbers in a run's checkpoint and in those of its parents (weights, and a few buffers)."""
     from safetensors import safe_open
@@ -110,6 +127,8 @@ Record = Mapping[str, Any]
 """What a job's file says; `fingerprint` names it."""
 Result = Mapping[str, Any]
 """What `OUT/NAME.json` holds."""
+Evaluate = Callable[[ExperimentConfig], object]
+"""`playslot evaluate` without a report, which lies above in the layers."""
 FOOTNOTES = "Footnotes"
 
 
@@ -121,16 +140,14 @@ class Measure[J: Job](Protocol):
         name: of the files that are written.
         unit: what messages call a job.
         config: of the study; `out` is its folder, and `prepare` completes it.
+        launcher: Hydra's name of what runs the jobs (empty: one after the other), and overrides for Hydra.
     """
 
     command: str
     name: str
     unit: str
     config: ExperimentConfig
-
-    @property
-    def launcher(self) -> tuple[str, Sequence[str]]:
-        """Hydra's name of the launcher that runs the jobs (empty: one after the other), and overrides for Hydra."""
+    launcher: tuple[str, Sequence[str]]
 
     def check(self) -> None:
         """Refuse what cannot be measured, before anything is written or computed, by a ConfigError, DataError or
@@ -141,7 +158,7 @@ class Measure[J: Job](Protocol):
         """Make what the jobs share, finished parts excepted; all jobs, in the order in which they run."""
 
     @staticmethod
-    def run(record: Record, commands: Commands) -> None:
+    def run(record: Record, evaluate: Evaluate) -> None:
         """Do what a job's file says, in a process of its own; what is done is skipped."""
 
     def rows(self, job: J, status: launch.Status) -> list[dict[str, Any]]:

@@ -8,12 +8,15 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from playslot_rl.colours import OKABE_ITO
 from playslot_rl.config.methods import METHODS, Style
+from playslot_rl.runtime.processes import here
+from playslot_rl.storage.atomic import read_json, write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -189,6 +192,15 @@ def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Ma
         style_axes(axes, theme)
     legend(figure, theme, ncols=4, fontsize=9)
     return figure_bytes(figure, theme)
+
+
+def draw_curve(folder: Path, method: str) -> None:
+    """Draw `curve.json` of a method's training, where it has one, as `curve_light.png` and `curve_dark.png`."""
+    if (folder / "curve.json").is_file() and here().first:
+        curve = read_json(folder / "curve.json")
+        for theme in (LIGHT, DARK):
+            chart = learning_chart({method: curve["rows"]}, curve["random"], theme)
+            write_bytes(folder / f"curve_{theme.name}.png", chart)
 
 
 def curve_figure(panels: Mapping[str, Mapping[str, Sequence[float] | np.ndarray[Any, Any]]], theme: Theme) -> Figure:

@@ -63,8 +63,7 @@ def dreamer() -> Actor:
 
 
 def sold() -> Actor:
-    from playslot_rl.methods.sold.actor import SOLDActor
-    from playslot_rl.methods.sold.networks import SOLDNetworks
+    from playslot_rl.methods.sold.networks import SOLDActor, SOLDNetworks
 
     config = compose(["preset=smoke"]).baselines.sold
     savi = agent().world_model.savi

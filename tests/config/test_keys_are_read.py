@@ -27,6 +27,7 @@ LOOPS = (
     "playslot_rl/training/",
     "playslot_rl/losses/dynamics.py",
     "playslot_rl/modules/predictors/",
+    "playslot_rl/methods/cloning.py",
     "playslot_rl/methods/online/",
     "playslot_rl/methods/video/",
 )

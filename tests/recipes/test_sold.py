@@ -17,8 +17,8 @@ from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError, TrainingError
-from playslot_rl.methods.sold.actor import load_actor, prior_steps
 from playslot_rl.methods.sold.learner import SOLDLearner
+from playslot_rl.methods.sold.networks import load_actor, prior_steps
 from playslot_rl.methods.training import train
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runs import Run

@@ -16,8 +16,8 @@ from playslot_rl.config.compose import compose
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.studies import launch
-from playslot_rl.studies.launch import Commands, Status, write_status
-from playslot_rl.studies.study import FOOTNOTES, Job, Record, Result, open_jobs_notes, run_study
+from playslot_rl.studies.launch import Status, write_status
+from playslot_rl.studies.study import FOOTNOTES, Evaluate, Job, Record, Result, open_jobs_notes, run_study
 from playslot_rl.visualization.charts import Theme, new_figure
 from playslot_rl.visualization.document import Document, Linked, Notes, Section, Table
 
@@ -69,7 +69,7 @@ class Dice:
         return {throw: {"name": throw.name, "fingerprint": self.fingerprint} for throw in throws}
 
     @staticmethod
-    def run(record: Record, commands: Commands) -> None:
+    def run(record: Record, evaluate: Evaluate) -> None:
         raise NotImplementedError
 
     def rows(self, job: Throw, status: Status) -> list[dict[str, Any]]:

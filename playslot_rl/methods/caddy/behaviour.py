@@ -26,7 +26,7 @@ from torch.nn import functional as F
 
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, moving_frames
+from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.caddy.heads import ORACLE, POLICY, MovesHead, StateHead, as_moves, load_model, states_of
@@ -34,7 +34,7 @@ from playslot_rl.methods.caddy.method import CADDYConfig, CADDYOracleConfig, CAD
 from playslot_rl.methods.caddy.model import CADDY
 from playslot_rl.methods.caddy.networks import Encoder
 from playslot_rl.methods.caddy.stage import CADDYStage
-from playslot_rl.methods.cloning import LatentCloning, cloning
+from playslot_rl.methods.cloning import LatentCloning, action_stage, cloning
 from playslot_rl.methods.video.training import on_clips, pixel_model
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators, global_seed
@@ -46,7 +46,6 @@ from playslot_rl.training.stage_regression import (
     FrameInputs,
     Inputs,
     RegressionStage,
-    demonstrated_frames,
     unexplained,
 )
 from playslot_rl.world_model import module_device
@@ -141,26 +140,15 @@ def oracle_stage(
     the model is damaged, a DataError where actions are missing or nothing moves.
     """
     own: CADDYOracleConfig = config.baselines.caddy_oracle
-    behaviour, width = config.behaviour, config.env.action_dim
     caddy = load_model(model, device)
-
-    def examples(source: EpisodeFrames, shift: int = 0) -> tuple[StateInputs, Tensor]:
-        moves = moving_frames(source, behaviour.trim_pixels, behaviour.trim_margin)
-        frames, actions = demonstrated_frames(source, moves, width, device, shift)
-        return StateInputs(caddy.encoder, frames), actions
-
     with global_seed(config.seed, 0, ORACLE):
-        oracle = StateHead(caddy.config.encoder[-1], width, acts=True).to(device)
-    criterion = BehaviourLoss(oracle, behaviour.loss)
-    criterion.set_keys(observation=keys.STATE_MAPS, action=keys.ACTION)
-    return RegressionStage(
-        "oracle",
-        criterion,
-        *examples(demos.trained, own.shift),
-        own.policy.batch_size,
-        held_out=None if demos.held_out is None else examples(demos.held_out),
-        validated=1024,
-        precision=own.policy.precision,
+        oracle = StateHead(caddy.config.encoder[-1], config.env.action_dim, acts=True).to(device)
+
+    def observe(frames: FrameInputs) -> Inputs:
+        return StateInputs(caddy.encoder, frames)
+
+    return action_stage(
+        "oracle", oracle, keys.STATE_MAPS, observe, config, demos, device, own.shift, own.policy, validated=1024
     )
 
 
@@ -178,7 +166,7 @@ def infer_moves(model: CADDY, source: EpisodeFrames, moves: Transitions) -> Tens
 def model(record: StageRecord) -> Training:
     own: CADDYConfig = record.config.baselines.caddy
     stage = CADDYStage(pixel_model(CADDY, own, record), record.clips(own.frames), own)
-    return on_clips(record, stage, own, extra={"perceptual": stage.perceptual_on})
+    return on_clips(record, stage, own, extra={"perceptual": stage.objective.perceptual is not None})
 
 
 def policy(record: StageRecord) -> Training:

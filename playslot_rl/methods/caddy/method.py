@@ -88,7 +88,7 @@ class CADDYConfig(VideoStageConfig):
 
     def check(self, name: str, config: ExperimentConfig) -> None:
         from playslot_rl.methods.caddy.model import CADDY
-        from playslot_rl.methods.caddy.perceptual import load_perceptual
+        from playslot_rl.methods.caddy.stage import load_perceptual
         from playslot_rl.methods.video.training import check_pixel_model
 
         check_pixel_model(CADDY, config, name.rpartition(".")[2])
@@ -96,36 +96,13 @@ class CADDYConfig(VideoStageConfig):
 
 
 @dataclass(frozen=True)
-class CADDYPolicyConfig(Checked):
-    """Schedule of CADDY's policy; its model is `baselines.caddy`. The action decoder's size is `model.action_decoder`,
-    its inputs, loss and labels are `behaviour`'s, as for PlaySlot.
-
-    Attributes:
-        shift: shift of frames in the policy's training, pixels.
-        policy: training of the policy.
-        decoder_steps: optimiser steps of the action decoder.
-        decoder_lr: its base learning rate; the rest is as for the policy.
-        world: run whose CADDY is taken; empty trains one on `data.root`.
-    """
-
-    group = "baselines.caddy_policy."
-    shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
-    policy: StageConfig = field(default_factory=lambda: clipped_stage(20_000, 2e-4, "constant"))
-    decoder_steps: int = field(default=20_000, metadata=at_least(1))
-    decoder_lr: float = field(default=2e-4, metadata=RATE)
-    world: str = field(default="", metadata=role("machine", "folder"))
-
-    def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        yield windows(f"{name}.policy", self.policy, frame_numbers(config))
-
-
-@dataclass(frozen=True)
 class CADDYOracleConfig(Checked):
-    """Schedule of the CADDY Oracle; its model is `baselines.caddy`, its loss `behaviour.loss`.
+    """Schedule of what acts on CADDY's states, of the oracle nothing else; the model is `baselines.caddy`, the loss
+    `behaviour.loss`.
 
     Attributes:
         shift: shift of frames in training, pixels.
-        policy: its training.
+        policy: training of the policy.
         world: run whose CADDY is taken; empty trains one on `data.root`.
     """
 
@@ -136,6 +113,21 @@ class CADDYOracleConfig(Checked):
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
         yield windows(f"{name}.policy", self.policy, frame_numbers(config))
+
+
+@dataclass(frozen=True)
+class CADDYPolicyConfig(CADDYOracleConfig):
+    """Schedule of the action decoder of CADDY's policy. Its size is `model.action_decoder`, its inputs and labels are
+    `behaviour`'s, as for PlaySlot.
+
+    Attributes:
+        decoder_steps: optimiser steps of the action decoder.
+        decoder_lr: its base learning rate; the rest is as for the policy.
+    """
+
+    group = "baselines.caddy_policy."
+    decoder_steps: int = field(default=20_000, metadata=at_least(1))
+    decoder_lr: float = field(default=2e-4, metadata=RATE)
 
 
 MODEL: Final = StageSpec(
@@ -170,12 +162,7 @@ ORACLE: Final = StageSpec(
 _LOADED: Final = "playslot_rl.methods.caddy.heads"
 CADDY: Final = Method("caddy", ("CADDY",), Style(5, "s"), CADDYConfig, (MODEL,), Load(video=f"{_LOADED}:load_video"))
 CADDY_POLICY: Final = Method(
-    "caddy_policy",
-    ("CADDY",),
-    Style(6, "X"),
-    CADDYPolicyConfig,
-    (MODEL, POLICY),
-    Load(actor=f"{_LOADED}:load_policy"),
+    "caddy_policy", ("CADDY",), Style(6, "X"), CADDYPolicyConfig, (MODEL, POLICY), Load(actor=f"{_LOADED}:load_policy")
 )
 CADDY_ORACLE: Final = Method(
     "caddy_oracle",

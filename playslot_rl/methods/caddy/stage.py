@@ -6,13 +6,18 @@
 r runs over the three resolutions, to which the real frames are brought by averaging. Pixels are compared in [-1, 1].
 Image and state terms are means over the frames that are `wanted`: for wanted ones that were drawn uniformly, unbiased
 estimates of those over all of them. The divergence is summed over Z and averaged over moves. Without VGG19's weights
-there is no L_perc: L1 only.
+there is no L_perc: L1 only. No package ships them.
+
+    L_perc(x^, x) = sum_l mean |phi_l(x^) - phi_l(x)|,   l over the first ReLU of each of VGG19's five resolutions
 
 Warm-up, temperature and the clips' length are functions of the step alone:
 
     warm-up       while step < warmup_steps
     temperature   from the first value to the second, linearly over anneal_steps
     length        from first_frames to S + predicted, linearly over growth_steps, rounded down
+
+Note: which five ReLUs the original takes is not stated; the first of each resolution is the common choice (Johnson et
+al., 2016). A frame that is too small for the last ones has fewer.
 
 Note: in the warm-up the other terms stay, on the reconstructions in place of the predictions. The original decays
 weights by 1e-6; our Adam does not. Counts of steps are those of the original, warm-up included.
@@ -23,6 +28,7 @@ Shapes: B batch, T frames, S seed frames, n frames that were generated, H W imag
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -34,13 +40,81 @@ from playslot_rl.losses.common import total_loss
 from playslot_rl.methods.caddy.action import ActionInformation, divergence, joint_distribution, mutual_information
 from playslot_rl.methods.caddy.method import CADDYConfig
 from playslot_rl.methods.caddy.model import CADDY, Rollout
-from playslot_rl.methods.caddy.perceptual import VGGFeatures, load_perceptual
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
 from playslot_rl.runtime.shares import own_rows
 from playslot_rl.seeds.draws import StepGenerators
+from playslot_rl.storage.tensors import pick_published, read_published
 from playslot_rl.world_model import module_device
+
+KEY = "baselines.caddy.perceptual"
+
+# Places of the ReLUs among the layers.
+_READ = (1, 6, 11, 20, 29)
+
+# Statistics of ImageNet, with which torchvision's weights were trained.
+_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+class VGGFeatures(nn.Module):
+    """VGG19 up to the last layer that is read, frozen; layers are named as torchvision names them."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self) -> None:
+        from torchvision.models.vgg import cfgs, make_layers
+
+        super().__init__()
+        self.features = make_layers(cfgs["E"])[: _READ[-1] + 1]
+        self.register_buffer("mean", torch.tensor(_MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(_STD).view(3, 1, 1), persistent=False)
+        self.requires_grad_(False)
+        self.eval()
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """Frames (B, 3, H, W) in [-1, 1] to the outputs of the ReLUs that are read, as many as the size allows."""
+        x = ((x + 1) / 2 - self.mean) / self.std
+        outputs = []
+        for place, layer in enumerate(self.features):
+            if isinstance(layer, nn.MaxPool2d) and min(x.shape[-2:]) < 2:
+                break
+            x = layer(x)
+            if place in _READ:
+                outputs.append(x)
+        return outputs
+
+    def distance(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """L_perc (scalar) of frames (B, 3, H, W) in [-1, 1]; no gradient goes to the target."""
+        with torch.no_grad():
+            wanted = self(target)
+        levels = [(a - b).float().abs().mean() for a, b in zip(self(predicted), wanted, strict=True)]
+        return torch.stack(levels).sum()
+
+
+def load_perceptual(weights: str) -> VGGFeatures | None:
+    """VGG19's features on the CPU, frozen, for `CADDYConfig.perceptual`; None where it is empty, or `auto` and torch's
+    cache does not have the weights; a CheckpointError where the file is missing, damaged or not VGG19's.
+    """
+    path = cached_weights() if weights == "auto" else Path(weights)
+    if not weights or (weights == "auto" and not path.is_file()):
+        return None
+    with torch.random.fork_rng(devices=[]):
+        network = VGGFeatures()
+    own, cure = network.state_dict(), "leave it empty"
+    state = read_published(path, KEY, "VGG19", cure)
+    names = {name: name for name in own}
+    where = f"{KEY}={path}"
+    network.load_state_dict(pick_published(state, names, own, where, f"give torchvision's VGG19, or {cure}"))
+    return network
+
+
+def cached_weights() -> Path:
+    """Where torchvision keeps VGG19's ImageNet weights, there or not."""
+    from torchvision.models import VGG19_Weights
+
+    return Path(torch.hub.get_dir()) / "checkpoints" / Path(VGG19_Weights.IMAGENET1K_V1.url).name
 
 
 class CADDYLoss:
@@ -48,10 +122,6 @@ class CADDYLoss:
 
     def __init__(self, config: CADDYConfig, perceptual: VGGFeatures | None = None) -> None:
         self.config, self.perceptual = config, perceptual
-
-    @property
-    def perceptual_on(self) -> bool:
-        return self.perceptual is not None
 
     def __call__(
         self, rollout: Rollout, frames: Tensor, information: ActionInformation, wanted: Collection[int] | None = None
@@ -104,10 +174,6 @@ class CADDYStage:
     @property
     def modules(self) -> Mapping[str, nn.Module]:
         return {"caddy": self.model}
-
-    @property
-    def perceptual_on(self) -> bool:
-        return self.objective.perceptual_on
 
     def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         config = self.config

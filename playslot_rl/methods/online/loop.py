@@ -40,63 +40,16 @@ if TYPE_CHECKING:
     from torchrl.trainers.algorithms import DreamerV3UpdateRatio
 
 
-def train_online(
-    learner: Learner,
-    online: OnlineConfig,
-    record: StageRecord,
-    begin: Callable[[], None],
-    *,
-    title: str,
-    device: torch.device,
-    prior_steps: int = 0,
-) -> tuple[OnlineState, int]:
-    """Train until `online.steps` agent steps (or `online.minutes`), carrying on from the newest checkpoint.
-
-    Writes `checkpoints`, `replay`, `logs`, `metrics.jsonl` and `curve.json` in `RUN/METHOD`, nothing else. `begin` is
-    called before the first step; `prior_steps`, behind what the learner was given, are added to the curve's. Returns
-    where
-    it ended, and the agent steps that this process started at.
-
-    Raises:
-        TrainingError: a loss or weight is not finite; the last good checkpoint stays.
-        CheckpointError: the folder was begun with another config, or its checkpoint is damaged.
-        OutputError: another command trains it, or a full disk; the last good checkpoint stays.
-        KeyboardInterrupt: Ctrl-C; its message says where the same command carries on.
-    """
-    run = _Run(learner, online, record, title, device, prior_steps)
-    begin()
-    return _train(run, record)
-
-
-def _train(run: _Run, record: StageRecord) -> tuple[OnlineState, int]:
-    online, start, logging = run.online, run.state.step, record.config.logging
-    run.watch.history.rewind(start)
-    if not run.finished:
-        progress = StageProgress(record.name, start, online.steps, logging.progress, online.evaluate_every)
-        with run.watch.running(logging, start), progress, run.pool, run.playing():
-            while not run.finished:
-                run.advance(progress)
-    run.write_curve()
-    return run.state, start
-
-
 class _Run:
-    """One process's part of a run: the pieces `train_online` moves from round to round."""
+    """One process's part of a run: the pieces that are moved from round to round."""
 
-    def __init__(
-        self,
-        learner: Learner,
-        online: OnlineConfig,
-        record: StageRecord,
-        title: str,
-        device: torch.device,
-        prior_steps: int,
-    ) -> None:
+    def __init__(self, training: OnlineTraining, record: StageRecord) -> None:
         from torchrl.trainers.algorithms import DreamerV3UpdateRatio
 
         config, folder, name = record.config, record.folder, record.name
-        self.learner, self.online, self.config, self.folder = learner, online, config, folder
-        self.title, self.device, self.prior_steps = title, device, prior_steps
+        self.learner, self.online, self.prior = training.learner, training.own, training.prior
+        self.config, self.folder, self.device = config, folder, record.device
+        learner, online = self.learner, self.online
         self.replay = Replay(online, config.env.max_steps + 1)
         own = {name: without(online, "free"), "seed": config.seed}
         self.checkpoints = OnlineCheckpoints(folder, {**own, **record.resumes()}, record.spec.typed)
@@ -226,7 +179,7 @@ class _Run:
         state = self.state
         point = self._measure()
         row = {
-            "env_steps": state.step + self.prior_steps,
+            "env_steps": state.step + self.prior,
             "updates": state.updates,
             "seconds": round(state.seconds, 1),
             **point,
@@ -239,7 +192,7 @@ class _Run:
     def write_curve(self) -> None:
         seeds = self._development_seeds()
         values = {
-            "method": self.title,
+            "method": METHODS[self.config.method].title,
             "env": self.config.env.name,
             "episodes": len(seeds),
             "first_seed": seeds[0],
@@ -277,7 +230,7 @@ class OnlineTraining:
         learner: on its device.
         own: settings of acting, replay and schedule.
         modules: what a finished run keeps of the learner.
-        prior: agent steps behind what it was given.
+        prior: agent steps behind what it was given, which are added to the curve's.
     """
 
     learner: Learner
@@ -285,28 +238,45 @@ class OnlineTraining:
     modules: Mapping[str, nn.Module]
     prior: int = 0
 
+    def train(self, record: StageRecord, begin: Callable[[], None]) -> tuple[OnlineState, int]:
+        """Train until `steps` agent steps (or `minutes`), carrying on from the newest checkpoint.
+
+        Writes `checkpoints`, `replay`, `logs`, `metrics.jsonl` and `curve.json` in `RUN/METHOD`, nothing else. `begin`
+        is called before the first step. Returns where it ended, and the agent steps that this process started at.
+
+        Raises:
+            TrainingError: a loss or weight is not finite; the last good checkpoint stays.
+            CheckpointError: the folder was begun with another config, or its checkpoint is damaged.
+            OutputError: another command trains it, or a full disk; the last good checkpoint stays.
+            KeyboardInterrupt: Ctrl-C; its message says where the same command carries on.
+        """
+        run = _Run(self, record)
+        begin()
+        online, start, logging = self.own, run.state.step, record.config.logging
+        run.watch.history.rewind(start)
+        if not run.finished:
+            progress = StageProgress(record.name, start, online.steps, logging.progress, online.evaluate_every)
+            with run.watch.running(logging, start), progress, run.pool, run.playing():
+                while not run.finished:
+                    run.advance(progress)
+        run.write_curve()
+        return run.state, start
+
     def carry_out(self, record: StageRecord, begin: Callable[[], None]) -> StageCheckpoint:
-        title = METHODS[record.config.method].title
-        state, _ = train_online(
-            self.learner, self.own, record, begin, title=title, device=record.device, prior_steps=self.prior
+        state, _ = self.train(record, begin)
+        extra = {
+            "env_steps": state.step + self.prior,
+            "savi_steps": self.prior,
+            "episodes": state.episodes,
+            "random_policy": state.random,
+            "parameters": sum(p.numel() for module in self.modules.values() for p in module.parameters()),
+        }
+        done = record.save(self.modules, state.metrics, state.updates, state.seconds, extra)
+        last, random, before = state.curve[-1], state.random, f" and {self.prior} of SAVi's data" if self.prior else ""
+        print(
+            f"{record.name}: {state.step} agent steps{before}, {state.updates} updates; development episodes: return "
+            f"{last['return_mean']:.2f} (random {random['return_mean']:.2f}), success "
+            f"{100 * last['success_rate']:.0f} % (random {100 * random['success_rate']:.0f} %); {record.folder}",
+            flush=True,
         )
-        return _save(record, state, self.modules, self.prior)
-
-
-def _save(record: StageRecord, state: OnlineState, modules: Mapping[str, nn.Module], prior: int) -> StageCheckpoint:
-    extra = {
-        "env_steps": state.step + prior,
-        "savi_steps": prior,
-        "episodes": state.episodes,
-        "random_policy": state.random,
-        "parameters": sum(p.numel() for module in modules.values() for p in module.parameters()),
-    }
-    done = record.save(modules, state.metrics, state.updates, state.seconds, extra)
-    last, random, before = state.curve[-1], state.random, f" and {prior} of SAVi's data" if prior else ""
-    print(
-        f"{record.name}: {state.step} agent steps{before}, {state.updates} updates; development episodes: return "
-        f"{last['return_mean']:.2f} (random {random['return_mean']:.2f}), success {100 * last['success_rate']:.0f} % "
-        f"(random {100 * random['success_rate']:.0f} %); {record.folder}",
-        flush=True,
-    )
-    return done
+        return done

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from safetensors.torch import load
@@ -96,16 +96,6 @@ def _play(weights: bytes, wanted: Round, part: int) -> tuple[bytes, PlayedEpisod
     return _player.play(weights, wanted, part)
 
 
-class _Worker(Protocol):
-    """A place where parts of rounds are played."""
-
-    def submit(self, weights: bytes, wanted: Round, part: int) -> Future[Any]:
-        """Begin to play."""
-
-    def close(self) -> None:
-        """End it at once, also while it plays or hangs."""
-
-
 class _LocalWorker:
     def __init__(self, setup: bytes) -> None:
         self._pool = ProcessPoolExecutor(1, worker_context(), _begin, (setup,))
@@ -114,6 +104,7 @@ class _LocalWorker:
         return self._pool.submit(_play, weights, wanted, part)
 
     def close(self) -> None:
+        """End it at once, also while it plays or hangs."""
         for process in list((self._pool._processes or {}).values()):  # one that hangs is ended no other way
             process.kill()
         self._pool.shutdown(cancel_futures=True)  # and wait: what is left to the garbage collector may leak semaphores
@@ -151,7 +142,7 @@ class Players:
         self._ray = RayCluster.find(settings.ray_address, count) if settings.backend == "ray" else None
         if self._ray is not None:
             self._ray.connect(_init_ray)
-        self._workers: list[_Worker] = [self._made() for _ in range(count)]
+        self._workers: list[_LocalWorker | _RayWorker] = [self._made() for _ in range(count)]
         self._ready = [False] * count
         self._weights, self._parts = b"", list[Round]()
         self._futures: list[Future[Any]] = []
@@ -187,7 +178,7 @@ class Players:
 
             ray.shutdown()
 
-    def _made(self) -> _Worker:
+    def _made(self) -> _LocalWorker | _RayWorker:
         return _LocalWorker(self._setup) if self._ray is None else _RayWorker(self._setup)
 
     def _wait(self, i: int) -> tuple[bytes, PlayedEpisodes]:

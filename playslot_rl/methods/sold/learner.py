@@ -21,9 +21,8 @@ from playslot_rl import keys
 from playslot_rl.frames import normalise
 from playslot_rl.methods.online.loop import OnlineTraining
 from playslot_rl.methods.sold import losses
-from playslot_rl.methods.sold.actor import SOLDActor, build_networks, prior_steps
 from playslot_rl.methods.sold.method import SOLDConfig
-from playslot_rl.methods.sold.networks import SOLDNetworks
+from playslot_rl.methods.sold.networks import SOLDActor, SOLDNetworks, build_networks, prior_steps
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.training.record import StageRecord

@@ -109,10 +109,5 @@ STAGE: Final = StageSpec(
     parts="playslot_rl.methods.sold.learner:training",
 )
 SOLD: Final = Method(
-    NAME,
-    ("SOLD",),
-    Style(4, "P"),
-    SOLDConfig,
-    (STAGE,),
-    Load(actor="playslot_rl.methods.sold.actor:load_actor"),
+    NAME, ("SOLD",), Style(4, "P"), SOLDConfig, (STAGE,), Load(actor="playslot_rl.methods.sold.networks:load_actor")
 )

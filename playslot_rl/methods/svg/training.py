@@ -22,8 +22,7 @@ from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise, psnr
 from playslot_rl.losses.common import draw_frames, of_frames
 from playslot_rl.methods.svg.method import SVGConfig
-from playslot_rl.methods.svg.model import SVG, TeacherForced
-from playslot_rl.methods.svg.networks import Gaussian
+from playslot_rl.methods.svg.model import SVG, Gaussian, TeacherForced
 from playslot_rl.methods.video.training import on_clips, pixel_model
 from playslot_rl.runs import Run
 from playslot_rl.runtime.precision import autocast

@@ -19,9 +19,10 @@ from playslot_rl.data.agreement import open_files
 from playslot_rl.data.views import first_demonstrations
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.held_out import held_out_seeds
+from playslot_rl.methods.training import train_model
 from playslot_rl.runs import Run
-from playslot_rl.studies.launch import Commands
-from playslot_rl.studies.study import Job, absolute, absolute_roots, fingerprint_of
+from playslot_rl.studies.launch import train
+from playslot_rl.studies.study import Job, absolute, fingerprint_of, job_config
 from playslot_rl.training.record import open_videos
 
 
@@ -125,33 +126,20 @@ def success_config(config: ExperimentConfig, job: SuccessJob, world: str) -> Exp
 
     Labels are the job's, else `behaviour.labelled_demos` or, with fewer demonstrations, all of them. PlaySlot's own
     oracle and the references of each evaluation are left out: the slot oracle is a method, and the references run once.
-    Paths are absolute, so that a job runs from any folder; `world` is the run of the world model.
     """
     labelled = job.labels or min(config.behaviour.labelled_demos, job.demos or config.behaviour.labelled_demos)
     policy = "" if job.policy_of is None else absolute(str(replace(job, labels=job.policy_of).run))
     own = {}
     if job.model is not None:
         own = {job.method: replace(getattr(config.baselines, job.method), world=absolute(str(job.model)))}
-    data = replace(
-        config.data,
-        root=absolute_roots(config.data.root),
-        demos=absolute(config.data.demos),
-        cache=absolute(config.data.cache),
-        draw=None if job.online else job.seed,
-    )
+    draw = None if job.online else job.seed
     return replace(
-        config,
-        method=job.method,
+        job_config(config, job, job.method, world, demos=absolute(config.data.demos), draw=draw),
         demos=job.demos,
-        seed=job.seed,
-        data=data,
-        out=absolute(str(job.run)),
-        run=absolute(world) if METHODS[job.method].slots else "",
         protocol="simulation",
         behaviour=replace(config.behaviour, labelled_demos=labelled, oracle=False, policy_from=policy),
         baselines=replace(config.baselines, **own),
         evaluation=replace(config.evaluation, references=False),
-        logging=replace(config.logging, progress=False),
     )
 
 
@@ -203,7 +191,7 @@ def check_demos(config: ExperimentConfig, episodes: int, where: str) -> None:
         )
 
 
-def prepare_shared(config: ExperimentConfig, commands: Commands) -> ExperimentConfig:
+def prepare_shared(config: ExperimentConfig) -> ExperimentConfig:
     """Record, train or find what the jobs share, finished parts excepted; the config with `data` and `run` complete."""
     out, models = Path(config.out), latent_models(config)
     world = uses_slots(config) and not config.run
@@ -214,10 +202,12 @@ def prepare_shared(config: ExperimentConfig, commands: Commands) -> ExperimentCo
     if world:
         model = str(out / "world_model")
         for command in ("train-slots", "train-dynamics"):
-            commands[command](replace(config, out=model, run=""))
+            train(command, replace(config, out=model, run=""))
         config = replace(config, run=model)
-    for stage, method in models.items():
-        commands["train-videos"](replace(config, out=str(model_folder(out, stage)), run="", method=method))
+    for method in models.values():
+        stage = METHODS[method].model
+        assert stage is not None
+        train_model(replace(config, method=method), stage, model_folder(out, stage.name))
     return config
 
 

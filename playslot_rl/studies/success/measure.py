@@ -17,8 +17,8 @@ from playslot_rl.methods.training import check_method
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing
 from playslot_rl.storage.checkpoints import require_config
-from playslot_rl.studies.launch import Commands, Status, train
-from playslot_rl.studies.study import Record, count_parameters
+from playslot_rl.studies.launch import Status, train
+from playslot_rl.studies.study import Evaluate, Record, count_parameters
 from playslot_rl.studies.success.jobs import (
     Shared,
     SuccessJob,
@@ -136,12 +136,7 @@ def _mean(values: Iterable[float | None]) -> int | None:
 
 
 class SuccessMeasure:
-    """See `playslot_rl.studies.study.Measure`.
-
-    Args:
-        config: with `out`; `run` names a world model, or none.
-        commands: by which what jobs share is trained.
-    """
+    """See `playslot_rl.studies.study.Measure`; the config has `out`, and `run` names a world model, or none."""
 
     command = "compare"
     name = "comparison"
@@ -149,20 +144,17 @@ class SuccessMeasure:
     page = staticmethod(success_page)
     figure = staticmethod(success_figure)
 
-    def __init__(self, config: ExperimentConfig, commands: Commands) -> None:
+    def __init__(self, config: ExperimentConfig) -> None:
         self.config = replace(config, episodes=config.episodes or DEFAULT_EPISODES)
-        self._commands, self._references, self._shared = commands, dict[str, Any](), dict[str, Any]()
-
-    @property
-    def launcher(self) -> tuple[str, Sequence[str]]:
-        return self.config.compare.launcher, self.config.compare.hydra
+        self.launcher: tuple[str, Sequence[str]] = (config.compare.launcher, config.compare.hydra)
+        self._references, self._shared = dict[str, Any](), dict[str, Any]()
 
     def check(self) -> None:
         check_success(self.config)
         self.config = check_data(self.config)
 
     def prepare(self) -> Mapping[SuccessJob, Record]:
-        self.config = config = prepare_shared(self.config, self._commands)
+        self.config = config = prepare_shared(self.config)
         wanted, shared = config.compare, Shared(config)
         plain = replace(
             config, compare=CompareConfig(evaluation_seed=wanted.evaluation_seed, processes=wanted.processes)
@@ -175,12 +167,12 @@ class SuccessMeasure:
         return found
 
     @staticmethod
-    def run(record: Record, commands: Commands) -> None:
+    def run(record: Record, evaluate: Evaluate) -> None:
         config = from_dict(ExperimentConfig, record["config"])
-        train("train-baseline", config, int(record["processes"]), commands)
+        train("train-baseline", config, int(record["processes"]))
         own = replace(config, run=config.out, out="", seed=int(record["evaluation_seed"]))
         for protocol in record["protocols"]:
-            commands["evaluate"](replace(own, protocol=protocol))
+            evaluate(replace(own, protocol=protocol))
 
     def rows(self, job: SuccessJob, status: Status) -> list[dict[str, Any]]:
         return job_rows(job, self.config.env.frame_skip, status)

@@ -4,7 +4,7 @@ steps, with footnotes."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config.methods import METHODS, stage_title
 from playslot_rl.runtime.progress import format_seconds
@@ -99,18 +99,25 @@ def _footnotes(result: Result) -> list[str]:
     notes = [f"{name}: {_reference(value)}, on the same episodes." for name, value in result["references"].items()]
     notes += _ratios(result["summary"])
     notes += [
-        f"Labels: {row['title']} saw the real actions of {row['labels']}."
-        for row in ({"title": t, "labels": _labels(done, t)} for t in _titles(done) if _labels(done, t))
+        f"Labels: {title} saw the real actions of {said}." for title in _titles(done) if (said := _labels(done, title))
     ]
     notes += _acting_cost(result)
-    notes += _one_each(done, "pretraining", "{title} starts from {value} weights.")
-    sizes = _one_each(done, "parameters", "{title} {value}")
-    notes += [f"Parameters, those of the models it builds on included: {'; '.join(sizes)}."] if sizes else []
-    kept = [f"{title} {_kept(shares)}" for title in _titles(done) if (shares := _shares(done, title))]
-    notes += [f"Rows learned from; still stretches of the videos are left out: {'; '.join(kept)}."] if kept else []
-    samples = _one_each(done, "samples", "{title} {value}")
-    counted = "Training of the policy, optimiser steps times batch (decoder and fine-tuning, which follow, not counted)"
-    notes += [f"{counted}: {'; '.join(samples)}."] if samples else []
+    notes += [f"{title} starts from {_list(values)} weights." for title, values in _values(done, "pretraining").items()]
+    shares = {title: (f"{100 * v[0]:.0f}", f"{100 * v[-1]:.0f}") for title, v in _values(done, "kept_rows").items()}
+    kept = [f"{t} {least} %" if least == most else f"{t} {least} to {most} %" for t, (least, most) in shares.items()]
+    sizes, samples = (
+        [f"{title} {_list(map(_number, values))}" for title, values in _values(done, key).items()]
+        for key in ("parameters", "samples")
+    )
+    for what, parts in (
+        ("Parameters, those of the models it builds on included", sizes),
+        ("Rows learned from; still stretches of the videos are left out", kept),
+        (
+            "Training of the policy, optimiser steps times batch (decoder and fine-tuning, which follow, not counted)",
+            samples,
+        ),
+    ):
+        notes += [f"{what}: {'; '.join(parts)}."] if parts else []
     notes.append(_times(done, result))
     notes += _shared(result)
     return [*notes, *open_jobs_notes(rows, "jobs"), f"{machine_note(result)}."]
@@ -177,22 +184,13 @@ def _labels(rows: Sequence[Result], title: str) -> str:
     return f"{said} demonstrations" if said else ""
 
 
-def _shares(rows: Sequence[Result], title: str) -> list[float]:
-    return sorted({row["kept_rows"] for row in rows if row["title"] == title and row.get("kept_rows") is not None})
-
-
-def _kept(shares: Sequence[float]) -> str:
-    least, most = f"{100 * shares[0]:.0f}", f"{100 * shares[-1]:.0f}"
-    return f"{least} %" if least == most else f"{least} to {most} %"
-
-
-def _one_each(rows: Sequence[Result], key: str, text: str) -> list[str]:
-    notes = []
-    for title in _titles(rows):
-        values = sorted({row[key] for row in rows if row["title"] == title and row[key] is not None})
-        if values:
-            notes.append(text.format(title=title, value=_list(map(_number, values))))
-    return notes
+def _values(rows: Sequence[Result], key: str) -> dict[str, list[Any]]:
+    """The values of a key in rising order, by title, where there are any."""
+    found: dict[str, set[Any]] = {}
+    for row in rows:
+        if row.get(key) is not None:
+            found.setdefault(row["title"], set()).add(row[key])
+    return {title: sorted(values) for title, values in found.items()}
 
 
 def _times(rows: Sequence[Result], result: Result) -> str:

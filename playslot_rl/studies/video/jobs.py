@@ -14,7 +14,7 @@ from playslot_rl.config.compare_video import CompareVideoConfig, method_of, titl
 from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import without
 from playslot_rl.errors import ConfigError
-from playslot_rl.studies.study import Job, absolute, absolute_roots, fingerprint_of
+from playslot_rl.studies.study import Job, absolute, fingerprint_of, job_config
 
 VARIED = ("model.inverse_dynamics.", "model.predictor.", "dynamics.")
 """Where the settings are that change what PlaySlot predicts, on a SAVi that is there."""
@@ -199,24 +199,10 @@ def video_config(config: ExperimentConfig, job: VideoJob, world: str) -> Experim
     if method_of(job.method).slots:  # those on pixels have no such setting
         config = with_training(config, job.method, from_start=0.0)
     config = _with_context(config, job.method, own.trained_seed + own.trained_frames - 1)
-    data = replace(
-        config.data,
-        root=absolute_roots(config.data.root),
-        demos="",
-        held_out=0,
-        tested=0.0 if own.test else own.tested,
-        cache=absolute(config.data.cache),
-    )
-    return replace(
-        config,
-        compare_video=replace(own, test=",".join(absolute(part.strip()) for part in own.test.split(",") if part)),
-        method=job.trained_as,
-        seed=job.seed,
-        data=data,
-        out=absolute(str(job.run)),
-        run=absolute(world) if method_of(job.method).slots else "",
-        logging=replace(config.logging, progress=False),
-    )
+    tests = ",".join(absolute(part.strip()) for part in own.test.split(",") if part)
+    config = replace(config, compare_video=replace(own, test=tests))
+    tested = 0.0 if own.test else own.tested
+    return job_config(config, job, job.trained_as, world, demos="", held_out=0, tested=tested)
 
 
 def _with_context(config: ExperimentConfig, method: str, frames: int) -> ExperimentConfig:

@@ -6,7 +6,7 @@ Shapes: C clips, P predicted frames.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,8 @@ from playslot_rl.evaluation.video import open_lpips
 from playslot_rl.methods.video.scores import bootstrap
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing, write_json, write_text
-from playslot_rl.studies.launch import Commands, Status
-from playslot_rl.studies.study import Record, count_parameters
+from playslot_rl.studies.launch import Status
+from playslot_rl.studies.study import Evaluate, Record, count_parameters, run_study
 from playslot_rl.studies.video.jobs import VideoJob, check_variants, video_config, video_jobs, video_record
 from playslot_rl.studies.video.page import objects_page, video_figure, video_page, video_sheet
 from playslot_rl.studies.video.shared import (
@@ -114,12 +114,7 @@ def _of_metric(name: str, values: Sequence[Any]) -> dict[str, Any]:
 
 
 class VideoMeasure:
-    """See `playslot_rl.studies.study.Measure`.
-
-    Args:
-        config: with `out`; `run` names a SAVi, or none.
-        commands: by which what jobs share is trained.
-    """
+    """See `playslot_rl.studies.study.Measure`; the config has `out`, and `run` names a SAVi, or none."""
 
     command = "compare-video"
     name = "video"
@@ -127,16 +122,13 @@ class VideoMeasure:
     page = staticmethod(video_page)
     figure = staticmethod(video_figure)
 
-    def __init__(self, config: ExperimentConfig, commands: Commands) -> None:
+    def __init__(self, config: ExperimentConfig) -> None:
         own = config.compare_video
         data = replace(config.data, tested=own.tested if config.data.root and not own.test else 0.0)
         self.config = replace(config, data=data, demos=None)
-        self._commands, self._jobs, self._lpips_reason = commands, list[VideoJob](), ""
+        self.launcher: tuple[str, Sequence[str]] = (own.launcher, own.hydra)
+        self._jobs, self._lpips_reason = list[VideoJob](), ""
         self._references, self._truth = list[dict[str, Any]](), dict[tuple[str, int], npt.NDArray[np.uint8]]()
-
-    @property
-    def launcher(self) -> tuple[str, Sequence[str]]:
-        return self.config.compare_video.launcher, self.config.compare_video.hydra
 
     def check(self) -> None:
         config = self.config
@@ -155,7 +147,7 @@ class VideoMeasure:
         config = prepare_videos(self.config)
         if config is not self.config:  # those just recorded are looked at before SAVi is trained
             check_clips(config)
-        self.config = config = prepare_slots(config, self._commands)
+        self.config = config = prepare_slots(config)
         parents, found = parent_prints(config), dict[VideoJob, Record]()
         for job in video_jobs(config, Path(config.out)):
             found[job] = video_record(job, video_config(config, job, config.run), parents, not self._lpips_reason)
@@ -165,9 +157,9 @@ class VideoMeasure:
         return found
 
     @staticmethod
-    def run(record: Record, commands: Commands) -> None:
+    def run(record: Record, evaluate: Evaluate) -> None:  # noqa: ARG004
         job = VideoJob(record["method"], int(record["seed"]), Path(record["out"]), record["variant"])
-        VideoTraining(job, record, commands).run(from_dict(ExperimentConfig, record["config"]))
+        VideoTraining(job, record).run(from_dict(ExperimentConfig, record["config"]))
 
     def rows(self, job: VideoJob, status: Status) -> list[dict[str, Any]]:
         return [training_row(job, status)]
@@ -217,7 +209,7 @@ def _predictions(jobs: Sequence[VideoJob], name: str) -> dict[str, npt.NDArray[n
     return found
 
 
-def each_number(config: ExperimentConfig, compare: Callable[[ExperimentConfig], None]) -> None:
+def each_number(config: ExperimentConfig) -> None:
     """Run the study for each of `compare_video.objects`, and write `OUT/video.json` and `OUT/video.md`. A ConfigError
     for another task, or videos that have their number of objects already; a PlaySlotError where trainings failed: all
     others have finished, and the tables say so.
@@ -234,7 +226,7 @@ def each_number(config: ExperimentConfig, compare: Callable[[ExperimentConfig], 
     for number in own.objects:
         part = out / f"objects_{number}"
         try:
-            compare(_with_objects(config, number, part))
+            run_study(VideoMeasure(_with_objects(config, number, part)))
         except PlaySlotError as error:
             if not (part / "video.json").is_file():
                 raise

@@ -31,7 +31,7 @@ from playslot_rl.runs import Run
 from playslot_rl.runtime.devices import open_device
 from playslot_rl.storage.atomic import json_or_nothing, write_json
 from playslot_rl.storage.checkpoints import require_config
-from playslot_rl.studies.launch import Commands
+from playslot_rl.studies.launch import train
 from playslot_rl.studies.video.jobs import uses_slots
 from playslot_rl.training.record import open_videos
 
@@ -154,12 +154,12 @@ def prepare_videos(config: ExperimentConfig) -> ExperimentConfig:
     return replace(config, compare_video=replace(own, test=",".join(map(str, tests.values()))))
 
 
-def prepare_slots(config: ExperimentConfig, commands: Commands) -> ExperimentConfig:
+def prepare_slots(config: ExperimentConfig) -> ExperimentConfig:
     """The config with the run of the SAVi that methods on slots share, which is trained where none was named."""
     if config.run or not uses_slots(config):
         return config
     model = str(Path(config.out) / "world_model")
-    commands["train-slots"](replace(config, out=model, run=""))
+    train("train-slots", replace(config, out=model, run=""))
     return replace(config, run=model)
 
 

@@ -26,7 +26,7 @@ from playslot_rl.runtime.devices import open_device
 from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing, write_json
 from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.storage.locks import locked
-from playslot_rl.studies.launch import Commands, train
+from playslot_rl.studies.launch import train
 from playslot_rl.studies.study import Record
 from playslot_rl.studies.video.jobs import (
     TRIAL_SEED,
@@ -103,11 +103,10 @@ def _other(name: str, got: Any, old: Any, folder: Path) -> CheckpointError:
 
 
 class VideoTraining:
-    """A job under way: what its file says, and the commands by which it is trained."""
+    """A job under way: what its file says, as it is trained and scored."""
 
-    def __init__(self, job: VideoJob, record: Record, commands: Commands) -> None:
-        self._job, self._record, self._commands = job, record, commands
-        self._asked = asked_of(record)
+    def __init__(self, job: VideoJob, record: Record) -> None:
+        self._job, self._record, self._asked = job, record, asked_of(record)
 
     def run(self, config: ExperimentConfig) -> None:
         """Choose, train, score; finished parts are skipped."""
@@ -117,7 +116,7 @@ class VideoTraining:
 
     def _train(self, config: ExperimentConfig) -> None:
         command = "train-dynamics" if method_of(self._job.method).imagines else "train-baseline"
-        train(command, config, int(self._record["processes"]), self._commands)
+        train(command, config, int(self._record["processes"]))
 
     def _chosen(self, config: ExperimentConfig) -> ExperimentConfig:
         """The config with the learning rate that was best after short trials, and the steps that fit the budget.

@@ -10,8 +10,7 @@ from caddy_parts import clips, tiny, tiny_config
 
 from playslot_rl.methods.caddy.action import divergence
 from playslot_rl.methods.caddy.model import CADDY, Rollout
-from playslot_rl.methods.caddy.perceptual import VGGFeatures
-from playslot_rl.methods.caddy.stage import CADDYLoss
+from playslot_rl.methods.caddy.stage import CADDYLoss, VGGFeatures
 
 S, T = 2, 5
 
@@ -159,8 +158,7 @@ def test_the_perceptual_term_is_there_where_the_network_is() -> None:
     torch.manual_seed(0)
     network = VGGFeatures()
     loss = CADDYLoss(model.config, network)
-    assert loss.perceptual_on
-    assert not CADDYLoss(model.config).perceptual_on
+    assert CADDYLoss(model.config).perceptual is None
     rollout = run(model, frames, [4])
     got = loss(rollout, frames, model.information, [4])
     real = frames[:, 4] * 2 - 1

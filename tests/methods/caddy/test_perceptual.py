@@ -10,7 +10,7 @@ from torch import nn
 from torchvision.models import vgg19
 
 from playslot_rl.errors import CheckpointError
-from playslot_rl.methods.caddy.perceptual import VGGFeatures, cached_weights, load_perceptual
+from playslot_rl.methods.caddy.stage import VGGFeatures, cached_weights, load_perceptual
 from playslot_rl.storage.tensors import save_tensors
 
 

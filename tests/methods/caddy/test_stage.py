@@ -12,8 +12,7 @@ from clips import moving_square
 
 from playslot_rl.data.windows import Clips
 from playslot_rl.methods.caddy.method import CADDYConfig
-from playslot_rl.methods.caddy.perceptual import load_perceptual
-from playslot_rl.methods.caddy.stage import CADDYStage, clip_length, temperature
+from playslot_rl.methods.caddy.stage import CADDYStage, clip_length, load_perceptual, temperature
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.tensors import load_tensors
 from playslot_rl.training.fit import Part, fit
@@ -158,6 +157,6 @@ def test_bf16_gives_finite_losses_and_gradients() -> None:
 
 
 def test_the_stage_says_whether_images_are_compared_by_more_than_l1(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert not stage_of().perceptual_on
+    assert stage_of().objective.perceptual is None
     assert load_perceptual("") is None
     assert list(stage_of().modules) == ["caddy"]

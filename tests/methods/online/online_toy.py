@@ -19,7 +19,7 @@ from playslot_rl.config import EnvConfig, ExperimentConfig, LoggingConfig, Rende
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.methods.online.config import OnlineConfig
-from playslot_rl.methods.online.loop import train_online
+from playslot_rl.methods.online.loop import OnlineTraining
 from playslot_rl.methods.online.replay import OnlineState
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.tensors import module_tensors
@@ -157,7 +157,7 @@ def toy_online(**changes: Any) -> OnlineConfig:
 
 
 class Trained(NamedTuple):
-    """What `train_online` returns."""
+    """What `OnlineTraining.train` returns."""
 
     state: OnlineState
     resumed_from: int
@@ -167,11 +167,11 @@ def train(run: Path, learner: ToyLearner | None = None, **changes: Any) -> tuple
     """Train with the pool of `monkeypatch`ed toy tasks, into `RUN/toy`."""
     learner = learner or ToyLearner()
     config = ExperimentConfig(
-        env=EnvConfig(max_steps=STEPS), seed=3, logging=LoggingConfig(backend="none", progress=False)
+        env=EnvConfig(max_steps=STEPS), seed=3, device="cpu", logging=LoggingConfig(backend="none", progress=False)
     )
     record = StageRecord(SPEC, run, config)
     with record.training() as begin:
-        done = train_online(learner, toy_online(**changes), record, begin, title="Toy", device=torch.device("cpu"))
+        done = OnlineTraining(learner, toy_online(**changes), learner.modules).train(record, begin)
     return learner, Trained(*done)
 
 

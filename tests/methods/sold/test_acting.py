@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDict
 
 from playslot_rl import keys
-from playslot_rl.methods.sold.actor import SOLDActor
 from playslot_rl.methods.sold.learner import SOLDLearner
+from playslot_rl.methods.sold.networks import SOLDActor
 
 Make = Callable[..., SOLDLearner]
 

@@ -9,8 +9,7 @@ import torch
 from torch import nn
 
 from playslot_rl.methods.svg.method import SVGConfig
-from playslot_rl.methods.svg.model import SVG
-from playslot_rl.methods.svg.networks import Decoder, Encoder
+from playslot_rl.methods.svg.model import SVG, Decoder, Encoder
 
 COMPACT = SVGConfig(channels=(16, 32, 64, 128), convs=(1, 1, 1, 1), features=64, latent_dim=16, hidden=128)
 

@@ -10,8 +10,7 @@ from torch import Tensor
 from torch.distributions import Independent, Normal, kl_divergence
 
 from playslot_rl.losses.common import draw_frames
-from playslot_rl.methods.svg.model import SVG
-from playslot_rl.methods.svg.networks import Gaussian
+from playslot_rl.methods.svg.model import SVG, Gaussian
 from playslot_rl.methods.svg.training import gaussian_kl, svg_objective
 
 
