@@ -101,7 +101,11 @@ def test_report_of_a_whole_run_is_self_contained(tmp_path: Path, monkeypatch: py
     z, actions = rng.normal(size=(40, 8)).astype(np.float32), rng.normal(size=(40, 4)).astype(np.float32)
     codes, episodes = rng.integers(0, 5, (40, 1)), np.repeat(np.arange(4), 10)
     probe = latents.probe_actions(z, actions, episodes, codes=codes)
-    monkeypatch.setattr(latents, "data_roots", lambda _: [Path("expert"), Path("broken")])
+    folders = [tmp_path / "expert", tmp_path / "broken"]
+    for folder in folders:
+        (folder / "meta").mkdir(parents=True)
+        (folder / "meta" / "info.json").touch()
+    monkeypatch.setattr(latents, "data_folders", lambda *_: folders)
 
     def read(model: WorldModel, root: Path, given: object) -> latents.LatentData:
         if root.name == "broken":
