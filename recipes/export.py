@@ -17,7 +17,11 @@ def main(config: ExperimentConfig) -> None:
     A folder that holds this very policy already is left as it is, and pushed where a push is asked for: that is how the
     same command is typed again after a kill or a push that failed, a HubError.
     """
-    run, folder = evaluate.run_with_policy(replace(config, out="")), check_out(config)
+    run, folder = evaluate.run_with_policy(replace(config, out="")), Path(config.out)
+    if not config.out or folder.resolve() == Path(config.run).resolve():
+        raise ConfigError("out: got nothing or the run itself, expected a new folder, such as out=policies/press")
+    if not METHODS[config.method].imagines:
+        raise ConfigError(f"run={config.run}: got a run of method={config.method}, expected one of PlaySlot")
     from playslot_rl.sharing.folder import is_model_folder
     from playslot_rl.sharing.run import export_run, read_source, require_exported
 
@@ -36,12 +40,3 @@ def main(config: ExperimentConfig) -> None:
         want = config.export
         result = push_policy(folder, want.repo, private=want.private, branch=want.branch or None, tag=want.tag or None)
         print("\n".join(result.lines()), flush=True)
-
-
-def check_out(config: ExperimentConfig) -> Path:
-    """The folder to write, if one was named."""
-    if not config.out or Path(config.out).resolve() == Path(config.run).resolve():
-        raise ConfigError("out: got nothing or the run itself, expected a new folder, such as out=policies/press")
-    if not METHODS[config.method].imagines:
-        raise ConfigError(f"run={config.run}: got a run of method={config.method}, expected one of PlaySlot")
-    return Path(config.out)

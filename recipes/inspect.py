@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import data_roots
@@ -18,10 +19,6 @@ from playslot_rl.runs.opening import run_of_pretrained, run_to_read, run_to_writ
 from playslot_rl.runtime.devices import open_device
 from playslot_rl.storage.atomic import write_json
 
-if TYPE_CHECKING:
-    from playslot_rl.data.source import EpisodeFrames
-    from playslot_rl.world_model import WorldModel
-
 
 def main(config: ExperimentConfig) -> None:
     """Measure the world model of `config.run` on a data set; print a line for each measure, and one for the verdict.
@@ -30,13 +27,17 @@ def main(config: ExperimentConfig) -> None:
     """
     from playslot_rl.evaluation.card import DEFAULT_EPISODES, FOLDER, RESULT, card_json, make_card
     from playslot_rl.evaluation.card_lines import concluded
+    from playslot_rl.training.record import open_videos
     from playslot_rl.visualization.card_page import card_document
     from playslot_rl.visualization.document import write_document
 
     run, began = opened(config), time.perf_counter()
     model = run.load_world_model(open_device(config.device, config.threads))
-    source = open_set(config, model)
-    card = make_card(model, source, stage_metas(run), config.data, config.episodes or DEFAULT_EPISODES, config.seed)
+    sized = replace(config, env=replace(config.env, image_size=model.env.image_size))
+    source = open_videos(sized, config.data.root, "inspect")
+    stages = run.world_stages | ({"policy": run.own("policy")} if run.has("policy") else {})
+    metas = {name: stage.meta for name, stage in stages.items()}
+    card = make_card(model, source, metas, config.data, config.episodes or DEFAULT_EPISODES, config.seed)
     out = (run_of_pretrained(config, run) if run.pretrained else run).folder
     result = card_json(card, source, facts(config, run), began)
     page = write_document(card_document(result, card, model), out / FOLDER, "inspect")
@@ -50,22 +51,6 @@ def opened(config: ExperimentConfig) -> Run:
     if run.pretrained:
         run_to_write(config)  # refused now, not after minutes
     return run
-
-
-def open_set(config: ExperimentConfig, model: WorldModel) -> EpisodeFrames:
-    """The data set(s) of `data.root`, in frames of the model's size."""
-    from dataclasses import replace
-
-    from playslot_rl.training.record import open_videos
-
-    env = replace(config.env, image_size=model.env.image_size)
-    return open_videos(replace(config, env=env), config.data.root, "inspect")
-
-
-def stage_metas(run: Run) -> dict[str, dict[str, Any]]:
-    """Stage -> `meta.json` of the world model that a run uses, and of its policy if it has one."""
-    stages = run.world_stages | ({"policy": run.own("policy")} if run.has("policy") else {})
-    return {name: stage.meta for name, stage in stages.items()}
 
 
 def facts(config: ExperimentConfig, run: Run) -> dict[str, Any]:

@@ -33,7 +33,7 @@ class DataRoot(NamedTuple):
         return self.path if self.weight is None else f"{self.path}:{self.weight:g}"
 
 
-def data_roots(text: str, key: str = "data.root") -> list[DataRoot]:
+def data_roots(text: str) -> list[DataRoot]:
     """The data sets that a text such as `a`, `a,b` or `a:2,b` names; where only some have a weight, the others have 1.
 
     What follows a part's last colon is its weight if it is a number, unless a folder has the whole part as its name.
@@ -45,13 +45,13 @@ def data_roots(text: str, key: str = "data.root") -> list[DataRoot]:
         >>> [root.text for root in data_roots("a:2,b")]
         ['a:2', 'b:1']
     """
-    roots = [_one(part.strip(), key) for part in text.split(",") if part.strip()]
+    roots = [_one(part.strip()) for part in text.split(",") if part.strip()]
     if any(root.weight is not None for root in roots):
         roots = [root if root.weight is not None else DataRoot(root.path, 1.0) for root in roots]
     return roots
 
 
-def _one(part: str, key: str) -> DataRoot:
+def _one(part: str) -> DataRoot:
     path, _, number = part.rpartition(":")
     if not path or Path(part).expanduser().exists():
         return DataRoot(part, None)
@@ -60,5 +60,5 @@ def _one(part: str, key: str) -> DataRoot:
     except ValueError:
         return DataRoot(part, None)
     if not (math.isfinite(weight) and weight > 0):
-        raise ConfigError(f"{key}: got the weight {number} in {part}, expected a number above 0, as in a:2,b:1")
+        raise ConfigError(f"data.root: got the weight {number} in {part}, expected a number above 0, as in a:2,b:1")
     return DataRoot(path, weight)
