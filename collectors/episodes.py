@@ -66,8 +66,8 @@ class SeededView(TensorView):
 
     A reset before the running episode's end starts it again. TorchRL resets more often than there are episodes (when it
     looks at the environment, and after an episode's last step): a reset without a job touches neither the simulator nor
-    the renderer, and its observation is all zeros.
-    `jobs` are places in the collection and seeds of episodes that have not been started.
+    the renderer, and its observation is all zeros. `jobs` are places in the collection and seeds of episodes that have
+    not been started.
     """
 
     def __init__(self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]] = ()) -> None:

@@ -54,7 +54,7 @@ class Cache:
         return Cache(config.cache, bytes_of(config.cache_limit), config.workers)
 
 
-CachePlace = str | Path | Cache  # A cache, or only its folder
+CachePlace = str | Path | Cache  # a cache, or only its folder
 
 
 def cache_folder(cache: CachePlace = "") -> Path:

@@ -1,12 +1,13 @@
 """Demonstrations as the behaviour stage sees them: slots, inferred latents, predicted slots, and some real actions; and
-which of their transitions say something, those in which something moves and a few after them:
+which of their transitions say something, those in which something moves and a few after them. A frozen world model
+labels them: latent actions, and slots as they are imagined.
 
     m_t = sqrt(mean (S_{t+1} - S_t)^2),   kept_t = m_t > threshold, or m_u > threshold for some t - margin <= u < t
 
 An expert that holds still once the task is solved fills half of the rows with the one action of doing nothing.
 
 Shapes: M transitions of all demonstrations in a row, N slots, D slot width, Z latent-action width, A action width,
-F frames, H W image height and width.
+B episodes of T transitions, F frames, H W image height and width.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ TIMED_SHARE: Final = 0.03  # of the time, which steps that are timed may take: t
 SHORTEST: Final = 20  # steps of a training at least, however little time there is
 TELLING: Final = 150
 """Steps from which on a trial says something: before that slots are not taken apart and one prototype holds all."""
-PASSES: Final = 3  # A training step takes so many times as long as parsing its frames
+PASSES: Final = 3  # a training step takes so many times as long as parsing its frames
 PICTURES: Final = 1000  # frames that a report card draws, whatever it is measured on
 PROBED: Final = 0.001  # seconds that its probes take for a transition
 FEWEST: Final = 8  # episodes of a report card, at least
