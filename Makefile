@@ -42,7 +42,7 @@ exit 1
 endef
 export FIND_PYTHON
 
-.PHONY: help setup demo test test-integration test-all test-browser docs tables animation notebook lint format typing lock clean FORCE
+.PHONY: help setup demo test test-integration test-most test-all test-browser docs tables animation notebook lint format typing lock clean FORCE
 
 help:
 	@echo "make demo      set up, then the main job: success in simulation and in imagination, in minutes"
@@ -86,6 +86,10 @@ test: $(STAMP)
 
 test-integration: $(STAMP)
 	@$(BIN)/python -m pytest -m "integration and not slow and not browser" -n $$(($(CORES) + 1)) $(PARALLEL) $(ARGS)
+
+# Both at once, as .ci/run takes them: workers that wait for processes leave the cores to the quick ones.
+test-most: $(STAMP)
+	@$(BIN)/python -m pytest -m "not slow and not browser" -n $$(($(CORES) + 1)) $(PARALLEL) $(ARGS)
 
 # The slow ones kill processes and count on time: one after the other.
 test-all: test test-integration
