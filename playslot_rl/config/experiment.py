@@ -53,6 +53,8 @@ class DataConfig(Checked):
         workers: processes that decode a data set into the frame cache; 0 means one per core.
         stream: decode frames while they are read instead of into the cache, for sets larger than the disk.
         shuffle_buffer: frames in memory from which windows are drawn with `stream`.
+        device: `auto` keeps frames and slots of a set in a GPU's memory where they fit; `cpu` copies those of each
+            batch there.
         validation: fraction of episodes held out from training.
         tested: fraction of episodes that no training and no validation sees, for `compare-video`; 0 keeps none.
     """
@@ -70,6 +72,7 @@ class DataConfig(Checked):
     workers: int = field(default=1, metadata=role("machine") | WORKERS)
     stream: bool = False
     shuffle_buffer: int = field(default=20_000, metadata=at_least(1))
+    device: Literal["auto", "cpu"] = field(default="auto", metadata=role("machine"))
     validation: float = field(default=0.05, metadata=below_one())
     tested: float = field(default=0.0, metadata=below_one())
 

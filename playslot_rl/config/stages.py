@@ -20,6 +20,8 @@ from playslot_rl.config.roles import (
 )
 from playslot_rl.runtime.precision import Precision as Precision
 
+Execution = Literal["auto", "eager", "graph"]
+
 AFTER_CLONING: Final = (
     "labelled_demos", "decoder_inputs", "decoder_state", "decoder_steps", "decoder_lr", "finetune_steps",
     "finetune_labels", "finetune_lr", "policy_from",
@@ -65,6 +67,8 @@ class StageConfig(Checked):
         checkpoint_every: steps between checkpoints.
         validate_every: steps between validations.
         log_every: steps between log lines.
+        execution: `graph` records what a step computes once, as a CUDA graph, and replays it; `eager` launches its
+            kernels one by one; `auto` is `graph` on a GPU, wherever the step can be recorded.
         compile: make kernels of the networks' parts by torch.compile; needs a C++ compiler, and a minute at the start.
     """
 
@@ -76,6 +80,7 @@ class StageConfig(Checked):
     validate_every: int = field(default=1000, metadata=role("free") | at_least(1))
     log_every: int = field(default=50, metadata=role("free") | at_least(1))
     compile: bool = field(default=False, metadata=role("free"))
+    execution: Execution = field(default="auto", metadata=role("free"))
 
 
 def clipped_stage(steps: int, lr: float, schedule: Literal["cosine", "constant"]) -> StageConfig:

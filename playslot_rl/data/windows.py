@@ -10,7 +10,10 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
+from playslot_rl.data.device_rows import DeviceRows
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.stream import ShuffleBuffer, streams_of
 from playslot_rl.data.views import IntArray as IntArray
@@ -98,14 +101,34 @@ def split_episodes(episodes: int, validation: float, seed: int) -> tuple[IntArra
 class Clips:
     """Clips of unlabelled videos: windows of the training episodes, and spread ones of the episodes held out.
 
+    Args:
+        shown: at most so many windows validate.
+        resident: whether a GPU may keep all frames (`playslot_rl.data.device_rows`).
+
     Raises:
         DataError: no episode has `frames` frames.
     """
 
-    def __init__(self, source: EpisodeFrames, frames: int, validation: float, seed: int, shown: int = 32) -> None:
+    def __init__(
+        self,
+        source: EpisodeFrames,
+        frames: int,
+        validation: float,
+        seed: int,
+        shown: int = 32,
+        resident: bool = True,
+    ) -> None:
         self.source, self.frames, self.shown, self.seed = source, frames, shown, seed
+        self.resident = resident and not streams_of(source.frames)
+        self._pixels: DeviceRows | None = None
         self.train_episodes, held_out = split_episodes(source.episodes, validation, seed)
         self.held_out = self.spread(held_out)
+
+    def pixels(self, rows: IntArray, device: torch.device) -> Tensor:
+        """Frames of rows (...), uint8 (..., 3, H, W), on a device."""
+        if self._pixels is None or self._pixels.device != device:
+            self._pixels = DeviceRows(self.source.pixels, len(self.source.frames), device, self.resident)
+        return self._pixels(rows)
 
     def spread(self, episodes: IntArray) -> IntArray:
         """At most `shown` disjoint windows of episodes: row indices (at most `shown`, T)."""

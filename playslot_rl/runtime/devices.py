@@ -8,6 +8,7 @@ from playslot_rl.errors import ConfigError, require_type
 
 if TYPE_CHECKING:
     import torch
+    from torch import Tensor
 
 KINDS: Final = ("cpu", "cuda", "mps", "xpu")
 """Kinds of devices on which numbers are computed; torch knows others, such as `meta`, which only keep shapes."""
@@ -33,6 +34,13 @@ def named_device(name: str | torch.device = "") -> torch.device:
             f"device={name}: got a device that computes nothing, expected one of {', '.join(KINDS)}; use device=cpu"
         )
     return device
+
+
+def to_device(values: Tensor, device: torch.device) -> Tensor:
+    """The values on a device; the host does not wait for the copy to a GPU."""
+    if device.type == "cuda" and values.device.type == "cpu":
+        return values.pin_memory().to(device, non_blocking=True)
+    return values.to(device)
 
 
 def open_device(name: str, threads: int) -> torch.device:

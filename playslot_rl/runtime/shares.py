@@ -15,7 +15,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -74,7 +74,33 @@ def own_rows[Rows: (Tensor, npt.NDArray[np.int64])](rows: Rows) -> Rows:
 def own_noise(shape: tuple[int, ...] | torch.Size, draw: Callable[[tuple[int, ...]], Tensor]) -> Tensor:
     """Random numbers of the own rows, of the shape (b, ...): `draw` is called with the global batch's."""
     own = _share.get()
-    return own_rows(draw((shape[0] * own.count, *shape[1:])))
+    return own_rows(drawn(lambda: draw((shape[0] * own.count, *shape[1:]))))
+
+
+def drawn(draw: Callable[[], Tensor]) -> Tensor:
+    """What `draw` gives: all that a step draws at random while it computes. Inside of `taped` the tape hands it out."""
+    tape = _tape.get()
+    return draw() if tape is None else tape.take(draw)
+
+
+class Tape(Protocol):
+    """Hands out random numbers that can be drawn anew, in the same order."""
+
+    def take(self, draw: Callable[[], Tensor]) -> Tensor:
+        """What `draw` gives, or gave."""
+
+
+_tape: ContextVar[Tape | None] = ContextVar("tape", default=None)
+
+
+@contextlib.contextmanager
+def taped(tape: Tape) -> Iterator[None]:
+    """Inside the block `drawn` takes from this tape."""
+    token = _tape.set(tape)
+    try:
+        yield
+    finally:
+        _tape.reset(token)
 
 
 def all_rows(own: Tensor) -> Tensor:

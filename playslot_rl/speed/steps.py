@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig, Precision, StageConfig
+from playslot_rl.config.stages import Execution
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.losses.common import total_loss
 from playslot_rl.losses.dynamics import DynamicsLoss
@@ -26,7 +27,8 @@ from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.speed.timing import seconds
 from playslot_rl.training.batches import GlobalBatches
 from playslot_rl.training.compiling import compile_parts
-from playslot_rl.training.fit import build_adam, clip_gradients, trainable_parameters
+from playslot_rl.training.optimizer import build_adam, trainable_parameters
+from playslot_rl.training.steps import Steps
 from playslot_rl.world_model import Agent, WorldModel
 
 STAGES: Final = ("slots", "dynamics", "policy", "decoder")
@@ -126,31 +128,27 @@ class RandomStage:
     def modules(self) -> Mapping[str, nn.Module]:
         return dict(self.criterion.named_children())
 
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+    def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         rows = own_rows(torch.arange(self.size, device=self.device))
+        return {key: value[rows] for key, value in self.data.items()}
+
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         with self.surrounded:
-            out = self.criterion(self.data[rows])
+            out = self.criterion(TensorDict(dict(batch)), generators.torch("noise"))
         return {"loss": total_loss(out)}
 
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
         return {}
 
-    def step(self) -> Step:
+    def step(self, execution: Execution = "eager") -> Step:
         """What takes one step, of this process's share of the batch where there are several."""
         parameters = trainable_parameters({"loss": self.criterion})
-        adam = build_adam(parameters, replace(self.optim, warmup_steps=0))
-        sized = replace(StageConfig(), batch_size=self.size, optim=replace(self.optim, accumulate=1))
-        batches = GlobalBatches(self, sized, parameters, self.group)
+        optim = replace(self.optim, warmup_steps=0, accumulate=1)
+        config = replace(StageConfig(), batch_size=self.size, optim=optim, execution=execution)
+        batches = GlobalBatches(self, config, parameters, self.group)
         batches.meet()
-
-        def take() -> Tensor:
-            adam.zero_grad(set_to_none=True)
-            loss = batches.backward(0, 0, self.device)["loss"]
-            clip_gradients(parameters, self.optim.grad_clip)
-            adam.step()
-            return loss.detach()
-
-        return take
+        steps = Steps(self.group, self.group, batches, build_adam(parameters, optim), config, 0, self.device)
+        return lambda: steps.take(0, optim.lr)["loss"]
 
 
 def time_step(

@@ -19,7 +19,7 @@ from playslot_rl.modules.quantizer import ActionQuantizer
 from playslot_rl.runtime.processes import copied, here, summed
 from playslot_rl.runtime.shares import Share, global_norms, sharing
 from playslot_rl.seeds.draws import StepGenerators, global_seed
-from playslot_rl.training.stage import Stage
+from playslot_rl.training.stage import Stage, step_loss
 
 
 class GlobalBatches:
@@ -54,26 +54,26 @@ class GlobalBatches:
             global_norms(module)
             copied([*module.parameters(), *module.buffers()])
 
-    def backward(self, step: int, seed: int, device: torch.device | str) -> dict[str, Tensor]:
+    def backward(self, step: int, generators: StepGenerators) -> dict[str, Tensor]:
         """Gradients of the global batch into the parameters; its loss and the other numbers of it.
 
         Raises:
             PeerError: another process ended.
         """
         if self.count == 1:
-            with global_seed(seed, step):
-                losses = dict(self.stage.loss(step, StepGenerators(seed, step, device)))
+            with global_seed(generators.seed, step):
+                losses = dict(step_loss(self.stage, step, generators))
                 losses["loss"].backward()
             return losses
-        generators, numbers = StepGenerators(seed, step, device), []
-        with global_seed(seed, step):
+        numbers = []
+        with global_seed(generators.seed, step):
             begins = self.micros > 1 and any(quantizer.starts_from_a_batch for quantizer in self._quantizers)
             if begins:
                 self._rehearse(step, generators)
                 numbers = [self._share(step, generators, own) for own in self._shares()]
         # Every micro-batch draws the global batch's noise anew, so that all slice the same.
         for own in () if begins else self._shares():
-            with global_seed(seed, step):
+            with global_seed(generators.seed, step):
                 numbers.append(self._share(step, generators, own))
         means = {key: torch.stack([part[key].float() for part in numbers]).mean() for key in numbers[0]}
         return self._averaged(means) if here().world > 1 else means
@@ -85,7 +85,7 @@ class GlobalBatches:
 
     def _share(self, step: int, generators: StepGenerators, own: Share) -> dict[str, Tensor]:
         with sharing(own):
-            losses = self.stage.loss(step, generators)
+            losses = step_loss(self.stage, step, generators)
             (losses["loss"] / self.micros).backward()
         return {key: value.detach() for key, value in losses.items()}
 
@@ -94,7 +94,7 @@ class GlobalBatches:
         """Show the first global batch to codebooks that start from it, before its first micro-batch is quantised."""
         for micro in range(self.micros):
             with sharing(Share(here().rank * self.micros + micro, self.count, micro, self.micros, rehearsal=True)):
-                self.stage.loss(step, generators)
+                step_loss(self.stage, step, generators)
 
     def _averaged(self, numbers: Mapping[str, Tensor]) -> dict[str, Tensor]:
         parameters = list(self.parameters.values())

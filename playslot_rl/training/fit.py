@@ -8,7 +8,6 @@ Of several processes (`playslot_rl.runtime.processes`) each computes its share o
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -16,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from playslot_rl.config import LoggingConfig, OptimConfig, StageConfig
+from playslot_rl.config import LoggingConfig, StageConfig
 from playslot_rl.config.roles import without
 from playslot_rl.errors import CheckpointError
 from playslot_rl.runtime.processes import agreed, here, spreading, wait
@@ -29,9 +28,11 @@ from playslot_rl.training.averages import WeightAverage
 from playslot_rl.training.batches import GlobalBatches
 from playslot_rl.training.compiling import compile_parts, release_parts
 from playslot_rl.training.logging import Watch, finite
+from playslot_rl.training.optimizer import build_adam, learning_rate, trainable_parameters
 from playslot_rl.training.pace import Pace
 from playslot_rl.training.patience import Patience
 from playslot_rl.training.stage import Stage, WatchedStage
+from playslot_rl.training.steps import Steps
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ def fit(
     wait()  # until all have looked, and what is there is there for all
     run.meet()
     if not run.ended:
-        progress = StageProgress(part.name, start, run.steps, logging.progress, config.log_every * 10)
+        progress = StageProgress(part.name, start, run.planned, logging.progress, config.log_every * 10)
         with run.watch.running(logging, start), run.compiled(), progress:
             while not run.ended:
                 run.advance(run.state.step, progress)
@@ -138,6 +139,7 @@ class _Run:
         self.parameters = trainable_parameters(part.stage.modules)
         self.batches = GlobalBatches(part.stage, part.config, self.parameters, part.group or part.name)
         self.optimizer = build_adam(self.parameters, part.config.optim)
+        self.steps = Steps(part.name, part.group or part.name, self.batches, self.optimizer, part.config, seed, device)
         ema = part.config.optim.ema
         self.average = WeightAverage(self.parameters, ema) if ema else None
         own = {part.name: without(part.config, "free"), "seed": seed}
@@ -157,7 +159,7 @@ class _Run:
         self._train_mode(True)
 
     @property
-    def steps(self) -> int:
+    def planned(self) -> int:
         """Of the whole training, as it is planned now."""
         return self.state.planned or self.config.steps
 
@@ -165,7 +167,7 @@ class _Run:
     def ended(self) -> bool:
         """Whether there is nothing left to do."""
         patient = self.patience is None or not self.patience.ended(self.state)
-        return self.state.step >= self.steps or not patient
+        return self.state.step >= self.planned or not patient
 
     @property
     def _averaged(self) -> Mapping[str, Tensor] | None:
@@ -204,8 +206,9 @@ class _Run:
         values = self._step(step)
         self.state = replace(self.state, step=done, seconds=time.monotonic() - self._began)
         self._keep_pace()
-        last, progress.total = done == self.steps, self.steps
+        last, progress.total = done == self.planned, self.planned
         if done == 1 or done % config.log_every == 0 or last:
+            self._require_finite()
             numbers = {key: float(value) for key, value in values.items()}
             self._log("train", done, numbers)
             progress.update(done, numbers)
@@ -227,31 +230,28 @@ class _Run:
     def _keep_pace(self) -> None:
         """Plan anew if it is time to: from the steps since the last look, and what came between them."""
         pace, (done, spent), state = self.part.pace, self._looked, self.state
-        if pace is None or not pace.due(state.step - done, state.seconds - spent, self.steps):
+        if pace is None or not pace.due(state.step - done, state.seconds - spent, self.planned):
             return
         # Validations come now and then, but evenly over all steps.
         a_step = (state.seconds - spent - self._validating) / (state.step - done)
         a_step += self._validation / self.config.validate_every
-        planned = pace.steps(state.step, state.seconds, a_step, self.steps, self._validation)
+        planned = pace.steps(state.step, state.seconds, a_step, self.planned, self._validation)
         self.state, self._looked, self._validating = replace(state, planned=planned), (state.step, state.seconds), 0.0
 
     def _step(self, step: int) -> dict[str, Tensor | float]:
-        rate = learning_rate(self.config.optim, step, self.steps)
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
-        self.optimizer.zero_grad(set_to_none=True)
-        losses = self.batches.backward(step, self.seed, self.device)
-        norm = clip_gradients(self.parameters, self.config.optim.grad_clip)
-        # One transfer for both, so that a GPU is waited for once a step.
-        loss, size = torch.stack([losses["loss"].detach().float(), norm.float()]).tolist()
-        for what, got in (("loss", loss), ("gradient norm", size)):
-            if not math.isfinite(got):
-                raise self.watch.not_finite(what, str(got), f"step {step + 1}")
-        self.optimizer.step()
+        rate = learning_rate(self.config.optim, step, self.planned)
+        values = self.steps.take(step, rate)
         if self.average is not None:
             self.average.update(step + 1)
-        values: dict[str, Tensor | float] = {key: value.detach() for key, value in losses.items()}
-        return values | {"loss": loss, "lr": rate, "grad_norm": size}
+        if not self.steps.on_gpu:
+            self._require_finite()
+        return {**values, "lr": rate}
+
+    def _require_finite(self) -> None:
+        found = self.steps.not_finite()
+        if found is not None:
+            what, value, step = found
+            raise self.watch.not_finite(what, str(value), f"step {step}")
 
     def _validate(self, done: int) -> dict[str, float]:
         self._train_mode(False)
@@ -299,40 +299,3 @@ class _Run:
         if not here().first:
             return
         self.watch.log(split, step, {**values, "seconds": round(self.state.seconds, 3)}, at=step)
-
-
-def learning_rate(config: OptimConfig, step: int, steps: int) -> float:
-    """Learning rate of step `step` (from 0) of `steps`: linear warm-up, then constant or cosine to zero.
-
-    Example:
-        >>> [learning_rate(OptimConfig(lr=1.0, warmup_steps=2), s, 4) for s in range(4)]
-        [0.5, 1.0, 1.0, 0.5]
-    """
-    if step < config.warmup_steps:
-        return config.lr * (step + 1) / config.warmup_steps
-    if config.schedule == "constant":
-        return config.lr
-    done = (step - config.warmup_steps) / max(1, steps - config.warmup_steps)
-    return config.lr * 0.5 * (1.0 + math.cos(math.pi * min(1.0, done)))
-
-
-def trainable_parameters(modules: Mapping[str, nn.Module]) -> dict[str, nn.Parameter]:
-    """Parameters with gradients by their full name, in a fixed order."""
-    return {
-        f"{name}.{key}": parameter
-        for name, module in modules.items()
-        for key, parameter in module.named_parameters()
-        if parameter.requires_grad
-    }
-
-
-def build_adam(parameters: Mapping[str, nn.Parameter], config: OptimConfig) -> torch.optim.Adam:
-    """Adam over `parameters`, fused: one kernel for all tensors, on CPU and GPU alike."""
-    if not parameters:
-        raise ValueError("got no trainable parameters, expected at least one: a stage's modules must not be frozen")
-    return torch.optim.Adam(list(parameters.values()), lr=config.lr, fused=True)
-
-
-def clip_gradients(parameters: Mapping[str, nn.Parameter], maximum: float) -> Tensor:
-    """Clip the gradient norm in place (0: leave it) and return the norm before clipping, a scalar tensor."""
-    return nn.utils.clip_grad_norm_(parameters.values(), maximum if maximum > 0 else math.inf)

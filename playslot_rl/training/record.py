@@ -146,7 +146,8 @@ class StageRecord:
         Raises:
             DataError: no episode has so many frames.
         """
-        return Clips(self.videos, frames, self.config.data.validation, self.config.seed, shown)
+        data = self.config.data
+        return Clips(self.videos, frames, data.validation, self.config.seed, shown, data.device == "auto")
 
     @property
     def data(self) -> EpisodeFrames:

@@ -28,7 +28,9 @@ from playslot_rl.training.stage_regression import (
     PairedInputs,
     RegressionStage,
     TensorInputs,
+    apart,
     apply_rows,
+    together,
 )
 
 VALIDATED: Final = 2048
@@ -135,9 +137,13 @@ class CloneStage:
         """Policy, and oracle if there is one."""
         return {name: stage.criterion.network for name, stage in self.stages.items()}
 
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+    def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+        """Those of the networks."""
+        return together({name: stage.batch(step, generators) for name, stage in self.stages.items()})
+
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         """Cloning error of one batch; the networks share no weights, so the sum trains each as alone."""
-        losses = {name: stage.loss(step, generators)["loss"] for name, stage in self.stages.items()}
+        losses = {name: stage.loss(apart(batch, name), step, generators)["loss"] for name, stage in self.stages.items()}
         return {"loss": torch.stack(list(losses.values())).sum(), **losses}
 
     def validate(self, step: int) -> Mapping[str, float]:
@@ -294,10 +300,17 @@ class FinetuneStage:
         """Policy and action decoder."""
         return {"policy": self.policy, "action_decoder": self.decoder}
 
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+    def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+        """Labelled rows, which both ways of acting share, and those that the policy clones."""
+        return together(
+            {"acting": self.acting[0].batch(step, generators), "cloning": self.clone.batch(step, generators)}
+        )
+
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         """Errors of actions and of latents."""
-        action = torch.stack([part.loss(step, generators)["loss"] for part in self.acting]).sum()
-        latent = self.clone.loss(step, generators)["loss"]
+        labelled = apart(batch, "acting")
+        action = torch.stack([part.loss(labelled, step, generators)["loss"] for part in self.acting]).sum()
+        latent = self.clone.loss(apart(batch, "cloning"), step, generators)["loss"]
         return {"loss": action + latent, "action": action, "latent": latent}
 
     def validate(self, step: int) -> Mapping[str, float]:

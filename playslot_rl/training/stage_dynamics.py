@@ -13,11 +13,13 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.config import DynamicsStageConfig, ModelConfig
 from playslot_rl.data.cache import Cache
+from playslot_rl.data.device_rows import DeviceRows
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.errors import DataError
 from playslot_rl.losses.common import total_loss
 from playslot_rl.losses.dynamics import DynamicsLoss
+from playslot_rl.runtime.devices import to_device
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
 from playslot_rl.runtime.shares import own_rows
@@ -41,8 +43,9 @@ class DynamicsStage:
     def __init__(
         self, model: WorldModel, clips: Clips, slots: npt.NDArray[np.float32], config: DynamicsStageConfig
     ) -> None:
-        self.model, self.clips, self.slots, self.config = model, clips, slots, config
+        self.model, self.clips, self.config = model, clips, config
         self.source, self.device = clips.source, module_device(model)
+        self.slots = DeviceRows(lambda rows: torch.from_numpy(slots[rows]), len(slots), self.device, clips.resident)
         self.criterion = DynamicsLoss(model.inverse_dynamics, model.predictor, model.savi, config)
         if self.criterion.needs_actions:
             if not np.isfinite(self.source.require_actions(model.env.action_dim)).all():
@@ -58,13 +61,20 @@ class DynamicsStage:
         """InvDyn and cOCVP."""
         return {"inverse_dynamics": self.model.inverse_dynamics, "predictor": self.model.predictor}
 
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+    def phase(self, step: int) -> str:
+        """In the first `teacher_steps` every input is a parsed slot; then predictions are fed back."""
+        return "teacher-forced" if step < self.config.teacher_steps else "rollout"
+
+    def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        """Slots and frames of clips, and their actions where they are the latents."""
+        return self._batch(own_rows(self._sample(generators)))
+
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         """Image, slot and quantiser loss of one batch of clips."""
         self.model.savi.precision = self.config.precision
         teacher = step < self.config.teacher_steps
-        batch = self._batch(own_rows(self._sample(generators)))
         with autocast(self.device.type, self.config.precision):
-            out = self.criterion(batch, generators.torch("latent"), teacher)
+            out = self.criterion(TensorDict(dict(batch)), generators.torch("latent"), teacher)
         logged = {key: value for key, value in out.items() if not key.startswith("loss_")}
         return {"loss": total_loss(out), "loss_vq": out["loss_vq"], **logged}
 
@@ -74,7 +84,7 @@ class DynamicsStage:
         names = ("mse_image", "mse_slot", "psnr", "usage", "perplexity")
 
         def look(_: int, rows: IntArray) -> list[float]:
-            out = self.criterion(self._batch(rows), step_generator(0, step, "validation", self.device))
+            out = self.criterion(TensorDict(self._batch(rows)), step_generator(0, step, "validation", self.device))
             return [float(out[name]) for name in names]
 
         columns = zip(*spread(self.clips.validation_batches(), look), strict=True)
@@ -90,14 +100,14 @@ class DynamicsStage:
             rows[chosen] = first[chosen, None] + np.arange(clips.frames)
         return rows
 
-    def _batch(self, rows: IntArray) -> TensorDict:
+    def _batch(self, rows: IntArray) -> dict[str, Tensor]:
         batch = {
-            keys.SLOTS: torch.from_numpy(self.slots[rows]).to(self.device),
-            keys.PIXELS: self.source.pixels(rows).to(self.device),
+            keys.SLOTS: self.slots(rows),
+            keys.PIXELS: self.clips.pixels(rows, self.device),
         }
         if self.criterion.needs_actions:
-            batch[keys.ACTION] = torch.from_numpy(self.source.require_actions()[rows]).to(self.device)
-        return TensorDict(batch, [len(rows)])
+            batch[keys.ACTION] = to_device(torch.from_numpy(self.source.require_actions()[rows]), self.device)
+        return batch
 
 
 def dynamics_on_slots(record: StageRecord, sizes: ModelConfig, own: DynamicsStageConfig) -> DynamicsStage:

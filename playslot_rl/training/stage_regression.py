@@ -19,9 +19,11 @@ from torch import Tensor, nn
 
 from playslot_rl.config import Precision
 from playslot_rl.data.demonstrations import Transitions, real_actions
+from playslot_rl.data.device_rows import DeviceRows
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.views import shift_frames
+from playslot_rl.data.stream import streams_of
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
+from playslot_rl.runtime.devices import to_device
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
 from playslot_rl.runtime.shares import own_noise, own_rows
@@ -72,13 +74,11 @@ class TensorInputs:
 
     def plain(self, rows: Tensor) -> Tensor:
         """Rows, without noise."""
-        first = self.parts[0]
-        if len(self.parts) == 1:
-            return first[rows]
-        values, start = first.new_empty(len(rows), *first.shape[1:]), 0
-        for part in self.parts:
+        values, start = self.parts[0][rows.clamp(max=len(self.parts[0]) - 1)], len(self.parts[0])
+        for part in self.parts[1:]:
             own = (rows >= start) & (rows < start + len(part))
-            values[own] = part[rows[own] - start]
+            there = part[(rows - start).clamp(0, len(part) - 1)]
+            values = torch.where(own.view(-1, *[1] * (values.dim() - 1)), there, values)
             start += len(part)
         return values
 
@@ -109,7 +109,9 @@ class FrameInputs:
     def __init__(
         self, source: EpisodeFrames, rows: npt.NDArray[np.int64], device: torch.device | str, shift: int = 0
     ) -> None:
-        self.source, self.rows, self.device, self.shift = source, rows, device, shift
+        self.rows, self.device, self.shift = rows, torch.device(device), shift
+        resident = not streams_of(source.frames)
+        self.frames = DeviceRows(lambda own: source.pixels(rows[own]), len(rows), device, resident)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -120,13 +122,22 @@ class FrameInputs:
             return self.plain(rows)
         generator = generators.torch("shift", "cpu")
         offsets = own_noise((len(rows), 2), lambda shape: torch.randint(2 * self.shift + 1, shape, generator=generator))
-        frames = self.source.frames[self.rows[rows.cpu().numpy()]]
-        moved = shift_frames(frames, offsets.numpy() - self.shift)
-        return torch.from_numpy(moved).movedim(-1, 1).to(self.device)
+        return shifted(self.plain(rows), to_device(offsets - self.shift, self.device))
 
     def plain(self, rows: Tensor) -> Tensor:
         """Frames of rows, as they are."""
-        return self.source.pixels(self.rows[rows.cpu().numpy()]).to(self.device)
+        return self.frames.take(rows)
+
+
+def shifted(frames: Tensor, offsets: Tensor) -> Tensor:
+    """Frames (b, C, H, W), each moved by its own pixels (b, 2), down and right; what enters repeats the edge."""
+    height, width = frames.shape[-2:]
+    down, right = (
+        (torch.arange(size, device=frames.device) - offsets[:, axis, None]).clamp(0, size - 1)
+        for axis, size in enumerate((height, width))
+    )
+    each = torch.arange(len(frames), device=frames.device)[:, None, None]
+    return frames.movedim(1, -1)[each, down[:, :, None], right[:, None, :]].movedim(-1, 1)
 
 
 def demonstrated_frames(
@@ -190,15 +201,17 @@ class RegressionStage:
         """The network."""
         return {self.name: self.criterion.network}
 
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """Error of one batch."""
-        device = self.targets.device
+    def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        """Inputs and targets of rows drawn uniformly."""
         drawn = torch.randint(len(self.targets), (self.batch_size,), generator=generators.torch(self.stream, "cpu"))
-        rows = own_rows(drawn).to(device)
+        rows = to_device(own_rows(drawn), self.targets.device)
         observed = dict(zip(self.criterion.observed, _several(self.inputs.draw(rows, generators)), strict=True))
-        batch = {**observed, self.criterion.tensor_keys.action: self.targets[rows]}
-        with autocast(device.type, self.precision):
-            losses = self.criterion(TensorDict(batch, [len(rows)]))
+        return {**observed, self.criterion.tensor_keys.action: self.targets[rows]}
+
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        """Error of one batch."""
+        with autocast(self.targets.device.type, self.precision):
+            losses = self.criterion(TensorDict(dict(batch)))
         return {"loss": losses[self.criterion.out_name]}
 
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
@@ -210,6 +223,16 @@ class RegressionStage:
         count = min(self.validated or len(targets), len(targets))
         rows = torch.linspace(0, len(targets) - 1, count, device=targets.device).long()
         return apply_rows(self.criterion.network, inputs, rows), targets[rows]
+
+
+def together(batches: Mapping[str, Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """Batches of several stages, by name, as one; `apart` gives one of them back."""
+    return {f"{name}/{key}": value for name, batch in batches.items() for key, value in batch.items()}
+
+
+def apart(batch: Mapping[str, Tensor], name: str) -> dict[str, Tensor]:
+    """The batch of that name in what `together` made."""
+    return {key.removeprefix(f"{name}/"): value for key, value in batch.items() if key.startswith(f"{name}/")}
 
 
 @torch.no_grad()

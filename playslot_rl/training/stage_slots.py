@@ -50,8 +50,12 @@ class SlotsStage:
         """SAVi."""
         return {"savi": self.savi}
 
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
-        """Reconstruction error of one batch of clips; in the first `zoom_steps` of their first frames, magnified.
+    def phase(self, step: int) -> str:
+        """In the first `zoom_steps` single frames, magnified; then clips."""
+        return "magnified" if step < self.config.zoom_steps else "clips"
+
+    def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+        """Clips; in the first `zoom_steps` their first frames, magnified.
 
         Note: the paper shows clips as they are. One colour explains most pixels of a plain ground, and Slot Attention
         averages over all of them, so that small things hardly change what it sees; magnified they do, and slots that
@@ -59,13 +63,15 @@ class SlotsStage:
         """
         own, count = self.config, self.config.batch_size
         rows = own_rows(self.clips.sample(count, generators.numpy("windows")))
-        zoomed = step < own.zoom_steps
-        batch = self._batch(rows[:, :1] if zoomed else rows)
-        if zoomed:
-            at = own_rows(corners(count, self.savi.image_size, own.zoom, generators.numpy("zoom")))
-            batch[keys.PIXELS] = magnified(batch[keys.PIXELS], own.zoom, at)
-        self.savi.precision = own.precision
-        out = self.criterion(batch, generator=generators.torch("slots"))
+        if step >= own.zoom_steps:
+            return {keys.PIXELS: self._pixels(rows)}
+        at = own_rows(corners(count, self.savi.image_size, own.zoom, generators.numpy("zoom")))
+        return {keys.PIXELS: magnified(self._pixels(rows[:, :1]), own.zoom, at)}
+
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        """Reconstruction error of one batch."""
+        self.savi.precision = self.config.precision
+        out = self.criterion(TensorDict(dict(batch)), generator=generators.torch("slots"))
         return {"loss": out["loss_reconstruction"], "psnr": out["psnr"]}
 
     def validate(self, step: int) -> Mapping[str, float]:
@@ -102,10 +108,11 @@ class SlotsStage:
         return {"slots": np.concatenate([np.concatenate(list(row), 1) for row in rows])}
 
     def _parse(self, rows: IntArray, step: int) -> tuple[Tensor, Decoded]:
-        return self.criterion.reconstruct(self._batch(rows), step_generator(0, step, "validation", self.device))
+        frames = TensorDict({keys.PIXELS: self._pixels(rows)})
+        return self.criterion.reconstruct(frames, step_generator(0, step, "validation", self.device))
 
-    def _batch(self, rows: IntArray) -> TensorDict:
-        return TensorDict({keys.PIXELS: self.clips.source.pixels(rows).to(self.device)}, [len(rows)])
+    def _pixels(self, rows: IntArray) -> Tensor:
+        return self.clips.pixels(rows, self.device)
 
 
 def warm_start(savi: SAVi, source: SAVi, where: str) -> None:

@@ -152,14 +152,14 @@ def test_a_command_gives_the_run_of_one_process(launch: Callable[..., Launched],
 
 
 def _rank_one_fails() -> None:
-    original = SlotsStage.loss
+    original = SlotsStage.batch
 
-    def loss(self: SlotsStage, step: int, generators: StepGenerators) -> object:
+    def batch(self: SlotsStage, step: int, generators: StepGenerators) -> object:
         if step == 3 and os.environ["RANK"] == "1":
             raise TrainingError("slots: got a rank that fails, expected none")
         return original(self, step, generators)
 
-    SlotsStage.loss = loss  # type: ignore[method-assign, assignment]
+    SlotsStage.batch = batch  # type: ignore[method-assign, assignment]
 
 
 def test_a_rank_that_dies_ends_the_others_with_its_error_in_one_line(
@@ -174,9 +174,9 @@ def _rank_one_is_killed(run: Path, killed: Path) -> Callable[[], None]:
     """After the first checkpoint is written, which rank 0 does while the other goes on; says when in `killed`."""
 
     def patch() -> None:
-        real = SlotsStage.loss
+        real = SlotsStage.batch
 
-        def loss(stage: SlotsStage, step: int, generators: StepGenerators) -> object:
+        def batch(stage: SlotsStage, step: int, generators: StepGenerators) -> object:
             if step == 4 and os.environ["RANK"] == "1":
                 while not list((run / "slots" / "checkpoints").glob("step_*")):
                     time.sleep(0.02)
@@ -184,7 +184,7 @@ def _rank_one_is_killed(run: Path, killed: Path) -> Callable[[], None]:
                 os.kill(os.getpid(), signal.SIGKILL)
             return real(stage, step, generators)
 
-        SlotsStage.loss = loss  # type: ignore[method-assign, assignment]
+        SlotsStage.batch = batch  # type: ignore[method-assign, assignment]
 
     return patch
 

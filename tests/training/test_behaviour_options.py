@@ -14,6 +14,7 @@ from playslot_rl.data.demonstrations import Demonstrations
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import StepGenerators
+from playslot_rl.training.stage import step_loss
 from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage, SeenSlots, cloning_settings
 from playslot_rl.training.stage_regression import TensorInputs
 
@@ -54,7 +55,7 @@ def train(stage: DecoderStage | FinetuneStage, steps: int, lr: float = 3e-3) -> 
     optimiser = torch.optim.Adam(parameters, lr=lr)
     for step in range(steps):
         optimiser.zero_grad()
-        stage.loss(step, StepGenerators(0, step))["loss"].backward()
+        step_loss(stage, step, StepGenerators(0, step))["loss"].backward()
         optimiser.step()
 
 
@@ -116,7 +117,7 @@ def test_fine_tuning_learns_actions_and_goes_on_cloning() -> None:
     clone = CloneStage(policy, None, demos, cloning_settings(config))
     stage = FinetuneStage(clone.stages["policy"], decoder, demos, config, demonstrations("slots", seed=1))
     assert set(stage.modules) == {"policy", "action_decoder"}
-    losses = stage.loss(0, StepGenerators(0, 0))
+    losses = step_loss(stage, 0, StepGenerators(0, 0))
     assert float((losses["action"] + losses["latent"]).detach()) == pytest.approx(float(losses["loss"].detach()))
     before = stage.validate(0)["unexplained_held_out"]
     train(stage, 150)

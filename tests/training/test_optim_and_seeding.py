@@ -9,7 +9,7 @@ from torch import nn
 
 from playslot_rl.config import OptimConfig
 from playslot_rl.seeds.draws import StepGenerators, global_seed, step_generator
-from playslot_rl.training.fit import build_adam, clip_gradients, learning_rate, trainable_parameters
+from playslot_rl.training.optimizer import build_adam, clip_gradients, learning_rate, trainable_parameters
 
 
 def test_warm_up_is_linear_and_cosine_ends_near_zero() -> None:

@@ -44,7 +44,10 @@ class Slow:
     def modules(self) -> Mapping[str, nn.Module]:
         return {"layer": self.layer}
 
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+    def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+        return {}
+
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         if step == self.dies:
             raise KeyboardInterrupt
         self.clock.now += next(

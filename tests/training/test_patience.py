@@ -28,7 +28,10 @@ class Counter:
         nn.init.ones_(self.modules["counter"].weight)
         self.modules["counter"].register_buffer("steps", torch.zeros(1))
 
-    def loss(self, step: int, generators: StepGenerators) -> dict[str, Tensor]:
+    def batch(self, step: int, generators: StepGenerators) -> dict[str, Tensor]:
+        return {}
+
+    def loss(self, batch: dict[str, Tensor], step: int, generators: StepGenerators) -> dict[str, Tensor]:
         if step == self.stop_at:
             raise KeyboardInterrupt
         self.seen += 1

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from playslot_rl.config import LoggingConfig, OptimConfig, SAViConfig, SlotsStageConfig
 from playslot_rl.data.source import EpisodeFrames
@@ -48,18 +49,14 @@ class Blind:
     """The same stage with the validation it had before: the error alone, from the loss module."""
 
     def __init__(self, seeing: SlotsStage) -> None:
-        self.seeing, self.modules, self.loss = seeing, seeing.modules, seeing.loss
+        self.seeing, self.modules, self.batch, self.loss = seeing, seeing.modules, seeing.batch, seeing.loss
 
     def validate(self, step: int) -> dict[str, float]:
         self.seeing.savi.precision = "fp32"
-        errors = [
-            float(
-                self.seeing.criterion(self.seeing._batch(rows), step_generator(0, step, "validation"))[
-                    "loss_reconstruction"
-                ]
-            )
-            for rows in self.seeing.clips.validation_batches()
-        ]
+        errors = []
+        for rows in self.seeing.clips.validation_batches():
+            clips, generator = TensorDict({"pixels": self.seeing._pixels(rows)}), step_generator(0, step, "validation")
+            errors.append(float(self.seeing.criterion(clips, generator)["loss_reconstruction"]))
         return {"mse": float(np.mean(errors))}
 
 

@@ -10,6 +10,7 @@ from tiny_stages import STAGES
 
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.seeds.draws import StepGenerators, global_seed
+from playslot_rl.training.stage import step_loss
 from playslot_rl.training.stage_dynamics import DynamicsStage
 
 KINDS = ["dynamics", "dynamics of many agents", "slotformer", "ocvp_seq"]
@@ -33,7 +34,7 @@ def test_bf16_is_trained_under_autocast_and_validated_in_fp32(kind: str, step: i
     for precision in ("fp32", "bf16", "fp32"):
         stage = stage_of(kind, precision)
         with torch.no_grad(), global_seed(0, step):
-            losses.append(stage.loss(step, StepGenerators(3, step)))
+            losses.append(step_loss(stage, step, StepGenerators(3, step)))
             validations.append(stage_of(kind, precision).validate(1))
     for name in ("loss", "mse_image", "mse_slot"):
         full, half, again = (values[name] for values in losses)

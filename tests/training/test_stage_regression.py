@@ -17,6 +17,7 @@ from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.testing import tiny_config
 from playslot_rl.training.fit import Part, fit
+from playslot_rl.training.stage import step_loss
 from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, oracle_stage
 from playslot_rl.training.stage_regression import RegressionStage, TensorInputs, unexplained
 
@@ -40,7 +41,7 @@ def test_a_linear_map_is_found(tmp_path: Path) -> None:
 def test_batches_are_a_function_of_seed_and_step() -> None:
     x, y, network = torch.randn(50, 3), torch.randn(50, 2), nn.Linear(3, 2)
     losses = [
-        float(_stage(network, x, y).loss(0, StepGenerators(*where))["loss"]) for where in ((0, 1), (0, 1), (0, 2))
+        float(step_loss(_stage(network, x, y), 0, StepGenerators(*where))["loss"]) for where in ((0, 1), (0, 1), (0, 2))
     ]
     assert losses[0] == losses[1] != losses[2]
 
@@ -79,7 +80,7 @@ def test_held_out_demonstrations_measure_and_are_not_trained_on() -> None:
     beside = CloneStage(policy, oracle, demos, config, other)
     generators = StepGenerators(3, 5)
     with torch.no_grad():
-        assert alone.loss(5, generators)["loss"] == beside.loss(5, generators)["loss"]
+        assert step_loss(alone, 5, generators)["loss"] == step_loss(beside, 5, generators)["loss"]
         plain, both = alone.validate(1), beside.validate(1)
     assert {key: both[key] for key in plain} == plain
     assert both.keys() - plain.keys() == {f"{key}_held_out" for key in plain}
@@ -104,7 +105,7 @@ def test_bf16_is_trained_under_autocast_and_validated_in_fp32() -> None:
 
     for full, half, plain in zip(stages("fp32"), stages("bf16"), stages("fp32"), strict=True):
         with torch.no_grad():
-            losses = [stage.loss(5, StepGenerators(3, 5)) for stage in (full, half, plain)]
+            losses = [step_loss(stage, 5, StepGenerators(3, 5)) for stage in (full, half, plain)]
             assert full.validate(1) == half.validate(1)
         for name in losses[0]:
             assert losses[0][name] == losses[2][name] != losses[1][name]
@@ -118,8 +119,9 @@ def test_the_oracle_beside_the_policy_is_the_oracle_alone() -> None:
     alone.load_state_dict(beside.state_dict())
     assert demos.actions is not None
     generators = StepGenerators(3, 5)
-    CloneStage(LatentPolicy(sizes, 32, 8), beside, demos, config).loss(5, generators)["loss"].backward()
-    oracle_stage(alone, demos.slots, demos.actions, config).loss(5, generators)["loss"].backward()
+    cloning = CloneStage(LatentPolicy(sizes, 32, 8), beside, demos, config)
+    for stage in (cloning, oracle_stage(alone, demos.slots, demos.actions, config)):
+        step_loss(stage, 5, generators)["loss"].backward()
     for one, two in zip(beside.parameters(), alone.parameters(), strict=True):
         assert one.grad is not None
         assert two.grad is not None

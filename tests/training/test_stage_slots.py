@@ -11,6 +11,7 @@ from playslot_rl import keys
 from playslot_rl.config import SlotsStageConfig
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.testing import tiny_savi
+from playslot_rl.training.stage import step_loss
 from playslot_rl.training.stage_slots import SlotsStage
 
 ZOOMED = 2
@@ -21,7 +22,7 @@ def shown(step: int, seed: int = 0) -> Tensor:
     stage = SlotsStage(tiny_savi(), clips(32, 4), SlotsStageConfig(**SETTINGS, clip_frames=4, zoom_steps=ZOOMED))
     seen: list[TensorDict] = []
     stage.criterion.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    stage.loss(step, StepGenerators(seed, step))
+    step_loss(stage, step, StepGenerators(seed, step))
     batch: Tensor = seen[0][keys.PIXELS]
     return batch
 

@@ -51,6 +51,8 @@ from playslot_rl.training.stage_regression import FrameInputs, RegressionStage
 from playslot_rl.training.stage_slots import SlotsStage
 from playslot_rl.world_model import WorldModel
 
+DEVICE = torch.device("cpu")
+"""Where the stages are made; tests of a GPU set another."""
 STEPS = 20
 BATCH = 6
 CADDY_STEPS = 8
@@ -88,11 +90,12 @@ def demonstrations() -> Demonstrations:
     slots, latents = torch.randn(30, 3, 16, generator=draw), torch.randn(30, 4, generator=draw)
     episode, step = torch.arange(30) // 6, torch.arange(30) % 6
     imagined, actions = slots + 0.1, torch.rand(30, 2, generator=draw) * 2 - 1
-    return Demonstrations(slots, imagined, latents, actions, episode, step, torch.full((5,), 6))
+    made = (slots, imagined, latents, actions, episode, step, torch.full((5,), 6))
+    return Demonstrations(*(part.to(DEVICE) for part in made))
 
 
 def slots() -> Part:
-    savi = tiny_savi(initial="gaussian")
+    savi = tiny_savi(initial="gaussian").to(DEVICE)
     own = SlotsStageConfig(**SETTINGS, clip_frames=4, zoom_steps=8)
     return Part("slots", SlotsStage(savi, clips(32, 4), own), own)
 
@@ -115,7 +118,7 @@ def dynamics(multi: bool = False, mode: Any = "hybrid", kind: Any = "cocvp", tea
     predictor = PredictorConfig(kind=kind, dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16)
     model = ModelConfig(savi=savi, inverse_dynamics=inverse, predictor=predictor)
     with global_seed(0, 0, "test"):
-        world = WorldModel(model, EnvConfig(image_size=32, action_dim=2))
+        world = WorldModel(model, EnvConfig(image_size=32, action_dim=2)).to(DEVICE)
         cached = torch.randn(42, 3, 16).numpy()
     own = DynamicsStageConfig(
         **SETTINGS, seed_frames=2, predicted_frames=3, decoded_frames=2, from_start=0.3, teacher_steps=teacher
@@ -130,6 +133,8 @@ def _behaviour() -> tuple[LatentPolicy, LatentPolicy, ActionDecoder, BehaviourSt
         decoder = ActionDecoder(
             ActionDecoderConfig(hidden_dim=8, reads_slots=True, state_dim=8, state_layers=1, state_heads=2), 4, 2, 16
         )
+    for network in (policy, oracle, decoder):
+        network.to(DEVICE)
     return policy, oracle, decoder, BehaviourStageConfig(**SETTINGS, labelled_demos=4, slot_noise=0.1)
 
 
@@ -156,12 +161,11 @@ def resnet() -> Part:
         # A thirteenth of the weights, and still blocks, shortcuts and BatchNorm.
         network.trunk.layer3 = nn.Sequential(nn.Conv2d(128, 256, 1, stride=2), nn.BatchNorm2d(256))
         network.trunk.layer4 = nn.Sequential(nn.Conv2d(256, 512, 1, stride=2), nn.BatchNorm2d(512))
-    criterion = BehaviourLoss(network)
+    criterion = BehaviourLoss(network.to(DEVICE))
     criterion.set_keys(observation=keys.PIXELS, action=keys.ACTION)
     rows = np.arange(42)
-    stage = RegressionStage(
-        "policy", criterion, FrameInputs(data, rows, "cpu", 2), torch.from_numpy(data.require_actions()).float(), BATCH
-    )
+    actions = torch.from_numpy(data.require_actions()).float().to(DEVICE)
+    stage = RegressionStage("policy", criterion, FrameInputs(data, rows, DEVICE, 2), actions, BATCH)
     return Part("resnet", stage, config)
 
 
@@ -178,7 +182,7 @@ def svg() -> Part:
         decoded_frames=2,
     )
     with global_seed(0, 0, "test"):
-        model = SVG(config, 16)
+        model = SVG(config, 16).to(DEVICE)
     return Part("svg", SVGStage(model, clips(16, 5), config), config)
 
 
@@ -197,14 +201,14 @@ def caddy() -> Part:
         growth_steps=4,
     )
     with global_seed(0, 0, "test"):
-        model = CADDY(config, 16)
+        model = CADDY(config, 16).to(DEVICE)
     return Part("caddy", CADDYStage(model, clips(16, 4), config), config)
 
 
 def lapo() -> Part:
     own = LAPOConfig(channels=(4, 8), hidden=16, groups=2, code_dim=4, codes=6, dead_threshold=1.5)
     with global_seed(0, 0, "test"):
-        inverse, forward = InverseModel(own, 16), ForwardModel(own)
+        inverse, forward = InverseModel(own, 16).to(DEVICE), ForwardModel(own).to(DEVICE)
     return Part("lapo", LAPOModelStage(inverse, forward, clips(16, 2), _plain()), _plain())
 
 

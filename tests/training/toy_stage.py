@@ -32,11 +32,14 @@ class ToyStage:
                 "decoder": nn.Linear(4, 6),
             }
 
-    def loss(self, step: int, generators: StepGenerators) -> dict[str, Tensor]:
+    def batch(self, step: int, generators: StepGenerators) -> dict[str, Tensor]:
         time.sleep(self.delay)
         self.steps_seen += 1
         x = torch.randn(16, 6, generator=generators.torch("x"))
-        x = x + torch.as_tensor(generators.numpy("shift").normal(), dtype=torch.float32)
+        return {"x": x + torch.as_tensor(generators.numpy("shift").normal(), dtype=torch.float32)}
+
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> dict[str, Tensor]:
+        x = batch["x"]
         z = self.modules["encoder"](x) + 0.1 * torch.randn(16, 4)
         p, _, commitment = self.modules["quantizer"](z)
         error = (self.modules["decoder"](p) - x).square().mean()

@@ -34,6 +34,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from playslot_rl import keys
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise, psnr
 from playslot_rl.losses.common import total_loss
@@ -175,10 +176,20 @@ class CADDYStage:
     def modules(self) -> Mapping[str, nn.Module]:
         return {"caddy": self.model}
 
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+    def phase(self, step: int) -> str | None:
+        """None while temperature or length change, or where the frames that are compared are drawn."""
         config = self.config
-        rows = own_rows(self.clips.sample(config.batch_size, generators.numpy("clips")))
-        frames = self._frames(rows[:, : clip_length(config, step)])
+        changes = config.temperature[0] != config.temperature[1] and step < config.anneal_steps
+        if changes or clip_length(config, step) < clip_length(config, config.growth_steps) or config.decoded_frames:
+            return None
+        return "warm-up" if step < config.warmup_steps else "all"
+
+    def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+        rows = own_rows(self.clips.sample(self.config.batch_size, generators.numpy("clips")))
+        return {keys.PIXELS: self._pixels(rows[:, : clip_length(self.config, step)])}
+
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
+        config, frames = self.config, normalise(batch[keys.PIXELS])
         wanted = self._wanted(frames.shape[1], generators)
         with autocast(frames.device.type, config.precision):
             rollout = self.model(
@@ -228,7 +239,10 @@ class CADDYStage:
         return error, latents.p.flatten(0, 1), again, squares
 
     def _frames(self, rows: IntArray) -> Tensor:
-        return normalise(self.clips.source.pixels(rows).to(module_device(self.model)))
+        return normalise(self._pixels(rows))
+
+    def _pixels(self, rows: IntArray) -> Tensor:
+        return self.clips.pixels(rows, module_device(self.model))
 
     def _wanted(self, frames: int, generators: StepGenerators) -> list[int] | None:
         """Times of the frames that are compared: `decoded_frames` of those after the first, the same in all clips."""

@@ -56,8 +56,12 @@ class LAPOModelStage:
     def modules(self) -> Mapping[str, nn.Module]:
         return {"inverse": self.inverse, "forward": self.forward}
 
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        first, second = self._frames(own_rows(self.clips.sample(self.config.batch_size, generators.numpy("pairs"))))
+    def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        rows = own_rows(self.clips.sample(self.config.batch_size, generators.numpy("pairs")))
+        return {keys.PIXELS: self._pixels(rows)}
+
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        first, second = normalise(batch[keys.PIXELS]).unbind(1)
         with autocast(first.device.type, self.config.precision):
             inferred = self.inverse(first, second)
             predicted = self.forward(first, inferred.z)
@@ -86,8 +90,11 @@ class LAPOModelStage:
         return {"unexplained": sum(errors) / max(1e-6, sum(stills)), "perplexity": float(perplexity)}
 
     def _frames(self, rows: IntArray) -> tuple[Tensor, Tensor]:
-        pixels = normalise(self.clips.source.pixels(rows).to(module_device(self.inverse)))
+        pixels = normalise(self._pixels(rows))
         return pixels[:, 0], pixels[:, 1]
+
+    def _pixels(self, rows: IntArray) -> Tensor:
+        return self.clips.pixels(rows, module_device(self.inverse))
 
 
 @torch.no_grad()

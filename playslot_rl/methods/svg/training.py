@@ -17,6 +17,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from playslot_rl import keys
 from playslot_rl.config import EnvConfig
 from playslot_rl.data.windows import Clips, IntArray
 from playslot_rl.frames import normalise, psnr
@@ -73,12 +74,14 @@ class SVGStage:
     def modules(self) -> Mapping[str, nn.Module]:
         return {"svg": self.model}
 
-    def loss(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        config = self.config
-        frames = self._frames(own_rows(self.clips.sample(config.batch_size, generators.numpy("clips"))))
-        device = frames.device
-        batch, count = frames.shape[:2]
-        steps = draw_frames(batch, count - 1, config.decoded_frames, generators.torch("decoded", device))
+    def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        rows = own_rows(self.clips.sample(self.config.batch_size, generators.numpy("clips")))
+        return {keys.PIXELS: self._pixels(rows)}
+
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        config, frames = self.config, normalise(batch[keys.PIXELS])
+        device, (count, length) = frames.device, frames.shape[:2]
+        steps = draw_frames(count, length - 1, config.decoded_frames, generators.torch("decoded", device))
         with autocast(device.type, config.precision):
             out = self.model(frames, config.seed_frames, generators.torch("latents", device), steps)
         return svg_objective(out, frames, config.kl_weight)
@@ -108,7 +111,10 @@ class SVGStage:
         }
 
     def _frames(self, rows: IntArray) -> Tensor:
-        return normalise(self.clips.source.pixels(rows).to(module_device(self.model)))
+        return normalise(self._pixels(rows))
+
+    def _pixels(self, rows: IntArray) -> Tensor:
+        return self.clips.pixels(rows, module_device(self.model))
 
 
 def _errors(predicted: Tensor, frames: Tensor) -> Tensor:

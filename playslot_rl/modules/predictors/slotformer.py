@@ -62,7 +62,8 @@ class SlotFormer(nn.Module):
         of = frame[:, None] - window + 1 + torch.arange(window, device=slots.device)
         there = seen[:, of.clamp(min=0)] & (of >= 0)
         there[..., -1] = True  # a padded frame still sees itself, so that its softmax is finite
-        out = self._next(slots[:, of.clamp(min=0)].flatten(0, 1), there.flatten(0, 1))
+        missing = window > 1 if valid is None else not bool(there.all())
+        out = self._next(slots[:, of.clamp(min=0)].flatten(0, 1), there.flatten(0, 1) if missing else None)
         return out.view(b, t, *out.shape[1:])
 
     def rollout(self, seed: Tensor, *condition: Tensor) -> Tensor:
@@ -90,7 +91,7 @@ class SlotFormer(nn.Module):
         code = self.code[:w].flip(0)
         x = (self.embed_slots(window) + code[None, :, None]).flatten(1, 2)
         mask = None
-        if there is not None and not bool(there.all()):
+        if there is not None:
             mask = there.repeat_interleave(n, dim=1)[:, None, None, :]
         for i, block in enumerate(self.blocks):
             last = i == len(self.blocks) - 1

@@ -17,6 +17,7 @@ from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.tensors import load_tensors
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.logging import History
+from playslot_rl.training.stage import step_loss
 
 FIT = {
     "seed_frames": 1,
@@ -59,7 +60,8 @@ def test_clips_grow_linearly_to_their_full_length() -> None:
 
 def test_the_warm_up_ends_at_its_step() -> None:
     stage = stage_of(warmup_steps=2, batch_size=2)
-    assert ["loss_fit" in stage.loss(step, StepGenerators(0, step)) for step in range(4)] == [True, True, False, False]
+    fitted = ["loss_fit" in step_loss(stage, step, StepGenerators(0, step)) for step in range(4)]
+    assert fitted == [True, True, False, False]
 
 
 def test_decoded_frames_are_drawn_anew_each_step_and_are_as_many_as_said() -> None:
@@ -86,16 +88,16 @@ def test_a_resumed_run_repeats_bit_for_bit_across_the_end_of_the_warm_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     train(tmp_path / "whole")
-    original = CADDYStage.loss
+    original = CADDYStage.batch
     for step, kept in ((3, 2), (5, 4)):
 
-        def loss(self: CADDYStage, number: int, generators: StepGenerators, stop: int = step) -> object:
+        def batch(self: CADDYStage, number: int, generators: StepGenerators, stop: int = step) -> object:
             if number == stop:
                 raise KeyboardInterrupt
             return original(self, number, generators)
 
         with monkeypatch.context() as patch:
-            patch.setattr(CADDYStage, "loss", loss)
+            patch.setattr(CADDYStage, "batch", batch)
             with pytest.raises(KeyboardInterrupt, match=f"carries on from step {kept} "):
                 train(tmp_path / "parts")
     assert train(tmp_path / "parts") == 4
@@ -119,7 +121,7 @@ def test_training_lowers_the_loss_and_the_held_out_error() -> None:
     losses = []
     for step in range(60):
         optimizer.zero_grad()
-        parts = stage.loss(step, StepGenerators(0, step))
+        parts = step_loss(stage, step, StepGenerators(0, step))
         parts["loss"].backward()
         optimizer.step()
         losses.append({key: value.item() for key, value in parts.items()})
@@ -152,7 +154,7 @@ def test_a_validation_says_what_the_actions_do() -> None:
 def test_bf16_gives_finite_losses_and_gradients() -> None:
     stage = stage_of(precision="bf16", batch_size=2)
     for step in (0, 2000):
-        stage.loss(step, StepGenerators(0, step))["loss"].backward()
+        step_loss(stage, step, StepGenerators(0, step))["loss"].backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in stage.model.parameters())
 
 

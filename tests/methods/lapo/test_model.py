@@ -18,6 +18,7 @@ from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolic
 from playslot_rl.methods.lapo.training import LAPOModelStage, infer_latents
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators, global_seed
+from playslot_rl.training.stage import step_loss
 
 CONFIG = LAPOConfig(channels=(8, 16), hidden=32, groups=2, code_dim=4, codes=4)
 
@@ -81,14 +82,14 @@ def test_training_predicts_the_change_and_the_codes_tell_directions_apart(
     stage = LAPOModelStage(inverse, forward, Clips(source, 2, validation=0.2, seed=0, shown=256), config)
     optimizer = torch.optim.Adam([*inverse.parameters(), *forward.parameters()], lr=3e-3)
     with torch.no_grad():
-        start = stage.loss(0, StepGenerators(0, 0))["loss_image"]
+        start = step_loss(stage, 0, StepGenerators(0, 0))["loss_image"]
     assert 0.5 < float(start) < 2, "before training the error is that of no change"
     for step in range(config.steps):
         # Falling to 0: at a constant rate the last steps' noise, another on each processor, decided.
         optimizer.param_groups[0]["lr"] = 3e-3 * (1 - step / config.steps)
         optimizer.zero_grad()
         with global_seed(0, step):
-            stage.loss(step, StepGenerators(0, step))["loss"].backward()
+            step_loss(stage, step, StepGenerators(0, step))["loss"].backward()
         optimizer.step()
     inverse.eval(), forward.eval()
     with torch.no_grad():

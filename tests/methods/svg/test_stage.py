@@ -17,6 +17,7 @@ from playslot_rl.methods.svg.training import SVGStage
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.tensors import load_tensors
 from playslot_rl.training.fit import Part, fit
+from playslot_rl.training.stage import step_loss
 
 
 def make_stage(config: SVGConfig, episodes: int = 6) -> SVGStage:
@@ -66,7 +67,7 @@ def test_a_steps_randomness_is_all_from_its_generators(config: SVGConfig) -> Non
     losses = []
     for seed, step in ((0, 1), (0, 1), (0, 2), (1, 1)):
         torch.manual_seed(len(losses))
-        losses.append(stage.loss(step, StepGenerators(seed, step))["loss"].item())
+        losses.append(step_loss(stage, step, StepGenerators(seed, step))["loss"].item())
     assert losses[0] == losses[1]
     assert len(set(losses)) == 3
 
@@ -80,7 +81,7 @@ def test_the_latents_of_a_step_are_sampled(config: SVGConfig, monkeypatch: pytes
     rows = stage.clips.held_out[:2]
     monkeypatch.setattr(stage.clips, "sample", lambda batch, generator: rows)
     with torch.no_grad():
-        one, two = (float(stage.loss(0, StepGenerators(seed, 0))["loss"]) for seed in (0, 1))
+        one, two = (float(step_loss(stage, 0, StepGenerators(seed, 0))["loss"]) for seed in (0, 1))
     assert one != two
 
 
@@ -89,7 +90,7 @@ def test_only_the_asked_frames_are_decoded(config: SVGConfig) -> None:
     for count in (0, 2):
         stage = make_stage(replace(config, decoded_frames=count))
         stage.model.decoder.register_forward_hook(lambda module, inputs, output: decoded.append(len(output)))
-        stage.loss(0, StepGenerators(0, 0))
+        step_loss(stage, 0, StepGenerators(0, 0))
     assert decoded == [3 * 5, 3 * 2]
 
 
@@ -107,7 +108,7 @@ def test_training_predicts_better_with_running_statistics_too(config: SVGConfig)
     for step in range(30):
         stage.model.train()
         optimizer.zero_grad()
-        terms = stage.loss(step, StepGenerators(0, step))
+        terms = step_loss(stage, step, StepGenerators(0, step))
         terms["loss"].backward()
         optimizer.step()
         values.append(terms["loss_image"].item())
@@ -148,7 +149,7 @@ def test_half_precision_trains_on_about_the_same_loss(config: SVGConfig) -> None
     losses = []
     for precision in ("fp32", "bf16"):
         stage = make_stage(replace(config, precision=precision))
-        loss = stage.loss(0, StepGenerators(0, 0))["loss"]
+        loss = step_loss(stage, 0, StepGenerators(0, 0))["loss"]
         loss.backward()
         assert loss.dtype == torch.float32
         losses.append(loss.item())

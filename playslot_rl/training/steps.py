@@ -1,0 +1,248 @@
+"""One optimisation step: as it is written, or captured once as a CUDA graph and replayed.
+
+    batch, random numbers -> buffers;   [ loss, gradients, clipping, Adam ] -> numbers
+
+What is in brackets is one graph for each phase of a stage (`playslot_rl.training.stage.PhasedStage`); a replay costs
+the host one launch instead of thousands. Random numbers are drawn before it, by the same generators in the same order
+as without a graph, so that they stay a function of seed, step and stream.
+
+Nothing in a step on a GPU waits for it: a step whose loss or gradient is not finite is skipped by Adam and found at the
+next look (`Steps.not_finite`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import traceback
+import warnings
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from playslot_rl.config import StageConfig
+from playslot_rl.errors import ConfigError, TrainingError
+from playslot_rl.runtime.shares import taped
+from playslot_rl.seeds.draws import StepGenerators, derived_seed, global_seed
+from playslot_rl.training.batches import GlobalBatches
+from playslot_rl.training.optimizer import clip_gradients
+from playslot_rl.training.stage import PhasedStage
+
+WARM: Final = 3
+"""Steps of a phase that are taken as they are written: kernels are chosen and Adam's state is made in them."""
+
+
+class _Tape:
+    """The random numbers of a step, in buffers: recorded in one step, handed out while the next is captured, drawn anew
+    before each replay.
+    """
+
+    def __init__(self, seed: int, device: torch.device) -> None:
+        self.seed, self.device, self.step = seed, device, 0
+        self._generators: dict[tuple[str, str], torch.Generator] = {}
+        self._draws: list[tuple[Callable[[], Tensor], Tensor]] = []
+        self._events: list[Callable[[], object]] = []
+        self._served: int | None = None
+
+    def record(self) -> None:
+        """Begin anew: what is drawn from now on is remembered."""
+        self._draws, self._events, self._served = [], [], None
+
+    def serve(self) -> None:
+        """From now on hand out the buffers, in their order."""
+        self._served = 0
+
+    def redraw(self) -> None:
+        """Fill the buffers with the numbers of `step`."""
+        for event in self._events:
+            event()
+
+    def take(self, draw: Callable[[], Tensor]) -> Tensor:
+        """See `playslot_rl.runtime.shares.Tape`."""
+        if self._served is not None:
+            self._served += 1
+            return self._draws[self._served - 1][1]
+        buffer = draw().clone()
+        self._draws.append((draw, buffer))
+        self._events.append(lambda: buffer.copy_(draw()))
+        return buffer
+
+    def generator(self, stream: str, device: torch.device | str) -> torch.Generator:
+        """That of a stream, which lives on from step to step and is seeded for each."""
+        generator = self._generators.setdefault((stream, str(device)), torch.Generator(device=device))
+
+        def seeded() -> torch.Generator:
+            return generator.manual_seed(derived_seed(self.seed, self.step, stream))
+
+        if self._served is None:
+            seeded()
+            self._events.append(seeded)
+        return generator
+
+
+@dataclass(frozen=True)
+class _TapedGenerators(StepGenerators):
+    tape: _Tape = field(kw_only=True)
+
+    def torch(self, stream: str, device: torch.device | str | None = None) -> torch.Generator:
+        return self.tape.generator(stream, self.device if device is None else device)
+
+
+class Steps:
+    """Takes the steps of one training.
+
+    Args:
+        name: of the training, and `key` its dotted config group, for messages.
+        cure: what to try where a number is not finite.
+
+    Raises:
+        ConfigError: `execution=graph` without a GPU, or with what a graph cannot hold.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        key: str,
+        batches: GlobalBatches,
+        optimizer: torch.optim.Optimizer,
+        config: StageConfig,
+        seed: int,
+        device: torch.device | str,
+    ) -> None:
+        self.name, self.key, self.batches, self.stage = name, key, batches, batches.stage
+        self.optimizer, self.config, self.seed, self.device = optimizer, config, seed, torch.device(device)
+        self.on_gpu = self.device.type == "cuda"
+        self.captures = self._captures()
+        self._tape = _Tape(seed, self.device)
+        self._replay: Callable[[], None] | None = None
+        self._phase: Hashable = None
+        self._taken = 0
+        self._inputs: dict[str, Tensor] = {}
+        self._values: dict[str, Tensor] = {}
+        self._trouble = torch.full((3,), -1.0, device=self.device)
+        self._number = torch.zeros((), device=self.device)
+        self._stream = torch.cuda.Stream(self.device) if self.on_gpu else None
+
+    def take(self, step: int, rate: float) -> dict[str, Tensor]:
+        """Step `step` (from 0) at a learning rate: its losses and `grad_norm`, scalars on the device, without gradient.
+
+        Raises:
+            TrainingError: on a CPU, where a loss or gradient is not finite; out of memory.
+        """
+        for group in self.optimizer.param_groups:
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+        with self._streamed():
+            self._number.fill_(step)
+            values = self._captured(step) if self.captures else self._written(step)
+        return values
+
+    def not_finite(self) -> tuple[str, float, int] | None:
+        """What was not finite first since the training began, its value, and after how many steps; this waits."""
+        step, loss, norm = self._trouble.tolist()
+        if step < 0:
+            return None
+        what, value = ("gradient norm", norm) if math.isfinite(loss) else ("loss", loss)
+        return what, value, int(step) + 1
+
+    def _written(self, step: int) -> dict[str, Tensor]:
+        self.optimizer.zero_grad(set_to_none=True)
+        losses = self.batches.backward(step, StepGenerators(self.seed, step, self.device))
+        return self._stepped(losses)
+
+    def _stepped(self, losses: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Clip, look whether all is finite, and let Adam step where it is."""
+        norm = clip_gradients(self.batches.parameters, self.config.optim.grad_clip)
+        found = torch.stack([self._number, losses["loss"].detach().float(), norm.detach().float()])
+        bad = ~found.isfinite().all()
+        self._trouble.copy_(torch.where(bad & (self._trouble[0] < 0), found, self._trouble))
+        if self.on_gpu:
+            self.optimizer.found_inf = bad.float()  # type: ignore[attr-defined]  # Adam skips the step where it is 1
+            self.optimizer.step()
+        elif not bad:
+            self.optimizer.step()
+        return {**{key: value.detach() for key, value in losses.items()}, "grad_norm": norm.detach()}
+
+    def _captured(self, step: int) -> dict[str, Tensor]:
+        phase = self.stage.phase(step) if isinstance(self.stage, PhasedStage) else "all"
+        if phase is None:
+            return self._written(step)
+        if phase != self._phase:
+            self._replay, self._phase, self._taken = None, phase, 0
+        tape, self._tape.step = self._tape, step
+        with global_seed(self.seed, step):
+            batch = self.stage.batch(step, StepGenerators(self.seed, step, self.device))
+            if self._taken < WARM:
+                self._taken += 1
+                tape.record()
+                return self._computed(step, batch)
+            if self._replay is None:
+                self._inputs = {name: value.clone() for name, value in batch.items()}
+                tape.serve()
+                self._replay = self._recorded(partial(self._computed, step, self._inputs))
+                if self._replay is None:
+                    return self._written(step)
+            for name, value in batch.items():
+                self._inputs[name].copy_(value)
+            tape.redraw()
+            self._replay()
+        return self._values
+
+    def _computed(self, step: int, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        self.optimizer.zero_grad(set_to_none=True)
+        with taped(self._tape):
+            generators = _TapedGenerators(self.seed, step, self.device, tape=self._tape)
+            losses = self.stage.loss(batch, step, generators)
+            losses["loss"].backward()
+        return self._stepped(losses)
+
+    def _recorded(self, compute: Callable[[], dict[str, Tensor]]) -> Callable[[], None] | None:
+        """What computes the same once more, into the same `_values`; None where it cannot be captured, which is said.
+
+        Raises:
+            TrainingError: it cannot, and `execution` is `graph`.
+        """
+        graph = torch.cuda.CUDAGraph()
+        try:
+            with torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"):
+                self._values = compute()
+        except (RuntimeError, torch.AcceleratorError) as error:
+            where = traceback.extract_tb(error.__traceback__)
+            own = [at for at in where if "playslot_rl" in at.filename and at.filename != __file__] or where
+            reason = f"{self.name}: a step could not be captured at `{own[-1].line}`: {str(error).splitlines()[0]}"
+            if self.config.execution == "graph":
+                raise TrainingError(f"{reason}: use {self.key}.execution=eager") from error
+            warnings.warn(f"{reason}; its kernels are launched one by one", RuntimeWarning, stacklevel=2)
+            self.captures = False
+            return None
+        return graph.replay
+
+    def _captures(self) -> bool:
+        """Whether steps are to be captured, by the setting and by what there is."""
+        wanted, why = self.config.execution, ""
+        if not self.on_gpu:
+            why = f"got device {self.device.type}, expected cuda"
+        elif self.batches.count > 1:
+            why = "got several processes or optim.accumulate above 1, expected one share of the batch"
+        elif self.config.compile:
+            why = "got compile=true, whose kernels are made anew while a step is captured"
+        if wanted == "graph" and why:
+            raise ConfigError(f"{self.key}.execution=graph: {why}: use {self.key}.execution=auto")
+        return wanted != "eager" and not why
+
+    @contextlib.contextmanager
+    def _streamed(self) -> Iterator[None]:
+        """All steps run on one stream of their own, as a capture has to, between what else runs."""
+        if self._stream is None:
+            yield
+            return
+        self._stream.wait_stream(torch.cuda.current_stream(self.device))
+        with torch.cuda.stream(self._stream):
+            yield
+        torch.cuda.current_stream(self.device).wait_stream(self._stream)

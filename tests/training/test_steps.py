@@ -1,0 +1,115 @@
+"""A step computes from its batch and its random numbers alone: so it can be recorded once and replayed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tiny_stages import CADDY_STEPS, STAGES, STEPS
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from playslot_rl.errors import ConfigError
+from playslot_rl.seeds.draws import StepGenerators
+from playslot_rl.storage.tensors import module_tensors
+from playslot_rl.training import fit as fit_module
+from playslot_rl.training.fit import Part, fit
+from playslot_rl.training.stage import PhasedStage, step_loss
+from playslot_rl.training.steps import WARM, Steps
+
+WAITS = ("_local_scalar_dense", "nonzero", "bincount", "masked_select", "unique")
+"""Operators that need a value on the host, or a shape that depends on values."""
+
+
+class Replayed(Steps):
+    """Steps as a graph takes them: what is recorded is one step's own call, and nothing of a later step reaches it but
+    the buffers. So a number that a stage reads elsewhere is that of the recorded step for ever."""
+
+    replays = 0
+
+    def _captures(self) -> bool:
+        return True
+
+    def _recorded(self, compute: Callable[[], dict[str, Tensor]]) -> Callable[[], None]:
+        def replay() -> None:
+            type(self).replays += 1
+            self._tape.serve()
+            self._values = compute()
+
+        return replay
+
+
+def trained(name: str, folder: Path) -> dict[str, Tensor]:
+    part = STAGES[name]()
+    fit(part, folder, seed=3)
+    return module_tensors(part.stage.modules)
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_a_replayed_step_is_the_step(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = trained(name, tmp_path / "written")
+    monkeypatch.setattr(fit_module, "Steps", Replayed)
+    monkeypatch.setattr(Replayed, "replays", 0)
+    replayed = trained(name, tmp_path / "replayed")
+    assert {key for key in written if not torch.equal(written[key], replayed[key])} == set()
+    steps = {"caddy": CADDY_STEPS, "resnet": 2}.get(name, STEPS)
+    stage = STAGES[name]().stage
+    phases = [stage.phase(step) if isinstance(stage, PhasedStage) else "all" for step in range(steps)]
+    expected = sum(max(0, phases.count(phase) - WARM) for phase in set(phases) if phase is not None)
+    assert Replayed.replays == expected
+    assert expected > 0 or name in ("caddy", "resnet")
+
+
+class _Seen(TorchDispatchMode):
+    def __init__(self) -> None:
+        super().__init__()
+        self.waits: set[str] = set()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        by_mask = "index" in func.name() and any(
+            isinstance(index, Tensor) and index.dtype == torch.bool
+            for given in args[1:2]
+            for index in (given if isinstance(given, list | tuple) else [given])
+        )
+        if by_mask or any(wait in func.name() for wait in WAITS):
+            self.waits.add(func.name())
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_a_step_never_waits_for_a_value(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = STAGES[name]().stage
+    for step in (0, STEPS - 1):  # the codebook starts in the first one, which is never replayed
+        generators = StepGenerators(3, step)
+        batch = stage.batch(step, generators)
+        seen = _Seen()  # type: ignore[no-untyped-call]
+        if step == 0:
+            stage.loss(batch, step, generators)
+            continue
+
+        def refuse(tensor: Tensor, *_: Any) -> None:
+            raise AssertionError(f"a step read a value of {tuple(tensor.shape)}")
+
+        for method in ("item", "tolist", "cpu", "numpy", "__bool__", "__float__", "__int__"):
+            monkeypatch.setattr(Tensor, method, refuse)
+        with seen:
+            stage.loss(batch, step, generators)["loss"].backward()
+        assert seen.waits == set()
+
+
+def test_a_graph_is_refused_without_a_gpu(tmp_path: Path) -> None:
+    part = STAGES["policy"]()
+    asked = Part(part.name, part.stage, part.config.__class__(**{**vars(part.config), "execution": "graph"}))
+    with pytest.raises(ConfigError, match=r"policy.execution=graph: got device cpu, expected cuda: use .*=auto"):
+        fit(asked, tmp_path, seed=3)
+
+
+def test_the_batch_of_a_step_is_a_function_of_seed_and_step() -> None:
+    for name, make in STAGES.items():
+        one, other = make().stage, make().stage
+        for key, value in one.batch(5, StepGenerators(3, 5)).items():
+            assert torch.equal(value, other.batch(5, StepGenerators(3, 5))[key]), (name, key)
+        assert step_loss(one, 0, StepGenerators(3, 0))["loss"].dim() == 0
