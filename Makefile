@@ -42,7 +42,8 @@ exit 1
 endef
 export FIND_PYTHON
 
-.PHONY: help setup demo test test-integration test-most test-all test-browser docs tables animation notebook lint format typing lock clean FORCE
+.PHONY: help setup demo test test-integration test-most test-all test-browser test-gpu docs tables animation notebook lint format typing lock \
+	clean FORCE
 
 help:
 	@echo "make demo      set up, then the main job: success in simulation and in imagination, in minutes"
@@ -50,6 +51,7 @@ help:
 	@echo "make test-integration  whole commands, trainings, simulators, pages, processes, builds: minutes"
 	@echo "make test-all  all tests but those in a browser"
 	@echo "make test-browser  the page of playslot play in headless Chromium (Debian, Ubuntu: apt-get install chromium)"
+	@echo "make test-gpu  training steps on a GPU: captured ones against written ones"
 	@echo "make docs      the site of README, docs/ and the API, in build/site"
 	@echo "make tables    the tables and plots of README and docs/, from results/*.json"
 	@echo "make animation  the README's pictures and the shipped episodes, from the shipped models"
@@ -104,6 +106,10 @@ test-browser: $(STAMP)
 	fi
 	@$(UV) pip install --quiet --compile-bytecode -r pyproject.toml --extra browser
 	@$(BIN)/python -m pytest -m browser $(ARGS)
+
+# On a machine with a GPU.
+test-gpu: $(STAMP)
+	@$(BIN)/python -m pytest -m gpu $(ARGS)
 
 lint: $(STAMP) typing
 	@$(BIN)/ruff check .

@@ -230,8 +230,6 @@ class Steps:
             why = f"got device {self.device.type}, expected cuda"
         elif self.batches.count > 1:
             why = "got several processes or optim.accumulate above 1, expected one share of the batch"
-        elif self.config.compile:
-            why = "got compile=true, whose kernels are made anew while a step is captured"
         if wanted == "graph" and why:
             raise ConfigError(f"{self.key}.execution=graph: {why}: use {self.key}.execution=auto")
         return wanted != "eager" and not why

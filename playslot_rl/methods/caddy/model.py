@@ -212,7 +212,7 @@ class CADDY(nn.Module):
         for t in range(a.shape[1]):
             y, memories = self.dynamics(s[:, t], a[:, t], v[:, t], memories)
             ys.append(y)
-        some = codes[:, [time - 1 for time in times]]
+        some = _at(codes, [time - 1 for time in times])
         quarter, half, full = (x.unflatten(0, some.shape[:2]) for x in self.generator(some.flatten(0, 1)))
         own, attended = self._encode(full)
         return Generated(tuple(times), (quarter, half, full), own, attended, torch.stack(ys, dim=1))

@@ -1,0 +1,122 @@
+"""Steps on a GPU: captured ones are the written ones, and none of them waits (`make test-gpu`)."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tiny_stages
+import torch
+from tiny_stages import STAGES
+from torch import Tensor
+
+from playslot_rl.errors import TrainingError
+from playslot_rl.storage.tensors import module_tensors
+from playslot_rl.training.batches import GlobalBatches
+from playslot_rl.training.fit import Part, fit
+from playslot_rl.training.optimizer import build_adam, trainable_parameters
+from playslot_rl.training.stage import PhasedStage
+from playslot_rl.training.steps import Steps
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+]
+
+STEPS = 50
+SAME = 1e-5
+"""Largest difference of a tensor after training, relative to its largest number. Kernels of a captured step may be
+chosen otherwise; codes and BatchNorm turn rounding into another curve, so that those stages are compared by their
+losses."""
+CURVES = ("slots", "resnet", "svg", "caddy", "lapo")
+
+
+@pytest.fixture(autouse=True)
+def on_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiny_stages, "DEVICE", torch.device("cuda"))
+    monkeypatch.setattr(torch.backends.cudnn, "deterministic", True)
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+
+
+def part_of(name: str, **settings: Any) -> Part:
+    part = STAGES[name]()
+    config = replace(part.config, steps=STEPS, checkpoint_every=25, validate_every=25, **settings)
+    part.stage.config = config  # type: ignore[attr-defined]
+    return replace(part, config=config)
+
+
+def trained(name: str, folder: Path, execution: str, **settings: Any) -> dict[str, Tensor]:
+    part = part_of(name, execution=execution, **settings)
+    fit(part, folder, seed=3, device="cuda")
+    return {key: value.cpu().clone() for key, value in module_tensors(part.stage.modules).items()}
+
+
+def difference(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:
+    assert one.keys() == other.keys()
+    return max(
+        float((one[key].double() - other[key].double()).abs().max() / one[key].double().abs().max().clamp(min=1e-3))
+        for key in one
+    )
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_captured_steps_end_with_the_weights_of_the_written_ones(name: str, tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)  # a step that could not be captured warns
+        captured = trained(name, tmp_path / "graph", "auto")
+    assert difference(trained(name, tmp_path / "eager", "eager"), captured) <= SAME
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_a_killed_and_resumed_training_ends_with_the_same_weights(name: str, tmp_path: Path) -> None:
+    whole = trained(name, tmp_path / "whole", "auto")
+    part = part_of(name)
+    fit(replace(part, config=replace(part.config, steps=STEPS)), tmp_path / "parts", seed=3, device="cuda")
+    newest = tmp_path / "parts" / part.folder / "checkpoints" / f"step_{STEPS:08d}"
+    for file in newest.iterdir():
+        file.unlink()
+    newest.rmdir()
+    assert difference(whole, trained(name, tmp_path / "parts", "auto")) <= SAME
+
+
+@pytest.mark.parametrize("execution", ["auto", "eager"])
+@pytest.mark.parametrize("name", STAGES)
+def test_a_step_never_waits_for_the_gpu(name: str, execution: str) -> None:
+    part = part_of(name, execution=execution)
+    stage = part.stage
+    for module in stage.modules.values():
+        module.train()
+    parameters = trainable_parameters(stage.modules)
+    batches = GlobalBatches(stage, part.config, parameters, name)
+    steps = Steps(name, name, batches, build_adam(parameters, part.config.optim), part.config, 3, "cuda")
+    phases = [stage.phase(step) if isinstance(stage, PhasedStage) else "all" for step in range(STEPS)]
+    last = phases.index(phases[-1])
+    for step in range(last, last + 5):  # kernels are chosen, the codebook starts
+        steps.take(step, 1e-3)
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for step in range(last + 5, last + 8):
+            steps.take(step, 1e-3)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert steps.not_finite() is None
+
+
+def test_a_step_that_is_not_finite_is_skipped_and_named(tmp_path: Path) -> None:
+    part = part_of("policy", log_every=10)
+    stage, original = part.stage, part.stage.batch
+
+    def batch(step: int, generators: Any) -> dict[str, Tensor]:
+        found = dict(original(step, generators))
+        if step == 13:
+            found = {key: value * float("nan") if value.is_floating_point() else value for key, value in found.items()}
+        return found
+
+    stage.batch = batch  # type: ignore[method-assign]
+    with pytest.raises(TrainingError, match=r"loss is nan at step 14, expected a finite number"):
+        fit(part, tmp_path, seed=3, device="cuda")
+    assert all(bool(value.isfinite().all()) for value in module_tensors(stage.modules).values())
