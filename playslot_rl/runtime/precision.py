@@ -37,13 +37,18 @@ def resolve_precision(precision: Precision, device_type: str) -> Precision:
     return "bf16" if native_bf16(device_type) else "fp32"
 
 
-def autocast(device_type: str, precision: Precision) -> torch.autocast:
-    """Surrounds what a stage computes in its precision; a RuntimeWarning says where `bf16` is emulated."""
-    import torch
-
+def in_bf16(device_type: str, precision: Precision) -> bool:
+    """Whether a stage of a precision computes in bf16; a RuntimeWarning says where that is emulated."""
     if precision == "bf16" and not native_bf16(device_type):
         _warn_of_emulation(device_type)
-    return torch.autocast(device_type, torch.bfloat16, enabled=resolve_precision(precision, device_type) == "bf16")
+    return resolve_precision(precision, device_type) == "bf16"
+
+
+def autocast(device_type: str, precision: Precision) -> torch.autocast:
+    """Surrounds what a stage computes in its precision; warns as `in_bf16`."""
+    import torch
+
+    return torch.autocast(device_type, torch.bfloat16, enabled=in_bf16(device_type, precision))
 
 
 def full_precision(device_type: str) -> torch.autocast:

@@ -1,11 +1,13 @@
-"""`compile=true`: the parts of a stage's networks as kernels made by torch.compile."""
+"""`compile=true`: parts of a stage's networks as kernels made by torch.compile."""
 
 from __future__ import annotations
 
 import os
 import shutil
 from collections.abc import Iterator, Mapping
+from typing import Any
 
+import torch
 from torch import nn
 
 from playslot_rl.errors import ConfigError
@@ -14,7 +16,8 @@ COMPILERS = ("g++", "gcc", "clang++", "clang")
 
 
 def compile_parts(modules: Mapping[str, nn.Module], key: str) -> None:
-    """Compile what the networks call step by step (SAVi's encoder, corrector, transition), in place; names stay.
+    """Compile what the networks call step by step, in place; names stay: the methods that a network names in `compiled`
+    (SAVi's encoder with keys and values, and its decoder), else its parts.
 
     Whole networks draw random numbers from generators, which torch.compile cannot trace; their parts do not. A
     ConfigError with the dotted name of the setting, `key`, where there is no C++ compiler.
@@ -24,19 +27,25 @@ def compile_parts(modules: Mapping[str, nn.Module], key: str) -> None:
             f"{key}=true: got no C++ compiler, expected g++ or clang++ on the PATH: install one (Debian, Ubuntu: "
             f"apt-get install g++), or leave {key} out"
         )
-    for part in _parts(modules):
-        part.compile()
+    for module, name in _parts(modules):
+        setattr(module, name, torch.compile(getattr(module, name), dynamic=False if name != "forward" else None))
 
 
 def release_parts(modules: Mapping[str, nn.Module]) -> None:
     """Have the networks run as they were written again."""
-    for part in _parts(modules):
-        part._compiled_call_impl = None
+    for module, name in _parts(modules):
+        vars(module).pop(name, None)
 
 
-def _parts(modules: Mapping[str, nn.Module]) -> list[nn.Module]:
-    children = [part for module in modules.values() for part in _called(module)]
-    return [part for part in children if any(parameter.requires_grad for parameter in part.parameters())]
+def _parts(modules: Mapping[str, nn.Module]) -> Iterator[tuple[nn.Module, str]]:
+    for module in modules.values():
+        named: Any = getattr(module, "compiled", None)
+        if named is not None:
+            yield from ((module, name) for name in named)
+            continue
+        for part in _called(module):
+            if any(parameter.requires_grad for parameter in part.parameters()):
+                yield part, "forward"
 
 
 def _called(module: nn.Module) -> Iterator[nn.Module]:

@@ -194,11 +194,12 @@ class _Run:
         if not self.config.compile:
             yield
             return
-        compile_parts(self.stage.modules, self.part.typed("compile"))
+        modules = {**self.stage.modules, **getattr(self.stage, "frozen", {})}
+        compile_parts(modules, self.part.typed("compile"))
         try:
             yield
         finally:
-            release_parts(self.stage.modules)
+            release_parts(modules)
 
     def advance(self, step: int, progress: StageProgress) -> None:
         """One step, and whatever is due after it."""

@@ -61,6 +61,11 @@ class DynamicsStage:
         """InvDyn and cOCVP."""
         return {"inverse_dynamics": self.model.inverse_dynamics, "predictor": self.model.predictor}
 
+    @property
+    def frozen(self) -> Mapping[str, nn.Module]:
+        """SAVi, whose decoder renders what is predicted."""
+        return {"savi": self.model.savi}
+
     def phase(self, step: int) -> str:
         """In the first `teacher_steps` every input is a parsed slot; then predictions are fed back."""
         return "teacher-forced" if step < self.config.teacher_steps else "rollout"

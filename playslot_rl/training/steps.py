@@ -73,7 +73,10 @@ class _Tape:
 
     def generator(self, stream: str, device: torch.device | str) -> torch.Generator:
         """That of a stream, which lives on from step to step and is seeded for each."""
-        generator = self._generators.setdefault((stream, str(device)), torch.Generator(device=device))
+        key = (stream, str(device))
+        if key not in self._generators:  # none may be made while a step is captured
+            self._generators[key] = torch.Generator(device=device)
+        generator = self._generators[key]
 
         def seeded() -> torch.Generator:
             return generator.manual_seed(derived_seed(self.seed, self.step, stream))

@@ -118,20 +118,23 @@ def test_the_average_forgets_where_the_weights_began() -> None:
 @pytest.mark.integration
 @pytest.mark.parametrize("stage", ["slots", "dynamics", "policy"])
 def test_what_is_compiled_are_the_parts_that_are_called(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each block of a list of them, never the list; and none is left compiled."""
+    """SAVi's two methods; elsewhere each block of a list of them, never the list; and none is left compiled."""
     monkeypatch.setenv("CXX", "g++")
     modules = STAGES[stage]().stage.modules
+    before = {id(part): set(vars(part)) for module in modules.values() for part in module.modules()}
     compile_parts(modules, "compile")
     inner = [part for module in modules.values() for part in module.modules()]
-    marked = {id(part) for part in inner if part._compiled_call_impl is not None}
-    lists = [part for part in inner if isinstance(part, torch.nn.ModuleList)]
+    marked = {id(part): set(vars(part)) - before[id(part)] for part in inner if set(vars(part)) != before[id(part)]}
     assert marked
-    assert not marked & {id(part) for part in lists}
-    covered = {id(part) for whole in inner if id(whole) in marked for part in whole.modules()}
-    blocks = [part for part in inner if isinstance(part, TransformerBlock)]
-    assert {id(part) for part in blocks} <= covered
+    if stage == "slots":
+        assert list(marked.values()) == [{"features", "rendered"}]
+    else:
+        assert all(names == {"forward"} for names in marked.values())
+        assert not any(id(part) in marked for part in inner if isinstance(part, torch.nn.ModuleList))
+        covered = {id(part) for whole in inner if id(whole) in marked for part in whole.modules()}
+        assert {id(part) for part in inner if isinstance(part, TransformerBlock)} <= covered
     release_parts(modules)
-    assert all(part._compiled_call_impl is None for part in inner)
+    assert all(set(vars(part)) == before[id(part)] for part in inner)
 
 
 def test_compiling_without_a_compiler_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

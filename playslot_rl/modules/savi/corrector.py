@@ -41,13 +41,13 @@ class SlotAttention(nn.Module):
         return self.to_k(normed), self.to_v(normed)
 
     def forward(self, k: Tensor, v: Tensor, slots: Tensor, iterations: int) -> Tensor:
-        """Refine slots (B, N, D) against keys and values (B, L, D)."""
+        """Refine slots (B, N, D) against keys and values (B, L, D), of whatever precision."""
         b, n, d = slots.shape
         for _ in range(iterations):
-            q = self.to_q(self.norm_slots(slots))
-            attention = torch.softmax(q @ k.transpose(1, 2) * self.scale, dim=1) + EPSILON
+            q = self.to_q(self.norm_slots(slots)).to(k.dtype)
+            attention = torch.softmax((q @ k.transpose(1, 2)).to(slots.dtype) * self.scale, dim=1) + EPSILON
             attention = attention / attention.sum(dim=2, keepdim=True)
-            updates = attention @ v
+            updates = (attention.to(v.dtype) @ v).to(slots.dtype)
             slots = self.gru(updates.reshape(b * n, d), slots.reshape(b * n, d)).view(b, n, d)
             slots = slots + self.mlp(self.norm_mlp(slots))
         return slots

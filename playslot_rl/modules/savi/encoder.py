@@ -67,10 +67,12 @@ class SAViEncoder(nn.Module):
         )
 
     def forward(self, frames: Tensor, autocast: AbstractContextManager[object] | None = None) -> Tensor:
-        """Frames (B, 3, H, W) in [0, 1] to tokens (B, L, token_dim); `autocast` surrounds the convolutions only."""
+        """Frames (B, 3, H, W) in [0, 1] to tokens (B, L, token_dim); `autocast` surrounds the convolutions only, what
+        follows is float32 then."""
         memory_format = torch.channels_last if self.channels_last else torch.contiguous_format
         with autocast or nullcontext():
             maps = self.convs(frames.contiguous(memory_format=memory_format))
-        maps = maps.float() + self.position()
+        position = self.position()
+        maps = maps + position.to(maps.dtype) if autocast is None else maps.float() + position
         tokens: Tensor = self.mlp(maps.flatten(2).transpose(1, 2))
         return tokens

@@ -18,7 +18,7 @@ from playslot_rl.modules.savi.decoder import BroadcastDecoder, PixelShuffleDecod
 from playslot_rl.modules.savi.encoder import SAViEncoder
 from playslot_rl.modules.savi.initializer import SlotInitializer
 from playslot_rl.modules.savi.transition import SlotTransition
-from playslot_rl.runtime.precision import autocast
+from playslot_rl.runtime.precision import in_bf16
 
 
 class Decoded(NamedTuple):
@@ -36,12 +36,17 @@ class SAVi(nn.Module):
         config: sizes.
         image_size: side of the square frames.
 
+    Attributes:
+        compiled: the methods that `compile=true` compiles: most of the arithmetic, and no random numbers.
+
     Example:
         >>> savi = SAVi(SAViConfig(n_slots=3), image_size=32)
         >>> slots, state = savi(torch.rand(2, 4, 3, 32, 32))
         >>> slots.shape, savi.decode(slots).frames.shape
         (torch.Size([2, 4, 3, 128]), torch.Size([2, 4, 3, 32, 32]))
     """
+
+    compiled = ("features", "rendered")
 
     def __init__(self, config: SAViConfig, image_size: int) -> None:
         super().__init__()
@@ -75,29 +80,45 @@ class SAVi(nn.Module):
             Slots (B, T, N, D), and the state to go on from.
         """
         b, t = frames.shape[:2]
-        tokens = self.encoder(frames.flatten(0, 1), autocast(frames.device.type, self.precision))
-        keys, values = self.corrector.keys_values(tokens)
-        keys, values = keys.view(b, t, *keys.shape[1:]), values.view(b, t, *values.shape[1:])
+        keys, values = (
+            x.unflatten(0, (b, t)).unbind(1) for x in self.features(frames.flatten(0, 1), self._bf16(frames))
+        )
         first = state is None
         current = self.initializer(b, generator) if state is None else state
         slots = []
         for i in range(t):
             iterations = self.config.first_iterations if first and i == 0 else self.config.iterations
-            corrected = self.corrector(keys[:, i], values[:, i], current, iterations)
+            corrected = self.corrector(keys[i], values[i], current, iterations)
             slots.append(corrected)
             current = self.transition(corrected)
         return torch.stack(slots, dim=1), current
 
+    def _bf16(self, inputs: Tensor) -> bool:
+        return in_bf16(inputs.device.type, self.precision)
+
+    def features(self, frames: Tensor, bf16: bool) -> tuple[Tensor, Tensor]:
+        """Keys and values (M, L, D) of frames (M, 3, H, W); of bf16 on a GPU, where it is on."""
+        device = frames.device.type
+        surrounded = torch.autocast(device, torch.bfloat16, enabled=bf16)
+        if device == "cpu":
+            return self.corrector.keys_values(self.encoder(frames, surrounded))
+        with surrounded:
+            return self.corrector.keys_values(self.encoder(frames))
+
     def decode(self, slots: Tensor) -> Decoded:
         """Render slots (..., N, D)."""
+        return Decoded(*self.rendered(slots, self._bf16(slots)))
+
+    def rendered(self, slots: Tensor, bf16: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """What `Decoded` names, of slots (..., N, D)."""
         lead = slots.shape[:-1]
-        with autocast(slots.device.type, self.precision):
+        with torch.autocast(slots.device.type, torch.bfloat16, enabled=bf16):
             out = self.decoder(slots.reshape(-1, slots.shape[-1]))
         out = out.float()
         out = out.reshape(*lead, *out.shape[1:])
         rgb, logits = out.split((3, 1), dim=-3)  # its backward is one copy, a slice's are zeros and a sum
         masks = torch.softmax(logits, dim=-4)
-        return Decoded((rgb * masks).sum(dim=-4), rgb, masks)
+        return (rgb * masks).sum(dim=-4), rgb, masks
 
 
 def _initialise(module: nn.Module) -> None:
