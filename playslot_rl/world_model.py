@@ -22,6 +22,7 @@ from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.modules.predictors import Predictor, build_predictor
 from playslot_rl.modules.savi import SAVi
+from playslot_rl.runtime.captured import Captured
 
 
 class WorldModel(nn.Module):
@@ -45,11 +46,17 @@ class WorldModel(nn.Module):
         self.predictor = build_predictor(
             config.predictor, config.savi.slot_dim, self.inverse_dynamics.latent_dim, self.inverse_dynamics.per_slot
         )
+        self.futures = Captured(self._futures)
+        """Slots (M, S, N, D) seen so far and latent actions (M, T, [N,] Z), S - 1 of them in the past, to the slots (M,
+        T, N, D) after each action; those inside the seen frames come from parsed slots."""
 
     @property
     def slot_shape(self) -> tuple[int, int]:
         """(N, D)."""
         return (self.config.savi.n_slots, self.config.savi.slot_dim)
+
+    def _futures(self, slots: Tensor, latents: Tensor) -> Tensor:
+        return self.predictor.rollout(slots, *self.inverse_dynamics.split(latents))
 
     @property
     def latent_shape(self) -> tuple[int, ...]:
@@ -140,6 +147,7 @@ class _Step(nn.Module):
         super().__init__()
         self.inverse_dynamics = inverse_dynamics
         self.predictor = predictor
+        self._next = Captured(self._predicted)
 
     def forward(
         self, z: Tensor, slot_history: Tensor, action_history: Tensor, length: Tensor
@@ -149,11 +157,13 @@ class _Step(nn.Module):
         actions = action_history.reshape(-1, *action_history.shape[len(batch) :])
         actions = torch.cat([actions[:, :-1], z.reshape(-1, 1, *z.shape[len(batch) :])], 1)
         lengths = length.reshape(-1)
-        # Frames before the longest episode's first carry nothing: leaving them out makes short imaginations cheap.
-        window = int(lengths.max())
-        valid = torch.arange(window, device=slots.device) >= window - lengths[:, None]
-        p, v = self.inverse_dynamics.split(actions[:, -window:])
-        predicted = self.predictor(slots[:, -window:], p, v, valid=None if bool(valid.all()) else valid)[:, -1]
+        if slots.device.type == "cuda":
+            predicted = self._next(slots, actions, lengths)
+        else:
+            # Frames before the longest episode's first carry nothing: leaving them out makes short imaginations cheap.
+            window = int(lengths.max())
+            whole = int(lengths.min()) == window
+            predicted = self._predicted(slots[:, -window:], actions[:, -window:], None if whole else lengths)
         slots = torch.cat([slots[:, 1:], predicted[:, None]], 1)
         actions = torch.cat([actions[:, 1:], torch.zeros_like(actions[:, :1])], 1)
         return (
@@ -162,6 +172,16 @@ class _Step(nn.Module):
             actions.reshape(*batch, *actions.shape[1:]),
             (length + 1).clamp(max=context),
         )
+
+    def _predicted(self, slots: Tensor, actions: Tensor, lengths: Tensor | None) -> Tensor:
+        """Slots (M, N, D) after histories (M, W, ...), of whose frames the last `lengths` (M,) are there; None: all."""
+        window = slots.shape[1]
+        valid = None
+        if lengths is not None:
+            valid = torch.arange(window, device=slots.device) >= window - lengths[:, None]
+        p, v = self.inverse_dynamics.split(actions)
+        predicted: Tensor = self.predictor(slots, p, v, valid=valid)[:, -1]
+        return predicted
 
 
 def dynamics_module(inverse_dynamics: InverseDynamics, predictor: Predictor) -> TensorDictSequential:

@@ -22,6 +22,7 @@ from playslot_rl.modules.savi.health import owners
 from playslot_rl.play.starts import Start
 from playslot_rl.play.steering import Driver, PlannerDriver, PolicyDriver, require_prototypes, variability_directions
 from playslot_rl.play.timeline import Frame, SceneMoment, Timeline
+from playslot_rl.runtime.captured import Captured
 from playslot_rl.world_model import Agent, WorldModel
 
 PREVIEW: Final = 6
@@ -60,6 +61,7 @@ class PlaySession:
             self.planner = PlannerDriver(agent)
             self.drivers = {"policy": PolicyDriver(agent.policy), "planner": self.planner}
         self._imagination = ImaginationSession(world_model)
+        self._decode = Captured(world_model.savi.decode)
         self._look: tuple[int, Look] | None = None
 
     @property
@@ -243,7 +245,7 @@ class PlaySession:
     @torch.no_grad()
     def _draw(self, state: Any, present: Sequence[int], number: int = 0) -> Frame:
         """The frame of a state, which becomes the present moment's look."""
-        decoded = self.world_model.savi.decode(state[keys.SLOTS][0])
+        decoded = self._decode(state[keys.SLOTS][0])
         frame: Frame = to_uint8(decoded.frames)
         owner = np.asarray(present)[owners(decoded.masks).cpu().numpy()]
         objects = decoded.rgb.clamp(0, 1) * decoded.masks + (1 - decoded.masks)
@@ -274,5 +276,5 @@ class PlaySession:
         latents = torch.stack([self.latent(number, variability, slot) for number in numbers])
         frames = [np.broadcast_to(now.frame, (k, *now.frame.shape))]
         for _ in range(steps):
-            frames.append(to_uint8(self.world_model.savi.decode(self._advance(ahead, latents)).frames))
+            frames.append(to_uint8(self._decode(self._advance(ahead, latents)).frames))
         return np.stack(frames, 1)

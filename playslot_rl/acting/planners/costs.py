@@ -131,10 +131,7 @@ class GoalCost:
         """Slots (M, H, N, D) that follow the present frame under latent actions (M, H, [N,] Z)."""
         m = len(latents)
         z = torch.cat([self.past.expand(m, *self.past.shape), latents], 1)
-        p, v = self.world_model.inverse_dynamics.split(z)
-        seed = self.slots.expand(m, *self.slots.shape)
-        future: Tensor = self.world_model.predictor.rollout(seed, p, v)
-        return future[:, len(self.past) :]
+        return self.world_model.futures(self.slots.expand(m, *self.slots.shape), z)[:, len(self.past) :]
 
     def __call__(self, latents: Tensor) -> Tensor:
         """Latent actions (M, H, [N,] Z) to costs (M,)."""

@@ -62,7 +62,7 @@ class SlotFormer(nn.Module):
         of = frame[:, None] - window + 1 + torch.arange(window, device=slots.device)
         there = seen[:, of.clamp(min=0)] & (of >= 0)
         there[..., -1] = True  # a padded frame still sees itself, so that its softmax is finite
-        missing = window > 1 if valid is None else not bool(there.all())
+        missing = window > 1 or valid is not None
         out = self._next(slots[:, of.clamp(min=0)].flatten(0, 1), there.flatten(0, 1) if missing else None)
         return out.view(b, t, *out.shape[1:])
 

@@ -1,0 +1,71 @@
+"""A function of tensors that is called again and again, on a GPU as one launch instead of hundreds."""
+
+from __future__ import annotations
+
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+SHAPES: Final = 8
+"""Graphs that are kept, of the shapes used last."""
+Key = tuple[tuple[torch.Size, torch.dtype, torch.device], ...]
+
+
+class Captured[Result]:
+    """Calls a function; on a GPU without gradients a second call with the same shapes records it as a CUDA graph, and
+    later ones replay that.
+
+    Args:
+        function: computes from its arguments (and weights that stay where they are) alone, without waiting for the
+            device and without random numbers.
+
+    Warns:
+        RuntimeWarning: it could not be recorded; it is called as it is from then on.
+    """
+
+    def __init__(self, function: Callable[..., Result]) -> None:
+        self.function = function
+        self._graphs: OrderedDict[Key, Callable[..., Result] | None] = OrderedDict()
+        self._captures = True
+
+    def __call__(self, *inputs: Tensor) -> Result:
+        if not self._captures or inputs[0].device.type != "cuda" or torch.is_grad_enabled():
+            return self.function(*inputs)
+        key = tuple((value.shape, value.dtype, value.device) for value in inputs)
+        known = key in self._graphs
+        replay = self._graphs.pop(key, None)
+        if known and replay is None:
+            replay = self._recorded(inputs)
+        self._graphs[key] = replay
+        while len(self._graphs) > SHAPES:
+            self._graphs.popitem(last=False)
+        return self.function(*inputs) if replay is None else replay(*inputs)
+
+    def _recorded(self, inputs: tuple[Tensor, ...]) -> Callable[..., Result] | None:
+        graph, buffers = torch.cuda.CUDAGraph(), [value.clone() for value in inputs]
+        try:
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                result = self.function(*buffers)
+        except RuntimeError as error:
+            first = str(error).splitlines()[0]
+            warnings.warn(f"a CUDA graph could not be recorded: {first}", RuntimeWarning, stacklevel=3)
+            self._captures = False
+            return None
+
+        def replay(*given: Tensor) -> Result:
+            for buffer, value in zip(buffers, given, strict=True):
+                buffer.copy_(value)
+            graph.replay()
+            copied: Result = pytree.tree_map(lambda value: value.clone(), result)
+            return copied
+
+        return replay
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies record their own."""
+        return (type(self), (self.function,))
