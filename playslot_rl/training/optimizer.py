@@ -44,7 +44,7 @@ def build_adam(parameters: Mapping[str, nn.Parameter], config: OptimConfig) -> t
         raise ValueError("got no trainable parameters, expected at least one: a stage's modules must not be frozen")
     device = next(iter(parameters.values())).device
     on_gpu = device.type == "cuda"
-    lr = torch.tensor(config.lr, device=device) if on_gpu else config.lr
+    lr = torch.tensor(config.lr, dtype=torch.float32, device=device) if on_gpu else config.lr
     return torch.optim.Adam(list(parameters.values()), lr=lr, fused=True, capturable=on_gpu)
 
 

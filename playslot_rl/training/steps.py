@@ -166,7 +166,7 @@ class Steps:
         bad = ~found.isfinite().all()
         self._trouble.copy_(torch.where(bad & (self._trouble[0] < 0), found, self._trouble))
         if self.on_gpu:
-            self.optimizer.found_inf = bad.float()  # type: ignore[attr-defined]  # Adam skips the step where it is 1
+            self.optimizer.found_inf = bad.to(torch.float32)  # type: ignore[attr-defined]  # Adam skips the step where it is 1
             self.optimizer.step()
         elif not bad:
             self.optimizer.step()

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import tiny_stages
 import torch
-from tiny_stages import CADDY_STEPS, DOUBLE, STAGES, in_double
+from tiny_stages import CADDY_STEPS, STAGES, in_double
 from torch import Tensor
 
 from playslot_rl.acting.imagination import ImaginationSession
@@ -34,9 +34,10 @@ pytestmark = [
 STEPS = 50
 SAME = 1e-5
 """Largest difference of a tensor after training, relative to its largest number."""
-IN_DOUBLE = (*DOUBLE, "dynamics", "dynamics of many agents")
-"""In double precision: a captured step may be computed by other kernels, and codes, BatchNorm and Adam turn their
-rounding into another curve within fifty steps (`tiny_stages.DOUBLE`)."""
+IN_DOUBLE = ("caddy",)
+"""In double precision: it normalises a hundred times a step, and two trainings that are written alike part, too."""
+NO_GRADIENT = "inverse_dynamics.to_mean.bias"
+"""It cancels in the differences of means: its gradient is rounding alone, which Adam makes steps of."""
 
 
 @pytest.fixture(autouse=True)
@@ -66,6 +67,7 @@ def difference(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:
     return max(
         float((one[key].double() - other[key].double()).abs().max() / one[key].double().abs().max().clamp(min=1e-3))
         for key in one
+        if key != NO_GRADIENT
     )
 
 
