@@ -58,7 +58,7 @@ class StepGenerators:
 def global_seed(seed: int, step: int, stream: str = "global") -> Iterator[None]:
     """Seed torch's global generators inside the block, and put their states back after it.
 
-    For libraries that take no generator, such as vector-quantize-pytorch's revival of dead codes.
+    For what takes no generator, such as k-means and the revival of dead codes.
     """
     devices = list(range(torch.cuda.device_count())) if torch.cuda.is_initialized() else []
     with torch.random.fork_rng(devices=devices):
