@@ -100,7 +100,6 @@ class Steps:
 
     Args:
         name: of the training, and `key` its dotted config group, for messages.
-        cure: what to try where a number is not finite.
 
     Raises:
         ConfigError: `execution=graph` without a GPU, or with what a graph cannot hold.
