@@ -216,9 +216,10 @@ COMMANDS: Final[dict[str, Command]] = {
     "bench": Command(
         "speed of this machine: training steps, rollout, playing, planning, data sets, rendering",
         "Times the fast paths in one run, medians over repeats, and counts what a training step of the preset costs. "
-        "Leave the machine idle.",
-        ("playslot bench", "playslot bench --json bench.json"),
-        "preset threads",
+        "With device=cuda: training steps, searches and games of two presets, as kernels launched one by one, captured "
+        "and compiled, with memory and share of the GPU's arithmetic. Leave the machine idle.",
+        ("playslot bench", "playslot bench --json bench.json", "playslot bench device=cuda --json gpu.json"),
+        "preset device threads",
     ),
     "doctor": Command(
         "what works on this machine, and the cure for what does not",

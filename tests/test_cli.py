@@ -54,7 +54,7 @@ KEYS = {
     "compare": "run= seed= out= methods= demos= labels= seeds= processes= hydra.launcher= compare. baselines.lapo.",
     "compare-video": "run= seed= methods= seeds= vary= values= objects= hydra.launcher= compare_video. metrics.",
     "demo": "episodes= seed= out= collect. behaviour.",
-    "bench": "preset= threads=",
+    "bench": "preset= device= threads=",
     "doctor": "device= out= data.cache=",
 }
 """Keys and groups of which the help of each command has a line."""

@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from playslot_rl.speed import gpu
+
 TASKS = {"ButtonPress": 30, "easy BlockPush": 30}
 """Tasks that have a picture, and how many numbers it shows."""
 PROGRAMS = {"playslot", "make", "python", ".venv/bin/python"}
@@ -144,3 +146,20 @@ def test_a_changed_number_makes_a_picture_old(pictures: ModuleType, tmp_path: Pa
 def test_a_task_without_rows_is_named(pictures: ModuleType) -> None:
     with pytest.raises(ValueError, match="got no rows of 'Maze'"):
         pictures.numbers(pictures.tables(), "Maze")
+
+
+def test_a_gpus_bench_fills_its_table(tables: ModuleType, site_module: Callable[[str], ModuleType]) -> None:
+    rows, empty = site_module("bench_rows"), gpu.empty()
+    empty["savi_step"] |= {"paper_bf16_eager": 0.2, "paper_bf16_captured": 0.1}
+    empty["savi_step_batch"]["paper"], empty["savi_step_arithmetic"]["paper"] = 64, 20.0
+    machine = {"gpu": "NVIDIA H200", "peak_tflops": 800.4, "torch": "2.11.0", "cores": 16, "cpu": "Xeon"}
+    before = json.loads(rows.FILE.read_text())
+    after = rows.filled(deepcopy(before), {**empty, "machine": machine}, "0123abc")
+    assert json.loads(rows.written(after)) == after
+    table = after["tables"].pop("gpu_bench")
+    assert len(table["rows"][0]) == len(table["columns"])
+    shown = tables.markdown(table)
+    assert "| `savi_step` | paper | bf16 | 64 | 200.0 | 100.0 | 2.0 | | | 25.0 |" in shown
+    assert "commit 0123abc" in tables.made(table)
+    assert "one NVIDIA H200, 800 TFLOP/s in a large product, torch 2.11.0, 16 cores of a Xeon" in tables.made(table)
+    assert after["tables"] == {name: entry for name, entry in before["tables"].items() if name != "gpu_bench"}

@@ -22,7 +22,7 @@ from playslot_rl.play.session import Look, PlaySession
 from playslot_rl.play.starts import Start
 from playslot_rl.play.timeline import Frame, SceneMoment
 from playslot_rl.visualization.grid import side_by_side
-from playslot_rl.world_model import WorldModel
+from playslot_rl.world_model import WorldModel, module_device
 
 EDGE: Final = 0.75
 TINT: Final = 0.35
@@ -172,7 +172,7 @@ def game(model: WorldModel, steps: int) -> Callable[[], Tensor]:
     encoded as what the page sends. What plays one returns the mean square of the last slots.
     """
     session, side = PlaySession(model), model.env.image_size
-    first = Start("", np.zeros((side, side, 3), np.uint8), torch.randn(1, *model.slot_shape))
+    first = Start("", np.zeros((side, side, 3), np.uint8), torch.randn(1, *model.slot_shape).to(module_device(model)))
 
     @torch.no_grad()
     def play() -> Tensor:

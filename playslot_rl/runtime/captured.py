@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from typing import Any, Final
 
 import torch
@@ -13,7 +15,18 @@ from torch.utils import _pytree as pytree
 
 SHAPES: Final = 8
 """Graphs that are kept, of the shapes used last."""
+_capturing: ContextVar[bool] = ContextVar("capturing", default=True)
 Key = tuple[tuple[torch.Size, torch.dtype, torch.device], ...]
+
+
+@contextlib.contextmanager
+def uncaptured() -> Iterator[None]:
+    """Inside the block every `Captured` calls its function as it is; what it recorded stays."""
+    before = _capturing.set(False)
+    try:
+        yield
+    finally:
+        _capturing.reset(before)
 
 
 class Captured[Result]:
@@ -34,7 +47,8 @@ class Captured[Result]:
         self._captures = True
 
     def __call__(self, *inputs: Tensor) -> Result:
-        if not self._captures or inputs[0].device.type != "cuda" or torch.is_grad_enabled():
+        capturing = self._captures and _capturing.get()
+        if not capturing or inputs[0].device.type != "cuda" or torch.is_grad_enabled():
             return self.function(*inputs)
         key = tuple((value.shape, value.dtype, value.device) for value in inputs)
         known = key in self._graphs

@@ -16,6 +16,7 @@ from playslot_rl.config import (
     EnvConfig,
     ExperimentConfig,
     OptimConfig,
+    Precision,
     SlotsStageConfig,
 )
 from playslot_rl.config.compose import compose
@@ -23,7 +24,7 @@ from playslot_rl.modules.predictors.cocvp import COCVP
 from playslot_rl.play.pictures import game
 from playslot_rl.speed.steps import RandomStage, Step, precisions
 from playslot_rl.speed.timing import in_turns
-from playslot_rl.world_model import WorldModel
+from playslot_rl.world_model import Agent, WorldModel, module_device
 
 CPU = torch.device("cpu")
 
@@ -106,29 +107,42 @@ def play_step(sizes: Sizes) -> dict[str, float]:
     own = replace(sizes.config.model, savi=replace(sizes.config.model.savi, n_slots=sizes.play_slots))
     models = {"shipped": Run.open("pretrained").load_world_model()}
     for precision in precisions("cpu"):
-        model = models[f"paper_{precision}"] = WorldModel(own, EnvConfig(image_size=sizes.config.env.image_size))
-        model.savi.precision = precision
-        model.inverse_dynamics.split(torch.randn(64, model.inverse_dynamics.latent_dim))  # sets the codebook
+        fresh = WorldModel(own, EnvConfig(image_size=sizes.config.env.image_size))
+        models[f"paper_{precision}"] = prepared(fresh, precision)
     took = in_turns({name: game(model, sizes.play_steps) for name, model in models.items()}, sizes.rounds)
     return {name: value / sizes.play_steps for name, value in took.items()}
 
 
+def prepared(model: WorldModel, precision: Precision) -> WorldModel:
+    """A fresh model with a codebook, in a precision."""
+    model.savi.precision = precision
+    model.inverse_dynamics.split(torch.randn(64, model.inverse_dynamics.latent_dim, device=module_device(model)))
+    return model
+
+
 def plan_step(sizes: Sizes) -> dict[str, float]:
     """Seconds of a search towards a goal's slots with the shipped model."""
-    from playslot_rl.acting.planners import CEMPlanner, Search, latent_statistics
-    from playslot_rl.acting.planners.costs import GoalCost, SlotDistance
     from playslot_rl.runs import Run
 
-    agent = Run.open("pretrained").load_agent()
+    return in_turns({"own": plan_towards_goal(Run.open("pretrained").load_agent(), sizes)}, sizes.rounds)
+
+
+def plan_towards_goal(agent: Agent, sizes: Sizes) -> Step:
+    """A search from random slots to random ones."""
+    from playslot_rl.acting.planners import CEMPlanner, Search, latent_statistics
+    from playslot_rl.acting.planners.costs import GoalCost, SlotDistance
+
+    device = module_device(agent)
     model, statistics = agent.world_model.eval().requires_grad_(False), latent_statistics(agent)
     candidates, iterations, horizon, elites = sizes.plan
-    start, goal = torch.randn(2, *model.slot_shape)
-    shape, generator = (horizon, *model.latent_shape), torch.Generator().manual_seed(0)
+    start, goal = torch.randn(2, *model.slot_shape).to(device)
+    shape, generator = (horizon, *model.latent_shape), torch.Generator(device).manual_seed(0)
+    past, none = (torch.empty(0, *of, device=device) for of in (model.latent_shape, shape))
     planner = CEMPlanner(candidates, iterations, elites)
 
     @torch.no_grad()
     def search() -> Tensor:
-        cost = GoalCost(model, start[None], torch.empty(0, *model.latent_shape), SlotDistance(goal))
-        return planner(Search(cost, shape, statistics, torch.empty(0, *shape)), generator).latents
+        cost = GoalCost(model, start[None], past, SlotDistance(goal))
+        return planner(Search(cost, shape, statistics, none), generator).latents
 
-    return in_turns({"own": search}, sizes.rounds)
+    return search

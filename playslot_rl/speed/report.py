@@ -58,10 +58,19 @@ def measure(sizes: Sizes, threads: int, quick: bool, say: Say) -> Figures:
     rates = set_rates(sizes)
     found["window_sampling"] = {"unit": "frames/s", "cache": rates["cache"], "stream": rates["stream"]}
     found |= {name: {"unit": unit, "rate": rates[name]} for name, unit in RATES.items()}
-    return {**found, "machine": {**_machine(), "threads": threads, "repeats": sizes.rounds, "quick": quick}}
+    return {
+        **found,
+        "machine": {
+            **machine("torch", "mujoco", "lerobot"),
+            "threads": threads,
+            "repeats": sizes.rounds,
+            "quick": quick,
+        },
+    }
 
 
-def _machine() -> dict[str, Any]:
+def machine(*packages: str) -> dict[str, Any]:
+    """Processor, system, and versions."""
     from importlib.metadata import version
 
     return {
@@ -69,7 +78,7 @@ def _machine() -> dict[str, Any]:
         "cores": available_cores(),
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
-        **{name: version(name) for name in ("torch", "mujoco", "lerobot")},
+        **{name: version(name) for name in packages},
     }
 
 
@@ -97,19 +106,22 @@ def table(figures: Figures) -> str:
 
 
 def cost_tables(config: ExperimentConfig, say: Say) -> str:
-    """What each stage's steps take, counted, then estimated; with `config.device` also measured there."""
+    """What each stage's steps take, counted (on the device), then estimated; with `config.device`, but a GPU (see
+    `playslot_rl.speed.gpu`), also measured there.
+    """
     import torch
 
+    device = torch.device(config.device or "cpu")
     from playslot_rl.speed.cost import Machine, stage_cost
     from playslot_rl.speed.steps import STAGES
 
     costs = []
     for stage in STAGES:
         say(stage)
-        costs.append(stage_cost(config, stage))
+        costs.append(stage_cost(config, stage, device))
     tables = [counted(costs), estimated(costs, Machine())]
-    if config.device:
-        tables.append(measured(config, costs, torch.device(config.device), say))
+    if config.device and device.type != "cuda":
+        tables.append(measured(config, costs, device, say))
     return "\n\n".join(tables)
 
 
@@ -151,21 +163,21 @@ def estimated(costs: Sequence[StageCost], machine: Machine) -> str:
 
 
 def measured(config: ExperimentConfig, costs: Sequence[StageCost], device: torch.device, say: Say) -> str:
-    """Seconds a step and the operations they sustain, a row a stage and precision; on a CPU of `CPU_BATCH` clips."""
+    """Seconds a step and the operations they sustain, a row a stage and precision; of `CPU_BATCH` clips."""
     import torch
 
     from playslot_rl.speed.steps import precisions, stage_config, time_step
 
-    on_gpu, rows = device.type == "cuda", []
-    where = torch.cuda.get_device_name(device) if on_gpu else f"this CPU, {torch.get_num_threads()} threads"
+    rows = []
+    where = f"this CPU, {torch.get_num_threads()} threads" if device.type == "cpu" else str(device)
     for cost in costs:
-        batch = cost.batch if on_gpu else min(cost.batch, CPU_BATCH)
+        batch = min(cost.batch, CPU_BATCH)
         ways = (False, True) if stage_config(config, cost.stage).compile else (False,)
         for precision, compiled in product(precisions(device.type), ways):
             how = f"{precision}, compiled" if compiled else precision
             say(f"{cost.stage}, {how}")
-            took, peak = time_step(config, cost.stage, device, precision, batch, 10 if on_gpu else 3, compiled)
-            rate, memory = cost.at(batch).flops / took / 1e12, "–" if peak is None else f"{peak / 2**30:.2f} GiB"
-            rows.append([cost.stage, how, str(batch), f"{took:.4g}", f"{rate:.3g}", memory])
-    titles = ["measured", "precision", "batch", "s a step", "TFLOP/s", "peak memory"]
+            took, _ = time_step(config, cost.stage, device, precision, batch, 3, compiled)
+            rate = cost.at(batch).flops / took / 1e12
+            rows.append([cost.stage, how, str(batch), f"{took:.4g}", f"{rate:.3g}"])
+    titles = ["measured", "precision", "batch", "s a step", "TFLOP/s"]
     return f"Measured on {where}, torch {torch.__version__}:\n\n{document.table(titles, rows)}"

@@ -24,11 +24,11 @@ from playslot_rl.losses.slots import SlotsLoss
 from playslot_rl.runtime.precision import autocast, native_bf16
 from playslot_rl.runtime.shares import own_rows
 from playslot_rl.seeds.draws import StepGenerators
-from playslot_rl.speed.timing import seconds
+from playslot_rl.speed.timing import timed
 from playslot_rl.training.batches import GlobalBatches
 from playslot_rl.training.compiling import compile_parts
 from playslot_rl.training.optimizer import build_adam, trainable_parameters
-from playslot_rl.training.steps import Steps
+from playslot_rl.training.steps import WARM, Steps
 from playslot_rl.world_model import Agent, WorldModel
 
 STAGES: Final = ("slots", "dynamics", "policy", "decoder")
@@ -159,19 +159,25 @@ def time_step(
     batch: int = 0,
     steps: int = 10,
     compiled: bool = False,
+    execution: Execution = "eager",
 ) -> tuple[float, int | None]:
     """Seconds a step, of `steps` in a row, and the bytes that tensors took on the device at most (None on a CPU).
 
-    Two that are not counted come before: kernels are chosen or compiled in them.
+    Those in which kernels are chosen, compiled or captured are not counted.
 
     Raises:
-        ConfigError: no C++ compiler for `compiled`, which has torch.compile make kernels, as `compile` of a stage does.
+        ConfigError: no C++ compiler for `compiled`, which has torch.compile make kernels, as `compile` of a stage does;
+            `execution` is graph without a GPU.
         ValueError: another stage.
     """
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
-    made = RandomStage(config, stage, device, precision, batch=batch)
-    if compiled:
-        compile_parts(made.modules, f"{made.group}.compile")
-    took = seconds(made.step(), steps)
-    return took, torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None
+
+    def make() -> Step:
+        made = RandomStage(config, stage, device, precision, batch=batch)
+        if compiled:
+            compile_parts(made.modules, f"{made.group}.compile")
+        step = made.step(execution)
+        for _ in range(WARM + 1 if execution == "graph" else 0):
+            step()
+        return step
+
+    return timed(make, device, steps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import MethodType
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from torch import nn
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import ConfigError
+from playslot_rl.modules.savi import SAVi
 from playslot_rl.speed import cost, report, steps
 from playslot_rl.speed.cost import Count, Machine, StageCost, estimate, stage_cost
 from playslot_rl.speed.timing import seconds
@@ -104,10 +106,15 @@ def test_what_is_trained_is_compiled_when_asked_for(
     config: ExperimentConfig, stage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compiled: list[nn.Module] = []
-    monkeypatch.setattr(nn.Module, "compile", lambda part: compiled.append(part))
+
+    def as_it_is(method: MethodType, **_: object) -> MethodType:
+        compiled.append(method.__self__)
+        return method
+
+    monkeypatch.setattr(torch, "compile", as_it_is)
     steps.time_step(config, stage, torch.device("cpu"), "fp32", 2, 1, True)
     assert compiled
-    assert all(any(p.requires_grad for p in part.parameters()) for part in compiled)
+    assert all(isinstance(part, SAVi) or any(p.requires_grad for p in part.parameters()) for part in compiled)
     seen = len(compiled)
     took, peak = steps.time_step(config, stage, torch.device("cpu"), "fp32", 2, 1)
     assert (len(compiled), peak) == (seen, None)
@@ -122,6 +129,11 @@ def test_without_a_compiler_the_setting_to_leave_out_is_named(
     monkeypatch.setenv("PATH", "")
     with pytest.raises(ConfigError, match=rf"^{key}\.compile=true: got no C\+\+ compiler"):
         steps.time_step(config, stage, torch.device("cpu"), "fp32", 2, 1, True)
+
+
+def test_a_step_is_captured_on_a_gpu_alone(config: ExperimentConfig) -> None:
+    with pytest.raises(ConfigError, match=r"dynamics\.execution=graph: got device cpu, expected cuda"):
+        steps.time_step(config, "dynamics", torch.device("cpu"), "fp32", 2, 1, execution="graph")
 
 
 def test_a_step_of_an_unknown_stage_is_not_timed(config: ExperimentConfig) -> None:
@@ -144,7 +156,7 @@ def test_the_measured_table_has_a_row_a_stage_and_precision(
         batch = min(costs[stage].batch, report.CPU_BATCH)
         rate = costs[stage].at(batch).flops / 0.5 / 1e12
         for precision in ("fp32", "bf16"):
-            row = f"| {stage} | {precision} | {batch} | 0.5 | {rate:.3g} | – |"
+            row = f"| {stage} | {precision} | {batch} | 0.5 | {rate:.3g} |"
             assert (row in table) == (native or precision == "fp32")
-            row = f"| {stage} | {precision}, compiled | {batch} | 0.25 | {2 * rate:.3g} | – |"
+            row = f"| {stage} | {precision}, compiled | {batch} | 0.25 | {2 * rate:.3g} |"
             assert (row in table) == (stage == "slots" and (native or precision == "fp32"))

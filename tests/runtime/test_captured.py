@@ -1,0 +1,23 @@
+"""Functions of tensors that a GPU replays; what a graph computes is tested on one, in `tests/gpu`."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from playslot_rl.runtime.captured import Captured, uncaptured
+
+
+def test_a_second_call_is_recorded_unless_capturing_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Captured, "_recorded", lambda *_: lambda *_: "replayed")
+    on_a_gpu: Any = SimpleNamespace(shape=torch.Size([2]), dtype=torch.float32, device=torch.device("cuda"))
+    call = Captured(lambda _: "called")
+    with torch.no_grad():
+        assert [call(on_a_gpu) for _ in range(3)] == ["called", "replayed", "replayed"]
+        with uncaptured():
+            assert call(on_a_gpu) == "called"
+        assert call(on_a_gpu) == "replayed"
+    assert call(on_a_gpu) == "called"  # gradients would be lost
