@@ -31,7 +31,7 @@ PRESETS: Final = {"compact": "block_push_easy", "paper": "button_press"}
 STAGES: Final = {"savi_step": "slots", "dynamics_step": "dynamics", "policy_step": "policy"}
 CASES: Final = (*STAGES, "plan_step", "play_step")
 WAYS: Final = ("eager", "captured", "compiled")
-"""Kernels launched one by one; in CUDA graphs; in graphs, made by torch.compile."""
+"""Kernels launched one by one; in CUDA graphs; in graphs, SAVi's made by torch.compile, as the commands have it."""
 UNITS: Final = {"": "s", "_memory": "GiB", "_arithmetic": "TFLOP", "_batch": "rows"}
 STEPS: Final = 10
 """Timed steps in a row; searches and games are timed `GAMES` times."""
@@ -106,10 +106,11 @@ def _timed(
     case: str, config: ExperimentConfig, sizes: Sizes, device: torch.device, precision: Precision, way: str
 ) -> tuple[float, int | None]:
     if case in STAGES:
-        if way == "compiled":
+        compiled = "savi" if way == "compiled" else False
+        if compiled:
             torch.compiler.reset()  # only so many variants of a function are kept
         execution: Execution = "eager" if way == "eager" else "graph"
-        return time_step(config, STAGES[case], device, precision, 0, STEPS, way == "compiled", execution)
+        return time_step(config, STAGES[case], device, precision, 0, STEPS, compiled, execution)
     with uncaptured() if way == "eager" else nullcontext():
         took, memory = timed(_made(case, config, sizes, device, precision), device, GAMES)
     return took / (FRAMES if case == "play_step" else 1), memory

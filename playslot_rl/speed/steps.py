@@ -158,7 +158,7 @@ def time_step(
     precision: Precision,
     batch: int = 0,
     steps: int = 10,
-    compiled: bool = False,
+    compiled: bool | str = False,
     execution: Execution = "eager",
 ) -> tuple[float, int | None]:
     """Seconds a step, of `steps` in a row, and the bytes that tensors took on the device at most (None on a CPU).
@@ -166,15 +166,16 @@ def time_step(
     Those in which kernels are chosen, compiled or captured are not counted.
 
     Raises:
-        ConfigError: no C++ compiler for `compiled`, which has torch.compile make kernels, as `compile` of a stage does;
-            `execution` is graph without a GPU.
+        ConfigError: no C++ compiler for `compiled`, which has torch.compile make kernels, as `compile` of a stage does,
+            or those of the one network that it names; `execution` is graph without a GPU.
         ValueError: another stage.
     """
 
     def make() -> Step:
         made = RandomStage(config, stage, device, precision, batch=batch)
         if compiled:
-            compile_parts(made.modules, f"{made.group}.compile")
+            modules = {name: module for name, module in made.modules.items() if compiled in (True, name)}
+            compile_parts(modules, f"{made.group}.compile")
         step = made.step(execution)
         for _ in range(WARM + 1 if execution == "graph" else 0):
             step()

@@ -115,6 +115,10 @@ def test_what_is_trained_is_compiled_when_asked_for(
     steps.time_step(config, stage, torch.device("cpu"), "fp32", 2, 1, True)
     assert compiled
     assert all(isinstance(part, SAVi) or any(p.requires_grad for p in part.parameters()) for part in compiled)
+    if stage == "dynamics":
+        compiled.clear()
+        steps.time_step(config, stage, torch.device("cpu"), "fp32", 2, 1, "savi")
+        assert all(isinstance(part, SAVi) for part in compiled)
     seen = len(compiled)
     took, peak = steps.time_step(config, stage, torch.device("cpu"), "fp32", 2, 1)
     assert (len(compiled), peak) == (seen, None)
