@@ -85,18 +85,32 @@ def generate(seeds: Iterable[int], steps: int, env: EnvConfig) -> Clips:
         >>> clips.frames.shape, clips.moves.shape
         ((2, 6, 64, 64, 3), (2, 5, 2))
     """
-    grid, size = env.grid, env.image_size
-    room = size - grid.size
-    if room < 2 * grid.speed:
-        raise ConfigError(
-            f"env.grid.size: got {grid.size} with speed {grid.speed}, expected shapes that can move in a frame of "
-            f"{size} pixels; make them smaller, or the frames larger"
-        )
+    grid, room = env.grid, _room(env)
     drawn = [_draw(seed, steps, env) for seed in seeds]
     start, shapes, colours, ground, turns, wanted = (np.stack(part) for part in zip(*drawn, strict=True))
     corners, moves = _move(start, turns, wanted, room, grid.speed)
-    frames, masks = _paint(corners, _sprites(grid.size)[shapes], colours, ground, size)
+    frames, masks = _paint(corners, sprites(grid.size)[shapes], colours, ground, env.image_size)
     return Clips(frames, moves, masks, corners, shapes, colours, ground)
+
+
+def visited(
+    rng: np.random.Generator, clips: int, steps: int, env: EnvConfig
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Where, of what shape and colour the objects of some clips are, all drawn by one generator with the probabilities
+    of `generate`; raises as that.
+
+    Returns:
+        Corners (C, T + 1, O, 2) and shapes (C, O) as of `Clips`; colours (C, 1 + O), index into `PALETTE`, the ground's
+        first.
+    """
+    grid, room, each = env.grid, _room(env), (clips, env.grid.objects)
+    start, shapes = rng.integers(0, room + 1, (*each, 2)), rng.integers(len(SHAPES), size=each)
+    chosen, rank = rng.integers(len(PALETTE), size=each), rng.random((clips, len(PALETTE)))
+    np.put_along_axis(rank, chosen, -1.0, 1)  # the ground has the first of those that are left, in any order
+    along = (clips, steps, grid.objects)
+    turns, wanted = rng.random(along) < grid.change, rng.integers(len(MOVES), size=along)
+    corners, _ = _move(start, turns, wanted, room, grid.speed)
+    return corners, shapes, np.concatenate([rank.argmax(1)[:, None], chosen], 1)
 
 
 def check_actions(env: EnvConfig) -> None:
@@ -111,6 +125,17 @@ def check_actions(env: EnvConfig) -> None:
             f"env.action_dim: got {env.action_dim}, expected {expected}, two for each of the {env.grid.objects} "
             f"objects: set env.action_dim={expected} and model.savi.n_slots={env.grid.objects + 1}"
         )
+
+
+def _room(env: EnvConfig) -> int:
+    """Pixels that a shape can be moved by inside the frame; a ConfigError where it cannot turn round in them."""
+    grid, room = env.grid, env.image_size - env.grid.size
+    if room < 2 * grid.speed:
+        raise ConfigError(
+            f"env.grid.size: got {grid.size} with speed {grid.speed}, expected shapes that can move in a frame of "
+            f"{env.image_size} pixels; make them smaller, or the frames larger"
+        )
+    return room
 
 
 def _draw(seed: int, steps: int, env: EnvConfig) -> tuple[npt.NDArray[Any], ...]:
@@ -146,7 +171,7 @@ def _move(
     return np.stack(corners, 1), np.stack(moves, 1)
 
 
-def _sprites(size: int) -> npt.NDArray[np.bool_]:
+def sprites(size: int) -> npt.NDArray[np.bool_]:
     """(3, G, G): the pixels of ball, triangle and square."""
     middle = (size - 1) / 2
     y, x = np.mgrid[:size, :size] - middle
@@ -157,21 +182,21 @@ def _sprites(size: int) -> npt.NDArray[np.bool_]:
 
 def _paint(
     corners: npt.NDArray[np.int64],
-    sprites: npt.NDArray[np.bool_],
+    drawn: npt.NDArray[np.bool_],
     colours: npt.NDArray[np.uint8],
     ground: npt.NDArray[np.uint8],
     size: int,
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Frames and masks; sprites are (C, O, G, G)."""
+    """Frames and masks; the shapes are drawn as (C, O, G, G) say."""
     clips, frames_each, objects = corners.shape[:3]
     masks = np.zeros((clips, frames_each, size, size), np.uint8)
-    inside = np.arange(sprites.shape[-1])
+    inside = np.arange(drawn.shape[-1])
     clip = np.arange(clips)[:, None, None, None]
     time = np.arange(frames_each)[:, None, None]
     for o in range(objects):
         rows = corners[:, :, o, 1, None, None] + inside[:, None]
         columns = corners[:, :, o, 0, None, None] + inside
         below = masks[clip, time, rows, columns]
-        masks[clip, time, rows, columns] = np.where(sprites[:, o, None], np.uint8(o + 1), below)
+        masks[clip, time, rows, columns] = np.where(drawn[:, o, None], np.uint8(o + 1), below)
     table = np.concatenate([ground[:, None], colours], 1)
     return table[clip, masks], masks

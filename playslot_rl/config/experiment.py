@@ -12,6 +12,7 @@ from playslot_rl.config.compare_video import CompareVideoConfig
 from playslot_rl.config.env import EnvConfig, RenderConfig
 from playslot_rl.config.methods import require_method
 from playslot_rl.config.model import ModelConfig
+from playslot_rl.config.plain import check
 from playslot_rl.config.planning import PlanConfig
 from playslot_rl.config.roles import (
     COUNT,
@@ -26,6 +27,7 @@ from playslot_rl.config.roles import (
     between,
     role,
     text,
+    was,
 )
 from playslot_rl.config.sizes import is_amount
 from playslot_rl.config.stages import BehaviourStageConfig, DynamicsStageConfig, SlotsStageConfig
@@ -55,6 +57,8 @@ class DataConfig(Checked):
         shuffle_buffer: frames in memory from which windows are drawn with `stream`.
         device: `auto` keeps frames and slots of a set in a GPU's memory where they fit; `cpu` copies those of each
             batch there.
+        drawn: with `env=grid_shapes`, clips that models learn from are drawn anew for every batch by the task's rules;
+            the data set only validates.
         validation: fraction of episodes held out from training.
         tested: fraction of episodes that no training and no validation sees, for `compare-video`; 0 keeps none.
     """
@@ -73,6 +77,7 @@ class DataConfig(Checked):
     stream: bool = False
     shuffle_buffer: int = field(default=20_000, metadata=at_least(1))
     device: Literal["auto", "cpu"] = field(default="auto", metadata=role("machine"))
+    drawn: bool = field(default=False, metadata=was(False))
     validation: float = field(default=0.05, metadata=below_one())
     tested: float = field(default=0.0, metadata=below_one())
 
@@ -282,3 +287,5 @@ class ExperimentConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_method("method", self.method)
+        drawable = self.env.name == "grid_shapes" or not self.data.drawn
+        check(drawable, "data.drawn", True, f"false with env={self.env.name}, whose clips cannot be drawn")

@@ -19,6 +19,8 @@ from playslot_rl.data.stream import ShuffleBuffer, streams_of
 from playslot_rl.data.views import IntArray as IntArray
 from playslot_rl.data.weighted import Shares, draw_episodes
 from playslot_rl.errors import DataError
+from playslot_rl.runtime.shares import own_rows
+from playslot_rl.seeds.draws import StepGenerators
 
 
 def sample_windows(
@@ -129,6 +131,14 @@ class Clips:
         if self._pixels is None or self._pixels.device != device:
             self._pixels = DeviceRows(self.source.pixels, len(self.source.frames), device, self.resident)
         return self._pixels(rows)
+
+    def batch(
+        self, stream: str, count: int, generators: StepGenerators, device: torch.device, frames: int | None = None
+    ) -> Tensor:
+        """The own clips of a step's `count`, or their first `frames` frames: uint8 (b, T, 3, H, W); `stream` names the
+        generator that draws them.
+        """
+        return self.pixels(own_rows(self.sample(count, generators.numpy(stream)))[:, :frames], device)
 
     def spread(self, episodes: IntArray) -> IntArray:
         """At most `shown` disjoint windows of episodes: row indices (at most `shown`, T)."""

@@ -23,7 +23,13 @@ from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig, StageConfig
-from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions, labelled_rows, moving_frames
+from playslot_rl.data.demonstrations import (
+    DemonstrationSplit,
+    Transitions,
+    labelled_rows,
+    moving_frames,
+    real_actions,
+)
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
@@ -36,7 +42,6 @@ from playslot_rl.training.stage_regression import (
     RegressionStage,
     TensorInputs,
     apply_rows,
-    demonstrated_frames,
 )
 
 
@@ -142,9 +147,12 @@ class LatentCloning(ABC):
 def moving_examples(
     config: ExperimentConfig, source: EpisodeFrames, device: torch.device, shift: int = 0
 ) -> tuple[Transitions, FrameInputs, Tensor]:
-    """The transitions in which something moves, the frames before them, and their real actions (M, A) in [-1, 1]."""
+    """The transitions in which something moves, the frames before them, and their real actions (M, A) in [-1, 1]; a
+    DataError where there are no actions, or of another width.
+    """
     moves = moving_frames(source, config.behaviour.trim_pixels, config.behaviour.trim_margin)
-    return moves, *demonstrated_frames(source, moves, config.env.action_dim, device, shift)
+    actions = real_actions(source, moves.rows, config.env.action_dim).to(device)
+    return moves, FrameInputs(source, moves.rows, device, shift, config.data.device == "auto"), actions
 
 
 def action_stage(

@@ -19,6 +19,7 @@ from playslot_rl.config.stage_spec import StageSpec, group_of
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.action_limits import ActionLimits, said, scaled
 from playslot_rl.data.demonstrations import DemonstrationSplit, split_demonstrations, transitions
+from playslot_rl.data.drawn_clips import DrawnClips
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import episode_range, split_tested
 from playslot_rl.data.weighted import open_configured, weighted
@@ -144,10 +145,21 @@ class StageRecord:
         """Clips of the videos, some of their episodes (`data.validation`) held out; `shown` of these at most validate.
 
         Raises:
+            ConfigError: `data.drawn`, and settings of the task that do not fit one another.
             DataError: no episode has so many frames.
         """
-        data = self.config.data
-        return Clips(self.videos, frames, data.validation, self.config.seed, shown, data.device == "auto")
+        data, env = self.config.data, self.config.env
+        given = self.videos, frames, data.validation, self.config.seed, shown
+        if data.drawn:  # of the data set only what validates is read
+            return DrawnClips(env, data.stride, *given, False)
+        return Clips(*given, data.device == "auto")
+
+    @property
+    def drawn(self) -> str:
+        """What is drawn instead of the videos (`data.drawn`); empty where nothing is."""
+        if not self.config.data.drawn or self.role != "train":
+            return ""
+        return ", ".join(f"{key}={value}" for key, value in to_dict(self.config.env.grid).items())
 
     @property
     def data(self) -> EpisodeFrames:
@@ -202,6 +214,8 @@ class StageRecord:
         facts: list[tuple[str, object, object]] = [("seed", self.config.seed, done.meta.get("seed", self.config.seed))]
         if self.role and self.roots:  # a finished stage can be asked for without
             facts.append(("data", self.data.fingerprint, next(iter(done.meta["data"].values()), "none")))
+        if self.role and self.roots:
+            facts.append(("data.drawn", self.drawn or "false", done.meta.get("drawn") or "false"))
         if self.role == "demos" and self.roots:
             ends = [said(plain if scaled(plain) else None) for plain in (self.actions, done.meta.get("actions"))]
             facts.append(("actions", ends[0], ends[1]))
@@ -228,6 +242,8 @@ class StageRecord:
             data["actions"] = said(self.actions)
         if self.role == "train":
             data["data.validation"] = self.config.data.validation
+            if self.drawn:
+                data["data.drawn"] = self.drawn
             if self.config.data.stream:  # other windows than from the cache
                 data["data.shuffle_buffer"] = self.config.data.shuffle_buffer
         return {**picked, **data, **self.prints}
@@ -320,7 +336,8 @@ class StageRecord:
     def _shown(self) -> dict[str, Any]:
         """What the frames are that the stage was shown: how many a second, and of which camera if it is one."""
         several = "," in self.config.data.camera
-        return {"fps": self.data.fps} | ({} if several else {"camera": self.data.camera})
+        drawn = {"drawn": self.drawn} if self.drawn else {}
+        return {"fps": self.data.fps, **drawn} | ({} if several else {"camera": self.data.camera})
 
 
 def put(values: dict[str, Any], key: str, value: Any) -> None:

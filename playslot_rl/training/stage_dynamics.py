@@ -14,11 +14,14 @@ from playslot_rl import keys
 from playslot_rl.config import DynamicsStageConfig, ModelConfig
 from playslot_rl.data.cache import Cache
 from playslot_rl.data.device_rows import DeviceRows
+from playslot_rl.data.drawn_clips import DrawnClips
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.windows import Clips, IntArray
-from playslot_rl.errors import DataError
+from playslot_rl.errors import ConfigError, DataError
+from playslot_rl.frames import normalise
 from playslot_rl.losses.common import total_loss
 from playslot_rl.losses.dynamics import DynamicsLoss
+from playslot_rl.runtime.captured import Captured
 from playslot_rl.runtime.devices import to_device
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
@@ -37,6 +40,7 @@ class DynamicsStage:
         slots: cached slots (F, N, D) of the videos.
 
     Raises:
+        ConfigError: mode `ground_truth`, and clips that are drawn.
         DataError: mode `ground_truth`, and no actions, of another width, or such that are no numbers.
     """
 
@@ -47,7 +51,12 @@ class DynamicsStage:
         self.source, self.device = clips.source, module_device(model)
         self.slots = DeviceRows(lambda rows: torch.from_numpy(slots[rows]), len(slots), self.device, clips.resident)
         self.criterion = DynamicsLoss(model.inverse_dynamics, model.predictor, model.savi, config)
+        self._parse = Captured(model.savi)
         if self.criterion.needs_actions:
+            if isinstance(clips, DrawnClips):
+                raise ConfigError(
+                    "data.drawn: got true in mode ground_truth, expected false: drawn clips come without actions"
+                )
             if not np.isfinite(self.source.require_actions(model.env.action_dim)).all():
                 raise DataError(
                     f"{self.source.name}: got NaN or infinite actions, expected finite numbers in mode ground_truth: "
@@ -71,8 +80,11 @@ class DynamicsStage:
         return "teacher-forced" if step < self.config.teacher_steps else "rollout"
 
     def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """Slots and frames of clips, and their actions where they are the latents."""
-        return self._batch(own_rows(self._sample(generators)))
+        """Slots and frames of clips, and their actions where they are the latents; drawn clips are parsed here."""
+        if not isinstance(self.clips, DrawnClips):
+            return self._batch(own_rows(self._sample(generators)))
+        frames = self.clips.batch("windows", self.config.batch_size, generators, self.device)
+        return {keys.SLOTS: self._parsed(frames, generators), keys.PIXELS: frames}
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         """Image, slot and quantiser loss of one batch of clips."""
@@ -104,6 +116,16 @@ class DynamicsStage:
             chosen = numpy.random(config.batch_size) < config.from_start
             rows[chosen] = first[chosen, None] + np.arange(clips.frames)
         return rows
+
+    @torch.no_grad()
+    def _parsed(self, frames: Tensor, generators: StepGenerators) -> Tensor:
+        """Slots (b, T, N, D) of clips uint8 (b, T, 3, H, W) from their first frame on, in fp32 as the slot cache's."""
+        savi, pixels = self.model.savi, normalise(frames)
+        savi.precision = "fp32"
+        random = savi.config.initial == "gaussian"
+        slots: Tensor
+        slots, _ = savi(pixels, None, generators.torch("parsing")) if random else self._parse(pixels)
+        return slots
 
     def _batch(self, rows: IntArray) -> dict[str, Tensor]:
         batch = {

@@ -18,7 +18,6 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from playslot_rl.config import Precision
-from playslot_rl.data.demonstrations import Transitions, real_actions
 from playslot_rl.data.device_rows import DeviceRows
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.stream import streams_of
@@ -103,14 +102,19 @@ class PairedInputs:
 
 class FrameInputs:
     """Frames by row: uint8 (b, 3, H, W), [0, 255], in training shifted by so many pixels at most; `rows` are the row
-    numbers of the frames, int64 (M,).
+    numbers of the frames, int64 (M,). A GPU keeps them where they fit, if they may be `resident`.
     """
 
     def __init__(
-        self, source: EpisodeFrames, rows: npt.NDArray[np.int64], device: torch.device | str, shift: int = 0
+        self,
+        source: EpisodeFrames,
+        rows: npt.NDArray[np.int64],
+        device: torch.device | str,
+        shift: int = 0,
+        resident: bool = True,
     ) -> None:
         self.rows, self.device, self.shift = rows, torch.device(device), shift
-        resident = not streams_of(source.frames)
+        resident = resident and not streams_of(source.frames)
         self.frames = DeviceRows(lambda own: source.pixels(rows[own]), len(rows), device, resident)
 
     def __len__(self) -> int:
@@ -138,17 +142,6 @@ def shifted(frames: Tensor, offsets: Tensor) -> Tensor:
     )
     each = torch.arange(len(frames), device=frames.device)[:, None, None]
     return frames.movedim(1, -1)[each, down[:, :, None], right[:, None, :]].movedim(-1, 1)
-
-
-def demonstrated_frames(
-    source: EpisodeFrames, moves: Transitions, action_dim: int, device: torch.device | str, shift: int = 0
-) -> tuple[FrameInputs, Tensor]:
-    """Frames of transitions of demonstrations, with their real actions (M, A) in [-1, 1].
-
-    Raises:
-        DataError: no actions, or actions of another width.
-    """
-    return FrameInputs(source, moves.rows, device, shift), real_actions(source, moves.rows, action_dim).to(device)
 
 
 Examples = tuple[Inputs, Tensor]

@@ -61,12 +61,12 @@ class SlotsStage:
         averages over all of them, so that small things hardly change what it sees; magnified they do, and slots that
         have learned to take large things apart go on with small ones. One frame is enough for that.
         """
-        own, count = self.config, self.config.batch_size
-        rows = own_rows(self.clips.sample(count, generators.numpy("windows")))
-        if step >= own.zoom_steps:
-            return {keys.PIXELS: self._pixels(rows)}
+        own, count, zooms = self.config, self.config.batch_size, step < self.config.zoom_steps
+        frames = self.clips.batch("windows", count, generators, self.device, 1 if zooms else None)
+        if not zooms:
+            return {keys.PIXELS: frames}
         at = own_rows(corners(count, self.savi.image_size, own.zoom, generators.numpy("zoom")))
-        return {keys.PIXELS: magnified(self._pixels(rows[:, :1]), own.zoom, at)}
+        return {keys.PIXELS: magnified(frames, own.zoom, at)}
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         """Reconstruction error of one batch."""
@@ -108,11 +108,8 @@ class SlotsStage:
         return {"slots": np.concatenate([np.concatenate(list(row), 1) for row in rows])}
 
     def _parse(self, rows: IntArray, step: int) -> tuple[Tensor, Decoded]:
-        frames = TensorDict({keys.PIXELS: self._pixels(rows)})
+        frames = TensorDict({keys.PIXELS: self.clips.pixels(rows, self.device)})
         return self.criterion.reconstruct(frames, step_generator(0, step, "validation", self.device))
-
-    def _pixels(self, rows: IntArray) -> Tensor:
-        return self.clips.pixels(rows, self.device)
 
 
 def warm_start(savi: SAVi, source: SAVi, where: str) -> None:

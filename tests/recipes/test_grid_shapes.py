@@ -61,6 +61,19 @@ def test_evaluate_says_that_there_is_nothing_to_act_on(shapes: Path) -> None:
     refused("train-policy", f"run={shapes}", message="variant: got multi, expected single")
 
 
+def test_models_learn_from_clips_that_are_drawn_for_every_batch(shapes: Path, tmp_path: Path) -> None:
+    wanted = ("env=grid_shapes", "preset=smoke", "data.drawn=true", f"data.root={shapes / 'data' / 'random'}")
+    drawn, run = "objects=2, size=15, speed=2, change=0.25", tmp_path / "run"
+    for stage in ("slots", "dynamics"):
+        command = (f"train-{stage}", *wanted, f"out={run}", *ONE_CORE)
+        done = playslot(*command)
+        assert done.code == 0, done.err
+        assert json.loads((run / stage / "checkpoint" / "meta.json").read_text())["drawn"] == drawn
+        assert "finished before" in playslot(*command).out
+        refused(*command, "env.grid.speed=3", message=f"got {drawn.replace('speed=2', 'speed=3')}, expected {drawn}")
+    refused("train-slots", *wanted, f"out={shapes}", message=f"data.drawn: got {drawn}, expected false as")
+
+
 def test_collected_clips_are_those_of_their_seeds(tmp_path: Path) -> None:
     wanted = ("env=grid_shapes", "env.grid.objects=3", "env.action_dim=6", "episodes=3", "collect.random_steps=5")
     done = playslot("collect", *wanted, "seed=2", f"out={tmp_path / 'set'}", *ONE_CORE)

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from tiny_stages import STAGES
+from tiny_stages import STAGES, dynamics
 
+from playslot_rl import keys
+from playslot_rl.data.slot_cache import slot_cache
+from playslot_rl.errors import ConfigError
+from playslot_rl.modules.savi.initializer import SlotInitializer
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.training.stage import step_loss
@@ -51,3 +57,29 @@ def test_latents_and_predictions_keep_the_precision_of_the_slots(kind: str) -> N
         latent = model.inverse_dynamics(slots)
         predicted = model.predictor.rollout(slots[:, :1], latent.prototype, latent.variability)
     assert {latent.z.dtype, latent.prototype.dtype, latent.variability.dtype, predicted.dtype} == {torch.float32}
+
+
+def test_drawn_clips_are_parsed_as_the_slot_cache_parses_them(tmp_path: Path) -> None:
+    stage = stage_of("dynamics of drawn clips", "bf16")
+    step_loss(stage, 0, StepGenerators(3, 0))  # leaves SAVi in the stage's precision
+    batch = stage.batch(1, StepGenerators(3, 1))
+    frames = batch[keys.PIXELS].flatten(0, 1).movedim(1, -1).numpy()
+    each = np.full(6, 5, np.int64)
+    source = replace(stage.source, frames=frames, starts=np.arange(6) * 5, lengths=each, fingerprint="drawn")
+    cached = slot_cache(source, stage.model.savi, "weights", tmp_path)
+    torch.testing.assert_close(batch[keys.SLOTS].flatten(0, 1), torch.from_numpy(np.array(cached)))
+    assert not batch[keys.SLOTS].requires_grad
+
+
+def test_initial_slots_of_drawn_clips_are_drawn_by_seed_and_step() -> None:
+    stage = stage_of("dynamics of drawn clips", "fp32")
+    savi = stage.model.savi
+    savi.config, savi.initializer = replace(savi.config, initial="gaussian"), SlotInitializer(3, 16, "gaussian")
+    one, again, other = (stage.batch(1, StepGenerators(seed, 1))[keys.SLOTS] for seed in (3, 3, 4))
+    assert torch.equal(one, again)
+    assert not torch.equal(one, other)
+
+
+def test_drawn_clips_have_no_actions_to_learn_from() -> None:
+    with pytest.raises(ConfigError, match=r"data\.drawn: got true in mode ground_truth, expected false"):
+        dynamics(mode="ground_truth", drawn=True)

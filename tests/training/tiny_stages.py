@@ -17,6 +17,7 @@ from playslot_rl.config import (
     BehaviourStageConfig,
     DynamicsStageConfig,
     EnvConfig,
+    GridConfig,
     InverseDynamicsConfig,
     ModelConfig,
     OptimConfig,
@@ -27,6 +28,7 @@ from playslot_rl.config import (
     StageConfig,
 )
 from playslot_rl.data.demonstrations import Demonstrations
+from playslot_rl.data.drawn_clips import DrawnClips
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import Clips
 from playslot_rl.losses.behaviour import BehaviourLoss
@@ -100,7 +102,14 @@ def slots() -> Part:
     return Part("slots", SlotsStage(savi, clips(32, 4), own), own)
 
 
-def dynamics(multi: bool = False, mode: Any = "hybrid", kind: Any = "cocvp", teacher: int = 5) -> Part:
+def drawn_clips(size: int, frames: int) -> DrawnClips:
+    env = EnvConfig("grid_shapes", size, 4, grid=GridConfig(size=9))
+    return DrawnClips(env, 1, videos(size), frames, 0.4, 0)
+
+
+def dynamics(
+    multi: bool = False, mode: Any = "hybrid", kind: Any = "cocvp", teacher: int = 5, drawn: bool = False
+) -> Part:
     savi = SAViConfig(**vars(tiny_savi().config))
     inverse = InverseDynamicsConfig(
         variant="multi" if multi else "single",
@@ -123,7 +132,7 @@ def dynamics(multi: bool = False, mode: Any = "hybrid", kind: Any = "cocvp", tea
     own = DynamicsStageConfig(
         **SETTINGS, seed_frames=2, predicted_frames=3, decoded_frames=2, from_start=0.3, teacher_steps=teacher
     )
-    return Part("dynamics", DynamicsStage(world, clips(32, 5), cached, own), own)
+    return Part("dynamics", DynamicsStage(world, (drawn_clips if drawn else clips)(32, 5), cached, own), own)
 
 
 def _behaviour() -> tuple[LatentPolicy, LatentPolicy, ActionDecoder, BehaviourStageConfig]:
@@ -239,6 +248,7 @@ STAGES: dict[str, Callable[[], Part]] = {
     "slots": slots,
     "dynamics": dynamics,
     "dynamics of many agents": lambda: dynamics(multi=True),
+    "dynamics of drawn clips": lambda: dynamics(drawn=True),
     "slotformer": lambda: dynamics(mode="none", kind="slotformer"),
     "ocvp_seq": lambda: dynamics(mode="none", kind="ocvp_seq"),
     "policy": policy,

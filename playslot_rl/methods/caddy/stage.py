@@ -44,7 +44,6 @@ from playslot_rl.methods.caddy.model import CADDY, Rollout
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
-from playslot_rl.runtime.shares import own_rows
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.tensors import pick_published, read_published
 from playslot_rl.world_model import module_device
@@ -185,8 +184,9 @@ class CADDYStage:
         return "warm-up" if step < config.warmup_steps else "all"
 
     def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
-        rows = own_rows(self.clips.sample(self.config.batch_size, generators.numpy("clips")))
-        return {keys.PIXELS: self._pixels(rows[:, : clip_length(self.config, step)])}
+        config, device = self.config, module_device(self.model)
+        frames = clip_length(config, step)
+        return {keys.PIXELS: self.clips.batch("clips", config.batch_size, generators, device, frames)}
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         config, frames = self.config, normalise(batch[keys.PIXELS])
@@ -239,10 +239,7 @@ class CADDYStage:
         return error, latents.p.flatten(0, 1), again, squares
 
     def _frames(self, rows: IntArray) -> Tensor:
-        return normalise(self._pixels(rows))
-
-    def _pixels(self, rows: IntArray) -> Tensor:
-        return self.clips.pixels(rows, module_device(self.model))
+        return normalise(self.clips.pixels(rows, module_device(self.model)))
 
     def _wanted(self, frames: int, generators: StepGenerators) -> list[int] | None:
         """Times of the frames that are compared: `decoded_frames` of those after the first, the same in all clips."""

@@ -34,7 +34,6 @@ from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
-from playslot_rl.runtime.shares import own_rows
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
 from playslot_rl.training.fit import Part
@@ -57,8 +56,8 @@ class LAPOModelStage:
         return {"inverse": self.inverse, "forward": self.forward}
 
     def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        rows = own_rows(self.clips.sample(self.config.batch_size, generators.numpy("pairs")))
-        return {keys.PIXELS: self._pixels(rows)}
+        device = module_device(self.inverse)
+        return {keys.PIXELS: self.clips.batch("pairs", self.config.batch_size, generators, device)}
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         first, second = normalise(batch[keys.PIXELS]).unbind(1)
@@ -90,11 +89,8 @@ class LAPOModelStage:
         return {"unexplained": sum(errors) / max(1e-6, sum(stills)), "perplexity": float(perplexity)}
 
     def _frames(self, rows: IntArray) -> tuple[Tensor, Tensor]:
-        pixels = normalise(self._pixels(rows))
+        pixels = normalise(self.clips.pixels(rows, module_device(self.inverse)))
         return pixels[:, 0], pixels[:, 1]
-
-    def _pixels(self, rows: IntArray) -> Tensor:
-        return self.clips.pixels(rows, module_device(self.inverse))
 
 
 @torch.no_grad()

@@ -28,7 +28,6 @@ from playslot_rl.methods.video.training import on_clips, pixel_model
 from playslot_rl.runs import Run
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
-from playslot_rl.runtime.shares import own_rows
 from playslot_rl.seeds.draws import StepGenerators, step_generator
 from playslot_rl.training.record import StageRecord, Training
 from playslot_rl.world_model import module_device
@@ -75,8 +74,7 @@ class SVGStage:
         return {"svg": self.model}
 
     def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        rows = own_rows(self.clips.sample(self.config.batch_size, generators.numpy("clips")))
-        return {keys.PIXELS: self._pixels(rows)}
+        return {keys.PIXELS: self.clips.batch("clips", self.config.batch_size, generators, module_device(self.model))}
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         config, frames = self.config, normalise(batch[keys.PIXELS])
@@ -111,10 +109,7 @@ class SVGStage:
         }
 
     def _frames(self, rows: IntArray) -> Tensor:
-        return normalise(self._pixels(rows))
-
-    def _pixels(self, rows: IntArray) -> Tensor:
-        return self.clips.pixels(rows, module_device(self.model))
+        return normalise(self.clips.pixels(rows, module_device(self.model)))
 
 
 def _errors(predicted: Tensor, frames: Tensor) -> Tensor:
