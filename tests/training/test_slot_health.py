@@ -55,7 +55,8 @@ class Blind:
         self.seeing.savi.precision = "fp32"
         errors = []
         for rows in self.seeing.clips.validation_batches():
-            clips, generator = TensorDict({"pixels": self.seeing._pixels(rows)}), step_generator(0, step, "validation")
+            clips = TensorDict({"pixels": self.seeing.clips.pixels(rows, self.seeing.device)})
+        generator = step_generator(0, step, "validation")
             errors.append(float(self.seeing.criterion(clips, generator)["loss_reconstruction"]))
         return {"mse": float(np.mean(errors))}
 

@@ -13,7 +13,6 @@ from playslot_rl.collectors.collection import collect_demos, collect_videos
 from playslot_rl.config import DataConfig, ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.compose import is_pretrained
 from playslot_rl.config.methods import METHODS, method_stage
-from playslot_rl.config.roles import without
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.agreement import open_files
 from playslot_rl.data.views import first_demonstrations
@@ -22,7 +21,7 @@ from playslot_rl.evaluation.held_out import held_out_seeds
 from playslot_rl.methods.training import train_model
 from playslot_rl.runs import Run
 from playslot_rl.studies.launch import train
-from playslot_rl.studies.study import Job, absolute, fingerprint_of, job_config
+from playslot_rl.studies.study import Job, absolute, computed, fingerprint_of, job_config
 from playslot_rl.training.record import open_videos
 
 
@@ -145,7 +144,7 @@ def success_config(config: ExperimentConfig, job: SuccessJob, world: str) -> Exp
 
 def success_record(job: SuccessJob, config: ExperimentConfig, parents: Mapping[str, str]) -> dict[str, Any]:
     """What the job's file says: with its own config, and fingerprints of what it builds on, which name it."""
-    result = without(config, "machine")  # of data and parents the content counts
+    result = computed(config)  # of data and parents the content counts
     result["baselines"] = result["baselines"].get(job.stage, {})  # another method's settings are none of this job's
     if result["model"]["predictor"]["kind"] == "cocvp":
         del result["model"]["predictor"]["kind"]  # jobs from before there was a choice are the same jobs

@@ -12,9 +12,8 @@ from typing import Any, Final, Literal
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.compare_video import CompareVideoConfig, method_of, title_of
 from playslot_rl.config.plain import flatten
-from playslot_rl.config.roles import without
 from playslot_rl.errors import ConfigError
-from playslot_rl.studies.study import Job, absolute, fingerprint_of, job_config
+from playslot_rl.studies.study import Job, absolute, computed, fingerprint_of, job_config
 
 VARIED = ("model.inverse_dynamics.", "model.predictor.", "dynamics.")
 """Where the settings are that change what PlaySlot predicts, on a SAVi that is there."""
@@ -230,7 +229,7 @@ def video_record(job: VideoJob, config: ExperimentConfig, parents: Mapping[str, 
     content = {key: value for key, value in asked.items() if key != "test"}  # of a data set the content counts
 
     def fingerprint(seed: int) -> str:
-        result = without(replace(config, seed=seed), "machine")
+        result = computed(replace(config, seed=seed))
         result.pop("compare_video", None)
         result["baselines"] = result["baselines"].get(job.method, {})  # another method's are none of this job's
         return fingerprint_of([result, content, dict(parents), lpips])
