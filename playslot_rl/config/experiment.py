@@ -57,8 +57,7 @@ class DataConfig(Checked):
         shuffle_buffer: frames in memory from which windows are drawn with `stream`.
         device: `auto` keeps frames and slots of a set in a GPU's memory where they fit; `cpu` copies those of each
             batch there.
-        drawn: with `env=grid_shapes`, clips that models learn from are drawn anew for every batch by the task's rules;
-            the data set only validates.
+        drawn: every training batch is drawn anew (`env=grid_shapes`); the data set only validates.
         validation: fraction of episodes held out from training.
         tested: fraction of episodes that no training and no validation sees, for `compare-video`; 0 keeps none.
     """

@@ -56,7 +56,7 @@ class Blind:
         errors = []
         for rows in self.seeing.clips.validation_batches():
             clips = TensorDict({"pixels": self.seeing.clips.pixels(rows, self.seeing.device)})
-        generator = step_generator(0, step, "validation")
+            generator = step_generator(0, step, "validation")
             errors.append(float(self.seeing.criterion(clips, generator)["loss_reconstruction"]))
         return {"mse": float(np.mean(errors))}
 
