@@ -46,7 +46,7 @@ class WorldModel(nn.Module):
         self.predictor = build_predictor(
             config.predictor, config.savi.slot_dim, self.inverse_dynamics.latent_dim, self.inverse_dynamics.per_slot
         )
-        self.futures = Captured(self._futures)
+        self.futures = Captured(self._futures, self)
         """Slots (M, S, N, D) seen so far and latent actions (M, T, [N,] Z), S - 1 of them in the past, to the slots (M,
         T, N, D) after each action; those inside the seen frames come from parsed slots."""
 
@@ -147,7 +147,7 @@ class _Step(nn.Module):
         super().__init__()
         self.inverse_dynamics = inverse_dynamics
         self.predictor = predictor
-        self._next = Captured(self._predicted)
+        self._next = Captured(self._predicted, self)
 
     def forward(
         self, z: Tensor, slot_history: Tensor, action_history: Tensor, length: Tensor

@@ -61,7 +61,7 @@ class PlaySession:
             self.planner = PlannerDriver(agent)
             self.drivers = {"policy": PolicyDriver(agent.policy), "planner": self.planner}
         self._imagination = ImaginationSession(world_model)
-        self._decode = Captured(world_model.savi.decode)
+        self._decode = Captured(world_model.savi.decode, world_model.savi)
         self._look: tuple[int, Look] | None = None
 
     @property

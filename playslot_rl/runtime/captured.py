@@ -10,13 +10,13 @@ from contextvars import ContextVar
 from typing import Any, Final
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
 SHAPES: Final = 8
 """Graphs that are kept, of the shapes used last."""
 _capturing: ContextVar[bool] = ContextVar("capturing", default=True)
-Key = tuple[tuple[torch.Size, torch.dtype, torch.device], ...]
+Key = tuple[object, ...]
 
 
 @contextlib.contextmanager
@@ -34,15 +34,16 @@ class Captured[Result]:
     later ones replay that.
 
     Args:
-        function: computes from its arguments (and weights that stay where they are) alone, without waiting for the
-            device and without random numbers.
+        function: computes from its arguments and a module's weights alone, without waiting for the device and without
+            random numbers.
+        module: whose weights are read. Where they lie elsewhere than before, as after `.to`, all is recorded anew.
 
     Warns:
         RuntimeWarning: it could not be recorded; it is called as it is from then on.
     """
 
-    def __init__(self, function: Callable[..., Result]) -> None:
-        self.function = function
+    def __init__(self, function: Callable[..., Result], module: nn.Module) -> None:
+        self.function, self.module = function, module
         self._graphs: OrderedDict[Key, Callable[..., Result] | None] = OrderedDict()
         self._captures = True
 
@@ -50,7 +51,8 @@ class Captured[Result]:
         capturing = self._captures and _capturing.get()
         if not capturing or inputs[0].device.type != "cuda" or torch.is_grad_enabled():
             return self.function(*inputs)
-        key = tuple((value.shape, value.dtype, value.device) for value in inputs)
+        weights = next(self.module.parameters()).data_ptr()
+        key: Key = (weights, *((value.shape, value.dtype, value.device) for value in inputs))
         known = key in self._graphs
         replay = self._graphs.pop(key, None)
         if known and replay is None:
@@ -82,4 +84,4 @@ class Captured[Result]:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies record their own."""
-        return (type(self), (self.function,))
+        return (type(self), (self.function, self.module))

@@ -129,8 +129,8 @@ def test_a_step_that_is_not_finite_is_skipped_and_named(tmp_path: Path) -> None:
 
 
 def test_a_captured_function_is_the_function() -> None:
-    weight = torch.randn(4, 4, device="cuda")
-    captured = Captured(lambda x, y: (x @ weight + y, x.sum()))
+    layer = torch.nn.Linear(4, 4, device="cuda").requires_grad_(False)
+    captured = Captured(lambda x, y: (layer(x) + y, x.sum()), layer)
     with torch.no_grad():
         for seed in range(4):
             x, y = (torch.randn(3, 4, device="cuda", generator=step_generator(seed, 0, name, "cuda")) for name in "xy")
