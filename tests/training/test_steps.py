@@ -21,8 +21,8 @@ from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.stage import PhasedStage, step_loss
 from playslot_rl.training.steps import WARM, Steps
 
-WAITS = ("_local_scalar_dense", "nonzero", "bincount", "masked_select", "unique")
-"""Operators that need a value on the host, or a shape that depends on values."""
+WAITS = ("_local_scalar_dense", "lift_fresh", "nonzero", "bincount", "masked_select", "unique")
+"""Operators that need a value on the host, a shape that depends on values, or a tensor made of a list (an index)."""
 
 
 class Replayed(Steps):
@@ -63,6 +63,20 @@ def test_a_replayed_step_is_the_step(name: str, tmp_path: Path, monkeypatch: pyt
     expected = sum(max(0, phases.count(phase) - WARM) for phase in set(phases) if phase is not None)
     assert Replayed.replays == expected
     assert expected > 0 or name in ("caddy", "resnet")
+
+
+class Refused(Replayed):
+    """Steps that cannot be recorded."""
+
+    def _recorded(self, compute: Callable[[], dict[str, Tensor]]) -> None:  # type: ignore[override]
+        self.captures = False
+
+
+def test_what_cannot_be_recorded_is_taken_as_it_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = trained("dynamics", tmp_path / "written")
+    monkeypatch.setattr(fit_module, "Steps", Refused)
+    refused = trained("dynamics", tmp_path / "refused")
+    assert {key for key in written if not torch.equal(written[key], refused[key])} == set()
 
 
 class _Seen(TorchDispatchMode):

@@ -212,7 +212,7 @@ class CADDY(nn.Module):
         for t in range(a.shape[1]):
             y, memories = self.dynamics(s[:, t], a[:, t], v[:, t], memories)
             ys.append(y)
-        some = _at(codes, [time - 1 for time in times])
+        some = at_times(codes, [time - 1 for time in times])
         quarter, half, full = (x.unflatten(0, some.shape[:2]) for x in self.generator(some.flatten(0, 1)))
         own, attended = self._encode(full)
         return Generated(tuple(times), (quarter, half, full), own, attended, torch.stack(ys, dim=1))
@@ -226,8 +226,8 @@ class CADDY(nn.Module):
         times = (0, *generated.times)
         first = [i for i in range(len(times) - 1) if times[i + 1] == times[i] + 1]
         second = [i + 1 for i in first]
-        before, after = (Gaussian(_at(mean, some), _at(var, some)) for some in (first, second))
-        return _at(moves.p, [times[i] for i in first]), self.action.moves(before, after, noise).p
+        before, after = (Gaussian(at_times(mean, some), at_times(var, some)) for some in (first, second))
+        return at_times(moves.p, [times[i] for i in first]), self.action.moves(before, after, noise).p
 
     def _encode(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Frames (B, T, 3, H, W) in [-1, 1] to states s and s m, each (B, T, C, H/8, W/8), float32."""
@@ -244,6 +244,6 @@ def _some(pose: Gaussian, first: int, last: int | None) -> Gaussian:
     return Gaussian(pose.mean[:, first:last], pose.var[:, first:last])
 
 
-def _at(x: Tensor, times: Sequence[int]) -> Tensor:
+def at_times(x: Tensor, times: Sequence[int]) -> Tensor:
     """(B, T, ...) at some times; an index made of a list would have the host wait for a GPU."""
     return torch.stack([x[:, time] for time in times], dim=1)

@@ -40,7 +40,7 @@ from playslot_rl.frames import normalise, psnr
 from playslot_rl.losses.common import total_loss
 from playslot_rl.methods.caddy.action import ActionInformation, divergence, joint_distribution, mutual_information
 from playslot_rl.methods.caddy.method import CADDYConfig
-from playslot_rl.methods.caddy.model import CADDY, Rollout
+from playslot_rl.methods.caddy.model import CADDY, Rollout, at_times
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
@@ -138,8 +138,9 @@ class CADDYLoss:
         places = [i for i, time in enumerate(generated.times) if wanted is None or time in wanted]
         times = [generated.times[i] for i in places]
         known = information(rollout.real, rollout.again)
-        terms = self._images([x[:, places] for x in generated.frames], frames[:, times] * 2 - 1)
-        terms["loss_state"] = config.state_weight * F.mse_loss(generated.s[:, places], rollout.s[:, times].detach())
+        terms = self._images([at_times(x, places) for x in generated.frames], at_times(frames, times) * 2 - 1)
+        state, true_state = at_times(generated.s, places), at_times(rollout.s, times).detach()
+        terms["loss_state"] = config.state_weight * F.mse_loss(state, true_state)
         terms["loss_kl"] = config.kl_weight * divergence(rollout.moves.direction).mean()
         terms["loss_information"] = -config.information_weight * known
         if rollout.codes is not None:

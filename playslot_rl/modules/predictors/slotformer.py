@@ -61,7 +61,7 @@ class SlotFormer(nn.Module):
         # Row i of a window that ends at frame t is frame t - window + 1 + i; before the first there is nothing.
         of = frame[:, None] - window + 1 + torch.arange(window, device=slots.device)
         there = seen[:, of.clamp(min=0)] & (of >= 0)
-        there[..., -1] = True  # a padded frame still sees itself, so that its softmax is finite
+        there[..., -1].fill_(True)  # a padded frame still sees itself, so that its softmax is finite
         missing = window > 1 or valid is not None
         out = self._next(slots[:, of.clamp(min=0)].flatten(0, 1), there.flatten(0, 1) if missing else None)
         return out.view(b, t, *out.shape[1:])
