@@ -246,4 +246,4 @@ def _some(pose: Gaussian, first: int, last: int | None) -> Gaussian:
 
 def at_times(x: Tensor, times: Sequence[int]) -> Tensor:
     """(B, T, ...) at some times; an index made of a list would have the host wait for a GPU."""
-    return torch.stack([x[:, time] for time in times], dim=1)
+    return torch.stack([x[:, time] for time in times], dim=1) if times else x[:, :0]
