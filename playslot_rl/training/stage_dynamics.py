@@ -51,7 +51,7 @@ class DynamicsStage:
         self.source, self.device = clips.source, module_device(model)
         self.slots = DeviceRows(lambda rows: torch.from_numpy(slots[rows]), len(slots), self.device, clips.resident)
         self.criterion = DynamicsLoss(model.inverse_dynamics, model.predictor, model.savi, config)
-        self._parse = Captured(model.savi)
+        self._parse = Captured(model.savi, model.savi)
         if self.criterion.needs_actions:
             if isinstance(clips, DrawnClips):
                 raise ConfigError(
