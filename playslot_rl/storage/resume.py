@@ -42,6 +42,7 @@ class TrainingState:
         best: those of the best validation, where a training stops early; else empty.
         stale: validations since then.
         planned: steps that it ends after, where the clock has changed them; 0 leaves those of its config.
+        precision: `fp32` or `bf16`, in which it began; `auto` where nobody knows.
     """
 
     step: int = 0
@@ -50,6 +51,7 @@ class TrainingState:
     best: dict[str, float] = field(default_factory=dict)
     stale: int = 0
     planned: int = 0
+    precision: str = "auto"
 
 
 def first_difference(
@@ -120,7 +122,11 @@ class TrainingCheckpoints:
         if average:
             load_into(average, load_tensors(last / "average.safetensors"), str(last))
         best, stale, planned = stored.get("best", {}), stored.get("stale", 0), stored.get("planned", 0)
-        return TrainingState(stored["step"], stored["seconds"], stored["metrics"], best, stale, planned)
+        begun = next(
+            (value for key, value in flatten(stored["identity"]).items() if key.endswith(".precision")), "auto"
+        )
+        precision = stored.get("precision", begun)
+        return TrainingState(stored["step"], stored["seconds"], stored["metrics"], best, stale, planned, precision)
 
     def _write(self, step: int, files: Mapping[str, Mapping[str, Tensor]], state: Mapping[str, Any]) -> Path:
         """Write `step_STEP` of tensors `NAME.safetensors` and a `state.json`; keep the newest two."""

@@ -24,7 +24,8 @@ from playslot_rl.training.stage import Stage, step_loss
 
 class GlobalBatches:
     """One process's part in the batches of a stage, whose BatchNorm layers are made global where there are other
-    processes, and whose weights are made equal; `key` is its dotted config group, for messages.
+    processes, and whose weights are made equal; `key` is its dotted config group, for messages. A stage whose network
+    normalises `by_batch` cannot accumulate.
 
     Raises:
         ConfigError: the shares do not divide the batch, or the stage cannot accumulate.
@@ -39,7 +40,8 @@ class GlobalBatches:
                 f"processes, {key}.optim.accumulate={self.micros}), so that every share has equally many rows"
             )
         modules = [part for module in stage.modules.values() for part in module.modules()]
-        if self.micros > 1 and any(isinstance(part, nn.modules.batchnorm._BatchNorm) for part in modules):
+        self.by_batch = any(isinstance(part, nn.modules.batchnorm._BatchNorm) for part in modules)
+        if self.micros > 1 and self.by_batch:
             raise ConfigError(
                 f"{key}.optim.accumulate: got {self.micros}, expected 1: this network normalises by its whole batch "
                 "(BatchNorm), which micro-batches do not have; start more processes instead"

@@ -1,11 +1,12 @@
-"""`compile=true`: parts of a stage's networks as kernels made by torch.compile."""
+"""`compile`: parts of a stage's networks as kernels made by torch.compile."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Final
 
 import torch
 from torch import nn
@@ -13,6 +14,30 @@ from torch import nn
 from playslot_rl.errors import ConfigError
 
 COMPILERS = ("g++", "gcc", "clang++", "clang")
+LEAST_STEPS: Final = 2000
+"""Steps that have to be left for what compiling takes, about a minute."""
+COMPACT: Final = False
+"""Whether SAVi with a strided encoder (`preset=compact`) is compiled unasked, too."""
+
+
+def compiling_pays(device: torch.device, steps: int) -> bool:
+    """Whether a training with so many steps left is to compile what is `worth_compiling` unasked."""
+    able = has_compiler() and importlib.util.find_spec("triton") is not None
+    return device.type == "cuda" and steps >= LEAST_STEPS and able
+
+
+def worth_compiling(modules: Mapping[str, nn.Module]) -> dict[str, nn.Module]:
+    """The networks that name methods for it, and are large."""
+
+    def large(module: nn.Module) -> bool:
+        return COMPACT or getattr(getattr(module, "config", None), "encoder", "full") == "full"
+
+    return {name: module for name, module in modules.items() if hasattr(module, "compiled") and large(module)}
+
+
+def has_compiler() -> bool:
+    """Whether there is one for C++."""
+    return bool(os.environ.get("CXX")) or any(map(shutil.which, COMPILERS))
 
 
 def compile_parts(modules: Mapping[str, nn.Module], key: str) -> None:
@@ -22,7 +47,7 @@ def compile_parts(modules: Mapping[str, nn.Module], key: str) -> None:
     Whole networks draw random numbers from generators, which torch.compile cannot trace; their parts do not. A
     ConfigError with the dotted name of the setting, `key`, where there is no C++ compiler.
     """
-    if not (os.environ.get("CXX") or any(map(shutil.which, COMPILERS))):
+    if not has_compiler():
         raise ConfigError(
             f"{key}=true: got no C++ compiler, expected g++ or clang++ on the PATH: install one (Debian, Ubuntu: "
             f"apt-get install g++), or leave {key} out"

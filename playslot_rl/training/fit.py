@@ -20,13 +20,14 @@ from torch import Tensor
 from playslot_rl.config import LoggingConfig, StageConfig
 from playslot_rl.config.roles import without
 from playslot_rl.errors import CheckpointError
+from playslot_rl.runtime.precision import keeping, resolve_precision
 from playslot_rl.runtime.processes import agreed, here, spreading, wait
 from playslot_rl.runtime.progress import StageProgress
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.storage.resume import TrainingCheckpoints, TrainingState
 from playslot_rl.training.averages import WeightAverage
 from playslot_rl.training.batches import GlobalBatches
-from playslot_rl.training.compiling import compile_parts, release_parts
+from playslot_rl.training.compiling import compile_parts, compiling_pays, release_parts, worth_compiling
 from playslot_rl.training.logging import Watch, finite
 from playslot_rl.training.optimizer import build_adam, learning_rate, trainable_parameters
 from playslot_rl.training.pace import Pace
@@ -114,7 +115,7 @@ def fit(
     run.meet()
     if not run.ended:
         progress = StageProgress(part.name, start, run.planned, logging.progress, config.log_every * 10)
-        with run.watch.running(logging, start), run.compiled(), progress:
+        with run.watch.running(logging, start), keeping(run.state.precision), run.compiled(), progress:
             while not run.ended:
                 run.advance(run.state.step, progress)
     if run.average is not None:
@@ -174,7 +175,7 @@ class _Run:
         return None if self.average is None else self.average.tensors
 
     def meet(self) -> None:
-        """Begin together: at the same step, with the first process's weights and buffers.
+        """Begin together: at the same step, in one precision, with the first process's weights and buffers.
 
         Raises:
             CheckpointError: processes have found checkpoints of different steps.
@@ -185,16 +186,24 @@ class _Run:
                 f"{self.folder}: got checkpoints of steps {', '.join(map(str, steps))} on ranks 0 to {len(steps) - 1}, "
                 "expected one: out= has to be a folder that all machines share"
             )
-        if not self.ended:
-            self.batches.meet()
+        if self.ended:
+            return
+        self.batches.meet()
+        with keeping(self.state.precision):
+            own = resolve_precision(self.config.precision, torch.device(self.device).type)
+        self.state = replace(self.state, precision="bf16" if agreed(own == "bf16")[0] else "fp32")
 
     @contextlib.contextmanager
     def compiled(self) -> Iterator[None]:
-        """Inside the block the networks' parts are compiled, if the config says so."""
-        if not self.config.compile:
+        """Inside the block the networks' parts are compiled, if the config says so, or leaves it open and it pays."""
+        asked = self.config.compile
+        unasked = asked is None and compiling_pays(torch.device(self.device), self.planned - self.state.step)
+        if not (asked or unasked):
             yield
             return
         modules = {**self.stage.modules, **getattr(self.stage, "frozen", {})}
+        if unasked:
+            modules = worth_compiling(modules)
         compile_parts(modules, self.part.typed("compile"))
         try:
             yield

@@ -29,6 +29,7 @@ from playslot_rl.errors import ConfigError, TrainingError
 from playslot_rl.runtime.shares import taped
 from playslot_rl.seeds.draws import StepGenerators, derived_seed, global_seed
 from playslot_rl.training.batches import GlobalBatches
+from playslot_rl.training.memory import does_not_fit, out_of_memory
 from playslot_rl.training.optimizer import clip_gradients
 from playslot_rl.training.stage import PhasedStage
 
@@ -133,17 +134,25 @@ class Steps:
         """Step `step` (from 0) at a learning rate: its losses and `grad_norm`, scalars on the device, without gradient.
 
         Raises:
-            TrainingError: on a CPU, where a loss or gradient is not finite; out of memory.
+            TrainingError: the batch does not fit into the GPU's memory.
         """
         for group in self.optimizer.param_groups:
             if isinstance(group["lr"], Tensor):
                 group["lr"].fill_(rate)
             else:
                 group["lr"] = rate
-        with self._streamed():
-            self._number.fill_(step)
-            values = self._captured(step) if self.captures else self._written(step)
-        return values
+        try:
+            with self._streamed():
+                self._number.fill_(step)
+                return self._captured(step) if self.captures else self._written(step)
+        except RuntimeError as error:
+            if not out_of_memory(error):
+                raise
+        # The error is gone, and with it its frames and what they held.
+        self._replay, self._inputs, self._values = None, {}, {}
+        self._tape.record()
+        self.optimizer.zero_grad(set_to_none=True)
+        raise does_not_fit(self.batches, self.config, self.key, step, self.seed, self.device)
 
     def not_finite(self) -> tuple[str, float, int] | None:
         """What was not finite first since the training began, its value, and after how many steps; this waits."""
@@ -215,6 +224,8 @@ class Steps:
             with torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"):
                 self._values = compute()
         except (RuntimeError, torch.AcceleratorError) as error:
+            if out_of_memory(error):
+                raise
             where = traceback.extract_tb(error.__traceback__)
             own = [at for at in where if "playslot_rl" in at.filename and at.filename != __file__] or where
             reason = f"{self.name}: a step could not be captured at `{own[-1].line}`: {str(error).splitlines()[0]}"

@@ -24,7 +24,7 @@ from playslot_rl.config.roles import Checked, keys_of, without
 from playslot_rl.errors import ConfigError
 from playslot_rl.methods.dreamer.method import DreamerConfig
 
-PRESETS = ["compact", "paper", "smoke"]
+PRESETS = ["compact", "compact_gpu", "paper", "smoke"]
 ENVS = ["block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "grid_shapes", "sketchy", "video"]
 
 
@@ -60,6 +60,35 @@ def test_the_paper_preset_has_the_papers_sizes_and_schedule() -> None:
     assert (config.behaviour.optim.lr, config.behaviour.optim.schedule) == (2e-4, "constant")
     assert config.behaviour.decoder_inputs == "inverse_dynamics"
     assert not config.behaviour.imagined
+
+
+@pytest.mark.parametrize("env", ["button_press", "block_push", "grid_shapes"])
+def test_the_preset_for_a_gpu_sees_as_many_clips_in_larger_batches(env: str) -> None:
+    small, large = (compose([f"env={env}", f"preset={preset}"]) for preset in ("compact", "compact_gpu"))
+    assert (large.slots.batch_size, large.dynamics.batch_size) == (64, 128)
+    for one, other in ((small.slots, large.slots), (small.dynamics, large.dynamics)):
+        assert other.steps * other.batch_size == one.steps * one.batch_size
+        assert other.optim == dataclasses.replace(
+            one.optim, lr=2 * one.optim.lr, warmup_steps=one.optim.warmup_steps // 4
+        )
+        for every in ("checkpoint_every", "validate_every", "log_every"):
+            assert getattr(other, every) == getattr(one, every) // 4
+    assert large.dynamics.teacher_steps == small.dynamics.teacher_steps // 4
+    assert (large.behaviour, large.model, large.baselines) == (small.behaviour, small.model, small.baselines)
+    typed = compose([f"env={env}", "preset=compact_gpu", "slots.steps=7", "dynamics.optim.lr=3"])
+    assert (typed.slots.steps, typed.dynamics.optim.lr, typed.slots.batch_size) == (7, 3, 64)
+
+
+def test_a_run_from_before_compiling_was_left_open_keeps_what_it_says(tmp_path: Path) -> None:
+    stored = to_dict(compose(["preset=smoke"]))
+    assert stored["slots"]["compile"] is None
+    for said in (False, True):
+        stored["slots"]["compile"] = said
+        run = tmp_path / str(said)
+        run.mkdir()
+        (run / "config.json").write_text(json.dumps(stored))
+        assert compose([f"run={run}"], "train-dynamics").slots.compile is said
+        assert compose([f"run={run}", "slots.compile=null"], "train-dynamics").slots.compile is None
 
 
 def test_a_command_line_value_beats_the_preset() -> None:
@@ -113,7 +142,10 @@ def test_a_folder_in_the_home_folder_may_be_written_with_a_tilde(monkeypatch: py
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ("preset=smol", "unknown preset 'smol': expected one of compact, paper, smoke; did you mean preset=smoke"),
+        (
+            "preset=smol",
+            "unknown preset 'smol': expected one of compact, compact_gpu, paper, smoke; did you mean preset=smoke",
+        ),
         ("env=kitchen", "unknown env 'kitchen': expected one of .*button_press"),
         ("env.name=kitchen", "unknown env 'kitchen'"),
         ("sed=1", "unknown key sed: expected one of .*did you mean seed"),
@@ -224,7 +256,9 @@ def test_the_full_encoder_takes_no_strides() -> None:
 
 def test_roles_say_what_each_key_counts_for() -> None:
     looking = {"checkpoint_every", "validate_every", "log_every"}
-    assert keys_of(SlotsStageConfig, "free") == looking | {"compile", "optim.accumulate", "segmented_episodes"}
+    assert keys_of(SlotsStageConfig, "free") == looking | {
+        "compile", "execution", "optim.accumulate", "segmented_episodes"
+    }  # fmt: skip
     assert keys_of(DreamerConfig, "free") == {"minutes", "replay_on_disk", "evaluate_every"} | looking - {
         "validate_every"
     }
@@ -249,7 +283,7 @@ def test_roles_say_what_each_key_counts_for() -> None:
         "play",
         "port",
     }
-    machine |= {"data.cache_limit", "data.workers"}
+    machine |= {"data.cache_limit", "data.device", "data.workers"}
     named = {"data.root", "data.demos", "data.cache", "behaviour.policy_from"}
     named |= {f"baselines.{method}.world" for method in ("lapo", "caddy_policy", "caddy_oracle")}
     measures = {"data.held_out", "collect.validation_episodes"}
@@ -268,11 +302,12 @@ def test_a_config_without_a_role_keeps_all_other_keys() -> None:
         "held_out",
         "workers",
         "cache_limit",
+        "device",
     }
     assert {**whole["data"], **left["data"]} == whole["data"]
     assert to_dict(config) == whole
     fixed = without(config, "free")
-    free = ("compile", "segmented_episodes")
+    free = ("compile", "execution", "segmented_episodes")
     kept = {k: v for k, v in whole["slots"].items() if not k.endswith("_every") and k not in free}
     kept["optim"] = {k: v for k, v in kept["optim"].items() if k != "accumulate"}
     assert fixed["slots"] == kept

@@ -13,7 +13,7 @@ from playslot_rl.config.compose import compose
 from playslot_rl.config.plain import flatten, to_dict
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runtime import precision as subject
-from playslot_rl.runtime.precision import autocast, native_bf16, resolve_precision
+from playslot_rl.runtime.precision import autocast, keeping, native_bf16, resolve_precision, speedup
 from playslot_rl.storage.resume import first_difference
 
 
@@ -87,3 +87,30 @@ def test_the_compact_preset_leaves_every_precision_to_the_processor_or_to_fp32()
     found = {key: value for key, value in flatten(to_dict(config)).items() if key.endswith("precision")}
     assert set(found.values()) == {"auto", "fp32"}
     assert found["slots.precision"] == found["dynamics.precision"] == "auto"
+
+
+def test_a_gpu_is_measured_and_a_processor_taken_at_its_word(native: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    for times, quicker in ((1.05, False), (1.1, True), (2.0, True)):
+        monkeypatch.setattr(subject, "speedup", lambda device, times=times: (asked.append(device), times)[1])
+        assert resolve_precision("auto", "cuda") == ("bf16" if native and quicker else "fp32")
+        assert resolve_precision("auto", "cpu") == ("bf16" if native else "fp32")
+        assert resolve_precision("bf16", "cuda") == "bf16"
+    assert asked == (["cuda"] * 3 if native else [])
+
+
+def test_the_measurement_draws_no_random_numbers() -> None:
+    before = torch.get_rng_state()
+    with torch.inference_mode():
+        assert 0 < speedup("cpu", 1, 8, 2) < float("inf")
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_what_a_training_began_with_is_kept_but_where_it_is_emulated(native: bool) -> None:
+    with keeping("fp32"):
+        assert resolve_precision("auto", "cpu") == "fp32"
+        assert resolve_precision("bf16", "cpu") == "bf16"
+    with keeping("bf16"):
+        assert resolve_precision("auto", "cpu") == ("bf16" if native else "fp32")
+    with keeping("auto"):
+        assert resolve_precision("auto", "cpu") == ("bf16" if native else "fp32")

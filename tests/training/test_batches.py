@@ -10,12 +10,15 @@ import torch
 from ranks import log_of
 from tiny_stages import STAGES
 
+from playslot_rl.config.compose import compose
 from playslot_rl.errors import ConfigError
+from playslot_rl.modules.savi import SAVi
 from playslot_rl.modules.transformer import TransformerBlock
 from playslot_rl.storage.tensors import load_tensors, module_tensors
 from playslot_rl.training import compiling
+from playslot_rl.training import fit as fit_module
 from playslot_rl.training.averages import WeightAverage
-from playslot_rl.training.compiling import compile_parts, release_parts
+from playslot_rl.training.compiling import LEAST_STEPS, compile_parts, compiling_pays, release_parts, worth_compiling
 from playslot_rl.training.fit import Part, fit
 
 
@@ -144,3 +147,39 @@ def test_compiling_without_a_compiler_is_refused_in_one_line(tmp_path: Path, mon
     with pytest.raises(ConfigError, match=r"policy\.compile=true: got no C\+\+ compiler") as caught:
         fit(replace(part, config=replace(part.config, compile=True)), tmp_path, seed=3)
     assert "\n" not in str(caught.value)
+
+
+def test_left_open_compiling_is_for_large_networks_on_a_gpu_with_many_steps_to_go(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gpu, cpu = torch.device("cuda"), torch.device("cpu")
+    monkeypatch.setenv("CXX", "g++")
+    monkeypatch.setattr(compiling.importlib.util, "find_spec", lambda _: object())
+    assert compiling_pays(gpu, LEAST_STEPS)
+    assert not compiling_pays(gpu, LEAST_STEPS - 1)
+    assert not compiling_pays(cpu, LEAST_STEPS)
+    monkeypatch.setattr(compiling.shutil, "which", lambda _: None)
+    monkeypatch.delenv("CXX")
+    assert not compiling_pays(gpu, LEAST_STEPS)
+    full, strided = (SAVi(compose([f"preset={preset}"]).model.savi, 64) for preset in ("paper", "compact"))
+    plain = torch.nn.Linear(1, 1)
+    assert list(worth_compiling({"full": full, "strided": strided, "plain": plain})) == ["full"]
+    monkeypatch.setattr(compiling, "COMPACT", True)
+    assert list(worth_compiling({"full": full, "strided": strided, "plain": plain})) == ["full", "strided"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "pays", "expected"), [(None, True, True), (None, False, False), (False, True, False)]
+)
+def test_what_a_training_compiles_unasked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: bool | None, pays: bool, expected: bool
+) -> None:
+    left: list[int] = []
+    compiled: list[dict[str, torch.nn.Module]] = []
+    monkeypatch.setattr(fit_module, "compiling_pays", lambda _, steps: bool(left.append(steps)) or pays)
+    monkeypatch.setattr(fit_module, "worth_compiling", lambda modules: {"some": modules["savi"]})
+    monkeypatch.setattr(fit_module, "compile_parts", lambda modules, _: compiled.append(modules))
+    part = changed("slots", 2)
+    fit(replace(part, config=replace(part.config, compile=asked)), tmp_path, seed=3)
+    assert [list(modules) for modules in compiled] == ([["some"]] if expected else [])
+    assert left == ([2] if asked is None else [])

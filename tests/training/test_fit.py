@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -10,15 +11,19 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from toy_stage import ToyStage, toy_config, train
 
 import playslot_rl.storage.resume as resume_module
-from playslot_rl.config import LoggingConfig
+from playslot_rl.config import LoggingConfig, Precision
 from playslot_rl.errors import CheckpointError, ConfigError, OutputError, TrainingError
+from playslot_rl.runtime import precision as precision_module
+from playslot_rl.runtime.precision import resolve_precision
 from playslot_rl.storage.atomic import lock
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
 from playslot_rl.training.fit import Part, fit
@@ -291,3 +296,40 @@ def test_the_stored_state_is_readable_json(tmp_path: Path) -> None:
     state = json.loads((tmp_path / "checkpoints" / "step_00000012" / "state.json").read_text())
     assert state["step"] == 12
     assert state["identity"]["toy"]["optim"]["lr"] == 0.01
+
+
+@pytest.mark.parametrize("stored", [True, False], ids=["as now", "as before precisions were stored"])
+@pytest.mark.parametrize("begun", ["auto", "fp32", "bf16"])
+def test_a_training_goes_on_in_the_precision_it_began_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begun: Precision, stored: bool
+) -> None:
+    found: list[Precision] = []
+
+    class Seen(ToyStage):
+        def loss(self, *given: Any) -> dict[str, torch.Tensor]:
+            found.append(resolve_precision("auto", "cpu"))
+            return super().loss(*given)
+
+    def trained(precision: Precision, steps: int) -> Precision:
+        config = replace(toy_config(12), precision=precision)
+        with pytest.raises(KeyboardInterrupt) if steps < 12 else contextlib.nullcontext(), monkeypatch.context() as by:
+            if steps < 12:
+                stop_at(by, steps, KeyboardInterrupt())
+            fit(Part("toy", Seen(), config), tmp_path, seed=3)
+        assert len(set(found)) == 1
+        return found.pop()
+
+    monkeypatch.setattr(precision_module, "native_bf16", lambda _: True)
+    monkeypatch.setattr(precision_module, "bf16_pays", lambda _: False)
+    first = trained(begun, 6)
+    found.clear()
+    monkeypatch.setattr(precision_module, "bf16_pays", lambda _: True)
+    state = tmp_path / "checkpoints" / "step_00000006" / "state.json"
+    values = json.loads(state.read_text())
+    assert values["precision"] == ("fp32" if begun == "auto" else begun)
+    if not stored:
+        del values["precision"]
+        state.write_text(json.dumps(values))
+    assert first == values.get("precision", first)
+    nobody_knows = begun == "auto" and not stored
+    assert trained("auto", 12) == ("bf16" if nobody_knows else "fp32" if begun == "auto" else begun)

@@ -37,7 +37,7 @@ class SAVi(nn.Module):
         image_size: side of the square frames.
 
     Attributes:
-        compiled: the methods that `compile=true` compiles: most of the arithmetic, and no random numbers.
+        compiled: the methods that `compile` is about: most of the arithmetic, and no random numbers.
 
     Example:
         >>> savi = SAVi(SAViConfig(n_slots=3), image_size=32)

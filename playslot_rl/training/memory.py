@@ -1,0 +1,123 @@
+"""A batch that does not fit into a GPU's memory, and the largest one that does.
+
+    peak(b) = a + c b,   so   b = (SAFE free - a) / c
+
+where b rows are what one share of the batch holds at once; the line goes through the measured peaks of loss and
+gradients at an eighth and at a quarter of them.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from playslot_rl.config import StageConfig
+from playslot_rl.errors import TrainingError
+from playslot_rl.runtime.processes import here
+from playslot_rl.runtime.shares import Share, sharing
+from playslot_rl.seeds.draws import StepGenerators, global_seed
+from playslot_rl.training.batches import GlobalBatches
+
+SAFE: Final = 0.9
+"""Of what is free: the rest is for the optimiser's first step, and for gaps between tensors."""
+ROWS: Final = 8
+"""A batch is a multiple of so many rows."""
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an error, or what it came from (a capture that ended early), is a GPU without memory."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, torch.OutOfMemoryError):
+        cause = cause.__cause__ or cause.__context__
+    return cause is not None
+
+
+def does_not_fit(
+    batches: GlobalBatches, config: StageConfig, key: str, step: int, seed: int, device: torch.device
+) -> TrainingError:
+    """The error of a step that ran out of memory and holds none any more; `key` is the dotted group of `config`."""
+    share = config.batch_size // batches.count
+    try:
+        rows = fitting(_Trial(batches, step, seed, device).peak, share, free_memory(device))
+    except (RuntimeError, AssertionError):  # not even these fit, or the device is in no state to tell
+        rows = 0
+    largest = rows * batches.count
+    unit = math.lcm(ROWS, batches.count)
+    largest -= largest % (unit if largest >= unit else batches.count)
+    what = f"{key}.batch_size: got {config.batch_size}, which does not fit into {device_memory(device)}"
+    if largest == 0:
+        return TrainingError(f"{what}, expected one that does; a small one does not either: choose smaller sizes")
+    cure = f"{what}, expected at most {largest}: use it"
+    if not batches.by_batch:
+        cure += f", or {key}.optim.accumulate={_micros(config, rows)}"
+    return TrainingError(cure)
+
+
+def fitting(peak: Callable[[int], float], rows: int, free: float) -> int:
+    """The most rows, fewer than `rows`, whose peak, as a straight line has it, is within what is free; 0 if none."""
+    few, more = max(1, rows // 8), max(2, rows // 4)
+    first, second = peak(few), peak(more)
+    each = max((second - first) / (more - few), 1e-9)
+    most = (SAFE * free - (first - each * few)) / each
+    return max(0, min(int(most), rows * 7 // 8))
+
+
+def free_memory(device: torch.device) -> float:
+    """Bytes that tensors can still take on a GPU."""
+    gc.collect()
+    torch.cuda.synchronize(device)
+    torch.cuda.empty_cache()
+    cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return torch.cuda.mem_get_info(device)[0] + cached
+
+
+def peak_memory(compute: Callable[[], None], device: torch.device) -> float:
+    """Bytes that tensors take on a GPU at most while something is computed, beside those there are."""
+    before = torch.cuda.memory_allocated(device)
+    torch.cuda.reset_peak_memory_stats(device)
+    compute()
+    return torch.cuda.max_memory_allocated(device) - before
+
+
+def device_memory(device: torch.device) -> str:
+    """A GPU and its memory, in words."""
+    if device.type != "cuda":
+        return f"the memory of {device}"
+    total = torch.cuda.get_device_properties(device).total_memory
+    return f"the {total / 2**30:.0f} GiB of {torch.cuda.get_device_name(device)}"
+
+
+class _Trial:
+    """Loss and gradients of the first rows of a step's batch, by this process alone."""
+
+    def __init__(self, batches: GlobalBatches, step: int, seed: int, device: torch.device) -> None:
+        self.batches, self.step, self.seed, self.device = batches, step, seed, device
+        self.generators = StepGenerators(seed, step, device)
+        own = Share(here().rank * batches.micros, batches.count, 0, batches.micros)
+        with global_seed(seed, step), sharing(own):
+            self.batch: Mapping[str, Tensor] = batches.stage.batch(step, self.generators)
+
+    def peak(self, rows: int) -> float:
+        """Bytes, with those of the batch itself."""
+        whole = max(len(value) for value in self.batch.values())
+
+        def compute() -> None:
+            batch = {key: value[: max(1, len(value) * rows // whole)].clone() for key, value in self.batch.items()}
+            with global_seed(self.seed, self.step):
+                self.batches.stage.loss(batch, self.step, self.generators)["loss"].backward()
+
+        found = peak_memory(compute, self.device)
+        for parameter in self.batches.parameters.values():
+            parameter.grad = None
+        return found
+
+
+def _micros(config: StageConfig, rows: int) -> int:
+    """The fewest micro-batches that divide a process's batch into shares of at most so many rows."""
+    own = config.batch_size // here().world
+    return next(n for n in range(1, own + 1) if own % n == 0 and own // n <= rows)
