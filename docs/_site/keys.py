@@ -24,7 +24,7 @@ INTRODUCTION: Final = """\
 
 Every key of the config, made from its classes by `.venv/bin/python docs/_site/keys.py`. Type it as `group.key=value`.
 The default is the class's, which is the paper's size; the column `compact` has what ButtonPress's `preset=compact`, the
-preset of a command that names none, changes. A task's own values are in `recipes/conf/env_model` and `env_preset`.
+preset of a command that names none, changes.
 
 `compare`, `compare-video` and `plan` take keys of their own group without its name: `methods=`, `seeds=`, `planner=`.
 

@@ -161,6 +161,21 @@ def earlier(cls: type) -> dict[str, Any]:
     return found
 
 
+def naming(config: Any) -> dict[str, Any]:
+    """What names a job of a comparison, nested: all but the keys of the machine. One that is left open, None, counts as
+    what it `was`, so that jobs from before it could be are the same jobs.
+    """
+    values = without(config, "machine")
+    for key, value in earlier(type(config)).items():  # type: ignore[arg-type]
+        *groups, name = key.split(".")
+        level = values
+        for group in groups:
+            level = level.get(group, {})
+        if level.get(name, value) is None:
+            level[name] = value
+    return values
+
+
 def by_default[Config](config: Config, unwanted: Role) -> Config:
     """A config whose keys of a role have their defaults again; those of groups inside it stay."""
     names = [field for field in dataclasses.fields(config) if unwanted in field.metadata.get("roles", ())]  # type: ignore[arg-type]

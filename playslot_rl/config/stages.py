@@ -62,15 +62,15 @@ class StageConfig(Checked):
         steps: optimiser steps.
         batch_size: windows per step.
         optim: optimiser.
-        precision: `bf16` autocasts SAVi's convolutions and the other networks; `auto` does so where the processor
-            multiplies bf16 itself, and a GPU is measured to be quicker with it. A training goes on as it began.
+        precision: `bf16` autocasts SAVi's convolutions and the other networks; `auto` does so where that is quicker,
+            and a training goes on as it began.
         checkpoint_every: steps between checkpoints.
         validate_every: steps between validations.
         log_every: steps between log lines.
         execution: `graph` records what a step computes once, as a CUDA graph, and replays it; `eager` launches its
             kernels one by one; `auto` is `graph` on a GPU, wherever the step can be recorded.
-        compile: make kernels of the networks' parts by torch.compile; needs a C++ compiler, and a minute at the start.
-            `null` does so for SAVi with the full encoder, on a GPU, where 2,000 steps are left and there is a compiler.
+        compile: make kernels of the networks' parts by torch.compile; needs a C++ compiler, and a minute at the start;
+            `null` compiles SAVi with the full encoder on a GPU, where 2,000 steps are left.
     """
 
     steps: int = field(default=200_000, metadata=at_least(1))
@@ -80,8 +80,8 @@ class StageConfig(Checked):
     checkpoint_every: int = field(default=1000, metadata=role("free") | at_least(1))
     validate_every: int = field(default=1000, metadata=role("free") | at_least(1))
     log_every: int = field(default=50, metadata=role("free") | at_least(1))
-    compile: bool | None = field(default=None, metadata=role("free"))
-    execution: Execution = field(default="auto", metadata=role("free"))
+    compile: bool | None = field(default=None, metadata=role("free") | was(False))
+    execution: Execution = field(default="auto", metadata=role("free", "machine"))
 
 
 def clipped_stage(steps: int, lr: float, schedule: Literal["cosine", "constant"]) -> StageConfig:

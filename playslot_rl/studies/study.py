@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import is_pretrained
 from playslot_rl.config.methods import METHODS
-from playslot_rl.config.roles import without
+from playslot_rl.config.roles import naming
 from playslot_rl.config.weights import data_roots, is_remote
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.evaluation.success import hardware
@@ -85,7 +85,7 @@ def fingerprint_of(content: Any) -> str:
 
 def computed(config: ExperimentConfig) -> dict[str, Any]:
     """What a job's config says of what it computes; jobs from before clips could be drawn are the same jobs."""
-    result = without(config, "machine")
+    result = naming(config)
     if not config.data.drawn:
         del result["data"]["drawn"]
     return result

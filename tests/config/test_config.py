@@ -20,7 +20,8 @@ from playslot_rl.config import (
     to_dict,
 )
 from playslot_rl.config.compose import choices, compose
-from playslot_rl.config.roles import Checked, keys_of, without
+from playslot_rl.config.plain import flatten
+from playslot_rl.config.roles import Checked, keys_of, naming, without
 from playslot_rl.errors import ConfigError
 from playslot_rl.methods.dreamer.method import DreamerConfig
 
@@ -283,6 +284,7 @@ def test_roles_say_what_each_key_counts_for() -> None:
         "play",
         "port",
     }
+    machine |= {key for key in keys_of(ExperimentConfig, "free") if key.endswith(".execution")}
     machine |= {"data.cache_limit", "data.device", "data.workers"}
     named = {"data.root", "data.demos", "data.cache", "behaviour.policy_from"}
     named |= {f"baselines.{method}.world" for method in ("lapo", "caddy_policy", "caddy_oracle")}
@@ -312,6 +314,15 @@ def test_a_config_without_a_role_keeps_all_other_keys() -> None:
     kept["optim"] = {k: v for k, v in kept["optim"].items() if k != "accumulate"}
     assert fixed["slots"] == kept
     assert "minutes" not in fixed["baselines"]["dreamer"]
+
+
+def test_a_job_is_named_as_before_compiling_was_left_open() -> None:
+    config = compose(["dynamics.compile=true"])
+    named, whole = naming(config), without(config, "machine")
+    assert (whole["slots"]["compile"], named["slots"]["compile"], named["dynamics"]["compile"]) == (None, False, True)
+    assert "execution" not in named["slots"]
+    changed = {key for key, value in flatten(whole).items() if flatten(named)[key] != value}
+    assert changed == {key for key in flatten(whole) if key.endswith(".compile")} - {"dynamics.compile"}
 
 
 def test_a_config_checks_its_values() -> None:
