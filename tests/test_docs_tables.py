@@ -161,5 +161,5 @@ def test_a_gpus_bench_fills_its_table(tables: ModuleType, site_module: Callable[
     shown = tables.markdown(table)
     assert "| `savi_step` | paper | bf16 | 64 | 200.0 | 100.0 | 2.0 | | | 25.0 |" in shown
     assert "commit 0123abc" in tables.made(table)
-    assert "one NVIDIA H200, 800 TFLOP/s in a large product, torch 2.11.0, 16 cores of a Xeon" in tables.made(table)
+    assert "one NVIDIA H200, 800 TFLOP/s in a large product, torch 2.11.0, 16 cores (Xeon)" in tables.made(table)
     assert after["tables"] == {name: entry for name, entry in before["tables"].items() if name != "gpu_bench"}

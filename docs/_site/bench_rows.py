@@ -30,7 +30,7 @@ def filled(document: dict[str, Any], figures: dict[str, Any], commit: str) -> di
             "command": ["playslot bench preset=paper device=cuda --json gpu.json"],
             "commit": commit,
             "machine": f"one {machine['gpu']}, {machine['peak_tflops']:.0f} TFLOP/s in a large product, torch "
-            f"{machine['torch']}, {machine['cores']} cores of a {machine['cpu']}",
+            f"{machine['torch']}, {machine['cores']} cores ({machine['cpu']})",
             "time": None,
             "date": datetime.date.today().isoformat(),
         }
