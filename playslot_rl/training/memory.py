@@ -43,7 +43,8 @@ def does_not_fit(
     """The error of a step that ran out of memory and holds none any more; `key` is the dotted group of `config`."""
     share = config.batch_size // batches.count
     try:
-        rows = fitting(_Trial(batches, step, seed, device).peak, share, free_memory(device))
+        free = free_memory(device)
+        rows = fitting(_Trial(batches, step, seed, device).peak, share, free)
     except (RuntimeError, AssertionError):  # not even these fit, or the device is in no state to tell
         rows = 0
     largest = rows * batches.count
@@ -103,15 +104,15 @@ class _Trial:
             self.batch: Mapping[str, Tensor] = batches.stage.batch(step, self.generators)
 
     def peak(self, rows: int) -> float:
-        """Bytes, with those of the batch itself."""
+        """Bytes, with those of the batch itself, which a captured step holds twice."""
         whole = max(len(value) for value in self.batch.values())
+        batch = {key: value[: max(1, len(value) * rows // whole)] for key, value in self.batch.items()}
 
         def compute() -> None:
-            batch = {key: value[: max(1, len(value) * rows // whole)].clone() for key, value in self.batch.items()}
             with global_seed(self.seed, self.step):
                 self.batches.stage.loss(batch, self.step, self.generators)["loss"].backward()
 
-        found = peak_memory(compute, self.device)
+        found = peak_memory(compute, self.device) + 2 * sum(value.nbytes for value in batch.values())
         for parameter in self.batches.parameters.values():
             parameter.grad = None
         return found

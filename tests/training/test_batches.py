@@ -13,6 +13,7 @@ from tiny_stages import STAGES
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import ConfigError
 from playslot_rl.modules.savi import SAVi
+from playslot_rl.modules.savi.decoder import _doubled
 from playslot_rl.modules.transformer import TransformerBlock
 from playslot_rl.storage.tensors import load_tensors, module_tensors
 from playslot_rl.training import compiling
@@ -183,3 +184,10 @@ def test_what_a_training_compiles_unasked(
     fit(replace(part, config=replace(part.config, compile=asked)), tmp_path, seed=3)
     assert [list(modules) for modules in compiled] == ([["some"]] if expected else [])
     assert left == ([2] if asked is None else [])
+
+
+@pytest.mark.integration
+@pytest.mark.skipif(not compiling.has_compiler(), reason="needs a C++ compiler")
+def test_a_doubling_can_be_compiled() -> None:
+    conv, x = torch.nn.Conv2d(4, 16, 3, padding=1), torch.rand(2, 4, 8, 8)
+    assert torch.allclose(torch.compile(_doubled)(conv, x, True), _doubled(conv, x, True), atol=1e-5)

@@ -122,7 +122,8 @@ def _doubled(conv: nn.Module, x: Tensor, activate: bool) -> Tensor:
     """
     assert isinstance(conv, nn.Conv2d)
     assert conv.bias is not None
-    weight, bias = (part.unflatten(0, (-1, 4)).transpose(0, 1).flatten(0, 1) for part in (conv.weight, conv.bias))
+    weight = conv.weight.unflatten(0, (-1, 4)).transpose(0, 1).flatten(0, 1)
+    bias = torch.cat(conv.bias.unflatten(0, (-1, 4)).unbind(1))  # torch.compile takes no view as a bias on a CPU
     y = F.conv2d(x, weight, bias, padding=conv.padding)
     y = F.relu(y) if activate else y
     m, c, h, w = y.shape
