@@ -23,6 +23,7 @@ from playslot_rl.methods.caddy.model import CADDY
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.checkpoints import StageCheckpoint, save_stage
+from playslot_rl.training.stage import step_loss
 
 pytestmark = pytest.mark.integration
 
@@ -109,7 +110,7 @@ def test_training_leaves_the_encoder_and_its_statistics_as_they_are(
     optimizer = torch.optim.Adam(head.parameters(), lr=1e-2)
     for step in range(3):
         optimizer.zero_grad()
-        stage.loss(step, StepGenerators(0, step))["loss"].backward()
+        step_loss(stage, step, StepGenerators(0, step))["loss"].backward()
         assert all(p.grad is not None and bool(p.grad.abs().sum() > 0) for p in head.parameters())
         optimizer.step()
     assert all(p.grad is None for p in model.parameters())

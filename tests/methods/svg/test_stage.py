@@ -41,7 +41,7 @@ def test_a_resumed_training_ends_with_the_same_weights_statistics_and_optimiser(
 ) -> None:
     config = replace(config, steps=4, decoded_frames=2, checkpoint_every=2, validate_every=2)
     train(tmp_path / "whole", config)
-    original = SVGStage.loss
+    original = SVGStage.batch
 
     def stop(self: SVGStage, step: int, generators: StepGenerators) -> object:
         if step == 3:
@@ -49,7 +49,7 @@ def test_a_resumed_training_ends_with_the_same_weights_statistics_and_optimiser(
         return original(self, step, generators)
 
     with monkeypatch.context() as patch:
-        patch.setattr(SVGStage, "loss", stop)
+        patch.setattr(SVGStage, "batch", stop)
         with pytest.raises(KeyboardInterrupt, match="from step 2 "):
             train(tmp_path / "parts", config)
     train(tmp_path / "parts", config)
