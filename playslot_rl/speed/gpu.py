@@ -82,7 +82,8 @@ def variants(case: str, preset: str, device: torch.device) -> list[tuple[Precisi
     if device.type != "cuda":
         ways = WAYS[:1]
     kinds: tuple[Precision, ...] = ("fp32",) if case == "plan_step" else precisions(device.type)
-    return [(precision, way) for precision in kinds for way in ways]
+    # What is compiled, for long trainings, is what they compute in: the last of them, bf16 where there is it.
+    return [(precision, way) for precision in kinds for way in ways if way != "compiled" or precision == kinds[-1]]
 
 
 def peak_flops(device: torch.device, side: int) -> float:
