@@ -1,13 +1,12 @@
-"""A batch that does not fit into a GPU's memory, and the largest one that does.
+"""A batch that does not fit into a GPU's memory, and one that does: smaller and smaller parts of it are tried, each by
+its loss and gradients, until what they take at most is `SAFE` of what is free.
 
-    peak(b) = a + c b,   so   b = (SAFE free - a) / c
-
-where b rows are what one share of the batch holds at once; the line goes through the measured peaks of loss and
-gradients at an eighth and at a quarter of them.
+Not by a straight line through two small ones: convolutions take what memory there is to be quick.
 """
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import math
 from collections.abc import Callable, Mapping
@@ -25,6 +24,8 @@ from playslot_rl.training.batches import GlobalBatches
 
 SAFE: Final = 0.9
 """Of what is free: the rest is for the optimiser's first step, and for gaps between tensors."""
+SHARES: Final = (7 / 8, 3 / 4, 5 / 8, 1 / 2, 3 / 8, 1 / 4, 3 / 16, 1 / 8, 1 / 16, 1 / 32)
+"""Of the batch, in the order in which they are tried."""
 ROWS: Final = 8
 """A batch is a multiple of so many rows."""
 
@@ -60,12 +61,13 @@ def does_not_fit(
 
 
 def fitting(peak: Callable[[int], float], rows: int, free: float) -> int:
-    """The most rows, fewer than `rows`, whose peak, as a straight line has it, is within what is free; 0 if none."""
-    few, more = max(1, rows // 8), max(2, rows // 4)
-    first, second = peak(few), peak(more)
-    each = max((second - first) / (more - few), 1e-9)
-    most = (SAFE * free - (first - each * few)) / each
-    return max(0, min(int(most), rows * 7 // 8))
+    """The largest of `SHARES` of some rows whose peak is within what is free, in rows; 0 if none is."""
+    for share in SHARES:
+        some = int(rows * share)
+        with contextlib.suppress(torch.OutOfMemoryError):
+            if some and peak(some) <= SAFE * free:
+                return some
+    return 0
 
 
 def free_memory(device: torch.device) -> float:
@@ -79,6 +81,8 @@ def free_memory(device: torch.device) -> float:
 
 def peak_memory(compute: Callable[[], None], device: torch.device) -> float:
     """Bytes that tensors take on a GPU at most while something is computed, beside those there are."""
+    gc.collect()
+    torch.cuda.empty_cache()
     before = torch.cuda.memory_allocated(device)
     torch.cuda.reset_peak_memory_stats(device)
     compute()
@@ -94,28 +98,31 @@ def device_memory(device: torch.device) -> str:
 
 
 class _Trial:
-    """Loss and gradients of the first rows of a step's batch, by this process alone."""
+    """Loss and gradients of the first rows of a step's batch, by this process alone; the batch waits on the CPU."""
 
     def __init__(self, batches: GlobalBatches, step: int, seed: int, device: torch.device) -> None:
         self.batches, self.step, self.seed, self.device = batches, step, seed, device
         self.generators = StepGenerators(seed, step, device)
         own = Share(here().rank * batches.micros, batches.count, 0, batches.micros)
         with global_seed(seed, step), sharing(own):
-            self.batch: Mapping[str, Tensor] = batches.stage.batch(step, self.generators)
+            batch: Mapping[str, Tensor] = batches.stage.batch(step, self.generators)
+        self.batch = {key: value.cpu() for key, value in batch.items()}
+        self.rows = max(map(len, self.batch.values()))
 
     def peak(self, rows: int) -> float:
         """Bytes, with those of the batch itself, which a captured step holds twice."""
-        whole = max(len(value) for value in self.batch.values())
-        batch = {key: value[: max(1, len(value) * rows // whole)] for key, value in self.batch.items()}
+        parts = {key: value[: max(1, len(value) * rows // self.rows)] for key, value in self.batch.items()}
 
         def compute() -> None:
+            batch = {key: value.to(self.device) for key, value in parts.items()}
             with global_seed(self.seed, self.step):
                 self.batches.stage.loss(batch, self.step, self.generators)["loss"].backward()
 
-        found = peak_memory(compute, self.device) + 2 * sum(value.nbytes for value in batch.values())
-        for parameter in self.batches.parameters.values():
-            parameter.grad = None
-        return found
+        try:
+            return peak_memory(compute, self.device) + sum(value.nbytes for value in parts.values())
+        finally:
+            for parameter in self.batches.parameters.values():
+                parameter.grad = None
 
 
 def _micros(config: StageConfig, rows: int) -> int:

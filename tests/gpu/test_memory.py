@@ -69,7 +69,7 @@ def test_what_is_named_fits(tmp_path: Path, execution: str) -> None:
     found = re.search(r"expected at most (\d+): use it, or rows\.optim\.accumulate=(\d+)$", message)
     assert found is not None, message
     rows, micros = map(int, found.groups())
-    assert 32 <= rows <= 256
+    assert 64 <= rows <= 256
     trained(Convolutions(rows), tmp_path / "fits", execution)
     trained(Convolutions(512), tmp_path / "shares", execution, micros)
     assert len(full) > 0
