@@ -238,13 +238,18 @@ def _stored(path: Path) -> int:
     return min(status.st_size, status.st_blocks * 512) if hasattr(status, "st_blocks") else status.st_size
 
 
+MAKING: Final = "it is being made"
+
+
 @contextlib.contextmanager
 def _unmade(part: Path) -> Iterator[bool]:
     """Whether nobody makes the entry; inside the block nobody begins to."""
     with contextlib.ExitStack() as stack:
         try:
-            stack.enter_context(locked(lock_file(part.with_name(_key(part))), busy="it is being made"))
-        except OutputError:
+            stack.enter_context(locked(lock_file(part.with_name(_key(part))), busy=MAKING))
+        except OutputError as error:
+            if str(error) != MAKING:
+                raise
             yield False
             return
         yield True

@@ -105,6 +105,8 @@ class Aggregate:
     def add(self, episode: Stats) -> None:
         for name, given in episode.items():
             values = {key: np.asarray(value, np.float64) for key, value in given.items()}
+            if not {*BASIC} <= values.keys() or not values["count"].reshape(-1)[:1] > 0:
+                raise ValueError(f"statistics of {name}: {', '.join(sorted(values))} of {given.get('count')} values")
             values["count"] = values["count"].reshape(-1)[:1]
             there = self._features.get(name)
             self._features[name] = values if there is None else _joined(there, values)
@@ -114,8 +116,9 @@ class Aggregate:
 
 
 def _joined(one: dict[str, Array], other: dict[str, Array]) -> dict[str, Array]:
-    if one["mean"].shape != other["mean"].shape:
-        raise ValueError(f"{other['mean'].shape} beside {one['mean'].shape}")
+    for key in one.keys() & other.keys():
+        if one[key].shape != other[key].shape:
+            raise ValueError(f"{key} of {other[key].shape} beside {one[key].shape}")
     n, m = float(one["count"][0]), float(other["count"][0])
     share = m / (n + m)
     total = {key: one[key] + share * (other[key] - one[key]) for key in one if key in other}

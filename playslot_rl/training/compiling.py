@@ -15,7 +15,7 @@ from playslot_rl.errors import ConfigError
 
 COMPILERS = ("g++", "gcc", "clang++", "clang")
 LEAST_STEPS: Final = 2000
-"""Steps that have to be left for what compiling takes, about a minute."""
+"""Steps that have to be left for what compiling takes, 10 to 60 seconds."""
 COMPACT: Final = False
 """Whether SAVi with a strided encoder (`preset=compact`) is compiled unasked, too."""
 

@@ -217,14 +217,17 @@ class _Run:
         self.state = replace(self.state, step=done, seconds=time.monotonic() - self._began)
         self._keep_pace()
         last, progress.total = done == self.planned, self.planned
-        if done == 1 or done % config.log_every == 0 or last:
+        logs = done == 1 or done % config.log_every == 0 or last
+        validates, saves = done % config.validate_every == 0 or last, done % config.checkpoint_every == 0
+        if logs or validates or saves:
             self._require_finite()
+        if logs:
             numbers = {key: float(value) for key, value in values.items()}
             self._log("train", done, numbers)
             progress.update(done, numbers)
         else:
             progress.update(done, {})
-        if done % config.validate_every == 0 or last:
+        if validates:
             began = time.monotonic()
             self.state = replace(self.state, metrics=self._validate(done))
             self._validation = time.monotonic() - began
@@ -232,7 +235,7 @@ class _Run:
             self._log("validation", done, self.state.metrics)
             self._look(done)
             self._judge()
-        if done % config.checkpoint_every == 0 or self.ended:
+        if saves or self.ended:
             self.watch.require_finite(self.stage.modules, f"step {done}")
             if here().first:
                 self.checkpoints.save(self.state, self.stage.modules, self.optimizer, self.parameters, self._averaged)

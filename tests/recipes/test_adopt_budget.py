@@ -46,15 +46,15 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def slowed(monkeypatch: pytest.MonkeyPatch, clock: Clock, stage: type, seconds: Callable[[int], float]) -> list[int]:
     """Let the steps of a stage take `seconds(n)`, the n-th of all of its trainings; how many there were, in a list."""
-    loss, count = stage.loss, [0]  # type: ignore[attr-defined]
+    batch, count = stage.batch, [0]  # type: ignore[attr-defined]
 
     def slow(self: Any, step: int, generators: Any) -> Mapping[str, Any]:
         clock.now += seconds(count[0])
         count[0] += 1
-        result: Mapping[str, Any] = loss(self, step, generators)
+        result: Mapping[str, Any] = batch(self, step, generators)
         return result
 
-    monkeypatch.setattr(stage, "loss", slow)
+    monkeypatch.setattr(stage, "batch", slow)
     return count
 
 

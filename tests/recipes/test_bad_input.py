@@ -85,8 +85,8 @@ def test_a_nan_loss_stops_and_the_last_good_checkpoint_carries_on(
 ) -> None:
     run, original = tmp_path / "run", SlotsStage.loss
 
-    def poisoned(self: SlotsStage, step: int, generators: object) -> dict[str, object]:
-        losses = dict(original(self, step, generators))  # type: ignore[arg-type]
+    def poisoned(self: SlotsStage, batch: object, step: int, generators: object) -> dict[str, object]:
+        losses = dict(original(self, batch, step, generators))  # type: ignore[arg-type]
         return losses | ({"loss": losses["loss"] * float("nan")} if step == 4 else {})
 
     with monkeypatch.context() as patch:

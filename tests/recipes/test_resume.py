@@ -103,7 +103,7 @@ def test_a_killed_stage_ends_with_the_weights_of_one_that_was_not(
 def test_an_interrupt_is_one_line_and_the_same_command_carries_on(
     shared_run: Path, videos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, original = tmp_path / "run", SlotsStage.loss
+    run, original = tmp_path / "run", SlotsStage.batch
 
     def pressed(self: SlotsStage, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         if step == 4:
@@ -112,7 +112,7 @@ def test_an_interrupt_is_one_line_and_the_same_command_carries_on(
 
     command = ("train-slots", f"out={run}", f"data.root={videos}")
     with monkeypatch.context() as patch:
-        patch.setattr(SlotsStage, "loss", pressed)
+        patch.setattr(SlotsStage, "batch", pressed)
         refused(*command, message="slots interrupted; the same command carries on from step 3 ", code=130)
     smoke(*command)
     assert weights(run, "slots") == weights(shared_run, "slots")
@@ -151,7 +151,7 @@ def test_a_new_run_is_one_commands_too(
     shared_run: Path, videos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The second command comes while the first trains; the first does not notice."""
-    run, original, said = tmp_path / "run", SlotsStage.loss, []
+    run, original, said = tmp_path / "run", SlotsStage.batch, []
     command = ("train-slots", f"out={run}", f"data.root={videos}")
     monkeypatch.setattr(record, "PATIENCE", 0.0)
 
@@ -161,7 +161,7 @@ def test_a_new_run_is_one_commands_too(
         return original(self, step, generators)
 
     with monkeypatch.context() as patch:
-        patch.setattr(SlotsStage, "loss", second)
+        patch.setattr(SlotsStage, "batch", second)
         done = playslot(*command, "preset=smoke", *ONE_CORE)
     assert (said, done.code) == ([1], 0)
     assert_one_line(done.err, "train-slots")

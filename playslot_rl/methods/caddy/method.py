@@ -97,7 +97,7 @@ class CADDYConfig(VideoStageConfig):
 
 @dataclass(frozen=True)
 class CADDYOracleConfig(Checked):
-    """Schedule of what acts on CADDY's states, of the oracle nothing else; the model is `baselines.caddy`, the loss
+    """Schedule of a policy on CADDY's states: the CADDY Oracle's whole one. The model is `baselines.caddy`, the loss
     `behaviour.loss`.
 
     Attributes:
@@ -117,7 +117,7 @@ class CADDYOracleConfig(Checked):
 
 @dataclass(frozen=True)
 class CADDYPolicyConfig(CADDYOracleConfig):
-    """Schedule of the action decoder of CADDY's policy. Its size is `model.action_decoder`, its inputs and labels are
+    """Schedule of CADDY's policy and of its action decoder, whose size is `model.action_decoder`; inputs and labels are
     `behaviour`'s, as for PlaySlot.
 
     Attributes:
