@@ -217,7 +217,8 @@ COMMANDS: Final[dict[str, Command]] = {
         "speed of this machine: training steps, rollout, playing, planning, data sets, rendering",
         "Times the fast paths in one run, medians over repeats, and counts what a training step of the preset costs. "
         "With device=cuda: training steps, searches and games of two presets, as kernels launched one by one, captured "
-        "and compiled, with memory and share of the GPU's arithmetic. An empty device= times the CPU. Leave the machine idle.",
+        "and compiled, with memory and share of the GPU's arithmetic. An empty device= times the CPU. "
+        "Leave the machine idle.",
         ("playslot bench", "playslot bench --json bench.json", "playslot bench device=cuda --json gpu.json"),
         "preset device threads",
     ),

@@ -20,7 +20,7 @@ from playslot_rl.frames import normalise
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.modules.policy import LatentPolicy
-from playslot_rl.modules.predictors import Predictor, build_predictor
+from playslot_rl.modules.predictors import build_predictor
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runtime.captured import Captured
 
@@ -46,6 +46,9 @@ class WorldModel(nn.Module):
         self.predictor = build_predictor(
             config.predictor, config.savi.slot_dim, self.inverse_dynamics.latent_dim, self.inverse_dynamics.per_slot
         )
+        self.next_slots = Captured(self._next_slots, self)
+        """Slots (M, N, D) after histories of slots (M, W, N, D) and latent actions (M, W, [N,] Z), of whose frames the
+        last (M,) are there."""
         self.futures = Captured(self._futures, self)
         """Slots (M, S, N, D) seen so far and latent actions (M, T, [N,] Z), S - 1 of them in the past, to the slots (M,
         T, N, D) after each action; those inside the seen frames come from parsed slots."""
@@ -54,6 +57,14 @@ class WorldModel(nn.Module):
     def slot_shape(self) -> tuple[int, int]:
         """(N, D)."""
         return (self.config.savi.n_slots, self.config.savi.slot_dim)
+
+    def _next_slots(self, slots: Tensor, latents: Tensor, lengths: Tensor | None) -> Tensor:
+        valid = None
+        if lengths is not None:
+            window = slots.shape[1]
+            valid = torch.arange(window, device=slots.device) >= window - lengths[:, None]
+        predicted: Tensor = self.predictor(slots, *self.inverse_dynamics.split(latents), valid=valid)[:, -1]
+        return predicted
 
     def _futures(self, slots: Tensor, latents: Tensor) -> Tensor:
         return self.predictor.rollout(slots, *self.inverse_dynamics.split(latents))
@@ -143,11 +154,9 @@ def frame_parser_module(savi: SAVi, generator: torch.Generator | None = None) ->
 class _Step(nn.Module):
     """One step of the predictor on right-aligned histories: the arithmetic of the imagination environment."""
 
-    def __init__(self, inverse_dynamics: InverseDynamics, predictor: Predictor) -> None:
+    def __init__(self, world_model: WorldModel) -> None:
         super().__init__()
-        self.inverse_dynamics = inverse_dynamics
-        self.predictor = predictor
-        self._next = Captured(self._predicted, self)
+        self.world_model = world_model
 
     def forward(
         self, z: Tensor, slot_history: Tensor, action_history: Tensor, length: Tensor
@@ -158,12 +167,14 @@ class _Step(nn.Module):
         actions = torch.cat([actions[:, :-1], z.reshape(-1, 1, *z.shape[len(batch) :])], 1)
         lengths = length.reshape(-1)
         if slots.device.type == "cuda":
-            predicted = self._next(slots, actions, lengths)
+            predicted = self.world_model.next_slots(slots, actions, lengths)
         else:
             # Frames before the longest episode's first carry nothing: leaving them out makes short imaginations cheap.
             window = int(lengths.max())
             whole = int(lengths.min()) == window
-            predicted = self._predicted(slots[:, -window:], actions[:, -window:], None if whole else lengths)
+            predicted = self.world_model._next_slots(
+                slots[:, -window:], actions[:, -window:], None if whole else lengths
+            )
         slots = torch.cat([slots[:, 1:], predicted[:, None]], 1)
         actions = torch.cat([actions[:, 1:], torch.zeros_like(actions[:, :1])], 1)
         return (
@@ -173,18 +184,8 @@ class _Step(nn.Module):
             (length + 1).clamp(max=context),
         )
 
-    def _predicted(self, slots: Tensor, actions: Tensor, lengths: Tensor | None) -> Tensor:
-        """Slots (M, N, D) after histories (M, W, ...), of whose frames the last `lengths` (M,) are there; None: all."""
-        window = slots.shape[1]
-        valid = None
-        if lengths is not None:
-            valid = torch.arange(window, device=slots.device) >= window - lengths[:, None]
-        p, v = self.inverse_dynamics.split(actions)
-        predicted: Tensor = self.predictor(slots, p, v, valid=valid)[:, -1]
-        return predicted
 
-
-def dynamics_module(inverse_dynamics: InverseDynamics, predictor: Predictor) -> TensorDictSequential:
+def dynamics_module(world_model: WorldModel) -> TensorDictSequential:
     """One step of the world model, on root keys, as `ModelBasedEnvBase` wants it.
 
     Reads LATENT_ACTION (..., [N,] Z), SLOT_HISTORY (..., C, N, D), ACTION_HISTORY (..., C, [N,] Z) and
@@ -194,7 +195,7 @@ def dynamics_module(inverse_dynamics: InverseDynamics, predictor: Predictor) -> 
     """
     return TensorDictSequential(
         TensorDictModule(
-            _Step(inverse_dynamics, predictor),
+            _Step(world_model),
             in_keys=[keys.LATENT_ACTION, keys.SLOT_HISTORY, keys.ACTION_HISTORY, keys.HISTORY_LENGTH],
             out_keys=[keys.SLOTS, keys.SLOT_HISTORY, keys.ACTION_HISTORY, keys.HISTORY_LENGTH],
         )

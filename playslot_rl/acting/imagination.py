@@ -69,7 +69,7 @@ class ImaginationEnv(ModelBasedEnvBase):
         world_model.eval()
         device = module_device(world_model)
         super().__init__(
-            dynamics_module(world_model.inverse_dynamics, world_model.predictor),
+            dynamics_module(world_model),
             device=device,
             batch_size=torch.Size(batch_size),
         )

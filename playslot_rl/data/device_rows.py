@@ -46,8 +46,10 @@ class DeviceRows:
         return self.table[to_device(torch.from_numpy(rows), self.device)]
 
     def take(self, rows: Tensor) -> Tensor:
-        """Rows of numbers that are on the device."""
-        return self(rows.cpu().numpy()) if self.table is None else self.table[rows]
+        """Rows of numbers on the CPU or on the device."""
+        if self.table is None or rows.device.type == "cpu":
+            return self(rows.cpu().numpy())
+        return self.table[rows]
 
     def _table(self) -> Tensor | None:
         one = self.host(np.arange(1))

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
+import itertools
 import warnings
+import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
@@ -35,24 +38,32 @@ class Captured[Result]:
 
     Args:
         function: computes from its arguments and a module's weights alone, without waiting for the device and without
-            random numbers.
-        module: whose weights are read. Where they lie elsewhere than before, as after `.to`, all is recorded anew.
+            random numbers. A method is held weakly, so that its object may hold this.
+        module: whose weights are read. Where they lie elsewhere than before, as after `.to`, or are in another mode or
+            precision, all is recorded anew. Held weakly.
 
     Warns:
         RuntimeWarning: it could not be recorded; it is called as it is from then on.
     """
 
     def __init__(self, function: Callable[..., Result], module: nn.Module) -> None:
-        self.function, self.module = function, module
+        self._function: Any = weakref.WeakMethod(function) if inspect.ismethod(function) else lambda: function
+        self._module = weakref.ref(module)
         self._graphs: OrderedDict[Key, Callable[..., Result] | None] = OrderedDict()
         self._captures = True
+        self._stream: torch.cuda.Stream | None = None
+
+    @property
+    def function(self) -> Callable[..., Result]:
+        """What is called."""
+        found: Callable[..., Result] = self._function()
+        return found
 
     def __call__(self, *inputs: Tensor) -> Result:
         capturing = self._captures and _capturing.get()
         if not capturing or inputs[0].device.type != "cuda" or torch.is_grad_enabled():
             return self.function(*inputs)
-        weights = next(self.module.parameters()).data_ptr()
-        key: Key = (weights, *((value.shape, value.dtype, value.device) for value in inputs))
+        key = self._key(inputs)
         known = key in self._graphs
         replay = self._graphs.pop(key, None)
         if known and replay is None:
@@ -62,21 +73,38 @@ class Captured[Result]:
             self._graphs.popitem(last=False)
         return self.function(*inputs) if replay is None else replay(*inputs)
 
+    def _key(self, inputs: tuple[Tensor, ...]) -> Key:
+        module = self._module()
+        assert module is not None
+        weights = (part.data_ptr() for part in itertools.chain(module.parameters(), module.buffers()))
+        mode = (module.training, getattr(module, "precision", None), torch.is_autocast_enabled("cuda"))
+        return (*weights, *mode, *((value.shape, value.dtype, value.device) for value in inputs))
+
     def _recorded(self, inputs: tuple[Tensor, ...]) -> Callable[..., Result] | None:
+        device = inputs[0].device
         graph, buffers = torch.cuda.CUDAGraph(), [value.clone() for value in inputs]
+        self._stream = self._stream or torch.cuda.Stream(device)
+        self._stream.wait_stream(torch.cuda.current_stream(device))
         try:
-            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            # The outer block puts the stream back where a capture fails and cannot.
+            with (
+                torch.cuda.device(device),
+                torch.cuda.stream(self._stream),
+                torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"),
+            ):
                 result = self.function(*buffers)
         except RuntimeError as error:
-            first = str(error).splitlines()[0]
+            first = str(error.__context__ or error).splitlines()[0]
             warnings.warn(f"a CUDA graph could not be recorded: {first}", RuntimeWarning, stacklevel=3)
             self._captures = False
             return None
+        torch.cuda.current_stream(device).wait_stream(self._stream)
 
         def replay(*given: Tensor) -> Result:
             for buffer, value in zip(buffers, given, strict=True):
                 buffer.copy_(value)
-            graph.replay()
+            with torch.cuda.device(device):
+                graph.replay()
             copied: Result = pytree.tree_map(lambda value: value.clone(), result)
             return copied
 
@@ -84,4 +112,4 @@ class Captured[Result]:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies record their own."""
-        return (type(self), (self.function, self.module))
+        return (type(self), (self.function, self._module()))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import os
 import shutil
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
@@ -23,7 +25,19 @@ COMPACT: Final = False
 def compiling_pays(device: torch.device, steps: int) -> bool:
     """Whether a training with so many steps left is to compile what is `worth_compiling` unasked."""
     able = has_compiler() and importlib.util.find_spec("triton") is not None
-    return device.type == "cuda" and steps >= LEAST_STEPS and able
+    return device.type == "cuda" and steps >= LEAST_STEPS and able and _compiles(device)
+
+
+@functools.cache
+def _compiles(device: torch.device) -> bool:
+    """Whether a small function can be compiled there: a compiler may lack Python's headers, a GPU be too old."""
+    try:
+        torch.compile(lambda x: x.square().sum())(torch.ones(64, device=device))
+    except Exception as error:  # noqa: BLE001  # whatever it is, nobody has asked for it
+        first = (str(error) or type(error).__name__).splitlines()[0]
+        warnings.warn(f"torch.compile does not work here, trained without: {first}", RuntimeWarning, stacklevel=3)
+        return False
+    return True
 
 
 def worth_compiling(modules: Mapping[str, nn.Module]) -> dict[str, nn.Module]:

@@ -120,6 +120,8 @@ def fit(
                 run.advance(run.state.step, progress)
     if run.average is not None:
         run.average.settle()
+    if run.steps.on_gpu:
+        run.optimizer.zero_grad(set_to_none=True)  # gradients of a captured step hold all of its memory
     return run.state, start
 
 
@@ -214,20 +216,19 @@ class _Run:
         """One step, and whatever is due after it."""
         config, done = self.config, step + 1
         values = self._step(step)
+        intervals = (config.log_every, config.validate_every, config.checkpoint_every)
+        if done in (1, self.planned) or any(done % every == 0 for every in intervals):
+            self._require_finite()  # waits for a GPU, before the clock is read and anything is kept
         self.state = replace(self.state, step=done, seconds=time.monotonic() - self._began)
         self._keep_pace()
         last, progress.total = done == self.planned, self.planned
-        logs = done == 1 or done % config.log_every == 0 or last
-        validates, saves = done % config.validate_every == 0 or last, done % config.checkpoint_every == 0
-        if logs or validates or saves:
-            self._require_finite()
-        if logs:
+        if done == 1 or done % config.log_every == 0 or last:
             numbers = {key: float(value) for key, value in values.items()}
             self._log("train", done, numbers)
             progress.update(done, numbers)
         else:
             progress.update(done, {})
-        if validates:
+        if done % config.validate_every == 0 or last:
             began = time.monotonic()
             self.state = replace(self.state, metrics=self._validate(done))
             self._validation = time.monotonic() - began
@@ -235,7 +236,7 @@ class _Run:
             self._log("validation", done, self.state.metrics)
             self._look(done)
             self._judge()
-        if saves or self.ended:
+        if done % config.checkpoint_every == 0 or self.ended:
             self.watch.require_finite(self.stage.modules, f"step {done}")
             if here().first:
                 self.checkpoints.save(self.state, self.stage.modules, self.optimizer, self.parameters, self._averaged)
@@ -245,6 +246,9 @@ class _Run:
         pace, (done, spent), state = self.part.pace, self._looked, self.state
         if pace is None or not pace.due(state.step - done, state.seconds - spent, self.planned):
             return
+        if self.steps.on_gpu:
+            self._require_finite()
+            self.state = state = replace(state, seconds=time.monotonic() - self._began)
         # Validations come now and then, but evenly over all steps.
         a_step = (state.seconds - spent - self._validating) / (state.step - done)
         a_step += self._validation / self.config.validate_every

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Final
 
 import torch
@@ -26,6 +26,8 @@ SAFE: Final = 0.9
 """Of what is free: the rest is for the optimiser's first step, and for gaps between tensors."""
 SHARES: Final = (7 / 8, 3 / 4, 5 / 8, 1 / 2, 3 / 8, 1 / 4, 3 / 16, 1 / 8, 1 / 16, 1 / 32)
 """Of the batch, in the order in which they are tried."""
+PARTS: Final = (1, 2, 4, 8)
+"""Into so many the batch is cut where it cannot even be made."""
 ROWS: Final = 8
 """A batch is a multiple of so many rows."""
 
@@ -45,8 +47,9 @@ def does_not_fit(
     share = config.batch_size // batches.count
     try:
         free = free_memory(device)
-        rows = fitting(_Trial(batches, step, seed, device).peak, share, free)
-    except (RuntimeError, AssertionError):  # not even these fit, or the device is in no state to tell
+        trial = _Trial(batches, step, seed, device)
+        rows = fitting(trial.peak, trial.rows, free, trial.rows < share)
+    except (RuntimeError, ValueError, AssertionError):  # not even these fit, or the device is in no state to tell
         rows = 0
     largest = rows * batches.count
     unit = math.lcm(ROWS, batches.count)
@@ -60,9 +63,11 @@ def does_not_fit(
     return TrainingError(cure)
 
 
-def fitting(peak: Callable[[int], float], rows: int, free: float) -> int:
-    """The largest of `SHARES` of some rows whose peak is within what is free, in rows; 0 if none is."""
-    for share in SHARES:
+def fitting(peak: Callable[[int], float], rows: int, free: float, whole: bool = False) -> int:
+    """The largest of `SHARES` of some rows, or all of them where the `whole` may fit, whose peak is within what is
+    free, in rows; 0 if none is.
+    """
+    for share in (1.0, *SHARES) if whole else SHARES:
         some = int(rows * share)
         with contextlib.suppress(torch.OutOfMemoryError):
             if some and peak(some) <= SAFE * free:
@@ -103,10 +108,13 @@ class _Trial:
     def __init__(self, batches: GlobalBatches, step: int, seed: int, device: torch.device) -> None:
         self.batches, self.step, self.seed, self.device = batches, step, seed, device
         self.generators = StepGenerators(seed, step, device)
-        own = Share(here().rank * batches.micros, batches.count, 0, batches.micros)
-        with global_seed(seed, step), sharing(own):
-            batch: Mapping[str, Tensor] = batches.stage.batch(step, self.generators)
-        self.batch = {key: value.cpu() for key, value in batch.items()}
+        self.batch: dict[str, Tensor] = {}
+        for parts in PARTS:  # to make the batch may be what takes too much
+            own = Share(here().rank * batches.micros * parts, batches.count * parts, 0, batches.micros)
+            with contextlib.suppress(torch.OutOfMemoryError), global_seed(seed, step), sharing(own):
+                self.batch = {k: v.cpu() for k, v in batches.stage.batch(step, self.generators).items()}
+            if self.batch:
+                break
         self.rows = max(map(len, self.batch.values()))
 
     def peak(self, rows: int) -> float:

@@ -39,7 +39,9 @@ class Inputs(Protocol):
         """M."""
 
     def draw(self, rows: Tensor, generators: StepGenerators) -> Observed:
-        """Inputs (b, ...) of rows int64 (b,) for training, with noise or augmentation drawn from `generators`."""
+        """Inputs (b, ...) of rows int64 (b,), on the CPU, for training, with noise or augmentation drawn from
+        `generators`.
+        """
 
     def plain(self, rows: Tensor) -> Observed:
         """Inputs (b, ...) of rows, as they are."""
@@ -73,6 +75,7 @@ class TensorInputs:
 
     def plain(self, rows: Tensor) -> Tensor:
         """Rows, without noise."""
+        rows = to_device(rows, self.parts[0].device)
         values, start = self.parts[0][rows.clamp(max=len(self.parts[0]) - 1)], len(self.parts[0])
         for part in self.parts[1:]:
             own = (rows >= start) & (rows < start + len(part))
@@ -197,9 +200,9 @@ class RegressionStage:
     def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         """Inputs and targets of rows drawn uniformly."""
         drawn = torch.randint(len(self.targets), (self.batch_size,), generator=generators.torch(self.stream, "cpu"))
-        rows = to_device(own_rows(drawn), self.targets.device)
+        rows = own_rows(drawn)
         observed = dict(zip(self.criterion.observed, _several(self.inputs.draw(rows, generators)), strict=True))
-        return {**observed, self.criterion.tensor_keys.action: self.targets[rows]}
+        return {**observed, self.criterion.tensor_keys.action: self.targets[to_device(rows, self.targets.device)]}
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         """Error of one batch."""

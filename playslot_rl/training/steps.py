@@ -26,6 +26,7 @@ from torch import Tensor
 
 from playslot_rl.config import StageConfig
 from playslot_rl.errors import ConfigError, TrainingError
+from playslot_rl.runtime.processes import here
 from playslot_rl.runtime.shares import taped
 from playslot_rl.seeds.draws import StepGenerators, derived_seed, global_seed
 from playslot_rl.training.batches import GlobalBatches
@@ -94,6 +95,17 @@ class _TapedGenerators(StepGenerators):
 
     def torch(self, stream: str, device: torch.device | str | None = None) -> torch.Generator:
         return self.tape.generator(stream, self.device if device is None else device)
+
+
+def operation(error: BaseException) -> str:
+    """The line that a capture ended at, and why: of the error that came first, since the end of the capture raises one
+    of its own.
+    """
+    while error.__context__ is not None:
+        error = error.__context__
+    where = traceback.extract_tb(error.__traceback__)
+    own = [at for at in where if "playslot_rl" in at.filename and at.filename != __file__] or where
+    return f"`{own[-1].line if own else '?'}`: {(str(error) or type(error).__name__).splitlines()[0]}"
 
 
 class Steps:
@@ -226,9 +238,7 @@ class Steps:
         except (RuntimeError, torch.AcceleratorError) as error:
             if out_of_memory(error):
                 raise
-            where = traceback.extract_tb(error.__traceback__)
-            own = [at for at in where if "playslot_rl" in at.filename and at.filename != __file__] or where
-            reason = f"{self.name}: a step could not be captured at `{own[-1].line}`: {str(error).splitlines()[0]}"
+            reason = f"{self.name}: a step could not be captured at {operation(error)}"
             if self.config.execution == "graph":
                 raise TrainingError(f"{reason}: use {self.key}.execution=eager") from error
             warnings.warn(f"{reason}; its kernels are launched one by one", RuntimeWarning, stacklevel=2)
@@ -245,6 +255,8 @@ class Steps:
             why = "got several processes or optim.accumulate above 1, expected one share of the batch"
         if wanted == "graph" and why:
             raise ConfigError(f"{self.key}.execution=graph: {why}: use {self.key}.execution=auto")
+        if wanted == "auto" and why and self.on_gpu and here().first:
+            warnings.warn(f"{self.name}: {why}: its kernels are launched one by one", RuntimeWarning, stacklevel=2)
         return wanted != "eager" and not why
 
     @contextlib.contextmanager
@@ -254,6 +266,8 @@ class Steps:
             yield
             return
         self._stream.wait_stream(torch.cuda.current_stream(self.device))
-        with torch.cuda.stream(self._stream):
-            yield
-        torch.cuda.current_stream(self.device).wait_stream(self._stream)
+        try:
+            with torch.cuda.stream(self._stream):
+                yield
+        finally:
+            torch.cuda.current_stream(self.device).wait_stream(self._stream)

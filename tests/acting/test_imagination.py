@@ -192,7 +192,7 @@ def test_imagining_changes_neither_the_model_nor_its_input(agent: Agent) -> None
 @torch.no_grad()
 def test_histories_are_right_aligned_and_slide(agent: Agent) -> None:
     model = agent.world_model
-    step = dynamics_module(model.inverse_dynamics, model.predictor)
+    step = dynamics_module(model)
     env = ImaginationEnv(model, [1])
     state = from_slots(env, slots_of((1,)))
     seen = [state[keys.SLOTS]]
