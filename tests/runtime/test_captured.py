@@ -14,7 +14,8 @@ from playslot_rl.runtime.captured import Captured, uncaptured
 def test_a_second_call_is_recorded_unless_capturing_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Captured, "_recorded", lambda *_: lambda *_: "replayed")
     on_a_gpu: Any = SimpleNamespace(shape=torch.Size([2]), dtype=torch.float32, device=torch.device("cuda"))
-    call = Captured(lambda _: "called", torch.nn.Linear(1, 1))
+    layer = torch.nn.Linear(1, 1)
+    call = Captured(lambda _: "called", layer)
     with torch.no_grad():
         assert [call(on_a_gpu) for _ in range(3)] == ["called", "replayed", "replayed"]
         with uncaptured():

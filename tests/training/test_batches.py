@@ -153,6 +153,7 @@ def test_compiling_without_a_compiler_is_refused_in_one_line(tmp_path: Path, mon
 def test_left_open_compiling_is_for_large_networks_on_a_gpu_with_many_steps_to_go(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(compiling, "_compiles", lambda _: True)
     gpu, cpu = torch.device("cuda"), torch.device("cpu")
     monkeypatch.setenv("CXX", "g++")
     monkeypatch.setattr(compiling.importlib.util, "find_spec", lambda _: object())
