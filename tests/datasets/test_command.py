@@ -188,8 +188,9 @@ def test_the_page_goes_beside_the_data_set_and_never_into_it(broken: Path, capsy
     assert broken.with_name("broken.html").is_file()
     assert cli.main(["dataset", "viz", str(broken), "--out", str(broken / "page.html")]) == 1
     assert "expected a file outside: a push would upload it" in capsys.readouterr().err
-    assert cli.main(["dataset", "viz", str(broken), "--episodes", "0"]) == 1
-    assert "--episodes: got 0, expected at least 1" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        cli.main(["dataset", "viz", str(broken), "--episodes", "0"])
+    assert "--episodes: got '0', expected a whole number from 1" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", ["images", "video"])

@@ -319,5 +319,6 @@ def test_the_card_of_another_kind_of_run_can_be_followed(
     if made in (adopted, of_two_cameras):
         assert read_config(tmp_path / "policy").camera == "observation.images.side"
     assert run_lines(card, tmp_path / "policy") == names
-    assert policy_print(Path("runs/again")) == policy_print(run)
+    if "followed the clock" not in card:  # which the card says where a slow machine has changed the planned steps
+        assert policy_print(Path("runs/again")) == policy_print(run)
     assert run_python(card, tmp_path / "policy", (64, 64))
