@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from playslot_rl.config import EnvConfig
-from playslot_rl.data.windows import Clips
+from playslot_rl.data.clips import Clips
 from playslot_rl.envs.grid_shapes import PALETTE, check_actions, sprites, visited
 from playslot_rl.runtime.devices import to_device
 from playslot_rl.runtime.shares import own_rows

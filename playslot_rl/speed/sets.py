@@ -19,9 +19,10 @@ from torch import Tensor
 from playslot_rl.collectors.export import export
 from playslot_rl.collectors.journal import CollectionSpec, Journal, RecordedEpisode
 from playslot_rl.config import EnvConfig, RenderConfig
+from playslot_rl.data.clips import Clips
 from playslot_rl.data.slot_cache import parse_episodes
 from playslot_rl.data.source import open_source
-from playslot_rl.data.windows import Clips, sample_windows
+from playslot_rl.data.windows import sample_windows
 from playslot_rl.datasets.verify import verify
 from playslot_rl.envs import make_env
 from playslot_rl.errors import DataError

@@ -18,12 +18,12 @@ from playslot_rl.config.roles import by_default, without
 from playslot_rl.config.stage_spec import StageSpec, group_of
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.action_limits import ActionLimits, said, scaled
+from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import DemonstrationSplit, split_demonstrations, transitions
 from playslot_rl.data.drawn_clips import DrawnClips
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import episode_range, split_tested
 from playslot_rl.data.weighted import open_configured, weighted
-from playslot_rl.data.windows import Clips
 from playslot_rl.errors import CheckpointError, DataError
 from playslot_rl.modules.action_range import range_of
 from playslot_rl.runs import Run

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.colours import segmentation
 from playslot_rl.config import SlotsStageConfig
-from playslot_rl.data.windows import Clips, IntArray
+from playslot_rl.data.clips import Clips
+from playslot_rl.data.windows import IntArray
 from playslot_rl.data.zoom import corners, magnified
 from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import psnr, to_uint8

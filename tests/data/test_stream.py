@@ -13,12 +13,12 @@ from foreign import LENGTHS, foreign_frames
 
 from playslot_rl.config import DataConfig
 from playslot_rl.data import agreement
+from playslot_rl.data.clips import Clips
 from playslot_rl.data.slot_cache import parse_episodes, slot_cache
 from playslot_rl.data.source import open_source
 from playslot_rl.data.stream import FrameStream, ShuffleBuffer, streams_of
 from playslot_rl.data.views import concatenate, every, shifted
 from playslot_rl.data.weighted import open_configured
-from playslot_rl.data.windows import Clips
 from playslot_rl.errors import DataError
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runtime import processes

@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from playslot_rl.config import DataConfig
+from playslot_rl.data.clips import Clips
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames, open_source
 from playslot_rl.data.views import concatenate, episode_range, split_tested
 from playslot_rl.data.weighted import open_configured, weighted
-from playslot_rl.data.windows import Clips
 from playslot_rl.errors import DataError
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.testing import tiny_config

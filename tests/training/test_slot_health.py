@@ -14,8 +14,8 @@ import torch
 from tensordict import TensorDict
 
 from playslot_rl.config import LoggingConfig, OptimConfig, SAViConfig, SlotsStageConfig
+from playslot_rl.data.clips import Clips
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import Clips
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.seeds.draws import step_generator
 from playslot_rl.testing import tiny_savi

@@ -27,10 +27,10 @@ from playslot_rl.config import (
     SlotsStageConfig,
     StageConfig,
 )
+from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import Demonstrations
 from playslot_rl.data.drawn_clips import DrawnClips
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import Clips
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.caddy.method import CADDYConfig
 from playslot_rl.methods.caddy.model import CADDY

@@ -35,7 +35,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from playslot_rl import keys
-from playslot_rl.data.windows import Clips, IntArray
+from playslot_rl.data.clips import Clips
+from playslot_rl.data.windows import IntArray
 from playslot_rl.frames import normalise, psnr
 from playslot_rl.losses.common import total_loss
 from playslot_rl.methods.caddy.action import ActionInformation, divergence, joint_distribution, mutual_information

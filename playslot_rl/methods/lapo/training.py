@@ -22,9 +22,10 @@ from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig, StageConfig
+from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import Clips, IntArray
+from playslot_rl.data.windows import IntArray
 from playslot_rl.frames import normalise
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.cloning import LatentCloning, cloning

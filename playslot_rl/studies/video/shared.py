@@ -17,10 +17,11 @@ from playslot_rl.collectors.collection import collect_demos, collect_videos
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compare_video import method_of
 from playslot_rl.config.weights import data_roots
+from playslot_rl.data.clips import Clips
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import split_tested
 from playslot_rl.data.weighted import open_configured
-from playslot_rl.data.windows import Clips, IntArray, spread_windows
+from playslot_rl.data.windows import IntArray, spread_windows
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.evaluation.video import open_lpips

@@ -10,7 +10,7 @@ import torch
 from caddy_parts import tiny, tiny_config
 from clips import moving_square
 
-from playslot_rl.data.windows import Clips
+from playslot_rl.data.clips import Clips
 from playslot_rl.methods.caddy.method import CADDYConfig
 from playslot_rl.methods.caddy.stage import CADDYStage, clip_length, load_perceptual, temperature
 from playslot_rl.seeds.draws import StepGenerators, global_seed

@@ -11,8 +11,8 @@ from clips import moving_square
 
 from playslot_rl.acting.actor import latent_actor
 from playslot_rl.config import ActionDecoderConfig, OptimConfig, StageConfig
+from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import transitions
-from playslot_rl.data.windows import Clips
 from playslot_rl.methods.lapo.method import LAPOConfig
 from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolicy
 from playslot_rl.methods.lapo.training import LAPOModelStage, infer_latents

@@ -9,7 +9,7 @@ import pytest
 import torch
 from clips import moving_square
 
-from playslot_rl.data.windows import Clips
+from playslot_rl.data.clips import Clips
 from playslot_rl.frames import normalise
 from playslot_rl.methods.svg.method import SVGConfig
 from playslot_rl.methods.svg.model import SVG
