@@ -67,6 +67,11 @@ _SYSTEM: Final = {
 """What a user can act on, whichever library ran into it; the place goes into the braces."""
 
 
+def first_line(error: BaseException) -> str:
+    """The first line of what an error says; its kind where it says nothing."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
 def explain(error: BaseException) -> str:
     """One line about an error, the system's refusals first: libraries wrap them in errors of their own."""
     cause: BaseException | None = error

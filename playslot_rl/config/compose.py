@@ -26,7 +26,7 @@ from playslot_rl.config.planning import GOALS, PLANNERS, PROPOSALS
 from playslot_rl.config.roles import keys_of
 from playslot_rl.config.tasks import GROUP as TASKS_GROUP
 from playslot_rl.config.tasks import TASKS
-from playslot_rl.errors import ConfigError
+from playslot_rl.errors import ConfigError, first_line
 
 PLAIN_ENV: Final = "button_press"
 """The task whose values one that another package brings starts from: it asks nothing of the model."""
@@ -290,8 +290,7 @@ def _explained() -> Iterator[None]:
     try:
         yield
     except (HydraException, OmegaConfBaseException) as error:
-        first_line = str(error).strip().splitlines()[0]
-        raise ConfigError(f"cannot read the arguments: {first_line}; expected key=value pairs") from error
+        raise ConfigError(f"cannot read the arguments: {first_line(error)}; expected key=value pairs") from error
 
 
 def _from_run(run: Path, pairs: Mapping[str, str]) -> ExperimentConfig:

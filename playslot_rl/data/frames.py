@@ -23,7 +23,7 @@ from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.metadata import LARGEST_PICTURE, stated_size
 from playslot_rl.data.places import Problems, inside, is_plain_path
 from playslot_rl.data.tables import WRONG_COLUMN, Array
-from playslot_rl.errors import DataError
+from playslot_rl.errors import DataError, first_line
 
 ROWS_A_PIECE = 256
 DAMAGED = "damaged frame"
@@ -221,7 +221,7 @@ def _frames_at(contents: Contents, path: Path, times: Sequence[float], tolerance
                     yield frame
                     number += 1
         except (av.FFmpegError, OSError, IndexError) as error:
-            reason = str(error).splitlines()[0]
+            reason = first_line(error)
         if number:
             break
     if number < len(times):

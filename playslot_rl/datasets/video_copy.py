@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from playslot_rl.data.metadata import VIDEO_PATH
-from playslot_rl.errors import DataError
+from playslot_rl.errors import DataError, first_line
 
 
 def video_place(camera: str, chunk: int, file: int, begin: float, end: float) -> dict[str, Any]:
@@ -61,7 +61,7 @@ class VideoCopier:
             return self._copy_packets(self._source, first, begin, length)
         except (av.FFmpegError, IndexError) as error:
             raise DataError(
-                f"{path}: got {str(error).splitlines()[0]}, expected a whole video; run `playslot dataset verify`"
+                f"{path}: got {first_line(error)}, expected a whole video; run `playslot dataset verify`"
             ) from error
 
     def close(self) -> None:
@@ -188,4 +188,4 @@ def frame_count(path: Path) -> int:
         with contextlib.closing(_Source(path)) as source:
             return len(source.times)
     except (av.FFmpegError, OSError, IndexError) as error:
-        raise DataError(f"{path}: got {str(error).splitlines()[0]}, expected a video") from error
+        raise DataError(f"{path}: got {first_line(error)}, expected a video") from error

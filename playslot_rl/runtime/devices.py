@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from playslot_rl.errors import ConfigError, require_type
+from playslot_rl.errors import ConfigError, first_line, require_type
 
 if TYPE_CHECKING:
     import torch
@@ -28,7 +28,7 @@ def named_device(name: str | torch.device = "") -> torch.device:
     try:
         device = torch.device(name or ("cuda" if torch.cuda.is_available() else "cpu"))
     except RuntimeError as error:
-        raise ConfigError(f"device={name}: {str(error).splitlines()[0]}; use device=cpu") from error
+        raise ConfigError(f"device={name}: {first_line(error)}; use device=cpu") from error
     if device.type not in KINDS:
         raise ConfigError(
             f"device={name}: got a device that computes nothing, expected one of {', '.join(KINDS)}; use device=cpu"
@@ -62,5 +62,5 @@ def probed(device: torch.device) -> torch.device:
     try:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:
-        raise ConfigError(f"device={device}: {str(error).splitlines()[0]}; use device=cpu") from error
+        raise ConfigError(f"device={device}: {first_line(error)}; use device=cpu") from error
     return device

@@ -11,7 +11,7 @@ from typing import Final, Protocol, runtime_checkable
 import torch
 from torch import Tensor, nn
 
-from playslot_rl.errors import CheckpointError
+from playslot_rl.errors import CheckpointError, first_line
 from playslot_rl.storage.atomic import write_bytes
 
 LONGEST_HEADER: Final = 100_000_000
@@ -59,7 +59,7 @@ def load_tensors(path: Path) -> dict[str, Tensor]:
         raise CheckpointError(f"{path} is missing, expected a checkpoint's weights: train that stage again") from error
     except (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(
-            f"{path} is damaged ({str(error).splitlines()[0]}), expected a whole safetensors file: "
+            f"{path} is damaged ({first_line(error)}), expected a whole safetensors file: "
             "delete its folder and run the same command again"
         ) from error
 

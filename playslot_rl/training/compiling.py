@@ -13,7 +13,7 @@ from typing import Any, Final
 import torch
 from torch import nn
 
-from playslot_rl.errors import ConfigError
+from playslot_rl.errors import ConfigError, first_line
 
 COMPILERS = ("g++", "gcc", "clang++", "clang")
 LEAST_STEPS: Final = 2000
@@ -34,8 +34,8 @@ def _compiles(device: torch.device) -> bool:
     try:
         torch.compile(lambda x: x.square().sum())(torch.ones(64, device=device))
     except Exception as error:  # noqa: BLE001  # whatever it is, nobody has asked for it
-        first = (str(error) or type(error).__name__).splitlines()[0]
-        warnings.warn(f"torch.compile does not work here, trained without: {first}", RuntimeWarning, stacklevel=3)
+        said = first_line(error)
+        warnings.warn(f"torch.compile does not work here, trained without: {said}", RuntimeWarning, stacklevel=3)
         return False
     return True
 
