@@ -57,6 +57,12 @@ class EMACodebook(nn.Module):
         """The number of the nearest code, int64 (M,), of latents (M, Z)."""
         return _nearest(z, self.embed[0].to(z.dtype))
 
+    def quantize(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """The nearest codes of latents (M, Z), and their numbers int64 (M,); of the first batch after `start`."""
+        self.start(z)
+        k = self.nearest(z)
+        return self.embed[0][k], k
+
     @torch.no_grad()
     def start(self, z: Tensor) -> None:
         """k-means of latents (M, Z), where no batch was seen yet; with fewer latents than codes some are equal."""
@@ -168,9 +174,7 @@ class ActionQuantizer(nn.Module):
             quantized, code = self._micro(seen)
         else:
             every = all_rows(seen) if self.training else seen
-            self.codebook.start(every)
-            code = self.codebook.nearest(every)
-            quantized = self.prototypes[code]
+            quantized, code = self.codebook.quantize(every)
             if self.training:
                 self.codebook.follow(every, code)
             if len(every) > len(seen):
@@ -187,9 +191,7 @@ class ActionQuantizer(nn.Module):
         if own.rehearsal:
             quantized, code = seen, seen.new_zeros(len(seen), dtype=torch.long)
         else:
-            self.codebook.start(seen)
-            code = self.codebook.nearest(seen)
-            quantized = self.prototypes[code]
+            quantized, code = self.codebook.quantize(seen)
         self._waiting = [*self._waiting, seen] if own.micro else [seen]
         if own.micro == own.micros - 1:
             every, self._waiting = all_rows(torch.cat(self._waiting)), []

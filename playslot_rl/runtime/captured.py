@@ -5,19 +5,24 @@ from __future__ import annotations
 import contextlib
 import inspect
 import itertools
+import traceback
 import warnings
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
+from pathlib import Path
 from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
+from playslot_rl.errors import first_line
+
 SHAPES: Final = 8
 """Graphs that are kept, of the shapes used last."""
+PACKAGE: Final = str(Path(__file__).parents[1])
 _capturing: ContextVar[bool] = ContextVar("capturing", default=True)
 Key = tuple[object, ...]
 
@@ -30,6 +35,30 @@ def uncaptured() -> Iterator[None]:
         yield
     finally:
         _capturing.reset(before)
+
+
+def recorded[Result](compute: Callable[[], Result], stream: torch.cuda.Stream) -> tuple[Callable[[], None], Result]:
+    """Record what a function computes on a stream, which is not run by that: what runs it, and what it will have
+    computed, always in the same place. Raises the error of torch where it cannot be recorded (`stopped_at`).
+    """
+    graph = torch.cuda.CUDAGraph()
+    # The outer stream is there to be put back: a capture that fails does not.
+    with (
+        torch.cuda.device(stream.device),
+        torch.cuda.stream(stream),
+        torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+    ):
+        result = compute()
+    return graph.replay, result
+
+
+def stopped_at(error: BaseException) -> str:
+    """The line that a recording stopped at, and why: of the error that came first, since its end raises one, too."""
+    while error.__context__ is not None:
+        error = error.__context__
+    where = traceback.extract_tb(error.__traceback__)
+    own = [at for at in where if at.filename.startswith(PACKAGE)] or where
+    return f"`{own[-1].line if own else '?'}`: {first_line(error)}"
 
 
 class Captured[Result]:
@@ -82,20 +111,14 @@ class Captured[Result]:
 
     def _recorded(self, inputs: tuple[Tensor, ...]) -> Callable[..., Result] | None:
         device = inputs[0].device
-        graph, buffers = torch.cuda.CUDAGraph(), [value.clone() for value in inputs]
+        buffers = [value.clone() for value in inputs]
         self._stream = self._stream or torch.cuda.Stream(device)
         self._stream.wait_stream(torch.cuda.current_stream(device))
         try:
-            # The outer block puts the stream back where a capture fails and cannot.
-            with (
-                torch.cuda.device(device),
-                torch.cuda.stream(self._stream),
-                torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"),
-            ):
-                result = self.function(*buffers)
+            again, result = recorded(lambda: self.function(*buffers), self._stream)
         except RuntimeError as error:
-            first = str(error.__context__ or error).splitlines()[0]
-            warnings.warn(f"a CUDA graph could not be recorded: {first}", RuntimeWarning, stacklevel=3)
+            reason = f"a CUDA graph could not be recorded at {stopped_at(error)}"
+            warnings.warn(reason, RuntimeWarning, stacklevel=3)
             self._captures = False
             return None
         torch.cuda.current_stream(device).wait_stream(self._stream)
@@ -103,8 +126,7 @@ class Captured[Result]:
         def replay(*given: Tensor) -> Result:
             for buffer, value in zip(buffers, given, strict=True):
                 buffer.copy_(value)
-            with torch.cuda.device(device):
-                graph.replay()
+            again()
             copied: Result = pytree.tree_map(lambda value: value.clone(), result)
             return copied
 

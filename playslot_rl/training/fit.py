@@ -217,8 +217,9 @@ class _Run:
         config, done = self.config, step + 1
         values = self._step(step)
         intervals = (config.log_every, config.validate_every, config.checkpoint_every)
-        if done in (1, self.planned) or any(done % every == 0 for every in intervals):
-            self._require_finite()  # waits for a GPU, before the clock is read and anything is kept
+        looks = done in (1, self.planned) or any(done % every == 0 for every in intervals)
+        if looks or not self.steps.on_gpu:  # it waits for a GPU: before the clock is read and anything is kept
+            self._require_finite()
         self.state = replace(self.state, step=done, seconds=time.monotonic() - self._began)
         self._keep_pace()
         last, progress.total = done == self.planned, self.planned
@@ -260,8 +261,6 @@ class _Run:
         values = self.steps.take(step, rate)
         if self.average is not None:
             self.average.update(step + 1)
-        if not self.steps.on_gpu:
-            self._require_finite()
         return {**values, "lr": rate}
 
     def _require_finite(self) -> None:

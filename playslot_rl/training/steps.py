@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import traceback
 import warnings
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -26,6 +25,7 @@ from torch import Tensor
 
 from playslot_rl.config import StageConfig
 from playslot_rl.errors import ConfigError, TrainingError
+from playslot_rl.runtime.captured import recorded, stopped_at
 from playslot_rl.runtime.processes import here
 from playslot_rl.runtime.shares import taped
 from playslot_rl.seeds.draws import StepGenerators, derived_seed, global_seed
@@ -46,13 +46,13 @@ class _Tape:
     def __init__(self, seed: int, device: torch.device) -> None:
         self.seed, self.device, self.step = seed, device, 0
         self._generators: dict[tuple[str, str], torch.Generator] = {}
-        self._draws: list[tuple[Callable[[], Tensor], Tensor]] = []
+        self._buffers: list[Tensor] = []
         self._events: list[Callable[[], object]] = []
         self._served: int | None = None
 
     def record(self) -> None:
         """Begin anew: what is drawn from now on is remembered."""
-        self._draws, self._events, self._served = [], [], None
+        self._buffers, self._events, self._served = [], [], None
 
     def serve(self) -> None:
         """From now on hand out the buffers, in their order."""
@@ -67,9 +67,9 @@ class _Tape:
         """See `playslot_rl.runtime.shares.Tape`."""
         if self._served is not None:
             self._served += 1
-            return self._draws[self._served - 1][1]
+            return self._buffers[self._served - 1]
         buffer = draw().clone()
-        self._draws.append((draw, buffer))
+        self._buffers.append(buffer)
         self._events.append(lambda: buffer.copy_(draw()))
         return buffer
 
@@ -95,17 +95,6 @@ class _TapedGenerators(StepGenerators):
 
     def torch(self, stream: str, device: torch.device | str | None = None) -> torch.Generator:
         return self.tape.generator(stream, self.device if device is None else device)
-
-
-def operation(error: BaseException) -> str:
-    """The line that a capture ended at, and why: of the error that came first, since the end of the capture raises one
-    of its own.
-    """
-    while error.__context__ is not None:
-        error = error.__context__
-    where = traceback.extract_tb(error.__traceback__)
-    own = [at for at in where if "playslot_rl" in at.filename and at.filename != __file__] or where
-    return f"`{own[-1].line if own else '?'}`: {(str(error) or type(error).__name__).splitlines()[0]}"
 
 
 class Steps:
@@ -231,20 +220,19 @@ class Steps:
         Raises:
             TrainingError: it cannot, and `execution` is `graph`.
         """
-        graph = torch.cuda.CUDAGraph()
+        assert self._stream is not None
         try:
-            with torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"):
-                self._values = compute()
-        except (RuntimeError, torch.AcceleratorError) as error:
+            replay, self._values = recorded(compute, self._stream)
+        except RuntimeError as error:
             if out_of_memory(error):
                 raise
-            reason = f"{self.name}: a step could not be captured at {operation(error)}"
+            reason = f"{self.name}: a step could not be captured at {stopped_at(error)}"
             if self.config.execution == "graph":
                 raise TrainingError(f"{reason}: use {self.key}.execution=eager") from error
             warnings.warn(f"{reason}; its kernels are launched one by one", RuntimeWarning, stacklevel=2)
             self.captures = False
             return None
-        return graph.replay
+        return replay
 
     def _captures(self) -> bool:
         """Whether steps are to be captured, by the setting and by what there is."""
