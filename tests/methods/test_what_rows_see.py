@@ -1,0 +1,128 @@
+"""What each row of a comparison sees: a line a method, held against what its weights depend on and what it acts on."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+from unittest.mock import patch
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
+
+from stages import few_videos
+
+from playslot_rl import keys
+from playslot_rl.config import plugins
+from playslot_rl.config.compose import compose
+from playslot_rl.config.methods import METHODS
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.recipes import train_baseline, train_dynamics, train_slots
+from playslot_rl.runs import Run
+from playslot_rl.storage import checkpoints
+from playslot_rl.training import record as records
+
+Labels = Literal["none", "some", "all"]
+LABELLED = 3
+
+
+@dataclass(frozen=True)
+class Sees:
+    """What a row sees.
+
+    Attributes:
+        videos: unlabelled ones, of `data.root`.
+        labels: real actions: of `behaviour.labelled_demos`, or of all demonstrations that it gets.
+        acts_on: what its policy reads of the camera.
+        state: its decoder may read that beside the latent action.
+    """
+
+    videos: bool
+    labels: Labels
+    acts_on: Literal["frames", "slots"]
+    state: bool = False
+
+
+TABLE = {
+    "playslot": Sees(True, "some", "slots", state=True),
+    "slot_oracle": Sees(True, "all", "slots"),
+    "slot_bc": Sees(True, "all", "slots"),
+    "resnet_oracle": Sees(False, "all", "frames"),
+    "resnet_bc": Sees(False, "all", "frames"),
+    "lapo": Sees(True, "some", "frames"),
+    "caddy_policy": Sees(True, "some", "frames"),
+    "caddy_oracle": Sees(True, "all", "frames"),
+    "dreamer": Sees(False, "none", "frames"),
+    "sold": Sees(True, "none", "slots"),
+}
+OFFLINE = [name for name in TABLE if not METHODS[name].online]
+
+
+def test_every_method_that_acts_has_a_line() -> None:
+    assert set(TABLE) == {name for name in METHODS if METHODS[name].acts}
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_videos_are_seen_where_a_model_of_them_is_built_on(name: str) -> None:
+    method = METHODS[name]
+    assert TABLE[name].videos == (method.slots or method.model is not None)
+
+
+class Trainings:
+    """Smoke trainings on eight demonstrations, some of whose actions are others."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.altered = folder, slice(0)
+        self.world = folder / "world"
+
+    def open_videos(self, config: Any, *_: str) -> Any:
+        found = few_videos(config.env.image_size, config.env.action_dim)
+        assert found.actions is not None
+        actions = found.actions.copy()
+        for start in found.starts[self.altered]:
+            actions[start : start + 8] = -0.9 * actions[start : start + 8]
+        return replace(found, actions=actions)
+
+    def train(self, name: str, altered: slice = slice(0)) -> Run:
+        """A run of a method; the actions of some demonstrations are others."""
+        shared = ["preset=smoke", "env=button_press", "data.root=videos", "device=cpu", "logging.backend=none"]
+        shared += [f"data.cache={self.folder / 'cache'}", "behaviour.oracle=false"]
+        shared += [f"behaviour.labelled_demos={LABELLED}", "baselines.resnet_oracle.steps=8"]  # a row of each
+        self.altered = slice(0)
+        if not self.world.is_dir():
+            for recipe in (train_slots, train_dynamics):
+                recipe.main(compose([*shared, f"out={self.world}"]))
+        self.altered, out = altered, self.folder / f"{name}-{altered.start}-{altered.stop}"
+        if not out.is_dir():
+            train_baseline.main(compose([*shared, f"method={name}", f"run={self.world}", f"out={out}"]))
+        return Run(out)
+
+
+@pytest.fixture(scope="module")
+def trainings(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Trainings]:
+    made = Trainings(tmp_path_factory.mktemp("sees"))
+    with patch.object(records, "open_videos", made.open_videos), patch.object(checkpoints, "provenance", dict):
+        yield made
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", OFFLINE)
+def test_weights_depend_on_the_actions_that_are_seen_and_on_no_others(name: str, trainings: Trainings) -> None:
+    def weights(*altered: int) -> str:
+        return trainings.train(name, slice(*altered)).own(METHODS[name].last.name).fingerprint
+
+    labels, plain = TABLE[name].labels, weights(0)
+    assert (weights(0, LABELLED) != plain) == (labels != "none")
+    assert (weights(LABELLED, 8) != plain) == (labels == "all")
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", TABLE)
+def test_it_acts_on_frames_or_on_their_slots(name: str, trainings: Trainings) -> None:
+    actor = plugins.call(METHODS[name].load.actor, trainings.train(name), "cpu")
+    assert (keys.SLOT_STATE in actor.memory_keys) == (TABLE[name].acts_on == "slots")
+    decoders = [part for part in actor.modules() if isinstance(part, ActionDecoder)]
+    assert any(decoder.reads_slots for decoder in decoders) == TABLE[name].state
