@@ -15,7 +15,7 @@ import os
 import shutil
 import zipfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, ExperimentConfig, RenderConfig, from_dict
-from playslot_rl.config.plain import flatten, nearest
+from playslot_rl.config.plain import flatten, nearest, to_dict
 from playslot_rl.envs import PROCEDURAL, gym_id
 from playslot_rl.errors import CheckpointError, ConfigError, OutputError
 from playslot_rl.seeds.episodes import EPISODES, LARGEST_SEED, episode_seed
@@ -96,7 +96,7 @@ class CollectionSpec:
 
         So a data set made before a task with settings of its own was added is still the same collection.
         """
-        values, default = asdict(self), asdict(EnvConfig())
+        values, default = to_dict(self), to_dict(EnvConfig())
         values["env"] = {k: v for k, v in values["env"].items() if not isinstance(v, dict) or v != default[k]}
         return values
 

@@ -46,9 +46,18 @@ def nearest(text: str, known: Iterable[str], prefix: str = "") -> str:
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """Nested plain dict of a config (tuples become lists, as in JSON)."""
-    plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
+    """Nested plain dict of a config (tuples become lists, as in JSON); fields marked `roles.UNSAID` only where they
+    differ from their default."""
+    plain: dict[str, Any] = json.loads(json.dumps(_plain(config)))
     return plain
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        fields = ((field, getattr(value, field.name)) for field in dataclasses.fields(value))
+        said = ((f.name, inner) for f, inner in fields if "unsaid" not in f.metadata or inner != f.default)
+        return {name: _plain(inner) for name, inner in said}
+    return [_plain(inner) for inner in value] if isinstance(value, list | tuple) else value
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

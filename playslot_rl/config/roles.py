@@ -101,6 +101,9 @@ LAYERS: Final = between(1, 1000, "1 to 1000")
 RATE: Final = at_least(0, "0 or more", 1e40)
 """Metadata of a learning rate; one that diverges is said by the training."""
 YEAR_MINUTES: Final = 525_600
+UNSAID: Final = {"unsaid": True}
+"""Metadata of a field that plain values name only where it differs from its default, so that configs, identities and
+data sets from before it are the same."""
 EPISODE_COUNT: Final = at_least(0, "0 or more", EPISODES)
 """Metadata of a number of episodes that are recorded with one seed."""
 

@@ -21,7 +21,7 @@ from playslot_rl.config import (
 )
 from playslot_rl.config.compose import choices, compose
 from playslot_rl.config.plain import flatten
-from playslot_rl.config.roles import Checked, keys_of, naming, without
+from playslot_rl.config.roles import UNSAID, Checked, keys_of, naming, without
 from playslot_rl.errors import ConfigError
 from playslot_rl.methods.dreamer.method import DreamerConfig
 
@@ -247,6 +247,23 @@ def test_an_empty_port_is_any_port(typed: str, port: int) -> None:
 def test_equal_configs_have_equal_fingerprints() -> None:
     assert fingerprint(compose(["preset=smoke"])) == fingerprint(compose(["preset=smoke"]))
     assert fingerprint(compose(["preset=smoke"])) != fingerprint(compose(["preset=smoke", "seed=1"]))
+
+
+def test_a_key_that_came_later_is_said_only_where_it_differs_from_its_default() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Own:
+        size: int = 1
+        later: str = dataclasses.field(default="", metadata=UNSAID)
+
+    @dataclasses.dataclass(frozen=True)
+    class Whole:
+        own: Own = dataclasses.field(default_factory=Own)
+        several: tuple[int, ...] = (1, 2)
+
+    assert to_dict(Whole()) == {"own": {"size": 1}, "several": [1, 2]}
+    named = Whole(Own(later="x"))
+    assert to_dict(named)["own"] == {"size": 1, "later": "x"}
+    assert from_dict(Own, to_dict(named)["own"]) == named.own
 
 
 def test_the_full_encoder_takes_no_strides() -> None:
