@@ -44,7 +44,7 @@ VARIANTS: Mapping[str, tuple[str, ...]] = {
     "options": (
         "slots.patience=2", "slots.zoom_steps=1", "slots.motion_weight=0.5", "dynamics.patience=1",
         "behaviour.whiten=false", "behaviour.decoder_state=false", "behaviour.finetune_steps=0",
-        "behaviour.trim_pixels=0.01", "baselines.resnet_oracle.patience=2", "baselines.lapo.targets=continuous",
+        "behaviour.trim_pixels=0.01", "baselines.resnet_oracle.patience=2", "baselines.lapo.targets=quantised",
         "baselines.sold.savi_steps=100", "baselines.slotformer.patience=1", "data.held_out=2", "seed=3",
         "dynamics.precision=auto", "baselines.dreamer.workers=2", "logging.backend=none",
     ),

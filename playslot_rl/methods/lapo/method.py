@@ -30,7 +30,8 @@ class LAPOConfig(Checked):
         dead_threshold: EMA cluster size under which a code is revived.
         commitment: weight beta of the commitment term.
         loss: of the latent policy and the action decoder: `l2` or `l1`.
-        targets: latents that the policy clones and the decoder reads, `quantised` or `continuous` (before they are).
+        targets: latents that policy and decoder learn from, `continuous` (before quantisation, as LAPO's code) or
+            `quantised`.
         shift: shift of frames in the latent policy's training, pixels.
         model: training of inverse and forward model.
         policy: training of the latent policy.
@@ -49,7 +50,7 @@ class LAPOConfig(Checked):
     dead_threshold: float = field(default=1.0, metadata=NOT_NEGATIVE)
     commitment: float = field(default=0.05, metadata=NOT_NEGATIVE)
     loss: Literal["l2", "l1"] = "l2"
-    targets: Literal["quantised", "continuous"] = field(default="quantised", metadata=was("quantised"))
+    targets: Literal["quantised", "continuous"] = field(default="continuous", metadata=was("quantised"))
     shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
     model: StageConfig = field(default_factory=lambda: clipped_stage(200_000, 3e-4, "cosine"))
     policy: StageConfig = field(default_factory=lambda: clipped_stage(20_000, 2e-4, "constant"))
