@@ -26,7 +26,8 @@ from playslot_rl.acting.planning import PlanningActor
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.planning import CostName, GoalName
 from playslot_rl.evaluation.goals import Frames, GoalEpisode, GoalPool, Trace, distance
-from playslot_rl.evaluation.success import summary, wilson
+from playslot_rl.evaluation.intervals import wilson
+from playslot_rl.evaluation.success import summary
 from playslot_rl.frames import normalise, to_uint8
 from playslot_rl.world_model import Agent, module_device
 

@@ -1,10 +1,20 @@
-"""Wilson intervals."""
+"""Intervals of one policy and of comparisons, on known values and on simulated outcomes."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from playslot_rl.evaluation.success import wilson
+from playslot_rl.evaluation.intervals import (
+    RATE,
+    Outcomes,
+    hierarchical,
+    interquartile_mean,
+    of_successes,
+    over_tasks,
+    paired,
+    wilson,
+)
 
 
 def test_interval_equals_published_values() -> None:
@@ -28,3 +38,96 @@ def test_interval_at_the_ends_is_exact_and_not_empty() -> None:
 def test_impossible_counts_are_refused(successes: int, trials: int) -> None:
     with pytest.raises(ValueError, match="wilson: got"):
         wilson(successes, trials)
+
+
+def simulated(
+    draws: np.random.Generator, shape: tuple[int, int, int], world: float, seed: float, episode: float
+) -> Outcomes:
+    """Successes of policies whose chances differ by world model, seed and episode, with these standard deviations."""
+    worlds, seeds, episodes = shape
+    chance = 0.6 + draws.normal(0, world, (worlds, 1, 1)) + draws.normal(0, seed, (1, seeds, 1))
+    chance = chance + draws.uniform(-1, 1, (1, 1, episodes)) * episode * 3**0.5
+    return (draws.random(shape) < chance.clip(0, 1)).astype(np.float64)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("world", "seed", "episode"), [(0.06, 0.04, 0.2), (0.12, 0.0, 0.1), (0.0, 0.08, 0.2), (0.0, 0.0, 0.2)]
+)
+def test_the_interval_holds_the_true_rate_as_often_as_it_says(world: float, seed: float, episode: float) -> None:
+    draws = np.random.default_rng(1)
+    held, pooled = 0, 0
+    for _ in range(300):
+        outcomes = simulated(draws, (3, 5, 100), world, seed, episode)
+        low, high = hierarchical(outcomes, RATE)
+        held += low <= 0.6 <= high
+        low, high = wilson(outcomes.sum(), outcomes.size)
+        pooled += low <= 0.6 <= high
+    assert 0.93 <= held / 300 <= 1.0
+    assert pooled / 300 < 0.8, "outcomes that share world models, seeds and episodes are not independent"
+
+
+@pytest.mark.slow
+def test_the_difference_of_rows_that_share_everything_but_luck_holds_0_and_is_narrower_than_its_rows() -> None:
+    draws, held, widths = np.random.default_rng(2), 0, np.zeros(2)
+    for _ in range(200):
+        worlds, seeds, episodes = draws.uniform(0.4, 1, (3, 1, 1)), draws.uniform(0.5, 1, (1, 5, 1)), draws.random(100)
+        ease = worlds * seeds * episodes
+        first, second = ((draws.random(ease.shape) < ease).astype(np.float64) for _ in range(2))
+        low, high = hierarchical(paired(first, second))
+        held += low <= 0 <= high
+        widths += np.array([high - low, np.subtract(*hierarchical(first)[::-1])])
+    assert widths[0] < 0.7 * widths[1]
+    assert held / 200 >= 0.93
+
+
+def test_the_difference_of_identical_rows_is_exactly_0() -> None:
+    outcomes = simulated(np.random.default_rng(0), (3, 5, 40), 0.1, 0.1, 0.1)
+    assert hierarchical(paired(outcomes, outcomes)) == (0.0, 0.0)
+
+
+def test_a_row_without_world_models_is_paired_with_each_of_the_others() -> None:
+    outcomes = simulated(np.random.default_rng(0), (3, 5, 40), 0.1, 0.1, 0.1)
+    alone = outcomes[:1] * 0
+    assert np.array_equal(paired(outcomes, alone), outcomes)
+
+
+def test_a_level_of_one_unit_is_not_drawn_and_more_world_models_that_differ_widen_the_interval() -> None:
+    episodes = (np.arange(100) % 2).astype(np.float64)
+    one = np.broadcast_to(episodes, (1, 1, 100))
+    assert hierarchical(one, RATE) == pytest.approx(wilson(50, 100), abs=0.015)
+    apart = np.stack([np.broadcast_to(episodes < limit, (1, 100)) for limit in (0.5, 0.5, 2)]).astype(np.float64)
+    low, high = hierarchical(apart, RATE)
+    assert high - low > 0.5
+
+
+def test_what_was_not_measured_is_left_out() -> None:
+    outcomes = simulated(np.random.default_rng(0), (2, 3, 40), 0.0, 0.0, 0.1)
+    padded = np.concatenate([outcomes, np.full((2, 1, 40), np.nan)], axis=1)
+    low, high = hierarchical(padded, RATE)
+    assert low < outcomes.mean() < high
+    with pytest.raises(ValueError, match="outcomes: got shape"):
+        hierarchical(np.full((1, 1, 2), np.nan))
+
+
+def test_no_failure_leaves_what_wilson_leaves() -> None:
+    assert of_successes(np.ones((1, 3, 50))) == wilson(50, 50)
+    assert of_successes(np.zeros((3, 1, 50))) == wilson(0, 50)
+
+
+def test_the_interquartile_mean_is_scipys() -> None:
+    from scipy.stats import trim_mean
+
+    scores = np.random.default_rng(0).random((5, 7))
+    assert interquartile_mean(scores) == pytest.approx(trim_mean(scores, 0.25, axis=None))
+
+
+def test_over_tasks_every_task_counts_and_equal_runs_leave_no_width() -> None:
+    easy, hard = np.ones((3, 5, 20)), np.zeros((3, 5, 20))
+    assert over_tasks([easy, easy]) == (1.0, (1.0, 1.0))
+    mean, (low, high) = over_tasks([easy, hard])
+    assert mean == pytest.approx(0.5, abs=0.05)
+    assert low <= mean <= high
+    mixed = simulated(np.random.default_rng(0), (3, 5, 20), 0.1, 0.1, 0.1)
+    mean, (low, high) = over_tasks([mixed, mixed])
+    assert low < mean < high

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from commands import Done, contents, playslot, refused, smoke, weights
 
-from playslot_rl.evaluation.success import wilson
+from playslot_rl.evaluation.intervals import wilson
 
 pytestmark = pytest.mark.integration
 

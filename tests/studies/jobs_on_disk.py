@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from playslot_rl.evaluation.success import wilson
+from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.tensors import save_tensors
 from playslot_rl.studies.launch import Status, write_status

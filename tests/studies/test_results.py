@@ -10,7 +10,7 @@ import pytest
 from jobs_on_disk import comparison, finish
 
 from playslot_rl.config.methods import METHODS
-from playslot_rl.evaluation.success import wilson
+from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.runs import Run
 from playslot_rl.studies.launch import Status, read_status, write_status
 from playslot_rl.studies.study import count_parameters

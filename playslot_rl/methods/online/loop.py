@@ -23,7 +23,7 @@ from torch import nn
 from playslot_rl.acting.episodes import LOCKSTEP, TaskPool
 from playslot_rl.config.methods import METHODS
 from playslot_rl.config.roles import without
-from playslot_rl.evaluation.success import wilson
+from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.methods.online.acting import Learner, PlayedEpisodes, play
 from playslot_rl.methods.online.config import OnlineConfig
 from playslot_rl.methods.online.players import Players, Round, play_round

@@ -89,19 +89,6 @@ def score_clips(
     return result, np.concatenate(pictures)
 
 
-def bootstrap(values: npt.ArrayLike, seed: int = 0, draws: int = 2000) -> tuple[float, float]:
-    """95 % percentile interval of the mean over clips, one number each, drawn with replacement.
-
-    Example:
-        >>> bootstrap([1.0, 1.0, 1.0])
-        (1.0, 1.0)
-    """
-    numbers = np.asarray(values, np.float64)
-    drawn = np.random.default_rng(seed).integers(0, len(numbers), (draws, len(numbers)))
-    low, high = np.quantile(numbers[drawn].mean(axis=1), [0.025, 0.975])
-    return float(low), float(high)
-
-
 class Row(NamedTuple):
     """One row of a model; `name` is empty for the model as it is, `sees` is what it is told of the true future, and
     `shuffled` takes the latents from another clip.

@@ -12,7 +12,8 @@ from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError
 from playslot_rl.evaluation.held_out import held_out_seeds
-from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_references, wilson
+from playslot_rl.evaluation.intervals import wilson
+from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_references
 from playslot_rl.methods.training import check_method
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.envs import RECORDED
 from playslot_rl.errors import ConfigError, PlaySlotError
+from playslot_rl.evaluation.intervals import hierarchical
 from playslot_rl.evaluation.video import open_lpips
-from playslot_rl.methods.video.scores import bootstrap
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing, write_json, write_text
 from playslot_rl.studies.launch import Status
@@ -79,8 +79,8 @@ def summarise_video(jobs: Sequence[Mapping[str, Any]], references: Sequence[Mapp
     """One row a method, kind of row, test set and number of seed frames: means over training seeds and clips.
 
     Keys: `method` (null for references), `title`, `variant`, `row`, `sees`, `clips_of`, `seed_frames`, `seeds`,
-    `clips`, and for each of `psnr`, `ssim` and `lpips` its mean, `NAME_ci95` (bootstrap over clips, of each clip's mean
-    over the seeds and steps), and `NAME_steps` with `NAME_steps_ci95` (P); null where it was not measured.
+    `clips`, and for each of `psnr`, `ssim` and `lpips` its mean, `NAME_ci95` (bootstrap over training seeds and
+    clips), and `NAME_steps` with `NAME_steps_ci95` (P); null where it was not measured.
     """
     groups: dict[tuple[Any, ...], list[tuple[int | None, Mapping[str, Any]]]] = {}
     for job in jobs:
@@ -104,12 +104,12 @@ def summarise_video(jobs: Sequence[Mapping[str, Any]], references: Sequence[Mapp
 def _of_metric(name: str, values: Sequence[Any]) -> dict[str, Any]:
     if any(value is None for value in values):
         return dict.fromkeys((name, f"{name}_ci95", f"{name}_steps", f"{name}_steps_ci95"))
-    clips = np.asarray(values, np.float64).mean(axis=0)  # (C, P)
+    scores = np.asarray(values, np.float64)[None]  # (1, seeds, C, P)
     return {
-        name: float(clips.mean()),
-        f"{name}_ci95": list(bootstrap(clips.mean(axis=1))),
-        f"{name}_steps": clips.mean(axis=0).tolist(),
-        f"{name}_steps_ci95": [list(bootstrap(step)) for step in clips.T],
+        name: float(scores.mean()),
+        f"{name}_ci95": list(hierarchical(scores.mean(axis=3))),
+        f"{name}_steps": scores.mean(axis=(0, 1, 2)).tolist(),
+        f"{name}_steps_ci95": [list(hierarchical(step)) for step in np.moveaxis(scores, 3, 0)],
     }
 
 

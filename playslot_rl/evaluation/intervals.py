@@ -1,0 +1,154 @@
+"""Intervals: of one policy's success over its episodes, and of comparisons, with the seeds of world model and policy.
+
+Outcomes are (W, S, E): world models, policy seeds, episodes or clips, NaN where nothing was measured. A bootstrap draws
+
+    m* = sum c_w c_s c_e y_wse / sum c_w c_s c_e,   c_l ~ multinomial(n_l - 1; 1 / n_l, ...) at each level l
+    interval = m + k (q - m),   q the 2.5 and 97.5 % quantiles of m*,   k = t_nu / z
+    nu = (sum V_l)^2 / sum V_l^2 / (n_l - 1),   V_l the variance of the means over the units of l, divided by n_l
+
+Levels are drawn across each other, not inside: seed s draws the same demonstrations for every world model, and all
+policies play the same episodes (the pigeonhole bootstrap; A. Owen, 2007). n - 1 of n units keep a level's variance
+unbiased (P. McCarthy and C. Snowden, 1985), and k is Student's quantile with Satterthwaite's degrees of freedom over
+the normal one: three world models are few. What is of a cell alone counts once for each level, so that an interval is
+rather too wide than too narrow. A level of one unit is not drawn, and the interval says nothing of it. A difference is
+that of the outcomes, cell by cell, so that pairs share world model, seed and episode.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from statistics import NormalDist
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+Outcomes = npt.NDArray[np.float64]
+"""(W, S, E)."""
+Interval = tuple[float, float]
+DRAWS: Final = 2000
+"""B."""
+RATE: Final = (0.0, 1.0)
+"""Bounds of a success rate."""
+_TAILS: Final = (0.025, 0.975)
+
+
+def wilson(successes: float, trials: int) -> Interval:
+    """95 % interval of a success probability (E. B. Wilson, 1927); unlike the normal one it stays in [0, 1] and is not
+    empty at 0 or 100 %. The successes may be a mean over repetitions. A ValueError where a count is outside its range.
+
+    Example:
+        >>> low, high = wilson(9, 10)
+        >>> round(low, 3), round(high, 3)
+        (0.596, 0.982)
+    """
+    if trials < 1 or not 0 <= successes <= trials:
+        raise ValueError(f"wilson: got {successes} of {trials}, expected 0 <= successes <= trials and trials >= 1")
+    z = NormalDist().inv_cdf(0.975)
+    rate = successes / trials
+    scale = 1 + z * z / trials
+    centre = (rate + z * z / (2 * trials)) / scale
+    half = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials)) / scale
+    # The ends at 0 and at 100 % are exact in theory; rounding would leave 1e-17.
+    low = 0.0 if successes == 0 else max(0.0, centre - half)
+    high = 1.0 if successes == trials else min(1.0, centre + half)
+    return low, high
+
+
+def hierarchical(outcomes: Outcomes, bounds: Interval = (-math.inf, math.inf), seed: int = 0) -> Interval:
+    """95 % interval of the mean outcome, cut to `bounds`; a ValueError where nothing was measured.
+
+    Example:
+        >>> hierarchical(np.ones((3, 5, 20)))
+        (1.0, 1.0)
+    """
+    there = ~np.isnan(outcomes)
+    if outcomes.ndim != 3 or not there.any():
+        raise ValueError(f"outcomes: got shape {outcomes.shape} with {there.sum()} measured, expected (W, S, E)")
+    values, mean = np.where(there, outcomes, 0.0), float(np.nanmean(outcomes))
+    counts = [_counts(units, seed + level) for level, units in enumerate(outcomes.shape)]
+    drawn, weight = _sums(counts, values), _sums(counts, there.astype(np.float64))
+    low, high = np.quantile(drawn[weight > 0] / weight[weight > 0], _TAILS)
+    wider = _widening(outcomes)
+    return max(bounds[0], mean + wider * (float(low) - mean)), min(bounds[1], mean + wider * (float(high) - mean))
+
+
+def of_successes(outcomes: Outcomes) -> Interval:
+    """95 % interval of a success rate: the bootstrap's, and where that is narrower, as with no failure at all, Wilson's
+    over the episodes of one policy.
+    """
+    low, high = hierarchical(outcomes, RATE)
+    trials = int((~np.isnan(outcomes)).any(axis=(0, 1)).sum())
+    least = wilson(float(np.nanmean(outcomes)) * trials, trials)
+    return min(low, least[0]), max(high, least[1])
+
+
+def paired(outcomes: Outcomes, reference: Outcomes) -> Outcomes:
+    """Differences of a row's outcomes and a reference's. One world model stands for all of the other's: a method
+    without a world model meets each of them.
+    """
+    return outcomes - reference
+
+
+def interquartile_mean(scores: npt.ArrayLike) -> float:
+    """Mean of the middle half of all scores, tasks and runs together (R. Agarwal and others, 2021; rliable).
+
+    Example:
+        >>> interquartile_mean([0, 1, 2, 3, 4, 5, 6, 100])
+        3.5
+    """
+    numbers = np.sort(np.asarray(scores, np.float64), axis=None)
+    cut = len(numbers) // 4
+    return float(numbers[cut : len(numbers) - cut].mean())
+
+
+def over_tasks(tasks: Sequence[Outcomes], seed: int = 0) -> tuple[float, Interval]:
+    """Interquartile mean of the runs' rates over tasks, each (W, S, E) with all measured, and its 95 % interval: the
+    percentiles of draws within each task, as wide as its levels are.
+    """
+    drawn: list[npt.NDArray[np.float64]] = []
+    for number, outcomes in enumerate(tasks):
+        draws = np.random.default_rng(seed + number)
+        worlds, seeds = (draws.integers(0, n, (DRAWS, max(1, n - 1))) for n in outcomes.shape[:2])
+        episodes = _counts(outcomes.shape[2], seed + number)
+        rates = np.einsum("be,wse->bws", episodes, outcomes) / episodes.sum(axis=1)[:, None, None]
+        rates = rates[np.arange(DRAWS)[:, None, None], worlds[:, :, None], seeds[:, None, :]]
+        drawn.append(rates.reshape(DRAWS, -1))
+    scores = np.sort(np.concatenate(drawn, axis=1), axis=1)
+    cut = scores.shape[1] // 4
+    low, high = np.quantile(scores[:, cut : scores.shape[1] - cut].mean(axis=1), _TAILS)
+    runs = np.concatenate([outcomes.mean(axis=2).ravel() for outcomes in tasks])
+    return interquartile_mean(runs), (float(low), float(high))
+
+
+@functools.lru_cache(maxsize=32)
+def _counts(units: int, seed: int) -> npt.NDArray[np.float64]:
+    """How often each unit of a level is drawn (B, units); a level of one is always there."""
+    if units == 1:
+        return np.ones((DRAWS, 1))
+    return np.random.default_rng(seed).multinomial(units - 1, np.full(units, 1 / units), DRAWS).astype(np.float64)
+
+
+def _sums(counts: Sequence[npt.NDArray[np.float64]], values: Outcomes) -> npt.NDArray[np.float64]:
+    worlds, seeds, episodes = counts
+    drawn = values.reshape(-1, values.shape[2]) @ episodes.T  # (W S, B)
+    sums: npt.NDArray[np.float64] = np.einsum("bw,bs,wsb->b", worlds, seeds, drawn.reshape(*values.shape[:2], -1))
+    return sums
+
+
+def _widening(outcomes: Outcomes) -> float:
+    """Student's quantile over the normal one, at the degrees of freedom that the levels together have."""
+    from scipy.special import stdtrit
+
+    shares, spent = [], []
+    for level, size in enumerate(outcomes.shape):
+        of_units = np.moveaxis(outcomes, level, 0).reshape(size, -1)
+        means = np.nanmean(of_units[~np.isnan(of_units).all(axis=1)], axis=1)
+        if len(means) > 1:
+            shares.append(float(means.var(ddof=1)) / len(means))
+            spent.append(shares[-1] ** 2 / (len(means) - 1))
+    if sum(spent) == 0:
+        return 1.0
+    return float(stdtrit(sum(shares) ** 2 / sum(spent), _TAILS[1])) / NormalDist().inv_cdf(_TAILS[1])
