@@ -207,9 +207,9 @@ def latent_policy_module(policy: nn.Module) -> TensorDictModule:
     return TensorDictModule(policy, in_keys=[keys.SLOTS], out_keys=[keys.LATENT_ACTION])
 
 
-def action_decoder_module(action_decoder: ActionDecoder) -> TensorDictModule:
-    """LATENT_ACTION (..., Z), and SLOTS (..., N, D) where it reads them, to ACTION (..., A) in [-1, 1]."""
-    read = [keys.LATENT_ACTION, keys.SLOTS] if action_decoder.reads_slots else [keys.LATENT_ACTION]
+def action_decoder_module(action_decoder: ActionDecoder, state: str = keys.SLOTS) -> TensorDictModule:
+    """LATENT_ACTION (..., Z), and SLOTS (..., N, D) or another state if it reads one, to ACTION (..., A) in [-1, 1]."""
+    read = [keys.LATENT_ACTION, state] if action_decoder.reads_slots else [keys.LATENT_ACTION]
     return TensorDictModule(action_decoder, in_keys=read, out_keys=[keys.ACTION])
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.action_range import ActionRange, range_of
+from playslot_rl.modules.policy import Decides
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.world_model import action_decoder_module, frame_parser_module
 
@@ -119,10 +120,20 @@ class ReactiveActor(Actor):
         return self.module(tensordict)
 
 
-def latent_actor(policy: nn.Module, decoder: ActionDecoder) -> Actor:
+class _Choice(nn.Module):
+    def __init__(self, policy: Any) -> None:
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        features = self.policy.features(pixels)
+        return self.policy.decide(features), features
+
+
+def latent_actor(policy: Decides, decoder: ActionDecoder) -> Actor:
     """The actor of a policy from frames (n, 3, H, W) to latent actions (n, Z), which a decoder turns into real ones."""
-    choose = TensorDictModule(policy, in_keys=[keys.PIXELS], out_keys=[keys.LATENT_ACTION])
-    return ReactiveActor(TensorDictSequential(choose, action_decoder_module(decoder)))
+    choose = TensorDictModule(_Choice(policy), in_keys=[keys.PIXELS], out_keys=[keys.LATENT_ACTION, keys.FEATURES])
+    return ReactiveActor(TensorDictSequential(choose, action_decoder_module(decoder, keys.FEATURES)))
 
 
 class ExpertActor(Actor):

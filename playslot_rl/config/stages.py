@@ -27,6 +27,11 @@ AFTER_CLONING: Final = (
     "finetune_labels", "finetune_lr", "policy_from",
 )  # fmt: skip
 """Settings of the behaviour stage for what comes after the policy."""
+DECODING: Final = tuple(
+    f"behaviour.{key}"
+    for key in ("labelled_demos", "decoder_inputs", "decoder_state", "finetune_steps", "finetune_labels", "finetune_lr")
+)
+"""Those that other methods share which clone latent actions."""
 
 
 @dataclass(frozen=True)
@@ -166,9 +171,10 @@ class BehaviourStageConfig(StageConfig):
         whiten: clone the latents in whitened coordinates (`playslot_rl.modules.whitening`), where each direction that
             they vary in weighs the same; false clones them as they are (paper).
         decoder_inputs: `inverse_dynamics` (InvDyn's latents; paper), `policy` (the policy's outputs) or `both`.
-        decoder_state: the decoder also reads the slots, a_t = D_a(z_t, S_t): the same change of the image asks for
-            different actions in different places. From very few labels that is not learned, so a decoder of the first
-            half of them is first tried on the second, with the slots and without. False reads z_t alone (paper).
+        decoder_state: the decoder also reads the slots, a_t = D_a(z_t, S_t), of LAPO and CADDY the policy's features:
+            the same change of the image asks for different actions in different places. From very few labels that is
+            not learned, so a decoder of the first half of them is first tried on the second, with the slots and
+            without. False reads z_t alone (paper).
         decoder_steps: optimiser steps of the action decoder.
         decoder_lr: its base learning rate; the rest of `optim` is shared.
         finetune_steps: optimiser steps after that, of policy and decoder together, on the labelled rows' actions; the

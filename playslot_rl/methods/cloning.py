@@ -2,9 +2,10 @@
 
     z_t = what the frozen model infers from (o_t, o_{t+1})
     pi(o_t) ~ z_t                       on the videos of all demonstrations, no action read
-    L_a = mean (D(z_t) - a_t)^2         on the labelled ones
+    L_a = mean (D(z_t) - a_t)^2         on the labelled ones, D(z_t, h_t) with the policy's features (`decoder_state`)
 
-Policies clone what moves: still transitions are left out (`behaviour.trim_pixels`).
+then both together, as PlaySlot's (`training.stage_behaviour`). Policies clone what moves: still transitions are left
+out (`behaviour.trim_pixels`).
 
 Shapes: M transitions, Z latent-action width, A action dim.
 """
@@ -14,16 +15,15 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.config import ExperimentConfig, StageConfig
+from playslot_rl.config import ExperimentConfig, ModelConfig, StageConfig
 from playslot_rl.data.demonstrations import (
+    Demonstrations,
     DemonstrationSplit,
     Transitions,
     labelled_rows,
@@ -31,29 +31,31 @@ from playslot_rl.data.demonstrations import (
     real_actions,
 )
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
+from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.training.demonstrated import cloned, policy_taken_over
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.stage import Stage
+from playslot_rl.training.stage_behaviour import JointStage, after_cloning
 from playslot_rl.training.stage_regression import (
     FrameInputs,
     Inputs,
     RegressionStage,
-    TensorInputs,
+    TakenInputs,
     apply_rows,
 )
 
 
 class Seen(NamedTuple):
     """Transitions: what the policy reads of the frame before each, the latents (M, Z) that the model infers, the real
-    actions (M, A) in [-1, 1], and whose they are (M,).
+    actions (M, A) in [-1, 1], and which they are.
     """
 
     inputs: Inputs
     latents: Tensor
     actions: Tensor
-    episode: npt.NDArray[np.int64]
+    moves: Transitions
 
 
 class LatentCloning(ABC):
@@ -64,7 +66,8 @@ class LatentCloning(ABC):
     batches and the precision of `schedule`, the policy on frames that are shifted by up to `shift` pixels.
     """
 
-    policy: nn.Module
+    policy: Any
+    """An nn.Module that `Decides`."""
     decoder: ActionDecoder
 
     kind: type[RegressionStage] = RegressionStage
@@ -77,11 +80,11 @@ class LatentCloning(ABC):
         device: torch.device,
         shift: int,
         schedule: StageConfig,
-        loss: str,
+        loss: Literal["l2", "l1"],
     ) -> None:
         self.config, self.device, self.schedule, self.loss = config, device, schedule, loss
         self.trained = self._seen(demos.trained, shift)
-        self.labelled = labelled_rows(self.trained.episode, config.behaviour.labelled_demos)
+        self.labelled = labelled_rows(self.trained.moves.episode, config.behaviour.labelled_demos)
         self.held_out = None if demos.held_out is None else self._seen(demos.held_out)
 
     @abstractmethod
@@ -91,10 +94,6 @@ class LatentCloning(ABC):
     def observe(self, frames: FrameInputs) -> Inputs:
         """What the policy reads of frames: themselves."""
         return frames
-
-    def chosen(self, outputs: Tensor) -> Tensor:
-        """The latent actions (M, Z) that the policy's outputs (M, ...) stand for: themselves."""
-        return outputs
 
     @abstractmethod
     def criterion(self) -> BehaviourLoss:
@@ -113,35 +112,55 @@ class LatentCloning(ABC):
             precision=self.schedule.precision,
         )
 
-    def decoder_stage(self) -> RegressionStage:
-        """Real actions of the labelled demonstrations, from inferred latents, the policy's, or both."""
-        inputs, actions = self._decoded(self.trained, self.labelled.to(self.device))
-        held_out = None
-        if self.held_out is not None:
-            held_out = self._decoded(self.held_out, torch.arange(len(self.held_out.actions), device=self.device))
-        self.decoder.standardise(inputs.whole())
-        return RegressionStage(
-            "action_decoder",
-            ActionDecoderLoss(self.decoder, self.loss),
-            inputs,
-            actions,
-            self.schedule.batch_size,
-            held_out=held_out,
+    def new_decoder(self, latent_dim: int, state_dim: int) -> ActionDecoder:
+        """One that may read the policy's features, of that width."""
+        model = sizes(self.config, self.config.model)
+        return ActionDecoder(model.action_decoder, latent_dim, self.config.env.action_dim, state_dim).to(self.device)
+
+    def decoding(
+        self, clone: RegressionStage, part: Callable[[str, Stage, int, float], Part], steps: int, lr: float
+    ) -> Iterator[Part]:
+        """What follows the policy, which `clone` has trained; see `after_cloning`. The decoder has `steps` and `lr`."""
+        config = replace(
+            self.config.behaviour,
+            parsed=True,
+            imagined=False,
+            slot_noise=0.0,
+            loss=self.loss,
+            batch_size=self.schedule.batch_size,
             precision=self.schedule.precision,
+            decoder_steps=steps,
+            decoder_lr=lr,
         )
+        self.policy.eval()
+        labelled, other = self.labelled.to(self.device), self.held_out
+        shown = TakenInputs(self.trained.inputs, labelled), self.trained.actions[labelled]
+
+        def finetune() -> JointStage:
+            measured = other and (other.inputs, other.actions)
+            return JointStage(clone, self.decoder, shown, measured, config)
+
+        held_out = None if other is None else self._decided(other, torch.arange(len(other.actions)))
+        demos = self._decided(self.trained, labelled)
+        yield from after_cloning(self.decoder, self.policy, demos, config, part, finetune, held_out)
 
     def _seen(self, source: EpisodeFrames, shift: int = 0) -> Seen:
         moves, frames, actions = moving_examples(self.config, source, self.device, shift)
-        return Seen(self.observe(frames), self.infer(source, moves), actions, moves.episode)
+        return Seen(self.observe(frames), self.infer(source, moves), actions, moves)
 
-    def _decoded(self, seen: Seen, rows: Tensor) -> tuple[TensorInputs, Tensor]:
-        """What the decoder regresses from, and what it should give."""
-        kind = self.config.behaviour.decoder_inputs
-        inputs: list[Tensor] = [] if kind == "policy" else [seen.latents[rows]]
-        if kind != "inverse_dynamics":
-            self.policy.eval()
-            inputs.append(self.chosen(apply_rows(self.policy, seen.inputs, rows)))
-        return TensorInputs(torch.cat(inputs)), seen.actions[rows].repeat(len(inputs), 1)
+    def _decided(self, seen: Seen, rows: Tensor) -> Demonstrations:
+        """What the decoder meets of some rows: the policy's features in place of slots."""
+        rows, moves = rows.to(self.device), seen.moves
+        features = apply_rows(self.policy.features, seen.inputs, rows)
+        episode, step = (torch.from_numpy(part).to(self.device)[rows] for part in (moves.episode, moves.step))
+        lengths = torch.from_numpy(moves.lengths)
+        return Demonstrations(features, features, seen.latents[rows], seen.actions[rows], episode, step, lengths)
+
+
+def sizes(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
+    """With a decoder that reads the policy's features where `behaviour.decoder_state` says so."""
+    decoder = replace(config.model.action_decoder, reads_slots=config.behaviour.decoder_state)
+    return replace(model, action_decoder=decoder)
 
 
 def moving_examples(
@@ -193,27 +212,27 @@ def cloning(
     decoder_steps: int,
     decoder_lr: float,
 ) -> Training:
-    """Latent policy, then action decoder; the policy is taken over where another run has trained it.
+    """Latent policy, then action decoder, then both; the policy is taken over where another run has trained it.
 
     `policy` is its schedule, `baselines.METHOD.policy`; the decoder has its own steps and rate, the rest is the
     policy's.
     """
     config, name, split = record.config, record.name, record.demos
-    decoding = replace(policy, steps=decoder_steps, optim=replace(policy.optim, lr=decoder_lr))
     labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
+    group = f"baselines.{name}"
+
+    def part(folder: str, stage: Stage, steps: int, lr: float) -> Part:
+        kind = folder.partition("_")[0]
+        typed = "behaviour.finetune" if kind == "finetune" else f"{group}.decoder"
+        own = replace(policy, steps=steps, optim=replace(policy.optim, lr=lr))
+        renamed = {"steps": f"{typed}_steps", "optim.lr": f"{typed}_lr"}
+        of = "action_decoder" if folder == "decoder" else folder
+        return Part(f"{name}.{of}", stage, own, folder, f"{group}.policy", renamed, labelled)
 
     def parts() -> Iterator[Part]:
-        group = f"baselines.{name}"
-        yield Part(f"{name}.policy", behaviour.policy_stage(), policy, group=f"{group}.policy")
-        yield Part(
-            f"{name}.action_decoder",
-            behaviour.decoder_stage(),
-            decoding,
-            folder="decoder",
-            group=f"{group}.policy",
-            renamed={"steps": f"{group}.decoder_steps", "optim.lr": f"{group}.decoder_lr"},
-            identity=labelled,
-        )
+        clone = behaviour.policy_stage()
+        yield Part(f"{name}.policy", clone, policy, group=f"{group}.policy")
+        yield from behaviour.decoding(clone, part, decoder_steps, decoder_lr)
 
     said, extra = cloned(name, split, len(behaviour.trained.actions), config.behaviour.labelled_demos)
     return Training(

@@ -18,12 +18,17 @@ class DecodedPolicy[Policy: nn.Module](nn.Module):
 
     @classmethod
     def load(
-        cls, done: StageCheckpoint, policy: Callable[[], Policy], latent_dim: int, device: torch.device | str
+        cls,
+        done: StageCheckpoint,
+        policy: Callable[[], Policy],
+        latent_dim: int,
+        state_dim: int,
+        device: torch.device | str,
     ) -> DecodedPolicy[Policy]:
-        """Those of a finished stage, frozen; `policy` builds an untrained one."""
+        """Those of a finished stage, frozen; `policy` builds an untrained one, whose features are `state_dim` wide."""
         model, env = done.sizes
 
         def build() -> DecodedPolicy[Policy]:
-            return cls(policy(), ActionDecoder(model.action_decoder, latent_dim, env.action_dim))
+            return cls(policy(), ActionDecoder(model.action_decoder, latent_dim, env.action_dim, state_dim))
 
         return done.restore(build, ("policy", "action_decoder"), device)

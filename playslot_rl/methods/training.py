@@ -63,9 +63,10 @@ def train(config: ExperimentConfig) -> StageCheckpoint:
     run = run_to_write(config)
     if method.model is None:
         return train_stage(method.last, config, run)
-    parents = dict[str, StageCheckpoint]()
+    parents, sizes = dict[str, StageCheckpoint](), method.last.sizes
+    groups = {"model": plugins.call(sizes, config, config.model)} if sizes else {}
     record = StageRecord(
-        method.last, run.folder, config, parents, ready=lambda: run.take(parents[record.spec.parents[0]])
+        method.last, run.folder, config, parents, groups, lambda: run.take(parents[record.spec.parents[0]])
     )
     parents[method.model.name] = _model(method.model, record, run)
     return run_stage(record, partial(plugins.call, record.spec.parts, record))

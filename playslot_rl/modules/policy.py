@@ -5,12 +5,24 @@ Shapes: slots (..., N, D) -> (..., Z). On real actions in place of latents it is
 
 from __future__ import annotations
 
+from typing import Protocol
+
 from torch import Tensor, nn
 
 from playslot_rl.config import PolicyConfig
 from playslot_rl.modules.action_range import ActionRange
 from playslot_rl.modules.transformer import SlotTokenEncoder
 from playslot_rl.modules.whitening import Whitening
+
+
+class Decides(Protocol):
+    """A policy as an action decoder meets it."""
+
+    def features(self, observed: Tensor) -> Tensor:
+        """What the decoder may read beside the latent action, (..., N, D), of what the policy observes."""
+
+    def decide(self, features: Tensor) -> Tensor:
+        """Latent actions (..., Z) from these."""
 
 
 class LatentPolicy(nn.Module):
@@ -40,3 +52,12 @@ class LatentPolicy(nn.Module):
         """Slots (..., N, D) to latent actions (..., Z)."""
         out: Tensor = self.head(self.encoder(slots))
         return out if self.whitening is None else self.whitening.inverse(out)
+
+    def features(self, observed: Tensor) -> Tensor:
+        """The slots themselves."""
+        return observed
+
+    def decide(self, features: Tensor) -> Tensor:
+        """Latent actions (..., Z)."""
+        z: Tensor = self(features)
+        return z

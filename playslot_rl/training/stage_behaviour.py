@@ -1,14 +1,15 @@
 """Stage 3: the latent policy (with the slot oracle beside it), then the action decoder (paper, "Learning behaviours").
 
-Two `Stage`s for `fit`. The world model is frozen and has labelled the demonstrations before.
+`Stage`s for `fit`. The world model is frozen and has labelled the demonstrations before. Other methods that clone
+latent actions decode them by the same: their slots are what their policy makes of a frame (`modules.policy.Decides`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
@@ -20,8 +21,10 @@ from playslot_rl.data.demonstrations import Demonstrations
 from playslot_rl.errors import DataError
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
-from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.modules.policy import Decides, LatentPolicy
 from playslot_rl.seeds.draws import StepGenerators
+from playslot_rl.training.fit import Part
+from playslot_rl.training.stage import Stage
 from playslot_rl.training.stage_regression import (
     HELD_OUT,
     Examples,
@@ -184,7 +187,7 @@ class DecoderStage(RegressionStage):
     def trial(
         cls,
         decoder: ActionDecoder,
-        policy: LatentPolicy,
+        policy: Decides,
         demos: Demonstrations,
         config: BehaviourStageConfig,
         horizon: int | None = None,
@@ -213,7 +216,7 @@ class DecoderStage(RegressionStage):
     def __init__(
         self,
         decoder: ActionDecoder,
-        policy: LatentPolicy,
+        policy: Decides,
         demos: Demonstrations,
         config: BehaviourStageConfig,
         held_out: Demonstrations | None = None,
@@ -228,7 +231,7 @@ class DecoderStage(RegressionStage):
             if config.decoder_inputs != "inverse_dynamics":
                 seen = SeenSlots.of(demos, config, horizon)
                 said = apply_rows(
-                    policy, TensorInputs(seen.slots), torch.arange(len(seen.rows), device=seen.rows.device)
+                    policy.decide, TensorInputs(seen.slots), torch.arange(len(seen.rows), device=seen.rows.device)
                 )
                 latents, slots, rows = [*latents, said], [*slots, *seen.slots], [*rows, seen.rows]
             z = torch.cat(latents)
@@ -251,43 +254,34 @@ class DecoderStage(RegressionStage):
         )
 
 
-class FinetuneStage:
+class JointStage:
     """Policy and decoder together on real actions, L_a(D_a(f_pi(S_t))), while the policy goes on cloning (`clone`): +
-    L_pi; where the decoder trusts slots, L_a(D_a(f_pi(S_t), S_t)) too.
+    L_pi; where the decoder trusts the state, L_a(D_a(f_pi(S_t), S_t)) too.
 
-    Note: not in the paper, whose decoder is trained beside a finished policy. The cloning term keeps the policy's
+    Note: not in the papers, whose decoder is trained beside a finished policy. The cloning term keeps the policy's
     latents what the predictor understands.
 
-    Raises:
-        DataError: no actions, or fewer demonstrations than `config.labelled_demos`.
+    Args:
+        labelled: what the policy observes, and real actions.
+        measured: the same of held-out demonstrations.
     """
 
     def __init__(
         self,
         clone: RegressionStage,
         decoder: ActionDecoder,
-        demos: Demonstrations,
+        labelled: Examples,
+        measured: Examples | None,
         config: BehaviourStageConfig,
-        held_out: Demonstrations | None = None,
-        horizon: int | None = None,
     ) -> None:
-        policy = clone.criterion.network
+        policy: Any = clone.criterion.network
         self.clone, self.policy, self.decoder = clone, policy, decoder
         # In imagination the decoder is given no slots.
         networks = [*([_Both(policy, decoder)] if decoder.acts_on_slots else []), _Both(policy, decoder, blind=True)]
 
-        def examples(demos: Demonstrations, noise: float) -> Examples:
-            actions = demos.require_actions()
-            seen = SeenSlots.of(demos, config, horizon)
-            return TensorInputs(seen.slots, noise, "finetune_noise"), actions[seen.rows]
-
-        acted = _acted(held_out)
-        labelled = examples(demos.take(demos.labelled(config.labelled_demos)), config.slot_noise)
-        measured = None if acted is None else examples(acted, 0.0)
-
         def acting(network: _Both) -> RegressionStage:
             criterion = BehaviourLoss(network, config.loss)
-            criterion.set_keys(action=keys.ACTION)
+            criterion.set_keys(observation=clone.criterion.tensor_keys.observation, action=keys.ACTION)
             return RegressionStage(
                 "finetune", criterion, *labelled, config.batch_size, held_out=measured, validated=VALIDATED,
                 precision=config.precision,
@@ -318,14 +312,64 @@ class FinetuneStage:
         return self.acting[0].validate(step)
 
 
+class FinetuneStage(JointStage):
+    """`JointStage` on slots. Raises DataError: no actions, or fewer demonstrations than `config.labelled_demos`."""
+
+    def __init__(
+        self,
+        clone: RegressionStage,
+        decoder: ActionDecoder,
+        demos: Demonstrations,
+        config: BehaviourStageConfig,
+        held_out: Demonstrations | None = None,
+        horizon: int | None = None,
+    ) -> None:
+        def examples(demos: Demonstrations, noise: float) -> Examples:
+            actions = demos.require_actions()
+            seen = SeenSlots.of(demos, config, horizon)
+            return TensorInputs(seen.slots, noise, "finetune_noise"), actions[seen.rows]
+
+        acted = _acted(held_out)
+        labelled = examples(demos.take(demos.labelled(config.labelled_demos)), config.slot_noise)
+        super().__init__(clone, decoder, labelled, None if acted is None else examples(acted, 0.0), config)
+
+
 class _Both(nn.Module):
-    def __init__(self, policy: nn.Module, decoder: ActionDecoder, blind: bool = False) -> None:
+    def __init__(self, policy: Any, decoder: ActionDecoder, blind: bool = False) -> None:
         super().__init__()
         self.policy, self.decoder, self.blind = policy, decoder, blind
 
-    def forward(self, slots: Tensor) -> Tensor:
-        out: Tensor = self.decoder(self.policy(slots), None if self.blind else slots)
+    def forward(self, observed: Tensor) -> Tensor:
+        features = self.policy.features(observed)
+        out: Tensor = self.decoder(self.policy.decide(features), None if self.blind else features)
         return out
+
+
+def after_cloning(
+    decoder: ActionDecoder,
+    policy: Decides,
+    demos: Demonstrations,
+    config: BehaviourStageConfig,
+    part: Callable[[str, Stage, int, float], Part],
+    finetune: Callable[[], JointStage],
+    held_out: Demonstrations | None = None,
+    horizon: int | None = None,
+) -> Iterator[Part]:
+    """What follows the policy: the decoder, after a trial of whether the state pays, and both together.
+
+    Args:
+        part: makes a training of its folder, stage, steps and learning rate.
+    """
+    if decoder.reads_slots:
+        decoder.trusts_slots.fill_(False)  # one demonstration cannot tell
+        trial = DecoderStage.trial(decoder, policy, demos, config, horizon)
+        if trial is not None:
+            yield part("decoder_trial", trial, -(-config.decoder_steps // 2), config.decoder_lr)
+            decoder.trusts_slots.fill_(trial.slots_pay())
+    stage = DecoderStage(decoder, policy, demos, config, held_out, horizon)
+    yield part("decoder", stage, config.decoder_steps, config.decoder_lr)
+    if config.finetune_steps and config.labelled_demos >= config.finetune_labels:
+        yield part("finetune", finetune(), config.finetune_steps, config.finetune_lr)
 
 
 def oracle_stage(

@@ -8,7 +8,7 @@ their first dimension.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -136,6 +136,24 @@ class FrameInputs:
         return self.frames.take(rows)
 
 
+class TakenInputs:
+    """Some rows of inputs, by their numbers int64 (M',)."""
+
+    def __init__(self, inputs: Inputs, rows: Tensor) -> None:
+        self.inputs, self.rows = inputs, rows.cpu()
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def draw(self, rows: Tensor, generators: StepGenerators) -> Observed:
+        """As of the inputs."""
+        return self.inputs.draw(self.rows[rows.cpu()], generators)
+
+    def plain(self, rows: Tensor) -> Observed:
+        """As of the inputs."""
+        return self.inputs.plain(self.rows[rows.cpu()])
+
+
 def shifted(frames: Tensor, offsets: Tensor) -> Tensor:
     """Frames (b, C, H, W), each moved by its own pixels (b, 2), down and right; what enters repeats the edge."""
     height, width = frames.shape[-2:]
@@ -232,7 +250,7 @@ def apart(batch: Mapping[str, Tensor], name: str) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def apply_rows(network: nn.Module, inputs: Inputs, rows: Tensor, batch: int = 1024) -> Tensor:
+def apply_rows(network: Callable[..., Tensor], inputs: Inputs, rows: Tensor, batch: int = 1024) -> Tensor:
     """A network's outputs (b, ...) on rows of its inputs, in the mode it is in."""
     parts = spread(rows.split(batch), lambda _, part: network(*_several(inputs.plain(part))))
     return torch.cat(parts).to(rows.device)

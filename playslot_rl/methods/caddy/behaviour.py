@@ -29,14 +29,13 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
-from playslot_rl.methods.caddy.heads import ORACLE, POLICY, MovesHead, StateHead, as_moves, load_model, states_of
+from playslot_rl.methods.caddy.heads import ORACLE, POLICY, MovesHead, StateHead, load_model, states_of
 from playslot_rl.methods.caddy.method import CADDYConfig, CADDYOracleConfig, CADDYPolicyConfig
 from playslot_rl.methods.caddy.model import CADDY
 from playslot_rl.methods.caddy.networks import Encoder
 from playslot_rl.methods.caddy.stage import CADDYStage
 from playslot_rl.methods.cloning import LatentCloning, action_stage, cloning
 from playslot_rl.methods.video.training import on_clips, pixel_model
-from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.training.demonstrated import cloned
@@ -117,7 +116,7 @@ class CADDYBehaviour(LatentCloning):
         width = sizes.actions + sizes.latent_dim
         with global_seed(config.seed, 0, POLICY):
             self.policy = MovesHead(sizes.encoder[-1], sizes.actions, sizes.latent_dim).to(device)
-            self.decoder = ActionDecoder(config.model.action_decoder, width, config.env.action_dim).to(device)
+            self.decoder = self.new_decoder(width, 2 * sizes.encoder[-1])
         self.policy.standardise(self.trained.latents[:, sizes.actions :])
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
@@ -125,9 +124,6 @@ class CADDYBehaviour(LatentCloning):
 
     def observe(self, frames: FrameInputs) -> Inputs:
         return StateInputs(self.model.encoder, frames)
-
-    def chosen(self, outputs: Tensor) -> Tensor:
-        return as_moves(outputs, self.policy.actions)
 
     def criterion(self) -> MovesLoss:
         return MovesLoss(self.policy)

@@ -46,7 +46,16 @@ class StateHead(nn.Module):
             self.action_range = ActionRange(out_dim)
 
     def forward(self, states: Tensor) -> Tensor:
-        out: Tensor = self.to_out(self.trunk(states))
+        return self.outputs(self.features(states))
+
+    def features(self, observed: Tensor) -> Tensor:
+        """States (B, C, H/8, W/8) to the trunk's features, as one slot (B, 1, 2C)."""
+        h: Tensor = self.trunk(observed)
+        return h[:, None]
+
+    def outputs(self, features: Tensor) -> Tensor:
+        """What is cloned, from these."""
+        out: Tensor = self.to_out(features[:, 0])
         return out
 
 
@@ -68,10 +77,14 @@ class MovesHead(StateHead):
         self.mean.copy_(v.mean(dim=0))
         self.scale.copy_((v - self.mean).square().mean().sqrt().clamp(min=1e-6))
 
-    def forward(self, states: Tensor) -> Tensor:
-        """States (B, C, H/8, W/8) to logits and variabilities (B, K + Z), float32."""
-        out = super().forward(states).float()
+    def outputs(self, features: Tensor) -> Tensor:
+        """Features (B, 1, 2C) to logits and variabilities (B, K + Z), float32."""
+        out = super().outputs(features).float()
         return torch.cat((out[:, : self.actions], self.mean + self.scale * out[:, self.actions :]), dim=-1)
+
+    def decide(self, features: Tensor) -> Tensor:
+        """Moves (B, K + Z), of which only v hands a gradient on."""
+        return as_moves(self.outputs(features), self.actions)
 
 
 class OnFrames(nn.Module):
@@ -83,6 +96,13 @@ class OnFrames(nn.Module):
         """Frames (B, 3, H, W), uint8 or float [0, 1], to moves (B, K + Z), or to actions (B, A) of an oracle."""
         out: Tensor = self.head(states_of(self.encoder, pixels))
         return as_moves(out, self.head.actions) if isinstance(self.head, MovesHead) else out
+
+    def features(self, observed: Tensor) -> Tensor:
+        return self.head.features(states_of(self.encoder, observed))
+
+    def decide(self, features: Tensor) -> Tensor:
+        moves: Tensor = self.head.decide(features)  # type: ignore[operator]
+        return moves
 
 
 @torch.no_grad()
@@ -123,7 +143,7 @@ def load_policy(run: Run, device: torch.device | str = "cpu") -> Actor:
     done, caddy = run.stage(POLICY, MODEL), load_video(run, device)
     own = caddy.config
     width, k, z = own.encoder[-1], own.actions, own.latent_dim
-    parts = DecodedPolicy.load(done, lambda: MovesHead(width, k, z), k + z, device)
+    parts = DecodedPolicy.load(done, lambda: MovesHead(width, k, z), k + z, 2 * width, device)
     return latent_actor(OnFrames(caddy.encoder, parts.policy), parts.action_decoder)
 
 

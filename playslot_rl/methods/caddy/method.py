@@ -22,7 +22,7 @@ from playslot_rl.config.roles import (
     role,
 )
 from playslot_rl.config.stage_spec import StageSpec
-from playslot_rl.config.stages import OptimConfig, StageConfig, clipped_stage
+from playslot_rl.config.stages import DECODING, OptimConfig, StageConfig, clipped_stage
 from playslot_rl.methods.video.method import VideoStageConfig
 
 
@@ -117,8 +117,8 @@ class CADDYOracleConfig(Checked):
 
 @dataclass(frozen=True)
 class CADDYPolicyConfig(CADDYOracleConfig):
-    """Schedule of CADDY's policy and of its action decoder, whose size is `model.action_decoder`; inputs and labels are
-    `behaviour`'s, as for PlaySlot.
+    """Schedule of CADDY's policy and of its action decoder, whose size is `model.action_decoder`; inputs, state, labels
+    and fine-tuning are `behaviour`'s, as for PlaySlot.
 
     Attributes:
         decoder_steps: optimiser steps of the action decoder.
@@ -141,10 +141,11 @@ _TRIMS: Final = ("behaviour.trim_pixels", "behaviour.trim_margin")
 POLICY: Final = StageSpec(
     "caddy_policy",
     keys=("model.action_decoder", "behaviour.loss", *_TRIMS, "baselines.caddy_policy.shift"),
-    settings=("behaviour.labelled_demos", "behaviour.decoder_inputs", "baselines.caddy_policy"),
+    settings=(*DECODING, "baselines.caddy_policy"),
     parents=("caddy",),
     data="demos",
     parts="playslot_rl.methods.caddy.behaviour:policy",
+    sizes="playslot_rl.methods.cloning:sizes",
     begun_names={
         "behaviour.trim_pixels": "trim_pixels",
         "behaviour.trim_margin": "trim_margin",

@@ -12,13 +12,13 @@ from playslot_rl.config.methods import Load, Method, Style
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import COUNT, NOT_NEGATIVE, OPEN_FRACTION, RATE, Checked, at_least, between, role, was
 from playslot_rl.config.stage_spec import StageSpec
-from playslot_rl.config.stages import StageConfig, clipped_stage
+from playslot_rl.config.stages import DECODING, StageConfig, clipped_stage
 
 
 @dataclass(frozen=True)
 class LAPOConfig(Checked):
-    """Sizes and schedule of LAPO. The action decoder's size is `model.action_decoder`, its inputs
-    `behaviour.decoder_inputs`, its labels `behaviour.labelled_demos`: as for PlaySlot.
+    """Sizes and schedule of LAPO. The action decoder's size is `model.action_decoder`; inputs, state, labels and
+    fine-tuning are `behaviour`'s, as for PlaySlot.
 
     Attributes:
         channels: of the convolutional encoders; each halves the resolution.
@@ -89,12 +89,12 @@ POLICY: Final = StageSpec(
         "baselines.lapo.targets", "baselines.lapo.shift",
     ),
     settings=(
-        "behaviour.labelled_demos", "behaviour.decoder_inputs", "baselines.lapo.policy", "baselines.lapo.decoder_steps",
-        "baselines.lapo.decoder_lr",
+        *DECODING, "baselines.lapo.policy", "baselines.lapo.decoder_steps", "baselines.lapo.decoder_lr",
     ),
     parents=("lapo_model",),
     data="demos",
     parts="playslot_rl.methods.lapo.training:policy",
+    sizes="playslot_rl.methods.cloning:sizes",
     begun_names={
         "model.action_decoder": "action_decoder",
         "behaviour.trim_pixels": "trim_pixels",

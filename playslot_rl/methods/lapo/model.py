@@ -73,7 +73,16 @@ class EncoderMLP(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(channels[-1] * side * side, hidden), nn.ReLU(), nn.Linear(hidden, out_dim))
 
     def forward(self, x: Tensor) -> Tensor:
-        out: Tensor = self.mlp(self.encoder(x)[-1].flatten(1))
+        return self.out(self.hidden(x))
+
+    def hidden(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to the hidden layer, (B, hidden), after its ReLU."""
+        h: Tensor = self.mlp[:2](self.encoder(x)[-1].flatten(1))
+        return h
+
+    def out(self, hidden: Tensor) -> Tensor:
+        """(B, hidden) to (B, out_dim)."""
+        out: Tensor = self.mlp[2](hidden)
         return out
 
 
@@ -144,13 +153,19 @@ class LAPOPolicy(nn.Module):
         self.network = EncoderMLP(3, config.channels, image_size, config.hidden, config.latent_dim)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        z: Tensor = self.network(normalise(pixels))
-        return z
+        return self.decide(self.features(pixels))
+
+    def features(self, observed: Tensor) -> Tensor:
+        """Frames to the hidden layer, as one slot (B, 1, hidden)."""
+        return self.network.hidden(normalise(observed))[:, None]
+
+    def decide(self, features: Tensor) -> Tensor:
+        return self.network.out(features[:, 0])
 
 
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a finished run; a CheckpointError where it is missing, damaged, or of another inverse model."""
     done = run.stage(NAME, MODEL.name)
     own, size = done.group(LAPOConfig, NAME), done.sizes[1].image_size
-    parts = DecodedPolicy.load(done, lambda: LAPOPolicy(own, size), own.latent_dim, device)
+    parts = DecodedPolicy.load(done, lambda: LAPOPolicy(own, size), own.latent_dim, own.hidden, device)
     return latent_actor(parts.policy, parts.action_decoder)

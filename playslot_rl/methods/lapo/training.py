@@ -31,7 +31,6 @@ from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.cloning import LatentCloning, cloning
 from playslot_rl.methods.lapo.method import NAME, LAPOConfig
 from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolicy
-from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
@@ -122,8 +121,7 @@ class LAPOBehaviour(LatentCloning):
         super().__init__(config, demos, device, self.own.shift, self.own.policy, self.own.loss)
         with global_seed(config.seed, 0, NAME):
             self.policy = LAPOPolicy(self.own, config.env.image_size).to(device)
-            width = self.own.latent_dim
-            self.decoder = ActionDecoder(config.model.action_decoder, width, config.env.action_dim).to(device)
+            self.decoder = self.new_decoder(self.own.latent_dim, self.own.hidden)
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
         return infer_latents(self.inverse, source, moves, self.device, self.own.targets == "quantised")

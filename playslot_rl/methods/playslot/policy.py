@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 from playslot_rl.config import BehaviourStageConfig, DynamicsStageConfig, ExperimentConfig, ModelConfig
 from playslot_rl.data.demonstrations import (
@@ -20,7 +21,7 @@ from playslot_rl.training.demonstrated import cloned, demonstration_views, polic
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord, Training
 from playslot_rl.training.stage import Stage
-from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage, cloning_settings
+from playslot_rl.training.stage_behaviour import CloneStage, FinetuneStage, after_cloning, cloning_settings
 from playslot_rl.world_model import Agent
 
 
@@ -56,17 +57,13 @@ def training(record: StageRecord) -> Training:
         clone = CloneStage(agent.policy, agent.oracle, demos, cloning, held_out, horizon)
         yield Part("policy", clone, cloning, group="behaviour")
         agent.eval()
-        if agent.action_decoder.reads_slots:
-            agent.action_decoder.trusts_slots.fill_(False)  # one demonstration cannot tell
-            trial = DecoderStage.trial(agent.action_decoder, agent.policy, demos, behaviour, horizon)
-            if trial is not None:
-                yield _part("decoder_trial", trial, behaviour, -(-behaviour.decoder_steps // 2), behaviour.decoder_lr)
-                agent.action_decoder.trusts_slots.fill_(trial.slots_pay())
-        decoder = DecoderStage(agent.action_decoder, agent.policy, demos, behaviour, held_out, horizon)
-        yield _part("decoder", decoder, behaviour, behaviour.decoder_steps, behaviour.decoder_lr)
-        if behaviour.finetune_steps and behaviour.labelled_demos >= behaviour.finetune_labels:
-            both = FinetuneStage(clone.stages["policy"], agent.action_decoder, demos, behaviour, held_out, horizon)
-            yield _part("finetune", both, behaviour, behaviour.finetune_steps, behaviour.finetune_lr)
+        decoder, given = agent.action_decoder, (held_out, horizon)
+
+        def finetune() -> FinetuneStage:
+            return FinetuneStage(clone.stages["policy"], decoder, demos, behaviour, *given)
+
+        part = partial(_part, behaviour)
+        yield from after_cloning(decoder, agent.policy, demos, behaviour, part, finetune, *given)
 
     said, extra = cloned("policy", split, len(demos.slots), behaviour.labelled_demos, len(views))
     return Training(
@@ -82,7 +79,7 @@ def training(record: StageRecord) -> Training:
     )
 
 
-def _part(name: str, stage: Stage, behaviour: BehaviourStageConfig, steps: int, lr: float) -> Part:
+def _part(behaviour: BehaviourStageConfig, name: str, stage: Stage, steps: int, lr: float) -> Part:
     own, group = replace(behaviour, steps=steps, optim=replace(behaviour.optim, lr=lr)), name.partition("_")[0]
     renamed = {"steps": f"behaviour.{group}_steps", "optim.lr": f"behaviour.{group}_lr"}
     return Part(name, stage, own, folder=name, group="behaviour", renamed=renamed)

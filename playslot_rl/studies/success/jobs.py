@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl.collectors.collection import collect_demos, collect_videos
-from playslot_rl.config import DataConfig, ExperimentConfig, from_dict, to_dict
+from playslot_rl.config import DataConfig, ExperimentConfig, from_dict, plugins, to_dict
 from playslot_rl.config.compose import is_pretrained
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.config.weights import data_roots
@@ -146,6 +146,9 @@ def success_record(job: SuccessJob, config: ExperimentConfig, parents: Mapping[s
     """What the job's file says: with its own config, and fingerprints of what it builds on, which name it."""
     result = computed(config)  # of data and parents the content counts
     result["baselines"] = result["baselines"].get(job.stage, {})  # another method's settings are none of this job's
+    method = METHODS[job.method]
+    if method.model and method.last.sizes:  # with what its decoder reads, which jobs from before could not
+        result["model"] = to_dict(plugins.call(method.last.sizes, config, config.model))
     if result["model"]["predictor"]["kind"] == "cocvp":
         del result["model"]["predictor"]["kind"]  # jobs from before there was a choice are the same jobs
     return {

@@ -24,6 +24,7 @@ from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.checkpoints import StageCheckpoint, save_stage
 from playslot_rl.training.stage import step_loss
+from playslot_rl.training.stage_regression import RegressionStage
 
 pytestmark = pytest.mark.integration
 
@@ -62,6 +63,16 @@ def split(source: EpisodeFrames) -> DemonstrationSplit:
 
 def behaviour(config: ExperimentConfig, finished: StageCheckpoint, source: EpisodeFrames) -> CADDYBehaviour:
     return CADDYBehaviour(config, finished, split(source), CPU)
+
+
+def decoder_stage(made: CADDYBehaviour, clone: RegressionStage) -> RegressionStage:
+    def part(name: str, stage: object, *_: float) -> object:
+        return name, stage
+
+    found = dict(made.decoding(clone, part, 4, 1e-3))  # type: ignore[arg-type]
+    assert set(found) == {"decoder", "finetune"}, "one demonstration cannot tell whether the state pays"
+    assert not made.decoder.acts_on_slots
+    return found["decoder"]  # type: ignore[index]
 
 
 def changed(source: EpisodeFrames, frame: int) -> EpisodeFrames:
@@ -138,7 +149,8 @@ def test_the_decoder_reads_the_labels_it_may_and_no_others(
     hidden[int(source.lengths[0]) :] = np.nan
     config = replace(config, behaviour=replace(config.behaviour, decoder_inputs=inputs))  # type: ignore[arg-type]
     made = [behaviour(config, finished, replace(source, actions=given)) for given in (source.actions, hidden)]
-    stages, policies = [one.decoder_stage() for one in made], [one.policy_stage() for one in made]
+    policies = [one.policy_stage() for one in made]
+    stages = [decoder_stage(one, clone) for one, clone in zip(made, policies, strict=True)]
     times = 2 if inputs == "both" else 1
     assert [len(stage.targets) for stage in stages] == [times * (int(source.lengths[0]) - 1)] * 2
     assert torch.equal(stages[0].targets, stages[1].targets)

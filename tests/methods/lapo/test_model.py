@@ -9,16 +9,20 @@ import pytest
 import torch
 from clips import moving_square
 
+from playslot_rl import keys
 from playslot_rl.acting.actor import latent_actor
-from playslot_rl.config import ActionDecoderConfig, OptimConfig, StageConfig
+from playslot_rl.config import ActionDecoderConfig, BehaviourStageConfig, OptimConfig, StageConfig
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import transitions
+from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.lapo.method import LAPOConfig
 from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolicy
 from playslot_rl.methods.lapo.training import LAPOModelStage, infer_latents
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.training.stage import step_loss
+from playslot_rl.training.stage_behaviour import JointStage
+from playslot_rl.training.stage_regression import FrameInputs, RegressionStage, TakenInputs
 
 CONFIG = LAPOConfig(channels=(8, 16), hidden=32, groups=2, code_dim=4, codes=4)
 
@@ -120,13 +124,38 @@ def test_latents_of_transitions_are_in_the_order_of_their_rows(models: tuple[Inv
     assert not torch.allclose(before, latents)
 
 
-def test_the_actor_decodes_the_policys_latent() -> None:
-    from playslot_rl import keys
-
+def test_the_actor_decodes_the_policys_latent_and_what_it_saw() -> None:
     torch.manual_seed(0)
     config = replace(CONFIG, channels=(4, 4))
-    policy, decoder = LAPOPolicy(config, 32), ActionDecoder(ActionDecoderConfig(8), config.latent_dim, 4)
-    actor = latent_actor(policy, decoder)
+    sizes = ActionDecoderConfig(8, state_dim=8, state_layers=1, state_heads=2)
     pixels = torch.randint(256, (3, 3, 32, 32), dtype=torch.uint8)
-    out = actor(actor.reset([1, 2, 3]).set(keys.PIXELS, pixels))
-    torch.testing.assert_close(out[keys.ACTION], decoder(policy(pixels.float() / 255)))
+    for reads in (False, True):
+        policy = LAPOPolicy(config, 32)
+        decoder = ActionDecoder(replace(sizes, reads_slots=reads), config.latent_dim, 4, config.hidden).eval()
+        actor = latent_actor(policy, decoder)
+        out = actor(actor.reset([1, 2, 3]).set(keys.PIXELS, pixels))
+        seen = policy.features(pixels.float() / 255)
+        assert seen.shape == (3, 1, config.hidden)
+        torch.testing.assert_close(out[keys.ACTION], decoder(policy(pixels.float() / 255), seen if reads else None))
+        if reads:
+            assert not torch.allclose(out[keys.ACTION], decoder(policy(pixels)))
+
+
+def test_fine_tuning_shows_labelled_rows_their_actions_and_goes_on_cloning_all() -> None:
+    torch.manual_seed(0)
+    source = moving_square()
+    moves = transitions(source)
+    frames, labelled = FrameInputs(source, moves.rows, "cpu"), torch.tensor([3, 8, 9])
+    policy, decoder = LAPOPolicy(CONFIG, 32), ActionDecoder(ActionDecoderConfig(8), CONFIG.latent_dim, 2, CONFIG.hidden)
+    criterion = BehaviourLoss(policy)
+    criterion.set_keys(observation=keys.PIXELS)
+    clone = RegressionStage("policy", criterion, frames, torch.randn(len(moves.rows), CONFIG.latent_dim), 64)
+    shown = TakenInputs(frames, labelled), torch.randn(3, 2)
+    stage = JointStage(clone, decoder, shown, None, BehaviourStageConfig(batch_size=64))
+    batch = stage.batch(0, StepGenerators(0, 0))
+    acted = {tuple(frame.flatten().tolist()) for frame in batch["acting/pixels"]}
+    assert acted == {tuple(frame.flatten().tolist()) for frame in source.pixels(moves.rows[labelled.numpy()])}
+    assert len(batch["cloning/pixels"].flatten(1).unique(dim=0)) > 3
+    stage.loss(batch, 0, StepGenerators(0, 0))["action"].backward()
+    for network in (policy.network.encoder, decoder):
+        assert any(bool(p.grad.abs().sum() > 0) for p in network.parameters() if p.grad is not None)
