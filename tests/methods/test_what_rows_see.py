@@ -71,6 +71,20 @@ def test_videos_are_seen_where_a_model_of_them_is_built_on(name: str) -> None:
     assert TABLE[name].videos == (method.slots or method.model is not None)
 
 
+DECODES = [name for name in TABLE if METHODS[name].decodes and METHODS[name].config is not None]
+
+
+@pytest.mark.parametrize("preset", ["compact", "paper"])
+@pytest.mark.parametrize("env", ["button_press", "block_push_easy", "block_push", "block_reach", "block_pick"])
+def test_policy_and_decoder_see_as_many_samples_as_playslots(env: str, preset: str) -> None:
+    config = compose([f"env={env}", f"preset={preset}"])
+    own = config.behaviour
+    for name in DECODES:
+        rival = getattr(config.baselines, name)
+        assert rival.policy.steps * rival.policy.batch_size >= own.steps * own.batch_size, name
+        assert rival.decoder_steps * rival.policy.batch_size >= own.decoder_steps * own.batch_size, name
+
+
 class Trainings:
     """Smoke trainings on eight demonstrations, some of whose actions are others."""
 
