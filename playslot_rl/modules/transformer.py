@@ -12,6 +12,8 @@ And the [ACT] transformer of InvDyn_S and of the latent policy:
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -46,21 +48,30 @@ def products(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Ten
 
 
 class TransformerBlock(nn.Module):
-    """One pre-norm block with a GELU; SAVi's transition has no output projection: there heads * head_dim = dim."""
+    """One pre-norm block; SAVi's transition has no output projection: there heads * head_dim = dim."""
 
-    def __init__(self, dim: int, heads: int, head_dim: int, mlp_dim: int, project_out: bool = True) -> None:
+    def __init__(
+        self,
+        dim: int,
+        heads: int,
+        head_dim: int,
+        mlp_dim: int,
+        project_out: bool = True,
+        norm: Callable[[int], nn.Module] = nn.LayerNorm,
+        activation: Callable[[], nn.Module] = nn.GELU,
+    ) -> None:
         super().__init__()
         inner = heads * head_dim
         if not project_out and inner != dim:
             raise ValueError(f"project_out=False: got heads * head_dim = {inner}, expected dim = {dim}")
         self.heads, self.head_dim = heads, head_dim
-        self.norm_attention = nn.LayerNorm(dim)
+        self.norm_attention = norm(dim)
         self.to_q = nn.Linear(dim, inner, bias=False)
         self.to_k = nn.Linear(dim, inner, bias=False)
         self.to_v = nn.Linear(dim, inner, bias=False)
         self.to_out: nn.Module = nn.Linear(inner, dim) if project_out else nn.Identity()
-        self.norm_mlp = nn.LayerNorm(dim)
-        self.mlp = nn.Sequential(nn.Linear(dim, mlp_dim), nn.GELU(), nn.Linear(mlp_dim, dim))
+        self.norm_mlp = norm(dim)
+        self.mlp = nn.Sequential(nn.Linear(dim, mlp_dim), activation(), nn.Linear(mlp_dim, dim))
 
     def forward(
         self,

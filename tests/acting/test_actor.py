@@ -63,11 +63,12 @@ def dreamer() -> Actor:
 
 
 def sold() -> Actor:
-    from playslot_rl.methods.sold.networks import SOLDActor, SOLDNetworks
+    from playslot_rl.methods.sold.acting import SOLDActor
+    from playslot_rl.methods.sold.networks import SOLDNetworks
 
     config = compose(["preset=smoke"]).baselines.sold
     savi = agent().world_model.savi
-    return SOLDActor(savi, SOLDNetworks(config, savi.config.slot_dim, 4, 5).actor, window=2, action_dim=4)
+    return SOLDActor(savi, SOLDNetworks(config, savi.config.slot_dim, 4, 5).actor, frames=2, action_dim=4)
 
 
 def performance(seeds: Sequence[int]) -> tuple[torch.Tensor, torch.Tensor]:

@@ -17,8 +17,9 @@ from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import CheckpointError, ConfigError, TrainingError
+from playslot_rl.methods.sold.acting import load_actor
 from playslot_rl.methods.sold.learner import SOLDLearner
-from playslot_rl.methods.sold.networks import load_actor, prior_steps
+from playslot_rl.methods.sold.networks import prior_steps
 from playslot_rl.methods.training import train
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runs import Run
@@ -161,6 +162,18 @@ def test_another_savi_than_it_was_trained_on_is_refused(trained: Path, tmp_path:
         train(_config(other, run))
 
 
+def test_networks_of_an_earlier_form_are_refused(trained: Path, world: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    path = run / "sold" / "checkpoint" / "config.json"
+    stored = json.loads(path.read_text())
+    del stored["sold"]["slow_weight"]
+    path.write_text(json.dumps(stored))
+    with pytest.raises(CheckpointError, match=r"networks of an earlier form .* run train-baseline method=sold with an"):
+        load_actor(Run(run))
+    with pytest.raises(CheckpointError, match=r"baselines.sold.slow_weight: got 0.1, expected nothing"):
+        train(_config(world, run))
+
+
 def test_a_world_without_slots_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(CheckpointError, match="no slots checkpoint"):
@@ -198,6 +211,7 @@ def test_savis_data_are_counted_from_the_config_the_checkpoint_or_its_episodes(w
         ("sequence=2", "sequence: got 2, expected 0, or more than"),
         ("gamma=1.5", r"gamma: got 1.5, expected a number in \[0, 1\]"),
         ("horizon=0", "horizon: got 0, expected at least 1"),
+        ("least_context=3", "least_context: got 3, expected at most baselines.sold.context=2"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(override: str, message: str) -> None:

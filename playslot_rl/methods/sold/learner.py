@@ -21,24 +21,27 @@ from playslot_rl import keys
 from playslot_rl.frames import normalise
 from playslot_rl.methods.online.loop import OnlineTraining
 from playslot_rl.methods.sold import losses
+from playslot_rl.methods.sold.acting import SOLDActor
 from playslot_rl.methods.sold.method import SOLDConfig
-from playslot_rl.methods.sold.networks import SOLDActor, SOLDNetworks, build_networks, prior_steps
+from playslot_rl.methods.sold.networks import SOLDNetworks, build_networks, prior_steps
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.training.record import StageRecord
 
 
 class SOLDLearner:
-    """SOLD as `playslot_rl.methods.online.acting.Learner`; SAVi is frozen, in evaluation mode."""
+    """SOLD as `playslot_rl.methods.online.acting.Learner`; SAVi is frozen, in evaluation mode. `frames` are those of an
+    episode.
+    """
 
-    def __init__(self, savi: SAVi, networks: SOLDNetworks, config: SOLDConfig, action_dim: int) -> None:
+    def __init__(self, savi: SAVi, networks: SOLDNetworks, config: SOLDConfig, action_dim: int, frames: int) -> None:
         self.savi, self.networks, self.config = savi, networks, config
         self.slow_critic = copy.deepcopy(networks.critic).requires_grad_(False)
         self.mean_actor = copy.deepcopy(networks.actor).requires_grad_(False)
         # The average of the returns' 5-95 percentile range; it starts at zero, as in DreamerV3.
         self.returns = PercentileValueNorm(rate=config.return_rate, min_scale=1.0).to(next(savi.parameters()).device)
-        self.exploring = SOLDActor(savi, networks.actor, config.context, action_dim)
-        self.acting = SOLDActor(savi, self.mean_actor, config.context, action_dim)
+        self.exploring = SOLDActor(savi, networks.actor, frames, action_dim)
+        self.acting = SOLDActor(savi, self.mean_actor, frames, action_dim)
         self.stored: tuple[str, ...] = (keys.SLOTS,) if config.image_weight == 0 else (keys.SLOTS, keys.PIXELS)
         rates = {"actor": config.actor_lr, "critic": config.critic_lr}
         self._adam = {
@@ -77,48 +80,47 @@ class SOLDLearner:
         return metrics
 
     def _model(self, batch: TensorDict, generators: StepGenerators) -> dict[str, Tensor]:
-        """Section 3.2: the autoregressive rollout from C frames, and the reward on parsed and on predicted slots.
+        """Section 3.2: the autoregressive rollout from C frames, and the reward on parsed slots.
 
-        Note: the reward's targets are the same on both; it is asked about predicted slots in imagination.
+        Note: with `predicted_rewards` on predicted slots as well, of the same targets.
         """
         batch, c = self._window(batch, generators)
         slots, is_first = batch[keys.SLOTS], batch[keys.IS_FIRST].squeeze(-1)
         valid = losses.same_episode(is_first)
-        predicted = self.networks.dynamics.rollout(slots[:, :c], batch[keys.ACTION][:, 1:])
-        slot = losses.slot_loss(predicted, slots[:, 1:], valid[:, 1:])
+        predicted = self.networks.dynamics.rollout(slots[:, :c], batch[keys.ACTION][:, 1:])[:, c - 1 :]
+        slot = losses.slot_loss(predicted, slots[:, c:], valid[:, c:])
         still = losses.slot_loss(slots[:, c - 1 : c].expand_as(slots[:, c:]), slots[:, c:], valid[:, c:])
-        ahead = losses.slot_loss(predicted[:, c - 1 :], slots[:, c:], valid[:, c:])
-        metrics = {"slot_mse": slot.detach(), "unexplained": ahead.detach() / still.clamp(min=1e-12)}
+        metrics = {"slot_mse": slot.detach(), "unexplained": slot.detach() / still.clamp(min=1e-12)}
         loss = self.config.slot_weight * slot
         if self.config.image_weight > 0:
-            image = self._image_loss(predicted, batch[keys.PIXELS][:, 1:], valid[:, 1:], generators)
+            image = self._image_loss(predicted, batch[keys.PIXELS][:, c:], valid[:, c:], generators)
             loss, metrics["image_mse"] = loss + self.config.image_weight * image, image.detach()
         metrics["dynamics_grad_norm"] = self._step("dynamics", loss)
 
-        imagined = torch.cat((slots[:, :c], predicted[:, c - 1 :]), dim=1).detach()
-        head, arrived = self.networks.reward, valid & ~is_first
-        entropy = head.cross_entropy(head(torch.cat((slots, imagined))), batch[keys.REWARD].squeeze(-1).repeat(2, 1))
-        reward = losses.masked_mean(entropy, arrived.repeat(2, 1))
+        head, seen = self.networks.reward, [slots]
+        if self.config.predicted_rewards:
+            seen.append(torch.cat((slots[:, :c], predicted), dim=1).detach())
+        targets, arrived = batch[keys.REWARD].squeeze(-1).repeat(len(seen), 1), (valid & ~is_first)
+        entropy = head.cross_entropy(head(torch.cat(seen)), targets)
+        reward = losses.masked_mean(entropy, arrived.repeat(len(seen), 1))
         return metrics | {"loss_reward": reward.detach(), "reward_grad_norm": self._step("reward", reward)}
 
     def _window(self, batch: TensorDict, generators: StepGenerators) -> tuple[TensorDict, int]:
-        """A window of C + H frames of each sequence (all of it, where it is shorter), and the frames c it starts from.
-
-        Note: c is drawn from 1 to C, as for imagination, which asks both networks about no other rollouts.
+        """A window of C + H frames of each sequence (all of it, where it is shorter), and the frames c it starts
+        from.
         """
-        draw = generators.torch("window", "cpu")
-        b, t = batch.batch_size
+        (b, t), device = batch.batch_size, torch.device(generators.device)
         frames = min(t, self.config.context + self.config.horizon)
-        first = torch.randint(t - frames + 1, (b, 1), generator=draw)
-        c = int(torch.randint(1, min(self.config.context, frames - 1) + 1, (), generator=draw))
-        window = first + torch.arange(frames)
-        return batch[torch.arange(b)[:, None], window.to(batch.device or "cpu")], c
+        first = torch.randint(t - frames + 1, (b, 1), generator=generators.torch("window"), device=device)
+        row = torch.arange(b, device=device)[:, None]
+        window = batch[row, first + torch.arange(frames, device=device)]
+        return window, self._context(generators, "context", frames - 1)
 
     def _image_loss(self, predicted: Tensor, pixels: Tensor, valid: Tensor, generators: StepGenerators) -> Tensor:
         """Mean squared error of decoded frames, through the frozen decoder."""
         count, frames = self.config.decoded_frames, predicted.shape[1]
         if 0 < count < frames:
-            picked = torch.randperm(frames, generator=generators.torch("decoded", "cpu"))[:count].to(predicted.device)
+            picked = torch.randperm(frames, generator=generators.torch("decoded"), device=predicted.device)[:count]
             predicted, pixels, valid = predicted[:, picked], pixels[:, picked], valid[:, picked]
         decoded = self.savi.decode(predicted).frames
         return losses.masked_mean((decoded - normalise(pixels)).square().mean(dim=(-3, -2, -1)), valid)
@@ -129,9 +131,7 @@ class SOLDLearner:
         context, actions = self._starts(batch, generators)
         frames = context.shape[1]
         noise = generators.torch("imagination")
-        imagined = losses.imagine(
-            networks.dynamics, networks.actor, context, actions, config.horizon, config.context, noise
-        )
+        imagined = losses.imagine(networks.dynamics, networks.actor, context, actions, config.horizon, noise)
         logits = networks.critic(imagined.slots)[:, frames - 1 :]
         values = networks.critic.decode(logits)
         rewards = networks.reward.decode(networks.reward(imagined.slots)[:, frames:])
@@ -143,7 +143,7 @@ class SOLDLearner:
         )
         with torch.no_grad():
             slow = self.slow_critic.decode(self.slow_critic(imagined.slots[:, :-1])[:, frames - 1 :])
-        value = losses.value_loss(networks.critic, logits[:, :-1], returns, slow, weights)
+        value = losses.value_loss(networks.critic, logits[:, :-1], returns, slow, weights, config.slow_weight)
         # Actor and critic share the critic's forward pass, so it is kept until both gradients are taken.
         norms = {
             "actor_grad_norm": self._step("actor", actor, keep=True),
@@ -160,25 +160,32 @@ class SOLDLearner:
             "action_size": imagined.locations.abs().mean(),
         }
 
+    def _context(self, generators: StepGenerators, stream: str, most: int) -> int:
+        """Frames c that rollouts start from.
+
+        Note: the source always takes C, as `least_context` has it by default. An episode's first C - 1 decisions are
+        then made on a history shorter than any that the actor learned on.
+        """
+        most = min(self.config.context, most)
+        return int(generators.numpy(stream).integers(min(self.config.least_context, most), most + 1))
+
     def _starts(self, batch: TensorDict, generators: StepGenerators) -> tuple[Tensor, Tensor]:
         """Windows (R, c, N, D) of one episode each, and the actions (R, c - 1, A) between their frames.
 
-        Note: c is drawn from 1 to C. The source starts from C frames always, but an episode's first decisions are made
-        from one frame and from two.
+        Note: drawn from all of the batch. The source takes the first C frames of each sequence, of which an episode has
+        none among its last H.
         """
-        draw = generators.torch("starts", "cpu")
-        c = int(torch.randint(1, self.config.context + 1, (), generator=draw))
-        slots, actions = batch[keys.SLOTS], batch[keys.ACTION]
         first = batch[keys.IS_FIRST].squeeze(-1)
+        t = first.shape[1]
+        c = self._context(generators, "starts", t)
         ends = torch.ones_like(first)
         ends[:, : c - 1] = False
         for back in range(c - 1):  # no frame of the window but its first may start an episode
-            ends[:, back:] &= ~first[:, : first.shape[1] - back]
-        row, end = ends.nonzero(as_tuple=True)
-        picked = torch.randint(len(row), (self.config.starts,), generator=draw).to(row.device)
-        row, first_frame = row[picked, None], (end[picked] - c + 1)[:, None]
-        steps = torch.arange(c, device=row.device)
-        return slots[row, first_frame + steps], actions[row, first_frame + steps[1:]]
+            ends[:, back:] &= ~first[:, : t - back]
+        draw = generators.torch("start_frames")
+        picked = torch.multinomial(ends.flatten().float(), self.config.starts, replacement=True, generator=draw)
+        row, frames = picked[:, None] // t, picked[:, None] % t - c + 1 + torch.arange(c, device=picked.device)
+        return batch[keys.SLOTS][row, frames], batch[keys.ACTION][row, frames[:, 1:]]
 
     def _step(self, name: str, loss: Tensor, keep: bool = False) -> Tensor:
         """Move one network by a loss; its gradient's norm before clipping. `keep` leaves the graph for another loss."""
@@ -186,10 +193,9 @@ class SOLDLearner:
         gradients = torch.autograd.grad(loss, parameters, retain_graph=keep)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
-        norm: Tensor = nn.utils.clip_grad_norm_(parameters, self.config.grad_clip)
-        # A step along a gradient that is not finite would spoil every weight; the loop stops at the number.
-        if bool(norm.isfinite()):
-            self._adam[name].step()
+        clip = self.config.dynamics_clip if name == "dynamics" else self.config.grad_clip
+        norm: Tensor = nn.utils.clip_grad_norm_(parameters, clip)
+        self._adam[name].step()  # one that is not finite spoils the weights, and the loop stops at the norm
         return norm.detach()
 
     @torch.no_grad()
@@ -210,5 +216,6 @@ def training(record: StageRecord) -> OnlineTraining:
     before = prior_steps(own, slots)
     with global_seed(config.seed, 0, record.name):
         networks = build_networks(own, slots, config.env.action_dim, config.env.max_steps).to(record.device)
-    learner = SOLDLearner(record.world.load_savi(record.device), networks, own, config.env.action_dim)
+    savi = record.world.load_savi(record.device)
+    learner = SOLDLearner(savi, networks, own, config.env.action_dim, config.env.max_steps + 1)
     return OnlineTraining(learner, own, dict(learner.trained), before)

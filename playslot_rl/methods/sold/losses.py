@@ -3,6 +3,8 @@ returns and critic).
 
     a_t ~ pi(. | sg(S_1, ..., S_t)),   S_{t+1} = dynamics(S_1, ..., S_t, a_1, ..., a_t)
 
+Note: the source's actor learns from all returns but the last one. That with `reinforce` has the wrong sign there.
+
 Shapes: B sequences of T frames or rollouts, C context frames, H imagined steps, N slots, D slot width, A action width,
 K bins.
 """
@@ -13,7 +15,7 @@ from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
-from torchrl.modules import TruncatedNormal
+from torch.distributions import Normal
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 from playslot_rl.methods.sold.networks import ActorHead, ScalarHead, sample_action
@@ -25,9 +27,9 @@ class Imagined(NamedTuple):
 
     Attributes:
         slots: (B, C + H, N, D); the context, then what follows from the actions. Differentiable in the actions.
-        actions: (B, H, A) in [-1, 1], reparameterised.
+        actions: (B, H, A), reparameterised, not clamped.
         log_probs, entropies: (B, H), summed over A; those of the actions as constants.
-        locations: (B, H, A), the modes of the actions' distributions, as constants.
+        locations: (B, H, A), the means of the actions' distributions, as constants.
     """
 
     slots: Tensor
@@ -43,31 +45,32 @@ def imagine(
     context: Tensor,
     actions: Tensor,
     horizon: int,
-    window: int,
     generator: torch.Generator | None = None,
 ) -> Imagined:
     """Unfold H steps from the last frame of parsed slots (B, C, N, D), between which `actions` (B, C - 1, A) were
     taken.
 
     The actor reads slots without their gradient (as in Dreamer): an action is judged by what the dynamics make of it.
-    It sees as many frames as it does when it acts, the last `window`, not all that were imagined so far.
+    It sees all frames so far, by the keys and values of those before: a step costs one step.
     """
     memory = None
     if context.shape[1] > 1:
         with torch.no_grad():  # no action that is judged leads there
             _, memory = dynamics.step(context[:, :-1], actions)
     frames, chosen, log_probs, entropies, locations = [context], [], [], [], []
-    current = context[:, -1:]
+    current, new, past = context[:, -1:], context, None
     for _ in range(horizon):
-        location, std, _past = actor(torch.cat(frames, dim=1)[:, -window:].detach())
-        distribution = TruncatedNormal(location[:, -1:], std[:, -1:])
-        action = sample_action(distribution, generator)
-        current, memory = dynamics.step(current, action, past=memory)
-        frames.append(current)
+        mean, std, past = actor(new.detach(), past)
+        mean, std = mean[:, -1:], std[:, -1:]
+        action = sample_action(mean, std, generator)
+        distribution = Normal(mean, std, validate_args=False)  # what is validated is waited for
+        new, memory = dynamics.step(current, action, past=memory)
+        current = new
+        frames.append(new)
         chosen.append(action)
-        log_probs.append(distribution.log_prob(action.detach()))
-        entropies.append(distribution.base_dist.entropy().sum(dim=-1))
-        locations.append(location[:, -1:].detach())
+        log_probs.append(distribution.log_prob(action.detach()).sum(dim=-1))
+        entropies.append(distribution.entropy().sum(dim=-1))
+        locations.append(mean.detach())
     return Imagined(*(torch.cat(parts, dim=1) for parts in (frames, chosen, log_probs, entropies, locations)))
 
 
@@ -125,8 +128,11 @@ def actor_loss(
     return -(weights * (objective + entropy * imagined.entropies)).mean()
 
 
-def value_loss(head: ScalarHead, logits: Tensor, returns: Tensor, slow: Tensor, weights: Tensor) -> Tensor:
-    """Cross entropy of the critic's logits (B, H, K) and its two targets of equal weight (DreamerV3), the returns and
-    what the slow critic says, each (B, H) and without gradient, weighed by w (H,).
+def value_loss(
+    head: ScalarHead, logits: Tensor, returns: Tensor, slow: Tensor, weights: Tensor, slow_weight: float
+) -> Tensor:
+    """Cross entropy of the critic's logits (B, H, K) and the returns (B, H), and `slow_weight` times that with what the
+    slow critic says (B, H), both without gradient, weighed by w (H,).
     """
-    return (weights * (head.cross_entropy(logits, returns) + head.cross_entropy(logits, slow))).mean()
+    to_slow = head.cross_entropy(logits, slow)
+    return (weights * (head.cross_entropy(logits, returns) + slow_weight * to_slow)).mean()

@@ -17,7 +17,8 @@ from playslot_rl.testing import tiny_config
 
 SIZES = {
     "batch_size": 3, "sequence": 6, "dim": 16, "heads": 2, "mlp_dim": 16, "dynamics_layers": 1, "head_layers": 1,
-    "bins": 41, "context": 3, "horizon": 3, "starts": 7, "image_weight": 0.0,
+    "bins": 41, "context": 3, "least_context": 1, "horizon": 3, "starts": 7, "image_weight": 0.0, "dynamics_clip": 10.0,
+    "predicted_rewards": True,
 }  # fmt: skip
 
 
@@ -25,7 +26,7 @@ SIZES = {
 def make_learner() -> Callable[..., SOLDLearner]:
     """Makes learners of equal weights; `spread` gives those weights that start at zero other values."""
 
-    def make(spread: bool = True, **changes: object) -> SOLDLearner:
+    def make(spread: bool = True, frames: int = 6, **changes: object) -> SOLDLearner:
         config = SOLDConfig(**{**SIZES, **changes})
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
@@ -34,7 +35,7 @@ def make_learner() -> Callable[..., SOLDLearner]:
             if spread:
                 for layer in (networks.dynamics.head, networks.reward.out, networks.critic.out):
                     torch.nn.init.normal_(layer.weight, std=0.1)
-        return SOLDLearner(savi, networks, config, 4)
+        return SOLDLearner(savi, networks, config, 4, frames)
 
     return make
 

@@ -1,4 +1,4 @@
-"""SOLD acting frame by frame: the same as its actor on the whole past."""
+"""SOLD acting frame by frame: the same as its actor in training, on the whole episode."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import torch
 from tensordict import TensorDict
 
 from playslot_rl import keys
+from playslot_rl.methods.sold.acting import SOLDActor
 from playslot_rl.methods.sold.learner import SOLDLearner
-from playslot_rl.methods.sold.networks import SOLDActor
+from playslot_rl.methods.sold.losses import imagine
 
 Make = Callable[..., SOLDLearner]
 
@@ -28,25 +29,50 @@ def _play(acting: SOLDActor, frames: torch.Tensor, **options: object) -> TensorD
     return torch.stack(seen, 1)
 
 
-def test_frame_by_frame_equals_the_whole_clip_seen_through_its_window(make_learner: Make) -> None:
-    acting = make_learner().acting.eval()
-    frames = _frames(5)
-    played = _play(acting, frames)
-    with torch.no_grad():
-        slots, _ = acting.savi(frames.float() / 255)
-        windows = [slots[:, max(0, t + 1 - acting.window) : t + 1] for t in range(5)]
-        location = torch.stack([acting.actor(window)[0][:, -1] for window in windows], dim=1)
-    torch.testing.assert_close(played[keys.SLOTS], slots)
-    torch.testing.assert_close(played[keys.ACTION], location)
-
-
-def test_past_the_window_the_actor_sees_its_last_frames(make_learner: Make) -> None:
+@torch.no_grad()
+def test_at_every_step_of_an_episode_the_actor_says_what_it_says_in_training(make_learner: Make) -> None:
+    """In one pass over the episode, and frame by frame in imagination: on the same history the same action."""
     learner = make_learner()
-    acting = SOLDActor(learner.savi, learner.networks.actor, window=3, action_dim=4).eval()
-    played = _play(acting, _frames(5))
-    with torch.no_grad():
-        location, _, _ = acting.actor(played[keys.SLOTS][:, 2:5])
-    torch.testing.assert_close(played[keys.ACTION][:, 4], location[:, 2])
+    acting = learner.acting.eval()
+    played = _play(acting, _frames(6))
+    slots, _ = acting.savi(_frames(6).float() / 255)
+    torch.testing.assert_close(played[keys.SLOTS], slots)
+    torch.testing.assert_close(played[keys.ACTION], acting.actor(slots)[0])
+
+    class Replayed:
+        """Dynamics that say what came."""
+
+        def step(self, given: torch.Tensor, actions: torch.Tensor, past: int | None = None) -> object:
+            seen = (past or 0) + given.shape[1]
+            return slots[:, seen : seen + 1], seen
+
+    imagined = imagine(Replayed(), acting.actor, slots[:, :2], torch.zeros(2, 1, 4), 4)  # type: ignore[arg-type]
+    torch.testing.assert_close(imagined.locations, played[keys.ACTION][:, 1:5])
+
+
+@torch.no_grad()
+def test_an_action_depends_on_all_frames_so_far_and_on_no_later_one(make_learner: Make) -> None:
+    acting = make_learner().acting.eval()
+    acting.actor.out.weight.mul_(100)
+    frames = _frames(6)
+    whole = _play(acting, frames)[keys.ACTION]
+    for changed in range(6):
+        other = frames.clone()
+        other[:, changed] = 255 - other[:, changed]
+        moved = (_play(acting, other)[keys.ACTION] - whole).abs().amax(dim=(0, 2))
+        assert (moved[:changed] == 0).all()
+        assert (moved[changed:] > 0).all()
+
+
+@torch.no_grad()
+def test_of_longer_episodes_the_last_frames_are_seen(make_learner: Make) -> None:
+    """With one layer keys and values are of single frames: then this is the actor on the last of them alone."""
+    learner = make_learner()
+    acting = SOLDActor(learner.savi, learner.networks.actor, frames=3, action_dim=4).eval()
+    played = _play(acting, _frames(8))
+    for t in range(8):
+        mean, _, _ = acting.actor(played[keys.SLOTS][:, max(0, t - 2) : t + 1])
+        torch.testing.assert_close(played[keys.ACTION][:, t], mean[:, -1])
 
 
 @torch.no_grad()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from playslot_rl.methods.sold.networks import SlotAggregation, alibi_bias, alibi_slopes
+from playslot_rl.methods.sold.aggregation import SlotAggregation, alibi_bias, alibi_slopes
 
 
 @pytest.fixture
@@ -14,19 +14,19 @@ def model() -> SlotAggregation:
     return SlotAggregation(slot_dim=6, dim=16, layers=2, heads=4, mlp_dim=32)
 
 
-def test_slopes_are_the_geometric_sequence_of_the_alibi_paper() -> None:
-    assert alibi_slopes(8).tolist() == [2.0**-k for k in range(1, 9)]
-    assert alibi_slopes(4).tolist() == [2.0**-2, 2.0**-4, 2.0**-6, 2.0**-8]
+def test_slopes_are_the_geometric_sequence_of_the_source() -> None:
+    torch.testing.assert_close(alibi_slopes(8), torch.tensor([2.0 ** (-k / 2) for k in range(1, 9)]))
+    assert alibi_slopes(4).tolist() == [2.0**-1, 2.0**-2, 2.0**-3, 2.0**-4]
 
 
-def test_the_bias_counts_steps_not_tokens_and_hides_later_steps() -> None:
-    bias = alibi_bias(torch.tensor([0.5]), new=2, past=1, tokens=2)[0]
+def test_the_bias_counts_steps_not_tokens_and_hides_later_steps_and_earlier_outputs() -> None:
+    bias = alibi_bias(torch.tensor([0.5]), new=2, past=1, slots=1)[0]
     inf = float("inf")
     assert bias.tolist() == [
-        [-0.5, -0.5, 0.0, 0.0, -inf, -inf],
-        [-0.5, -0.5, 0.0, 0.0, -inf, -inf],
-        [-1.0, -1.0, -0.5, -0.5, 0.0, 0.0],
-        [-1.0, -1.0, -0.5, -0.5, 0.0, 0.0],
+        [-0.5, 0.0, 0.0, -inf, -inf],
+        [-0.5, 0.0, 0.0, -inf, -inf],
+        [-1.0, -0.5, -inf, 0.0, 0.0],
+        [-1.0, -0.5, -inf, 0.0, 0.0],
     ]
 
 
@@ -63,10 +63,30 @@ def test_step_by_step_with_kept_keys_equals_one_pass(model: SlotAggregation) -> 
     torch.testing.assert_close(torch.cat(parts, dim=1), whole)
 
 
-def test_only_distances_matter_so_a_window_may_slide(model: SlotAggregation) -> None:
-    """With one layer, what lies before the window is all that is missing; its own frames look the same."""
-    shifted = alibi_bias(model.slopes, new=3, past=4, tokens=2)[:, :, 8:]
-    assert torch.equal(shifted, alibi_bias(model.slopes, new=3, past=0, tokens=2))
+@torch.no_grad()
+def test_frame_by_frame_with_episodes_of_any_age_equals_one_pass(model: SlotAggregation) -> None:
+    slots, ages = torch.randn(3, 7, 4, 6), torch.tensor([0, 2, 5])
+    whole, _ = model(slots)
+    kept = model.blank(3, 7, 4)
+    for t in range(5):  # the others are ahead
+        ahead = ages > t
+        kept[ahead] = model.step(slots[ahead, t], kept[ahead], torch.full((int(ahead.sum()),), t))[1]
+    for t in range(2):
+        summary, kept = model.step(slots[torch.arange(3), ages + t], kept, ages + t)
+        torch.testing.assert_close(summary, whole[torch.arange(3), ages + t])
+
+
+def test_kept_keys_and_values_carry_the_gradient_of_one_pass(model: SlotAggregation) -> None:
+    slots = torch.randn(2, 5, 3, 6)
+    whole, _ = model(slots)
+    first, past = model(slots[:, :2])
+    rest, _ = model(slots[:, 2:], past)
+    for parameter in model.parameters():
+        wanted, got = (
+            torch.autograd.grad(each[:, -1].sum(), parameter, retain_graph=True)[0] for each in (whole, rest)
+        )
+        torch.testing.assert_close(got, wanted, atol=1e-5, rtol=1e-4)
+    assert first.shape == (2, 2, 16)
 
 
 def test_heads_that_do_not_divide_the_width_are_refused() -> None:

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import Tensor
-from torchrl.modules import TruncatedNormal
+from torch.distributions import Normal
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from playslot_rl import keys
 from playslot_rl.methods.sold import losses
@@ -103,7 +103,7 @@ def test_the_last_weights_explore_and_their_average_is_evaluated(make_learner: M
     slots = learner.act(memory, torch.Generator().manual_seed(0), explore=False)[keys.SLOTS].unsqueeze(1)
     best, _, _ = learner.mean_actor(slots)
     location, std, _ = learner.networks.actor(slots)
-    sampled = sample_action(TruncatedNormal(location[:, 0], std[:, 0]), torch.Generator().manual_seed(0))
+    sampled = sample_action(location[:, 0], std[:, 0], torch.Generator().manual_seed(0)).clamp(-1, 1)
     for explore, expected in ((False, best[:, 0]), (True, sampled)):
         seen = learner.act(memory, torch.Generator().manual_seed(0), explore)
         torch.testing.assert_close(seen[keys.ACTION], expected)
@@ -147,15 +147,18 @@ def test_rollouts_start_within_one_episode_with_the_actions_taken_there(make_lea
     assert ends == {(row, t) for row in range(3) for t in range(6)}
 
 
-def test_imagined_steps_follow_from_the_dynamics_and_the_actors_history(make_learner: Make, batch: TensorDict) -> None:
+def test_imagined_steps_follow_from_the_dynamics_and_the_actors_whole_history(
+    make_learner: Make, batch: TensorDict
+) -> None:
     networks = make_learner().networks
     context, taken = batch[keys.SLOTS][:, :3], batch[keys.ACTION][:, 1:3]
-    out = imagine(networks.dynamics, networks.actor, context, taken, 3, 6, torch.Generator().manual_seed(0))
+    out = imagine(networks.dynamics, networks.actor, context, taken, 3, torch.Generator().manual_seed(0))
     torch.testing.assert_close(out.slots[:, :3], context)
     whole = networks.dynamics(out.slots[:, :-1], torch.cat((taken, out.actions), dim=1))
     torch.testing.assert_close(out.slots[:, 3:], whole[:, 2:])
-    location, std, _ = networks.actor(out.slots)
-    expected = TruncatedNormal(location[:, 2:-1], std[:, 2:-1]).log_prob(out.actions)
+    mean, std, _ = networks.actor(out.slots[:, :-1])
+    torch.testing.assert_close(out.locations, mean[:, 2:])
+    expected = Normal(mean[:, 2:], std[:, 2:]).log_prob(out.actions).sum(dim=-1)
     torch.testing.assert_close(out.log_probs, expected, atol=1e-4, rtol=1e-4)
 
 
@@ -163,7 +166,7 @@ def test_an_action_is_judged_by_what_follows_and_not_by_what_it_saw(make_learner
     """sg(S) in a ~ pi(. | sg(S)): no gradient runs from the actions back into slots."""
     networks = make_learner().networks
     context = batch[keys.SLOTS][:, :2].clone().requires_grad_()
-    out = imagine(networks.dynamics, networks.actor, context, batch[keys.ACTION][:, 1:2], 3, 3)
+    out = imagine(networks.dynamics, networks.actor, context, batch[keys.ACTION][:, 1:2], 3)
     assert torch.autograd.grad(out.actions.sum(), context, allow_unused=True, retain_graph=True) == (None,)
     assert torch.autograd.grad(out.slots.sum(), context)[0].abs().max() > 0
 
@@ -186,21 +189,43 @@ class _Counting(torch.nn.Module):
         return logits.squeeze(-1) * 0 + values.detach() * 0
 
 
-def test_the_actor_sees_as_many_frames_when_it_imagines_as_when_it_acts(
-    make_learner: Make, batch: TensorDict, monkeypatch: pytest.MonkeyPatch
+def test_dynamics_learn_from_what_lies_beyond_the_context_only(make_learner: Make, batch: TensorDict) -> None:
+    """The prediction of a context frame is nobody's: its target may be anything."""
+    learner = make_learner(context=3, least_context=3, image_weight=1.0, predicted_rewards=False)
+    other = batch.clone()
+    other[keys.PIXELS][:, :3] = 0
+    wanted, got = (make_learner(**vars(learner.config))._model(b, StepGenerators(0, 0)) for b in (batch, other))
+    assert wanted["image_mse"] == got["image_mse"]
+    predicted = learner.networks.dynamics.rollout(batch[keys.SLOTS][:, :3], batch[keys.ACTION][:, 1:])[:, 2:]
+    kept = losses.same_episode(batch[keys.IS_FIRST].squeeze(-1))[:, 3:]
+    expected = (predicted - batch[keys.SLOTS][:, 3:]).square().mean(dim=(-2, -1))[kept].mean()
+    torch.testing.assert_close(wanted["slot_mse"], expected.detach())
+
+
+@pytest.mark.parametrize("predicted", [False, True])
+def test_the_reward_head_learns_from_predicted_slots_only_if_asked(
+    make_learner: Make, batch: TensorDict, predicted: bool
 ) -> None:
-    learner = make_learner()
-    networks, lengths = learner.networks, list[int]()
-    whole = networks.actor.forward
+    """Where it does, what the dynamics predict is something to it."""
+    moving, still = (make_learner(predicted_rewards=predicted) for _ in range(2))
+    torch.nn.init.zeros_(still.networks.dynamics.head.weight)
+    one, other = (learner._model(batch, StepGenerators(0, 0))["loss_reward"] for learner in (moving, still))
+    assert bool(one != other) is predicted
 
-    def watched(slots: Tensor, *rest: Any) -> Any:
-        lengths.append(slots.shape[1])
-        return whole(slots, *rest)
 
-    monkeypatch.setattr(networks.actor, "forward", watched)
-    imagine(networks.dynamics, networks.actor, batch[keys.SLOTS][:, :2], batch[keys.ACTION][:, 1:2], 4, 3)
-    assert lengths == [2, 3, 3, 3]
-    assert learner.acting.window == learner.config.context
+class _Waits(TorchDispatchMode):
+    """Refuses what needs a value on the host."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        assert not any(wait in func.name() for wait in ("_local_scalar_dense", "nonzero", "masked_select")), func.name()
+        return func(*args, **(kwargs or {}))
+
+
+def test_an_update_waits_for_no_value(make_learner: Make, batch: TensorDict, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.optim.Adam, "step", lambda self: None)  # it counts its steps on the host
+    learner = make_learner(image_weight=1.0, decoded_frames=1)
+    with _Waits():
+        learner.update(batch, StepGenerators(0, 0))
 
 
 def test_rewards_are_of_the_frames_reached_and_values_of_the_frames_left(

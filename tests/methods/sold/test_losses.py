@@ -75,3 +75,14 @@ def test_reinforce_raises_the_probability_of_better_than_expected_actions_only()
     by_probability, by_returns = torch.autograd.grad(loss, (log_probs, returns), allow_unused=True)
     assert by_probability.tolist() == [[-0.5, 0.5]]
     assert by_returns is None
+
+
+def test_what_the_slow_critic_says_weighs_a_tenth() -> None:
+    class Head:
+        def cross_entropy(self, logits: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+            return logits[..., 0] * values
+
+    returns, slow = torch.full((2, 3), 2.0), torch.full((2, 3), 30.0)
+    weights = torch.tensor([1.0, 0.5, 0.25])
+    loss = losses.value_loss(Head(), torch.ones(2, 3, 1), returns, slow, weights, 0.1)  # type: ignore[arg-type]
+    assert loss.item() == pytest.approx((2 + 0.1 * 30) * 1.75 / 3)
