@@ -108,6 +108,8 @@ _OURS: Final[Mapping[str, str]] = {
     "resnet_oracle": "resnet_oracle.method:RESNET_ORACLE",
     "slot_bc": "slot_oracle.method:SLOT_BC",
     "resnet_bc": "resnet_oracle.method:RESNET_BC",
+    "act": "lerobot_policy.method:ACT",
+    "diffusion": "lerobot_policy.method:DIFFUSION",
     "lapo": "lapo.method:LAPO",
     "dreamer": "dreamer.method:DREAMER",
     "sold": "sold.method:SOLD",

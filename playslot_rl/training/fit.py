@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from playslot_rl.config import LoggingConfig, StageConfig
+from playslot_rl.config import LoggingConfig, OptimConfig, StageConfig
 from playslot_rl.config.roles import without
 from playslot_rl.errors import CheckpointError
 from playslot_rl.runtime.precision import keeping, resolve_precision
@@ -50,6 +50,7 @@ class Part:
         identity: further plain values that a resumed one must share.
         patience: ends the training before `config.steps`, with the weights of the best validation; None does not.
         pace: changes `config.steps` as the clock says; None does not.
+        optimizer: makes Adam, or one of its kind, of the parameters.
     """
 
     name: str
@@ -61,6 +62,7 @@ class Part:
     identity: Mapping[str, Any] = field(default_factory=dict)
     patience: Patience | None = None
     pace: Pace | None = None
+    optimizer: Callable[[Mapping[str, nn.Parameter], OptimConfig], torch.optim.Adam] = build_adam
 
     def typed(self, key: str) -> str:
         """The full name under which a key of `config` is typed."""
@@ -141,7 +143,7 @@ class _Run:
         self.folder, self.patience = folder, part.patience
         self.parameters = trainable_parameters(part.stage.modules)
         self.batches = GlobalBatches(part.stage, part.config, self.parameters, part.group or part.name)
-        self.optimizer = build_adam(self.parameters, part.config.optim)
+        self.optimizer = part.optimizer(self.parameters, part.config.optim)
         self.steps = Steps(part.name, part.group or part.name, self.batches, self.optimizer, part.config, seed, device)
         ema = part.config.optim.ema
         self.average = WeightAverage(self.parameters, ema) if ema else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -36,16 +37,16 @@ def trainable_parameters(modules: Mapping[str, nn.Module]) -> dict[str, nn.Param
     }
 
 
-def build_adam(parameters: Mapping[str, nn.Parameter], config: OptimConfig) -> torch.optim.Adam:
-    """Adam over `parameters`, fused: one kernel for all tensors, on CPU and GPU alike. On a GPU its learning rate is a
-    tensor there, so that a captured step can be given another one.
+def build_adam(parameters: Mapping[str, nn.Parameter], config: OptimConfig, **settings: Any) -> torch.optim.Adam:
+    """Adam over `parameters`, with further settings of torch, fused: one kernel for all tensors, on CPU and GPU alike.
+    On a GPU its learning rate is a tensor there, so that a captured step can be given another one.
     """
     if not parameters:
         raise ValueError("got no trainable parameters, expected at least one: a stage's modules must not be frozen")
     device = next(iter(parameters.values())).device
     on_gpu = device.type == "cuda"
     lr = torch.tensor(config.lr, dtype=torch.float32, device=device) if on_gpu else config.lr
-    return torch.optim.Adam(list(parameters.values()), lr=lr, fused=True, capturable=on_gpu)
+    return torch.optim.Adam(list(parameters.values()), lr=lr, fused=True, capturable=on_gpu, **settings)
 
 
 def clip_gradients(parameters: Mapping[str, nn.Parameter], maximum: float) -> Tensor:

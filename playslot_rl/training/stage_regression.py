@@ -105,7 +105,8 @@ class PairedInputs:
 
 class FrameInputs:
     """Frames by row: uint8 (b, 3, H, W), [0, 255], in training shifted by so many pixels at most; `rows` are the row
-    numbers of the frames, int64 (M,). A GPU keeps them where they fit, if they may be `resident`.
+    numbers of the frames, int64 (M,). With (M, F) each input is F frames (b, F, 3, H, W), shifted alike. A GPU keeps
+    them where they fit, if they may be `resident`.
     """
 
     def __init__(
@@ -129,7 +130,8 @@ class FrameInputs:
             return self.plain(rows)
         generator = generators.torch("shift", "cpu")
         offsets = own_noise((len(rows), 2), lambda shape: torch.randint(2 * self.shift + 1, shape, generator=generator))
-        return shifted(self.plain(rows), to_device(offsets - self.shift, self.device))
+        frames = self.plain(rows)
+        return shifted(frames.flatten(1, -3), to_device(offsets - self.shift, self.device)).view_as(frames)
 
     def plain(self, rows: Tensor) -> Tensor:
         """Frames of rows, as they are."""

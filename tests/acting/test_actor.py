@@ -43,6 +43,16 @@ def lapo() -> Actor:
     return latent_actor(LAPOPolicy(own, 64), ActionDecoder(config.model.action_decoder, own.latent_dim, 4))
 
 
+def chunks(name: str) -> Actor:
+    from playslot_rl.methods.lerobot_policy.actor import ChunkActor
+    from playslot_rl.methods.lerobot_policy.policy import chunk_policy
+
+    own = getattr(compose(["preset=smoke"]).baselines, name)
+    policy = chunk_policy(own, 64, 4, own.sized(8))
+    policy.give(torch.randn(9, 4))
+    return ChunkActor(policy, 64)
+
+
 def caddy(oracle: bool) -> Actor:
     from playslot_rl.methods.caddy.heads import MovesHead, OnFrames, StateHead
     from playslot_rl.methods.caddy.model import CADDY
@@ -84,6 +94,8 @@ ACTORS: dict[str, Callable[[], Actor]] = {
     "replay": lambda: ReplayActor(agent(), performance),
     "slot_oracle": lambda: oracle_actor(agent()),
     "resnet_oracle": resnet,
+    "act": lambda: chunks("act"),
+    "diffusion": lambda: chunks("diffusion"),
     "lapo": lapo,
     "caddy_policy": lambda: caddy(oracle=False),
     "caddy_oracle": lambda: caddy(oracle=True),

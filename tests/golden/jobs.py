@@ -14,11 +14,12 @@ from playslot_rl.studies.video.jobs import video_config, video_jobs, video_recor
 OUT = Path("/comparison")
 PARENTS = {"slots": "a", "dynamics": "b", "demos": "c", "videos": "d"}
 ACTING = (
-    "playslot,slot_oracle,resnet_oracle,slot_bc,resnet_bc,lapo,dreamer,sold,caddy_policy,caddy_oracle"  # all that act
+    "playslot,slot_oracle,resnet_oracle,slot_bc,resnet_bc,act,diffusion,lapo,dreamer,sold,caddy_policy,caddy_oracle"
 )
+UNLABELLED = ACTING.replace("slot_bc,resnet_bc,act,diffusion,", "")
 CHOICES: dict[str, tuple[str, ...]] = {
     "all methods": (f"methods={ACTING}", "demos=4,8", "labels=2,4", "seeds=0,1"),
-    "no labels": (f"methods={ACTING.replace('slot_bc,resnet_bc,', '')}", "demos=8", "seeds=2", "preset=smoke"),
+    "no labels": (f"methods={UNLABELLED}", "demos=8", "seeds=2", "preset=smoke"),
     "another task": ("methods=playslot,lapo", "demos=8", "seeds=0", "env=block_push", "model.predictor.kind=ocvp_seq"),
 }
 VIDEO_CHOICES: dict[str, tuple[str, ...]] = {

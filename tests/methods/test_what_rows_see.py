@@ -52,6 +52,8 @@ TABLE = {
     "slot_bc": Sees(True, "all", "slots"),
     "resnet_oracle": Sees(False, "all", "frames"),
     "resnet_bc": Sees(False, "all", "frames"),
+    "act": Sees(False, "all", "frames"),
+    "diffusion": Sees(False, "all", "frames"),
     "lapo": Sees(True, "some", "frames", state=True),
     "caddy_policy": Sees(True, "some", "frames", state=True),
     "caddy_oracle": Sees(True, "all", "frames"),

@@ -15,7 +15,7 @@ from playslot_rl.config.compose import compose
 
 pytestmark = pytest.mark.integration
 
-METHODS = ("slot_oracle", "resnet_oracle", "lapo", "caddy_policy", "caddy_oracle")
+METHODS = ("slot_oracle", "resnet_oracle", "act", "diffusion", "lapo", "caddy_policy", "caddy_oracle")
 
 
 def _command(method: str, shared_run: Path, out: Path, *more: object) -> tuple[str, ...]:
@@ -45,7 +45,15 @@ def _meta(run: Path, stage: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize(
     ("method", "labels"),
-    [("slot_oracle", 4), ("resnet_oracle", 4), ("lapo", 3), ("caddy_policy", 3), ("caddy_oracle", 4)],
+    [
+        ("slot_oracle", 4),
+        ("resnet_oracle", 4),
+        ("act", 4),
+        ("diffusion", 4),
+        ("lapo", 3),
+        ("caddy_policy", 3),
+        ("caddy_oracle", 4),
+    ],
 )
 def test_a_baseline_is_a_run_that_says_what_it_saw(trained: dict[str, Path], method: str, labels: int) -> None:
     run = trained[method]
@@ -53,7 +61,7 @@ def test_a_baseline_is_a_run_that_says_what_it_saw(trained: dict[str, Path], met
     assert (meta["demos"], meta["labelled_demos"]) == (4, labels)
     assert json.loads((run / "config.json").read_text())["method"] == method
     assert (run / method / "metrics.jsonl").is_file()
-    assert ("pretraining" in meta) == (method == "resnet_oracle")
+    assert ("pretraining" in meta) == (method in ("resnet_oracle", "act", "diffusion"))
 
 
 def test_a_finished_slot_oracle_does_not_ask_for_what_it_has_none_of(

@@ -43,10 +43,13 @@ class ResNetOracleConfig(StageConfig):
         yield windows(name, self, frame_numbers(config))
 
     def check(self, name: str, config: ExperimentConfig) -> None:  # noqa: ARG002
-        if self.weights not in ("auto", "download", "scratch") and not Path(self.weights).is_file():
-            raise ConfigError(
-                f"{name}.weights: got {self.weights}, expected a file, auto, download or scratch: check it"
-            )
+        require_weights(name, self.weights)
+
+
+def require_weights(name: str, weights: str) -> None:
+    """Refuse `NAME.weights` that no ResNet-18 can start from, by a ConfigError."""
+    if weights not in ("auto", "download", "scratch") and not Path(weights).is_file():
+        raise ConfigError(f"{name}.weights: got {weights}, expected a file, auto, download or scratch: check it")
 
 
 NAME: Final = "resnet_oracle"

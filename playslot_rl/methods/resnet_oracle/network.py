@@ -13,6 +13,7 @@ Shapes: B batch, H W image height and width, h w those of the feature map (H / 3
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -34,7 +35,7 @@ WIDTH = 512
 Pretraining = Literal["imagenet", "scratch"]
 
 # Statistics of ImageNet, with which torchvision's weights were trained.
-_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class ResNetPolicy(nn.Module):
@@ -52,8 +53,8 @@ class ResNetPolicy(nn.Module):
         self.trunk = trunk
         self.position = nn.Parameter(torch.randn((image_size // 32) ** 2, WIDTH) * 0.02)
         self.head = LatentPolicy(config, WIDTH, out_dim, acts=True)
-        self.register_buffer("mean", torch.tensor(_MEAN).view(3, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(_STD).view(3, 1, 1), persistent=False)
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
 
     def features(self, pixels: Tensor) -> Tensor:
         """Frames (B, 3, H, W), uint8 or float [0, 1], to tokens (B, h w, 512)."""
@@ -67,8 +68,13 @@ class ResNetPolicy(nn.Module):
 
 
 def load_pretrained(policy: ResNetPolicy, weights: str) -> Pretraining:
-    """Give the trunk its starting weights (`ResNetOracleConfig.weights`), and say which; a CheckpointError where the
-    file is missing, damaged or not ResNet-18's, or cannot be fetched.
+    """See `load_trunk`."""
+    return load_trunk(policy.trunk, weights, f"baselines.{NAME}.weights")
+
+
+def load_trunk(trunk: nn.Module, weights: str, key: str, names: Mapping[str, str] | None = None) -> Pretraining:
+    """Give a ResNet-18 its starting weights (`ResNetOracleConfig.weights`), and say which; a CheckpointError where the
+    file is missing, damaged or not ResNet-18's, or cannot be fetched. `names` are torchvision's of its tensors.
     """
     if weights == "scratch":
         return "scratch"
@@ -76,12 +82,12 @@ def load_pretrained(policy: ResNetPolicy, weights: str) -> Pretraining:
     if weights == "auto" and not path.is_file():
         return "scratch"
     if weights == "download" and not path.is_file():
-        _download(path)
-    key, cure, own = "baselines.resnet_oracle.weights", "set it to scratch", policy.trunk.state_dict()
+        _download(path, key)
+    cure, own = "set it to scratch", trunk.state_dict()
     state = read_published(path, key, "ResNet-18", cure)
-    names = {name: name for name in own}
     where = f"{key}={path} (torchvision's ResNet-18)"
-    policy.trunk.load_state_dict(pick_published(state, names, own, where, f"give another, or {cure}"))
+    known = names or {name: name for name in own}
+    trunk.load_state_dict(pick_published(state, known, own, where, f"give another, or {cure}"))
     return "imagenet"
 
 
@@ -92,7 +98,7 @@ def cached_weights() -> Path:
     return Path(torch.hub.get_dir()) / "checkpoints" / Path(ResNet18_Weights.IMAGENET1K_V1.url).name
 
 
-def _download(path: Path) -> None:
+def _download(path: Path, key: str) -> None:
     from torchvision.models import ResNet18_Weights
 
     try:
@@ -100,8 +106,7 @@ def _download(path: Path) -> None:
         torch.hub.download_url_to_file(ResNet18_Weights.IMAGENET1K_V1.url, str(path), progress=False)
     except OSError as error:
         raise CheckpointError(
-            f"baselines.resnet_oracle.weights=download: got {error}, expected a network: put the file at {path}, "
-            "or set it to scratch"
+            f"{key}=download: got {error}, expected a network: put the file at {path}, or set it to scratch"
         ) from error
 
 

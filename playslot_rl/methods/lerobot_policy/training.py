@@ -1,0 +1,154 @@
+"""Training of LeRobot's policies on the labelled demonstrations: as `lerobot-train` does it, on rows of our caches.
+
+A row is a frame with the H actions that follow it (of Diffusion Policy, that begin with its first frame's); those
+before the episode's first action or after its last repeat it and are marked as padding.
+
+Note: LeRobot's reader takes an episode's last row for one with an action; here it has none, so it neither begins a
+chunk nor is in one. Rows are drawn with replacement; still stretches begin no chunk (`behaviour.trim_pixels`), which
+LeRobot's reader knows nothing of. Diffusion's warm-up begins one step further.
+
+Shapes: M rows, B batch, F frames, H actions of a chunk, E of them executed, A action dim.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from playslot_rl import keys
+from playslot_rl.config import ExperimentConfig, OptimConfig
+from playslot_rl.data.demonstrations import moving_frames, real_actions, require_finite, transitions
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.methods.lerobot_policy.method import ACTConfig, ChunkConfig
+from playslot_rl.methods.lerobot_policy.policy import PAD, ChunkPolicy, chunk_policy
+from playslot_rl.methods.resnet_oracle.network import load_trunk
+from playslot_rl.runtime.devices import to_device
+from playslot_rl.runtime.precision import autocast
+from playslot_rl.runtime.shares import own_rows
+from playslot_rl.seeds.draws import StepGenerators, global_seed
+from playslot_rl.training.demonstrated import cloned
+from playslot_rl.training.fit import Part
+from playslot_rl.training.optimizer import build_adam
+from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.stage_regression import HELD_OUT, FrameInputs, unexplained
+
+VALIDATED = 128
+"""Rows of each set that a validation predicts chunks of."""
+
+
+class Chunks(NamedTuple):
+    """Rows: frames (M, F), the actions (M, H, A) in [-1, 1] that are predicted from them, and which of these are
+    padding, bool (M, H).
+    """
+
+    frames: FrameInputs
+    actions: Tensor
+    pad: Tensor
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+def chunked(
+    config: ExperimentConfig, source: EpisodeFrames, own: ChunkConfig, chunk: int, device: torch.device, shift: int = 0
+) -> Chunks:
+    """The rows of demonstrations; a DataError where there are no actions, or nothing moves."""
+    moves = moving_frames(source, config.behaviour.trim_pixels, config.behaviour.trim_margin)
+    lengths = moves.lengths[moves.episode]
+    # As LeRobot's sampler: the last rows of an episode, whose chunks would be padding for the most part, begin none.
+    unused = max(0, chunk - own.kept(chunk) - own.frames + 1) if own.drops else 0
+    kept = moves.step < np.maximum(1, lengths - unused)
+    rows, step, lengths = moves.rows[kept], moves.step[kept], lengths[kept]
+    first = (rows - step)[:, None]
+    last = first + lengths[:, None] - 1
+    wanted = rows[:, None] + np.arange(1 - own.frames, 1 - own.frames + chunk)
+    seen = np.maximum(rows[:, None] + np.arange(1 - own.frames, 1), first)
+    actions = real_actions(source, np.clip(wanted, first, last), config.env.action_dim)
+    frames = FrameInputs(source, seen, device, shift, config.data.device == "auto")
+    return Chunks(frames, actions.to(device), torch.from_numpy((wanted < first) | (wanted > last)).to(device))
+
+
+class ChunkStage:
+    """A policy of LeRobot's on chunks, trained in place."""
+
+    def __init__(self, policy: ChunkPolicy, own: ChunkConfig, trained: Chunks, held_out: Chunks | None) -> None:
+        self.policy, self.own, self.trained = policy, own, trained
+        self.checks = {"unexplained": trained}
+        if held_out is not None:
+            self.checks[f"unexplained{HELD_OUT}"] = held_out
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        return {"policy": self.policy}
+
+    def phase(self, step: int) -> Hashable:  # noqa: ARG002
+        """LeRobot's loss waits for values: no step can be captured."""
+        return None
+
+    def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        drawn = torch.randint(len(self.trained), (self.own.batch_size,), generator=generators.torch("policy", "cpu"))
+        rows = own_rows(drawn)
+        there = to_device(rows, self.trained.actions.device)
+        pixels = self.trained.frames.draw(rows, generators)
+        return {keys.PIXELS: pixels, keys.ACTION: self.trained.actions[there], PAD: self.trained.pad[there]}
+
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        """Note: dropout, the VAE's and the diffusion's noise are drawn for each share of a batch alike."""
+        with autocast(batch[keys.PIXELS].device.type, self.own.precision):
+            return {"loss": self.policy.loss(batch[keys.PIXELS], batch[keys.ACTION], batch[PAD]).float()}
+
+    def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
+        """Unexplained fraction of the variance of the actions that are executed."""
+        return {name: unexplained(*self._compared(rows)) for name, rows in self.checks.items()}
+
+    def _compared(self, chunks: Chunks) -> tuple[Tensor, Tensor]:
+        rows = torch.linspace(0, len(chunks) - 1, min(VALIDATED, len(chunks))).long()
+        predicted = self.policy.plan(chunks.frames.plain(rows), rows.tolist())
+        there, begin = to_device(rows, predicted.device), self.own.frames - 1
+        shown = slice(begin, begin + self.policy.executed)
+        real = ~chunks.pad[there][:, shown]
+        return predicted[real], chunks.actions[there][:, shown][real]
+
+
+def training(record: StageRecord) -> Training:
+    config, device, split = record.config, record.device, record.demos
+    own: ChunkConfig = getattr(config.baselines, record.name)
+    width = config.env.action_dim
+    split.trained.require_actions(width)
+    require_finite(split)
+    moves = transitions(split.trained)
+    chunk = own.sized(int(moves.lengths.max()))
+    with global_seed(config.seed, 0, record.name):
+        policy = chunk_policy(own, config.env.image_size, width, chunk)
+    trunk, names = policy.trunk()
+    pretraining = load_trunk(trunk, own.weights, f"baselines.{record.name}.weights", names)
+    policy.give(real_actions(split.trained, moves.rows, width))
+    policy.to(device)
+    trained = chunked(config, split.trained, own, chunk, device, own.shift)
+    held_out = None if split.held_out is None else chunked(config, split.held_out, own, chunk, device)
+    stage = ChunkStage(policy, own, trained, held_out)
+    said, extra = cloned(record.name, split, len(trained))
+    facts = {"pretraining": pretraining, "chunk": chunk}
+    return Training(
+        [Part(f"baselines.{record.name}", stage, own, optimizer=partial(_optimizer, policy, own))],
+        device,
+        lambda _: f"{said}, chunks of {chunk}, ResNet-18 from {pretraining}, {record.folder}",
+        extra={**extra, **facts},
+        identity=facts,
+    )
+
+
+def _optimizer(
+    policy: ChunkPolicy, own: ChunkConfig, parameters: Mapping[str, nn.Parameter], config: OptimConfig
+) -> torch.optim.Adam:
+    """Adam or AdamW with LeRobot's settings for this policy, but for rate and decay, which are ours."""
+    preset = policy.policy.config.get_optimizer_preset()
+    return build_adam(
+        parameters, config, betas=tuple(preset.betas), eps=preset.eps, weight_decay=own.weight_decay,
+        decoupled_weight_decay=isinstance(own, ACTConfig),
+    )  # fmt: skip
