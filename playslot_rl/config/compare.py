@@ -26,9 +26,9 @@ class CompareConfig(Checked):
     Attributes:
         methods: names of `playslot_rl.config.methods`.
         demos: numbers of demonstrations, for the methods that learn from them.
-        labels: numbers of labelled demonstrations. PlaySlot, LAPO and CADDY learn from the videos of all `demos` and
-            the real actions of so many of them, `slot_bc`, `resnet_bc`, `act` and `diffusion` from these alone, the
-            oracles from the actions of all. Empty: PlaySlot, LAPO and CADDY see those of `behaviour.labelled_demos`.
+        labels: numbers of labelled demonstrations. Those with latent actions learn from the videos of all `demos`
+            and the real actions of so many of them, `slot_bc`, `resnet_bc`, `act` and `diffusion` from these alone, the
+            oracles from the actions of all. Empty: they see those of `behaviour.labelled_demos`.
         seeds: training seeds; each has its own draw of demonstrations.
         online_seeds: training seeds of the methods that act, which take the longest; empty means `seeds`.
         evaluation_seed: seed of the evaluation's episodes, the same for every method and training seed.

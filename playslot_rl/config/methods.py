@@ -111,6 +111,7 @@ _OURS: Final[Mapping[str, str]] = {
     "act": "lerobot_policy.method:ACT",
     "diffusion": "lerobot_policy.method:DIFFUSION",
     "lapo": "lapo.method:LAPO",
+    "laom": "laom.method:LAOM",
     "dreamer": "dreamer.method:DREAMER",
     "sold": "sold.method:SOLD",
     "caddy_policy": "caddy.method:CADDY_POLICY",

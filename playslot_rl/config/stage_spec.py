@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from operator import attrgetter
+from typing import Any, Literal
 
 BASELINES = "baselines."
 
@@ -37,6 +38,8 @@ class StageSpec:
         parents: stages it is trained on.
         copies: its run has copies of them and is whole, instead of naming the run that they lie in.
         data: what it learns from: `videos`, `demos`, the `labelled` ones of these alone; empty learns by acting.
+        labels: key of the weight with which the real actions of the labelled demonstrations count in it beside the
+            videos; empty sees none.
         parts: `module:function` that makes what is trained from a `StageRecord`: a `Training`.
         sizes: `module:function` that makes the group `model` from the command's config and that of its parents; empty
             takes the latter.
@@ -53,6 +56,7 @@ class StageSpec:
     parents: tuple[str, ...] = ()
     copies: bool = False
     data: Literal["videos", "demos", "labelled", ""] = "videos"
+    labels: str = ""
     parts: str = ""
     sizes: str = ""
     title: str = ""
@@ -64,6 +68,10 @@ class StageSpec:
     def groups(self) -> tuple[str, ...]:
         """Groups that its checkpoint keeps, `env` first."""
         return tuple(dict.fromkeys(["env", *map(group_of, (*self.stores, *self.keys, *self.settings))]))
+
+    def sees_labels(self, config: Any) -> bool:
+        """Whether real actions count in it beside the videos, so that it is another one for each draw of labels."""
+        return bool(self.labels) and bool(attrgetter(self.labels)(config) > 0)
 
     def stored_name(self, key: str, begun: bool = False) -> str:
         """What a checkpoint, or a half-finished training, calls a key."""

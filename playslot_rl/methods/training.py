@@ -130,6 +130,12 @@ def _model(spec: StageSpec, record: StageRecord, run: Run) -> StageCheckpoint:
     shared = [key for key in record.spec.keys if key in spec.keys]
     wanted = StageRecord(replace(spec, keys=tuple(shared), settings=()), run.folder, config).finishes()
     require_config(model, wanted, record.spec.typed)
+    mine, theirs = StageRecord(spec, run.folder, config).labels, model.meta.get("labelled", "none")
+    if mine != theirs:
+        raise CheckpointError(
+            f"baselines.{config.method}.world={world}: got {spec.title} of the labels {theirs}, expected {mine}: leave "
+            "it out to train one"
+        )
     return model
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
@@ -47,6 +47,7 @@ from playslot_rl.training.pace import Pace
 _ROLES: Final[Mapping[str, Literal["train", "demos", ""]]] = {
     "videos": "train", "demos": "demos", "labelled": "demos", "": "",
 }  # fmt: skip
+LABELS: Final = "behaviour.labelled_demos"
 PATIENCE: Final = 10.0
 """Seconds in which the children of a killed training end."""
 
@@ -154,6 +155,22 @@ class StageRecord:
             return DrawnClips(env, data.stride, *given, False)
         return Clips(*given, data.device == "auto")
 
+    @cached_property
+    def labelled(self) -> EpisodeFrames | None:
+        """The labelled demonstrations of the draw, whose actions count beside the videos; None where none do. Raises
+        as `demos`.
+        """
+        if not self.spec.sees_labels(self.config):
+            return None
+        config = replace(self.config, demos=self.config.behaviour.labelled_demos)
+        return replace(self, spec=replace(self.spec, data="demos"), config=config).demos.trained
+
+    @property
+    def labels(self) -> str:
+        """How many these are, and their fingerprint."""
+        found = self.labelled
+        return "none" if found is None else f"{found.episodes} ({found.fingerprint})"
+
     @property
     def drawn(self) -> str:
         """What is drawn instead of the videos (`data.drawn`); empty where nothing is."""
@@ -216,6 +233,8 @@ class StageRecord:
             facts.append(("data", self.data.fingerprint, next(iter(done.meta["data"].values()), "none")))
         if self.role and self.roots:
             facts.append(("data.drawn", self.drawn or "false", done.meta.get("drawn") or "false"))
+        if self.spec.labels and self.roots:
+            facts.append((LABELS, self.labels, done.meta.get("labelled")))
         if self.role == "demos" and self.roots:
             ends = [said(plain if scaled(plain) else None) for plain in (self.actions, done.meta.get("actions"))]
             facts.append(("actions", ends[0], ends[1]))
@@ -240,6 +259,8 @@ class StageRecord:
         data: dict[str, Any] = {"data": self.data.fingerprint} if self.role else {}
         if self.role == "demos" and scaled(self.actions):
             data["actions"] = said(self.actions)
+        if self.labelled is not None:
+            data[LABELS] = self.labels
         if self.role == "train":
             data["data.validation"] = self.config.data.validation
             if self.drawn:
@@ -313,7 +334,9 @@ class StageRecord:
         Raises:
             OutputError: full disk, or a folder that cannot be written.
         """
-        known = {"actions": self.actions} if self.role == "demos" else {}
+        known: dict[str, Any] = {"actions": self.actions} if self.role == "demos" else {}
+        if self.spec.labels:
+            known["labelled"] = self.labels
         path = checkpoint_folder(self.run, self.name)
         if not here().first:
             wait()

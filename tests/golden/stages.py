@@ -29,8 +29,8 @@ from playslot_rl.training import record as records
 from playslot_rl.training.record import StageRecord
 
 BASELINES = (
-    "slot_oracle", "resnet_oracle", "lapo", "dreamer", "sold", "caddy_policy", "caddy_oracle", "svg", "caddy",
-    "slotformer", "ocvp_seq", "act", "diffusion",
+    "slot_oracle", "resnet_oracle", "lapo", "laom", "dreamer", "sold", "caddy_policy", "caddy_oracle", "svg",
+    "caddy", "slotformer", "ocvp_seq", "act", "diffusion",
 )  # fmt: skip
 ON_A_MODEL = {"lapo": "lapo_model", "caddy_policy": "caddy", "caddy_oracle": "caddy"}
 WHOLE = ("button_press", "compact")

@@ -55,6 +55,7 @@ TABLE = {
     "act": Sees(False, "all", "frames"),
     "diffusion": Sees(False, "all", "frames"),
     "lapo": Sees(True, "some", "frames", state=True),
+    "laom": Sees(True, "some", "frames", state=True),
     "caddy_policy": Sees(True, "some", "frames", state=True),
     "caddy_oracle": Sees(True, "all", "frames"),
     "dreamer": Sees(False, "none", "frames"),

@@ -96,14 +96,12 @@ def test_the_result_is_json(ended: dict[str, Any]) -> None:
     assert json.loads(json.dumps(ended, allow_nan=False)) == ended
 
 
-def test_every_method_has_a_colour_and_a_marker_of_its_own() -> None:
+def test_every_method_has_a_marker_of_its_own_and_kin_have_one_colour() -> None:
     styles = {name: method.style for name, method in METHODS.items() if method.acts}
-    colours = {name: style.colour for name, style in styles.items()}
-    assert (colours.pop("slot_bc"), colours.pop("resnet_bc")) == (colours["slot_oracle"], colours["resnet_oracle"])
-    assert len(set(colours.values())) == len(colours), (
-        "cloning few labels has its oracle's colour, the others their own"
-    )
     assert len({style.marker for style in styles.values()}) == len(styles)
+    kin = {"slot_bc": "slot_oracle", "resnet_bc": "resnet_oracle", "laom": "lapo"}
+    assert [styles[name].colour for name in kin] == [styles[name].colour for name in kin.values()]
+    assert {style.colour for style in styles.values()} == set(range(len(LIGHT.series))), "each before one is used again"
 
 
 def test_seeds_of_a_method_that_acts_are_dots_beside_their_mean(ended: dict[str, Any]) -> None:

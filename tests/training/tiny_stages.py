@@ -17,6 +17,7 @@ from playslot_rl.config import (
     BehaviourStageConfig,
     DynamicsStageConfig,
     EnvConfig,
+    ExperimentConfig,
     GridConfig,
     InverseDynamicsConfig,
     ModelConfig,
@@ -35,10 +36,14 @@ from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.caddy.method import CADDYConfig
 from playslot_rl.methods.caddy.model import CADDY
 from playslot_rl.methods.caddy.stage import CADDYStage
+from playslot_rl.methods.laom.method import LAOMConfig
+from playslot_rl.methods.laom.training import LAOMStage
+from playslot_rl.methods.laom.training import built as laom_built
 from playslot_rl.methods.lapo.method import LAPOConfig
 from playslot_rl.methods.lapo.model import ForwardModel, InverseModel
 from playslot_rl.methods.lapo.training import LAPOModelStage
 from playslot_rl.methods.resnet_oracle.network import ResNetPolicy
+from playslot_rl.methods.supervised import LabelledMoves
 from playslot_rl.methods.svg.method import SVGConfig
 from playslot_rl.methods.svg.model import SVG
 from playslot_rl.methods.svg.training import SVGStage
@@ -221,6 +226,15 @@ def lapo() -> Part:
     return Part("lapo", LAPOModelStage(inverse, forward, clips(16, 2), _plain()), _plain())
 
 
+def laom() -> Part:
+    own = LAOMConfig(channels=(4, 8), hidden=16, latent_dim=4, offset=3, jitter=1, label_weight=1.0, model=_plain())
+    with global_seed(0, 0, "test"):
+        model, target = laom_built(own, 16, 2)
+    videos = clips(16, 2)
+    labelled = LabelledMoves(videos.source, ExperimentConfig(env=EnvConfig(action_dim=2)), DEVICE)
+    return Part("laom", LAOMStage(model.to(DEVICE), target.to(DEVICE), videos, labelled, own), own.model)
+
+
 @contextlib.contextmanager
 def in_double(wanted: bool) -> Iterator[None]:
     """Compute everything in double precision, also what the library says is float32."""
@@ -258,4 +272,5 @@ STAGES: dict[str, Callable[[], Part]] = {
     "svg": svg,
     "caddy": caddy,
     "lapo": lapo,
+    "laom": laom,
 }

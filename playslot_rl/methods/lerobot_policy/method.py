@@ -182,5 +182,5 @@ def _method(name: str, titles: tuple[str, ...], style: Style, config: type[Chunk
     )
 
 
-ACT: Final = _method("act", ("ACT",), Style(6, "D"), ACTConfig)
+ACT: Final = _method("act", ("ACT",), Style(6, "d"), ACTConfig)
 DIFFUSION: Final = _method("diffusion", ("Diffusion Policy",), Style(7, "h"), DiffusionConfig)

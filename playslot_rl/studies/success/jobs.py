@@ -13,6 +13,7 @@ from playslot_rl.collectors.collection import collect_demos, collect_videos
 from playslot_rl.config import DataConfig, ExperimentConfig, from_dict, plugins, to_dict
 from playslot_rl.config.compose import is_pretrained
 from playslot_rl.config.methods import METHODS, method_stage
+from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.agreement import open_files
 from playslot_rl.data.views import first_demonstrations
@@ -64,12 +65,6 @@ class SuccessJob(Job):
         return METHODS[self.method].online
 
     @property
-    def model(self) -> Path | None:
-        """Run folder of the model of unlabelled videos that it takes, made once for all; None where it takes none."""
-        stage = METHODS[self.method].model
-        return model_folder(self.out, stage.name) if stage else None
-
-    @property
     def wave(self) -> int:
         """Those whose policy others take over come first; these would train it again, side by side."""
         return int(self.policy_of is not None)
@@ -90,16 +85,31 @@ def success_jobs(config: ExperimentConfig, out: Path) -> list[SuccessJob]:
         found += [SuccessJob(name, n, seed, out, n) for n in labels for name in alone]
         for demos in sorted(wanted.demos):
             for name in others:
-                found += _of_demonstrations(name, demos, seed, out, labels)
+                found += _of_demonstrations(name, demos, seed, out, labels, _supervised(config, name))
     seeds = wanted.online_seeds or wanted.seeds
     return [*found, *(SuccessJob(name, None, seed, out) for seed in seeds for name in online)]
 
 
-def _of_demonstrations(method: str, demos: int, seed: int, out: Path, labels: Sequence[int]) -> list[SuccessJob]:
-    """One job, or one for each number of labels where the method's policy needs none and serves them all."""
+def _of_demonstrations(
+    method: str, demos: int, seed: int, out: Path, labels: Sequence[int], supervised: bool
+) -> list[SuccessJob]:
+    """One job, or one for each number of labels: the first one's policy serves them all, unless its latents are
+    `supervised` by the labels."""
     if not labels or not METHODS[method].decodes:
         return [SuccessJob(method, demos, seed, out)]
-    return [SuccessJob(method, demos, seed, out, n, None if n == labels[0] else labels[0]) for n in labels]
+    own = {labels[0], *(labels if supervised else ())}
+    return [SuccessJob(method, demos, seed, out, n, None if n in own else labels[0]) for n in labels]
+
+
+def _supervised(config: ExperimentConfig, method: str) -> bool:
+    """Whether labels count in the model of videos that a method builds on, so that each job trains its own."""
+    model = METHODS[method].model
+    return model is not None and model.sees_labels(config)
+
+
+def shared_model(config: ExperimentConfig, method: str) -> StageSpec | None:
+    """The model of unlabelled videos that a method builds on, made once for all jobs; None where there is none."""
+    return None if _supervised(config, method) else METHODS[method].model
 
 
 def uses_demos(config: ExperimentConfig) -> bool:
@@ -111,8 +121,8 @@ def uses_slots(config: ExperimentConfig) -> bool:
 
 
 def latent_models(config: ExperimentConfig) -> dict[str, str]:
-    """Stages of the models of unlabelled videos that methods build on, and for each of them a method that does."""
-    return {model.name: name for name in config.compare.methods if (model := METHODS[name].model)}
+    """Stages of the models of unlabelled videos that methods share, and for each of them a method that does."""
+    return {model.name: name for name in config.compare.methods if (model := shared_model(config, name))}
 
 
 def model_folder(out: Path, stage: str) -> Path:
@@ -129,8 +139,9 @@ def success_config(config: ExperimentConfig, job: SuccessJob, world: str) -> Exp
     labelled = job.labels or min(config.behaviour.labelled_demos, job.demos or config.behaviour.labelled_demos)
     policy = "" if job.policy_of is None else absolute(str(replace(job, labels=job.policy_of).run))
     own = {}
-    if job.model is not None:
-        own = {job.method: replace(getattr(config.baselines, job.method), world=absolute(str(job.model)))}
+    if model := shared_model(config, job.method):
+        world_of = absolute(str(model_folder(job.out, model.name)))
+        own = {job.method: replace(getattr(config.baselines, job.method), world=world_of)}
     draw = None if job.online else job.seed
     return replace(
         job_config(config, job, job.method, world, demos=absolute(config.data.demos), draw=draw),
@@ -199,7 +210,7 @@ def prepare_shared(config: ExperimentConfig) -> ExperimentConfig:
     world = uses_slots(config) and not config.run
     if uses_demos(config) or (world and config.collect.learn_from_demos):
         config = replace(config, data=_demos(config, out))
-    if (world or models) and not config.data.root:
+    if (world or any(METHODS[name].model for name in config.compare.methods)) and not config.data.root:
         config = replace(config, data=collect_videos(config, out))
     if world:
         model = str(out / "world_model")
@@ -207,7 +218,7 @@ def prepare_shared(config: ExperimentConfig) -> ExperimentConfig:
             train(command, replace(config, out=model, run=""))
         config = replace(config, run=model)
     for method in models.values():
-        stage = METHODS[method].model
+        stage = shared_model(config, method)
         assert stage is not None
         train_model(replace(config, method=method), stage, model_folder(out, stage.name))
     return config
@@ -251,12 +262,16 @@ class Shared:
         self._source = config.run if is_pretrained(config.run) else Path(config.run).name
         self._models = {stage: Run(model_folder(Path(config.out), stage)).own(stage) for stage in latent_models(config)}
         self._demos = open_videos(config, config.data.demos, "compare") if uses_demos(config) else None
+        self._supervised = {name for name in config.compare.methods if _supervised(config, name)}
+        self._videos = open_videos(config, config.data.root, "compare").fingerprint if self._supervised else ""
 
     def parents(self, job: SuccessJob) -> dict[str, str]:
         """Fingerprints of the weights, by stage, and of the demonstrations that a job builds on."""
         method = METHODS[job.method]
         prints = {name: stage.fingerprint for name, stage in self._world.items()} if method.slots else {}
-        if method.model:
+        if job.method in self._supervised:
+            prints["videos"] = self._videos
+        elif method.model:
             prints[method.model.name] = self._models[method.model.name].fingerprint
         if job.demos is not None and self._demos is not None:
             prints["demos"] = first_demonstrations(self._demos, job.demos).fingerprint  # the draw is in its config

@@ -9,6 +9,7 @@ from typing import Any
 
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
+from playslot_rl.config.methods import METHODS
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import CheckpointError
 from playslot_rl.evaluation.held_out import held_out_seeds
@@ -70,7 +71,7 @@ def job_rows(job: SuccessJob, frame_skip: int, status: Status) -> list[dict[str,
                 "episodes": info.get("episodes"),
                 "ci95": info.get("ci95"),
                 "mean_steps_to_success": info.get("mean_steps_to_success"),
-                "train_seconds": meta.get("seconds"),
+                "train_seconds": meta.get("seconds", 0) + own_model_seconds(job) if meta else None,
                 "evaluation_seconds": info.get("wall_seconds"),
                 "parameters": count_parameters(Run(job.run), job.stage) if meta else None,
                 "pretraining": meta.get("pretraining"),
@@ -79,6 +80,13 @@ def job_rows(job: SuccessJob, frame_skip: int, status: Status) -> list[dict[str,
             }
         )
     return rows
+
+
+def own_model_seconds(job: SuccessJob) -> float:
+    """Training of the model of videos that a job makes for itself, because its labels count in it."""
+    model = METHODS[job.method].model
+    meta = json_or_nothing(job.run / model.name / "checkpoint" / "meta.json") if model and model.labels else {}
+    return float(meta.get("seconds", 0)) if meta.get("labelled", "none") != "none" else 0
 
 
 def learning_curve(job: SuccessJob, frame_skip: int) -> list[dict[str, Any]] | None:

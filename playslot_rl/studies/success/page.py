@@ -151,7 +151,9 @@ def _shared(result: Result) -> list[str]:
             f"{stage_title(stage)}: {model['seconds']:.0f} s of training on {model['episodes']} videos without "
             f"actions, {rest}."
         )
-    return notes
+    models = [METHODS[method].model for method in dict.fromkeys(row["method"] for row in result["rows"])]
+    own = [model.title for model in models if model and model.labels and model.name not in result["latent_models"]]
+    return [*notes, *(f"{title}: trained in every job, whose labels count in it, and in its time." for title in own)]
 
 
 def _ratios(summary: Sequence[Result]) -> list[str]:

@@ -1,0 +1,1 @@
+"""LAOM: latent actions in a latent space, which a few real actions supervise."""

@@ -1,0 +1,202 @@
+"""Trainings of LAOM: the latent-action model on unlabelled videos and the labelled demonstrations; then a latent policy
+that clones its latents, and an action decoder.
+
+    L = mean (FDM(sg[h_t], z_t) - (e_{t+1} - e_t))^2 / s + lambda mean (W z_u + b - a_u)^2,   s ~ mean (e_{t+1} - e_t)^2
+
+t runs over the videos and u over the moving transitions of the labelled demonstrations, equally many a step; each frame
+is shifted by itself. s is an average over the last steps, so that lambda (`label_weight`) counts alike in all tasks.
+Targets of the policy are z of one step (k = 1), from frames as they are.
+
+Note: the original's error is not divided, its lambda is 0.001, and its augmentations also turn and tilt frames. Our
+episodes have 20 to 50 steps: k ends with the episode, where the original leaves out its last K steps.
+
+Shapes: B batch, H W image height and width, M transitions, Z latent-action width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from playslot_rl import keys
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.data.clips import Clips
+from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.windows import IntArray
+from playslot_rl.frames import normalise
+from playslot_rl.losses.behaviour import BehaviourLoss
+from playslot_rl.methods.cloning import LatentCloning, cloning
+from playslot_rl.methods.laom.method import NAME, LAOMConfig
+from playslot_rl.methods.laom.model import LAOMPolicy, LatentActions, Target
+from playslot_rl.methods.supervised import Ends, LabelledMoves, jittered
+from playslot_rl.runtime.precision import autocast
+from playslot_rl.runtime.processes import spread
+from playslot_rl.runtime.shares import averaged, own_rows, share
+from playslot_rl.seeds.draws import StepGenerators, global_seed
+from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
+from playslot_rl.training.fit import Part
+from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.stage_regression import apart, together
+from playslot_rl.world_model import module_device
+
+BATCH = 64
+RATE = 0.05
+"""Of the average of the features' change."""
+
+
+class LAOMStage:
+    """The model and its target encoder, the model trained in place; `labelled` is None where labels do not count."""
+
+    def __init__(
+        self, model: LatentActions, target: Target, clips: Clips, labelled: LabelledMoves | None, config: LAOMConfig
+    ) -> None:
+        self.model, self.target, self.clips, self.labelled, self.config = model, target, clips, labelled, config
+        self.ends = Ends.of(clips.source)
+        change = [self.target(*self._frames(rows)) for rows in self._batches(clips.spread(clips.train_episodes))]
+        self.target.change.fill_(max(1e-6, float(torch.cat(change).square().mean())))
+        self._seen = torch.zeros_like(self.target.change)
+
+    @property
+    def modules(self) -> Mapping[str, nn.Module]:
+        return {"model": self.model, "target": self.target}
+
+    def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        count, device = self.config.model.batch_size, module_device(self.model)
+        rows = self.clips.sample(count, generators.numpy("moves"))[:, 0]
+        later = self._later(self.ends, rows, generators, "offsets")
+        frames = self.clips.pixels(own_rows(np.stack((rows, rows + 1, later), axis=1)), device)
+        parts = {"videos": {keys.PIXELS: jittered(frames, self.config.jitter, generators, "jitter")}}
+        if self.labelled is not None:
+            rows, actions = self.labelled.draw(count, generators)
+            later = self._later(self.labelled.ends, rows, generators, "labelled_offsets")
+            frames = self.labelled.pixels(own_rows(np.stack((rows, later), axis=1)))
+            frames = jittered(frames, self.config.jitter, generators, "labelled_jitter")
+            parts["labelled"] = {keys.PIXELS: frames, keys.ACTION: actions}
+        return together(parts)
+
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+        model, videos, labelled = self.model, apart(batch, "videos"), apart(batch, "labelled")
+        now, after, later = normalise(videos[keys.PIXELS]).unbind(1)
+        known = normalise(labelled[keys.PIXELS]).unbind(1) if labelled else ()
+        if model.training and share().micro == 0:
+            self.target.follow(model.features, self.config.target_rate)
+        with autocast(now.device.type, self.config.model.precision):
+            wanted = self.target(now, after)
+            h, h_later, *h_known = model.features(torch.cat((now, later, *known))).split(len(now))
+            predicted = model.change(h, model.infer(h, h_later))
+            actions = model.action(model.infer(*h_known)) if labelled else None
+        latent = (predicted.float() - wanted).square().mean() / self._scale(wanted)
+        if actions is None:
+            return {"loss": latent, "loss_latent": latent}
+        action = (actions.float() - labelled[keys.ACTION]).square().mean()
+        return {"loss": latent + self.config.label_weight * action, "loss_latent": latent, "loss_action": action}
+
+    @torch.no_grad()
+    def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
+        """`unexplained`: error on held-out pairs over that of no change, in the target's features."""
+
+        def look(_: int, rows: IntArray) -> tuple[float, float]:
+            first, second = self._frames(rows)
+            h, later = self.model.features(torch.cat((first, second))).chunk(2)
+            wanted = self.target(first, second)
+            error = self.model.change(h, self.model.infer(h, later)) - wanted
+            return float(error.square().sum()), float(wanted.square().sum())
+
+        errors, stills = zip(*spread(self._batches(self.clips.held_out), look), strict=True)
+        return {"unexplained": sum(errors) / max(1e-12, sum(stills))}
+
+    def _later(self, ends: Ends, rows: IntArray, generators: StepGenerators, stream: str) -> IntArray:
+        return ends.ahead(rows, self.config.offset, generators.numpy(stream))
+
+    def _scale(self, wanted: Tensor) -> Tensor:
+        """s, as it was before this step; the step's own changes (B, E) are taken in after its last micro-batch."""
+        own, scale = share(), self.target.change.clone()
+        seen = wanted.square().mean() / own.micros
+        self._seen = self._seen + seen if own.micro else seen
+        if self.model.training and own.micro == own.micros - 1:
+            self.target.change.lerp_(averaged(self._seen), RATE)
+        return scale
+
+    def _frames(self, rows: IntArray) -> tuple[Tensor, Tensor]:
+        pixels = normalise(self.clips.pixels(rows, module_device(self.model)))
+        return pixels[:, 0], pixels[:, 1]
+
+    @staticmethod
+    def _batches(rows: IntArray) -> list[IntArray]:
+        return np.array_split(rows, -(-len(rows) // BATCH))
+
+
+@torch.no_grad()
+def infer_latents(
+    model: LatentActions, source: EpisodeFrames, moves: Transitions, device: torch.device | str = "cpu"
+) -> Tensor:
+    """Latent actions (M, Z) of transitions, one step each; the model in evaluation mode."""
+    parts = []
+    for rows in np.array_split(moves.rows, -(-len(moves.rows) // BATCH)):
+        pixels = source.pixels(np.stack((rows, rows + 1), axis=1)).to(device)
+        parts.append(model(pixels[:, 0], pixels[:, 1]))
+    return torch.cat(parts)
+
+
+class LAOMBehaviour(LatentCloning):
+    """See `LatentCloning`; a CheckpointError where the model is damaged."""
+
+    def __init__(
+        self, config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
+    ) -> None:
+        self.own: LAOMConfig = config.baselines.laom
+        self.model = load_model(model, device)
+        super().__init__(config, demos, device, self.own.shift, self.own.policy, self.own.loss)
+        with global_seed(config.seed, 0, NAME):
+            self.policy = LAOMPolicy(self.own, config.env.image_size).to(device)
+            self.decoder = self.new_decoder(self.own.latent_dim, self.own.hidden)
+
+    def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
+        return infer_latents(self.model, source, moves, self.device)
+
+    def criterion(self) -> BehaviourLoss:
+        criterion = BehaviourLoss(self.policy, self.own.loss)
+        criterion.set_keys(observation=keys.PIXELS)
+        return criterion
+
+
+def built(own: LAOMConfig, image_size: int, action_dim: int) -> tuple[LatentActions, Target]:
+    """The model and its target encoder, untrained."""
+    model = LatentActions(own, image_size, action_dim)
+    return model, Target(model.features, own.channels, image_size)
+
+
+def load_model(model: StageCheckpoint, device: torch.device | str) -> LatentActions:
+    own, (_, env) = model.group(LAOMConfig, NAME), model.sizes
+    with torch.random.fork_rng(devices=[]):
+        latents, target = built(own, env.image_size, env.action_dim)
+    load_weights(model, {"model": latents, "target": target})
+    return latents.to(device).eval().requires_grad_(False)
+
+
+def model(record: StageRecord) -> Training:
+    config, device = record.config, record.device
+    own: LAOMConfig = config.baselines.laom
+    with global_seed(config.seed, 0, record.name):
+        latents, target = built(own, config.env.image_size, config.env.action_dim)
+    labelled = None if record.labelled is None else LabelledMoves(record.labelled, config, device)
+    stage = LAOMStage(latents.to(device), target.to(device), record.clips(2, shown=256), labelled, own)
+    return Training(
+        [Part("baselines.laom.model", stage, own.model)],
+        device,
+        lambda metrics: (
+            f"{record.name}: {100 * metrics.get('unexplained', float('nan')):.0f} % of the features' change left on "
+            f"held-out pairs, {0 if labelled is None else config.behaviour.labelled_demos} labelled, {record.folder}"
+        ),
+        extra={"episodes": record.data.episodes},
+    )
+
+
+def policy(record: StageRecord) -> Training:
+    own: LAOMConfig = record.config.baselines.laom
+    behaviour = LAOMBehaviour(record.config, record.parents["laom_model"], record.demos, record.device)
+    return cloning(record, behaviour, own.policy, own.decoder_steps, own.decoder_lr)
