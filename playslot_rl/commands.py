@@ -177,7 +177,8 @@ COMMANDS: Final[dict[str, Command]] = {
         "Trains and evaluates every method with every number of demonstrations and every seed, on the same held-out "
         "episodes, and writes OUT/comparison.json, .md, .png and .svg. What is done is reused, so the same command "
         "carries on after a stop and tries what failed again. Here demos=, labels=, seeds= and methods= are lists; "
-        "labels= makes it a table by labelled demonstrations, beside slot_bc and resnet_bc on these alone. The world "
+        "labels= makes it a table by labelled demonstrations, beside slot_bc and resnet_bc on these alone, and videos= "
+        "one by unlabelled videos. worlds= are world models, compare.block=test a fresh block of episodes. The world "
         "model is run=, or trained once into OUT/world_model; data are data.root and data.demos, or recorded once "
         "into OUT/data. Jobs run one after the other, or by a Hydra launcher: hydra.launcher=joblib, submitit_local, "
         "submitit_slurm or ray, with its own keys as hydra.launcher.KEY=VALUE.",

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from playslot_rl.errors import explain
+from playslot_rl.runtime.devices import processor
+from playslot_rl.storage.checkpoints import source_commit
 from playslot_rl.studies.launch import Status, job_lock, read_status, write_status
 
 if TYPE_CHECKING:
@@ -41,7 +43,8 @@ def main(file: Path) -> Status:
             write_status(file, failed)
             print(f"{job['name']}: error: {failed.error}", file=sys.stderr, flush=True)
             return failed
-        done = Status("done", job["fingerprint"], "", round(time.monotonic() - began, 1))
+        spent = round(time.monotonic() - began, 1)
+        done = Status("done", job["fingerprint"], "", spent, source_commit(), processor())
         write_status(file, done)
         return done
 

@@ -16,7 +16,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngImageFile
 
 from playslot_rl.config.methods import canonical_method
-from playslot_rl.studies.success.page import success_figure
+from playslot_rl.studies.success.figure import success_figure
 from playslot_rl.visualization.charts import LIGHT, figure_bytes
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -67,11 +67,13 @@ def draw(found: dict[str, Any]) -> bytes:
             "protocol": "imagination" if dreamt else "simulation",
             "demos": int(videos),
             "labels": int(labels),
+            "world": 0,
         }
         summary.append(row | {"success_rate": mean / 100, "ci95": [low / 100, high / 100]})
         seeds += [row | {"success_rate": end / 100, "seed": seed, "curve": None} for seed, end in enumerate(ends)]
     references = {name: {"success_rate": rate / 100} for name, rate in found["references"].items()}
-    result = {"summary": summary, "rows": seeds, "labels": True, "references": references}
+    result = {"summary": summary, "rows": seeds, "labels": True, "videos": [], "differences": []}
+    result["references"] = references
     return figure_bytes(success_figure(result, LIGHT), LIGHT, facts={FACT: fingerprint(found)})
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from playslot_rl.config.methods import METHODS, require_method
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import SEED, Checked, at_least, between, role
+from playslot_rl.config.roles import SEED, UNSAID, Checked, at_least, between, role
+from playslot_rl.seeds.episodes import TEST_BLOCKS
 
 LAUNCHERS: dict[str, str] = {
     "basic": "hydra",
@@ -21,7 +23,7 @@ LAUNCHERS: dict[str, str] = {
 @dataclass(frozen=True)
 class CompareConfig(Checked):
     """What is compared. On the command line of `playslot compare` the keys are `methods=`, `demos=`, `labels=`,
-    `seeds=`, `processes=` and `hydra.launcher=`, without the group's name.
+    `videos=`, `worlds=`, `seeds=`, `processes=` and `hydra.launcher=`, without the group's name.
 
     Attributes:
         methods: names of `playslot_rl.config.methods`.
@@ -29,9 +31,15 @@ class CompareConfig(Checked):
         labels: numbers of labelled demonstrations. Those with latent actions learn from the videos of all `demos`
             and the real actions of so many of them, `slot_bc`, `resnet_bc`, `act` and `diffusion` from these alone, the
             oracles from the actions of all. Empty: they see those of `behaviour.labelled_demos`.
+        videos: numbers of unlabelled videos that policies clone beside `labels`, instead of `demos`.
+        worlds: world models, and models such as LAPO's, each with all seeds: `run`, `runs`, the rest trained.
+        runs: run folders of further world models, separated by commas.
         seeds: training seeds; each has its own draw of demonstrations.
         online_seeds: training seeds of the methods that act, which take the longest; empty means `seeds`.
-        evaluation_seed: seed of the evaluation's episodes, the same for every method and training seed.
+        evaluation_seed: block of evaluation episodes, the same for all; from 2^31 on a test's.
+        block: `test` takes one that nobody has seen, drawn once for the folder.
+        reference: method whose differences to the others are shown.
+        tasks: comparisons of other tasks, separated by commas, for the interquartile mean over all.
         processes: that each training runs on, by torchrun; methods that act learn in one, and evaluation is in one.
         launcher: Hydra launcher that runs the jobs; empty runs them one after the other.
         hydra: further overrides for Hydra, such as `hydra.launcher.n_jobs=2`.
@@ -41,9 +49,15 @@ class CompareConfig(Checked):
     methods: tuple[str, ...] = ("playslot", "lapo", "slot_oracle", "resnet_oracle", "dreamer", "sold")
     demos: tuple[int, ...] = field(default=(10, 50, 100, 150), metadata=at_least(1, "numbers of at least 1"))
     labels: tuple[int, ...] = field(default=(), metadata=at_least(1, "numbers of at least 1"))
+    videos: tuple[int, ...] = field(default=(), metadata=UNSAID | at_least(0, "numbers of 0 or more"))
+    worlds: int = field(default=1, metadata=UNSAID | between(1, 100, "1 to 100"))
+    runs: str = field(default="", metadata=UNSAID | role("folder"))
     seeds: tuple[int, ...] = field(default=(0, 1, 2), metadata=SEED)
     online_seeds: tuple[int, ...] = field(default=(), metadata=SEED)
     evaluation_seed: int = field(default=100, metadata=SEED)
+    block: Literal["development", "test"] = field(default="development", metadata=UNSAID)
+    reference: str = field(default="playslot", metadata=UNSAID)
+    tasks: str = field(default="", metadata=UNSAID | role("folder"))
     processes: int = field(default=1, metadata=role("machine") | between(1, 1024, "at least 1, 1024 at most"))
     launcher: str = ""
     hydra: tuple[str, ...] = ()
@@ -58,9 +72,25 @@ class CompareConfig(Checked):
             require_method("methods", name)
         still = [name for name in self.methods if not METHODS[name].acts]
         check(not still, "methods", ",".join(still), "methods that act; `playslot compare-video` compares predictions")
-        check(len(set(self.labels)) == len(self.labels), "labels", self.labels, "each one once")
+        for name in ("labels", "videos"):
+            values = getattr(self, name)
+            check(len(set(values)) == len(values), name, values, "each one once")
         most = max(self.labels, default=0)
-        check(most <= min(self.demos), "labels", most, f"at most the {min(self.demos)} demonstrations of demos=")
+        if self.videos:
+            check(bool(self.labels), "videos", self.videos, "numbers of labelled demonstrations, labels=, with them")
+            check(self.demos == CompareConfig.demos, "demos", self.demos, "none with videos=, which says how many")
+        else:
+            check(most <= min(self.demos), "labels", most, f"at most the {min(self.demos)} demonstrations of demos=")
+        self._check_rest()
+
+    def _check_rest(self) -> None:
+        further = [part for part in self.runs.split(",") if part.strip()]
+        check(len(further) < self.worlds, "compare.runs", self.runs, f"fewer than the {self.worlds} of worlds=")
+        frozen = self.evaluation_seed >= TEST_BLOCKS
+        seed = self.evaluation_seed
+        check(not frozen or self.block == "test", "compare.evaluation_seed", seed, "compare.block=test with a test's")
+        known = ", ".join(self.methods)
+        check(self.reference in ("playslot", *self.methods), "compare.reference", self.reference, f"one of {known}")
         alone = [name for name in self.methods if METHODS[name].labelled_only]
         check(bool(self.labels) or not alone, "labels", self.labels, f"some numbers with methods={','.join(alone)}")
         online = self.online_seeds
@@ -69,3 +99,10 @@ class CompareConfig(Checked):
         known = ", ".join(LAUNCHERS)
         check(self.launcher in ("", *LAUNCHERS), "hydra.launcher", self.launcher, f"one of {known}")
         check(not self.hydra or bool(self.launcher), "hydra", self.hydra, "hydra.launcher=NAME with it")
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """All numbers of demonstrations, rising: `demos`, or the labelled ones and the unlabelled `videos`."""
+        if not self.videos:
+            return tuple(sorted(self.demos))
+        return tuple(sorted({labels + videos for labels in self.labels for videos in self.videos}))

@@ -30,13 +30,13 @@ from playslot_rl.errors import ConfigError, first_line
 
 PLAIN_ENV: Final = "button_press"
 """The task whose values one that another package brings starts from: it asks nothing of the model."""
-METHOD_KEYS: Final = ("method", "compare.methods")
+METHOD_KEYS: Final = ("method", "compare.methods", "compare.reference")
 CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
 CONTINUES: Final = frozenset({"evaluate", "export", "inspect", "plan", "play", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
 COMPARISONS: Final = {
-    "compare": ("methods", "demos", "labels", "seeds", "processes"),
+    "compare": ("methods", "demos", "labels", "videos", "worlds", "seeds", "processes"),
     "compare-video": ("methods", "seeds", "vary", "values", "objects", "processes"),
 }
 """Commands with a group of their own in the config, and its keys that go without its name."""
@@ -129,9 +129,7 @@ def _method_names(key: str, value: str) -> str:
     text = _unquote(value.strip())
     words = text.removeprefix("[").removesuffix("]").split(",")
     try:
-        names = ",".join(
-            canonical_method(_unquote(word.strip()), key == "compare.methods") for word in words if word.strip()
-        )
+        names = ",".join(canonical_method(_unquote(word.strip()), key != "method") for word in words if word.strip())
     except ConfigError as error:
         raise ConfigError(f"{key}: {error}") from None
     return f"[{names}]" if text.startswith("[") else names
@@ -153,7 +151,7 @@ def _short_keys(overrides: Sequence[str], command: str) -> list[str]:
         elif equals and name in lists:
             if name == "values":  # of whatever kind the setting is: text until then
                 inside = ",".join(quoted(_unquote(part.strip())) for part in inside.split(",") if part.strip())
-            kept.append(f"{group}.{name}={inside if name in ('vary', 'processes') else f'[{inside}]'}")
+            kept.append(f"{group}.{name}={inside if name in ('vary', 'worlds', 'processes') else f'[{inside}]'}")
         elif equals and lists and name == "hydra.launcher":
             kept.append(f"{group}.launcher={value}")
         elif equals and lists and name.startswith("hydra."):

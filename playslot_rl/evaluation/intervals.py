@@ -76,13 +76,16 @@ def hierarchical(outcomes: Outcomes, bounds: Interval = (-math.inf, math.inf), s
 
 
 def of_successes(outcomes: Outcomes) -> Interval:
-    """95 % interval of a success rate: the bootstrap's, and where that is narrower, as with no failure at all, Wilson's
-    over the episodes of one policy.
+    """95 % interval of a success rate: Wilson's over the episodes for one policy; for several the bootstrap's, or that
+    where it is wider, as with no failure at all.
     """
+    there = ~np.isnan(outcomes)
+    trials = int(there.any(axis=(0, 1)).sum())
+    alone = wilson(float(np.nanmean(outcomes)) * trials, trials)
+    if there.any(axis=2).sum() == 1:
+        return alone
     low, high = hierarchical(outcomes, RATE)
-    trials = int((~np.isnan(outcomes)).any(axis=(0, 1)).sum())
-    least = wilson(float(np.nanmean(outcomes)) * trials, trials)
-    return min(low, least[0]), max(high, least[1])
+    return min(low, alone[0]), max(high, alone[1])
 
 
 def paired(outcomes: Outcomes, reference: Outcomes) -> Outcomes:

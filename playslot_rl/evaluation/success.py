@@ -30,6 +30,7 @@ from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.held_out import check_disjoint, first_seed, held_out_seeds, training_seeds
 from playslot_rl.evaluation.intervals import wilson
+from playslot_rl.runtime.devices import processor
 from playslot_rl.runtime.threads import available_cores
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.world_model import Agent
@@ -227,6 +228,7 @@ def hardware() -> dict[str, Any]:
     """Where and on what a result was measured."""
     return {
         "machine": platform.machine(),
+        "processor": processor(),
         "system": platform.system(),
         "cores": available_cores(),
         "threads": torch.get_num_threads(),

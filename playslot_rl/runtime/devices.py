@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import platform
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from playslot_rl.errors import ConfigError, first_line, require_type
@@ -34,6 +37,18 @@ def named_device(name: str | torch.device = "") -> torch.device:
             f"device={name}: got a device that computes nothing, expected one of {', '.join(KINDS)}; use device=cpu"
         )
     return device
+
+
+@functools.cache
+def processor() -> str:
+    """The kind of processor that computes here, and of GPU where there is one: `AMD EPYC 9R14, NVIDIA H100`."""
+    import torch
+
+    about = Path("/proc/cpuinfo")
+    lines = about.read_text(errors="replace").splitlines() if about.is_file() else []
+    named = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+    kinds = [named or platform.processor() or platform.machine()]
+    return ", ".join([*kinds, torch.cuda.get_device_name()] if torch.cuda.is_available() else kinds)
 
 
 def to_device(values: Tensor, device: torch.device) -> Tensor:

@@ -19,6 +19,10 @@ LARGEST_SEED: Final = 2**32 - 1
 LARGEST_DRAW: Final = 2**63 - 1  # of seeds that only shuffle what is there
 EPISODES: Final = 1_000_000  # episodes of one seed in one stream
 
+TEST_BLOCKS: Final = 2**31
+"""From here on a seed of the evaluation stream is a test's block of episodes, drawn once, when all is frozen; below are
+development's blocks, which choices are made on."""
+
 _SMALL: Final[dict[Stream, tuple[int, int]]] = {
     "collection": (0, 1_000_000_000),
     "evaluation": (1_000_000_000, 3_000_000_000),

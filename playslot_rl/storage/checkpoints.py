@@ -22,6 +22,7 @@ from playslot_rl.config import EnvConfig, ModelConfig, from_dict
 from playslot_rl.config.methods import METHODS
 from playslot_rl.config.plain import flatten
 from playslot_rl.errors import CheckpointError
+from playslot_rl.runtime.devices import processor
 from playslot_rl.runtime.precision import native_bf16
 from playslot_rl.storage.atomic import read_json, write_json
 from playslot_rl.storage.folders import new_folder
@@ -214,6 +215,7 @@ def provenance() -> dict[str, Any]:
         "torch": torch.__version__,
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {'' if native_bf16('cpu') else 'no '}bf16",
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else "",
+        "processor": processor(),
     }
 
 

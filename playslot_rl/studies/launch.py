@@ -38,14 +38,16 @@ SWEEP_MODULE: Final = "playslot_rl.recipes.compare_sweep"
 
 @dataclass(frozen=True)
 class Status:
-    """How a job stands: the fingerprint that it had when this was written, one line of error of a failed job, and
-    wall-clock seconds of the process that wrote this.
+    """How a job stands: the fingerprint that it had when this was written, one line of error of a failed job,
+    wall-clock seconds of the process that wrote this, its commit and its processor.
     """
 
     status: Literal["waiting", "running", "done", "failed"] = "waiting"
     fingerprint: str = ""
     error: str = ""
     seconds: float = 0.0
+    commit: str = ""
+    processor: str = ""
 
 
 def log_file(job_file: Path) -> Path:

@@ -132,6 +132,12 @@ def count_parameters(run: Run, stage: str) -> int:
     return count
 
 
+def made_by(meta: Mapping[str, Any], status: launch.Status) -> dict[str, list[str]]:
+    """`commits` and `processors` that trained a job, as its checkpoint's `meta` says, and that measured it."""
+    kinds = {str(meta.get("processor", "")), status.processor} - {""}
+    return {"commits": sorted({str(meta.get("commit", "")), status.commit} - {""}), "processors": sorted(kinds)}
+
+
 Record = Mapping[str, Any]
 """What a job's file says; `fingerprint` names it."""
 Result = Mapping[str, Any]
@@ -312,6 +318,24 @@ def open_jobs_notes(rows: Sequence[Result], unit: str) -> list[str]:
     notes.append(f"Failures: {len(failed)} of {len(jobs)} {unit}, see above." if failed else "Failures: none.")
     if waiting:
         notes.append(f"Not finished: {len(waiting)} of {len(jobs)} {unit}; the same command carries on.")
+    return notes
+
+
+def origin_notes(rows: Sequence[Result]) -> list[str]:
+    """Of which commit and kind of processor the finished jobs are; where they differ, which are of which."""
+    notes, jobs = [], {row["name"]: row for row in rows if row["status"] == "done"}
+    for key, what in (("commits", "commit"), ("processors", "kind of processor")):
+        found: dict[str, list[str]] = {}
+        for name, row in jobs.items():
+            for one in row.get(key) or ["unknown"]:
+                found.setdefault(one, []).append(name)
+        if len(found) == 1:
+            notes.append(f"Every job is of one {what}: {next(iter(found))}.")
+        elif found:
+            most = max(found, key=lambda one: len(found[one]))
+            others = [f"{one}: {', '.join(names)}" for one, names in found.items() if one != most]
+            parts = [f"{most}: {len(found[most])} of {len(jobs)} jobs", *others]
+            notes.append(f"**Jobs are of more than one {what}.** {'; '.join(parts)}.")
     return notes
 
 

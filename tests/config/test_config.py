@@ -308,6 +308,7 @@ def test_roles_say_what_each_key_counts_for() -> None:
     measures = {"data.held_out", "collect.validation_episodes"}
     assert keys_of(ExperimentConfig, "machine") == machine | named | measures
     weights = {"slots.start_from", "baselines.caddy.perceptual", "metrics.lpips_weights", "compare_video.test"}
+    weights |= {"compare.runs", "compare.tasks"}
     assert keys_of(ExperimentConfig, "folder") == {"out", "run"} | weights | named
 
 

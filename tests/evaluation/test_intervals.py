@@ -110,6 +110,11 @@ def test_what_was_not_measured_is_left_out() -> None:
         hierarchical(np.full((1, 1, 2), np.nan))
 
 
+def test_one_policy_has_wilsons_interval() -> None:
+    outcomes = (np.arange(10) < 4).astype(np.float64)[None, None]
+    assert of_successes(outcomes) == wilson(4, 10)
+
+
 def test_no_failure_leaves_what_wilson_leaves() -> None:
     assert of_successes(np.ones((1, 3, 50))) == wilson(50, 50)
     assert of_successes(np.zeros((3, 1, 50))) == wilson(0, 50)

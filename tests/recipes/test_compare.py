@@ -101,7 +101,7 @@ def test_caddy_and_its_oracle_are_compared_on_one_model(shared_run: Path, tmp_pa
     assert started == ["caddy_policy-d3-l1-s0", "caddy_policy-d3-l2-s0", "caddy_oracle-d3-s0"]
     metas = [json.loads(path.read_text()) for path in (out / "runs").glob("*/caddy_*/checkpoint/meta.json")]
     assert len(metas) == 3
-    assert {meta["parents"]["caddy"] for meta in metas} == {_result(out)["latent_models"]["caddy"]["fingerprint"]}
+    assert {meta["parents"]["caddy"] for meta in metas} == {_result(out)["latent_models"]["caddy"][0]["fingerprint"]}
     first, second = (out / "runs" / f"caddy_policy-d3-l{n}-s0" / "caddy_policy" for n in (1, 2))
     kept = "checkpoints/step_00000006/state.json"
     assert (second / kept).read_bytes() == (first / kept).read_bytes(), "the policy needs no label: trained once"
@@ -109,6 +109,33 @@ def test_caddy_and_its_oracle_are_compared_on_one_model(shared_run: Path, tmp_pa
     page = (out / "comparison.md").read_text()
     assert "CADDY's video model: " in page
     assert "With the actions of all 3: CADDY Oracle" in page
+
+
+@pytest.mark.slow
+def test_two_world_models_on_a_test_block_drawn_once(shared_run: Path, tmp_path: Path, started: list[str]) -> None:
+    out = tmp_path / "out"
+    command = _arguments(shared_run, out, "methods=slot_oracle,lapo", "demos=2", "compare.reference=lapo")
+    assert playslot(*command).code == 0
+    before = _result(out)
+    started.clear()
+    done = playslot(*command, "worlds=2")
+    assert (done.code, done.err) == (0, "")
+    assert started == ["slot_oracle-d2-w1-s0", "lapo-d2-w1-s0"], "those of the first world model are done"
+    found = _result(out)
+    assert found["world_models"][1]["source"] == "world_model_1"
+    prints = {world["fingerprints"]["slots"] for world in found["world_models"]}
+    prints |= {model["fingerprint"] for model in found["latent_models"]["lapo_model"]}
+    assert len(prints) == 4, "two SAVis and two models of LAPO"
+    assert [row["runs"] for row in found["summary"]] == [2, 2]
+    assert [row["method"] for row in found["differences"]] == ["slot_oracle"]
+    assert (before["block"]["kind"], before["summary"][0]["runs"]) == ("development", 1)
+
+    started.clear()
+    assert playslot(*command, "worlds=2", "compare.block=test").code == 0
+    test = _result(out)["block"]
+    assert (test["kind"], len(started)) == ("test", 4), "every policy meets the new episodes"
+    assert playslot(*command, "worlds=2", "compare.block=test").out.count("done before, skipped") == 4
+    assert _result(out)["block"] == test
 
 
 def test_a_changed_setting_is_not_mixed_with_old_results(shared_run: Path, tmp_path: Path, started: list[str]) -> None:
@@ -207,7 +234,7 @@ def test_from_nothing_data_and_world_model_are_made_once(tmp_path: Path, started
     assert (out / "world_model" / "dynamics" / "checkpoint").is_dir()
     assert (out / "lapo_world" / "lapo_model" / "checkpoint").is_dir()
     assert (out / "caddy_world" / "caddy" / "checkpoint").is_dir()
-    assert _result(out)["world_model"]["source"] == "world_model"
+    assert [world["source"] for world in _result(out)["world_models"]] == ["world_model"]
     shared = {name: contents(out / name) for name in ("data", "world_model", "lapo_world", "caddy_world")}
     more = ["demos=3,6" if word == "demos=3" else word for word in command]
     assert playslot(*more).code == 0

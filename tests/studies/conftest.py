@@ -11,7 +11,7 @@ from jobs_on_disk import comparison, finish
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.studies.launch import Status, read_status, write_status
 from playslot_rl.studies.success.jobs import SuccessJob
-from playslot_rl.studies.success.measure import job_rows, summarise
+from playslot_rl.studies.success.measure import job_rows
 
 
 @pytest.fixture
@@ -31,4 +31,4 @@ def ended(tmp_path: Path) -> dict[str, Any]:
     failed = SuccessJob("lapo", 10, 0, tmp_path)
     write_status(failed.file, Status("failed", "f", "loss is nan at step 3, expected a finite number", 1.0))
     rows = [row for job in [*jobs, failed] for row in job_rows(job, 5, read_status(job.file))]
-    return comparison(tmp_path, rows, summarise(rows))
+    return comparison(tmp_path, rows)

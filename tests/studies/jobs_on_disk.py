@@ -12,6 +12,7 @@ from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.tensors import save_tensors
 from playslot_rl.studies.launch import Status, write_status
 from playslot_rl.studies.success.jobs import SuccessJob
+from playslot_rl.studies.success.summary import differences, summarise
 
 
 def finish(job: SuccessJob, successes: dict[str, int], episodes: int = 10, **meta: Any) -> SuccessJob:
@@ -25,23 +26,27 @@ def finish(job: SuccessJob, successes: dict[str, int], episodes: int = 10, **met
         info = {
             "success_rate": won / episodes, "episodes": episodes, "ci95": list(wilson(won, episodes)),
             "mean_steps_to_success": None, "wall_seconds": 4.0,
+            "per_episode": [{"success": number < won} for number in range(episodes)],
         }  # fmt: skip
         write_json(job.run / "evaluation" / protocol / "eval_info.json", info)
     return job
 
 
-def comparison(out: Path, rows: list[dict[str, Any]], summary: list[dict[str, Any]]) -> dict[str, Any]:
+def comparison(out: Path, rows: list[dict[str, Any]], reference: str = "playslot") -> dict[str, Any]:
     """A result as `comparison.json` holds it."""
-    reference = {"success_rate": 1.0, "ci95": [0.7, 1.0]}
+    expert = {"success_rate": 1.0, "ci95": [0.7, 1.0]}
     return {
         "env": "button_press", "preset": "compact",
         "labels": sorted({row["labels"] for row in rows if row["labels"]}), "seeds": [0, 1],
         "episodes": 10, "evaluation_seed": 100,
+        "block": {"number": 100, "kind": "development"}, "videos": [], "worlds": 1, "across_tasks": None,
+        "reference": reference, "differences": differences(rows, reference),
         "max_steps": 20, "frame_skip": 5, "learn_from_demos": True, "latent_models": {},
-        "threads": 0, "jobs": 7, "rows": rows, "summary": summary, "seconds": 99.0, "command": "playslot compare",
+        "threads": 0, "jobs": 7,
+        "rows": rows, "summary": summarise(rows), "seconds": 99.0, "command": "playslot compare",
         "commit": "c", "hardware": {"machine": "x86_64", "cores": 2, "gpu": None},
-        "references": {"expert": reference, "random": {"success_rate": 0.0, "ci95": [0.0, 0.3]}},
-        "world_model": {
-            "source": "pretrained", "fingerprints": {"slots": "ab"}, "seconds": 5.0, "episodes": 700,
-        },
+        "references": {"expert": expert, "random": {"success_rate": 0.0, "ci95": [0.0, 0.3]}},
+        "world_models": [
+            {"source": "pretrained", "fingerprints": {"slots": "ab"}, "seconds": 5.0, "episodes": 700}
+        ],
     }  # fmt: skip

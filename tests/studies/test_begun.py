@@ -145,6 +145,12 @@ COMPARE: dict[str, Any] = {
     "seeds": (0, 1, 2),
     "online_seeds": (0,),
     "evaluation_seed": 7,
+    "block": "test",
+    "videos": (0, 2),
+    "worlds": 2,
+    "runs": "other",
+    "reference": "lapo",
+    "tasks": "other",
     "processes": 2,
     "launcher": "basic",
     "hydra": ("hydra.launcher.n_jobs=2",),
@@ -159,7 +165,12 @@ def test_every_setting_of_compare_is_in_the_table() -> None:
 def test_no_setting_of_compare_makes_a_begun_training_another_one(tmp_path: Path, name: str) -> None:
     """Jobs of the same name train alike, so that there is nothing to refuse."""
     before = compose(["preset=smoke", "methods=playslot,lapo,slot_oracle", "demos=2,3", "seeds=0,1"], "compare")
-    changes = {name: COMPARE[name]} | ({"launcher": "basic"} if name == "hydra" else {})
+    with_it: dict[str, dict[str, Any]] = {
+        "hydra": {"launcher": "basic"},
+        "runs": {"worlds": 2},
+        "videos": {"labels": (2,), "demos": CompareConfig.demos},
+    }
+    changes = {name: COMPARE[name], **with_it.get(name, {})}
     after = dataclasses.replace(before, compare=dataclasses.replace(before.compare, **changes))
     same = set(success_jobs(before, tmp_path)) & set(success_jobs(after, tmp_path))
     assert same

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,11 @@ from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.runs import Run
 from playslot_rl.studies.launch import Status, read_status, write_status
 from playslot_rl.studies.study import count_parameters
+from playslot_rl.studies.success.figure import success_figure
 from playslot_rl.studies.success.jobs import SuccessJob
-from playslot_rl.studies.success.measure import job_rows, summarise
-from playslot_rl.studies.success.page import cell, success_figure, success_page
+from playslot_rl.studies.success.measure import job_rows
+from playslot_rl.studies.success.page import cell, success_page
+from playslot_rl.studies.success.summary import summarise
 from playslot_rl.visualization.charts import LIGHT, figure_bytes
 from playslot_rl.visualization.document import to_markdown
 
@@ -30,8 +33,10 @@ def _of(result: dict[str, Any], method: str, protocol: str = "simulation", demos
 def test_seeds_are_pooled_and_their_range_is_kept(ended: dict[str, Any]) -> None:
     row = _of(ended, "playslot")
     assert row["success_rate"] == pytest.approx(0.7)
-    assert row["ci95"] == list(wilson(7, 10))  # the seeds share their ten episodes
+    assert row["ci95"][0] < wilson(7, 10)[0]
+    assert row["ci95"][1] > wilson(7, 10)[1], "two seeds that differ say more than the episodes of one"
     assert (row["lowest"], row["highest"], row["seeds"], row["episodes"]) == (0.6, 0.8, [0, 1], 20)
+    assert (row["worlds"], row["runs"]) == ([0], 2)
     assert _of(ended, "playslot", "imagination")["success_rate"] == pytest.approx(0.2)
 
 
@@ -60,7 +65,9 @@ def test_parameters_count_floats_of_run_and_parents(tmp_path: Path) -> None:
 
 def test_the_page_has_the_table_the_footnotes_and_the_failure(ended: dict[str, Any]) -> None:
     page = to_markdown(success_page(ended))
-    assert "| PlaySlot, simulation | 70 % (40 to 89; seeds 60 to 80) | – |" in page
+    assert re.search(r"\| PlaySlot, simulation \| 70 % \(\d+ to \d+; seeds 60 to 80\) \| – \|", page)
+    assert "| less PlaySlot | 10 demonstrations |" in page
+    assert re.search(r"\| ResNet Oracle, simulation \| \*{0,2}−40 \(−\d+ to ", page), page
     assert "| Slot Oracle, simulation | 100 % (72 to 100; 1 of 2 seeds) | 100 % (72 to 100; 1 of 2 seeds) |" in page
     assert "| DreamerV3, 30 s on 2 cores | 10,000 | 70 % (40 to 89; 1 of 2 seeds) |" in page
     assert "| DreamerV3, 30 s on 1 core |" in to_markdown(success_page({**ended, "threads": 1}))
@@ -83,13 +90,13 @@ def test_the_page_has_the_table_the_footnotes_and_the_failure(ended: dict[str, A
 def test_a_job_that_waits_is_no_failure(tmp_path: Path) -> None:
     jobs = [finish(SuccessJob("lapo", 10, 0, tmp_path), {"simulation": 8}), SuccessJob("lapo", 50, 0, tmp_path)]
     rows = [row for job in jobs for row in job_rows(job, 5, read_status(job.file))]
-    page = to_markdown(success_page({**comparison(tmp_path, rows, summarise(rows)), "jobs": 2}))
+    page = to_markdown(success_page({**comparison(tmp_path, rows), "jobs": 2}))
     assert "Failures: none." in page
     assert "Not finished: 1 of 2 jobs" in page
 
 
 def test_a_cell_of_one_seed_has_no_range(ended: dict[str, Any]) -> None:
-    assert cell(_of(ended, "resnet_oracle"), seeds=1) == "40 % (17 to 69)"
+    assert cell(_of(ended, "resnet_oracle"), {**ended, "seeds": [0]}) == "40 % (17 to 69)"
 
 
 def test_the_result_is_json(ended: dict[str, Any]) -> None:

@@ -1,5 +1,5 @@
-"""Jobs of a comparison of success: one for each method, number of demonstrations, of labels, and training seed; and
-what they share, made once: demonstrations, videos, the world model, other models of videos."""
+"""Jobs of a comparison of success: one for each method, number of demonstrations, of labels, world model and training
+seed; and what they share, made once: demonstrations, videos, world models, other models of videos."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ class SuccessJob(Job):
             comparison has one number for all (`behaviour.labelled_demos`).
         policy_of: labels of the job, with the same demonstrations and seed, whose policy is this one's too; None for
             one that trains its own.
+        world: number of the world model, or other model of videos, that it builds on; 0 for a method that has none.
     """
 
     method: str
@@ -44,13 +45,15 @@ class SuccessJob(Job):
     out: Path
     labels: int | None = None
     policy_of: int | None = None
+    world: int = 0
 
     @property
     def name(self) -> str:
-        """Such as `lapo-d50-s0`, `lapo-d50-l10-s0` or `dreamer-s0`."""
+        """Such as `lapo-d50-s0`, `lapo-d50-l10-s0`, `lapo-d50-w1-s0` of the second model, or `dreamer-s0`."""
         demos = "" if self.demos is None else f"-d{self.demos}"
         labels = "" if self.labels is None else f"-l{self.labels}"
-        return f"{self.method}{demos}{labels}-s{self.seed}"
+        world = f"-w{self.world}" if self.world else ""
+        return f"{self.method}{demos}{labels}{world}-s{self.seed}"
 
     @property
     def title(self) -> str:
@@ -81,24 +84,31 @@ def success_jobs(config: ExperimentConfig, out: Path) -> list[SuccessJob]:
     alone = [name for name in wanted.methods if METHODS[name].labelled_only]
     others = [name for name in wanted.methods if name not in (*online, *alone)]
     found: list[SuccessJob] = []
-    for seed in wanted.seeds:
-        found += [SuccessJob(name, n, seed, out, n) for n in labels for name in alone]
-        for demos in sorted(wanted.demos):
-            for name in others:
-                found += _of_demonstrations(name, demos, seed, out, labels, _supervised(config, name))
+    for world in range(wanted.worlds):
+        for seed in wanted.seeds:
+            found += [SuccessJob(name, n, seed, out, n, None, world) for n in labels for name in alone]
+            for demos in wanted.numbers:
+                for name in others:
+                    used = [n for n in labels if not wanted.videos or demos - n in wanted.videos]
+                    found += _of_demonstrations(SuccessJob(name, demos, seed, out, world=world), used, config)
     seeds = wanted.online_seeds or wanted.seeds
-    return [*found, *(SuccessJob(name, None, seed, out) for seed in seeds for name in online)]
+    for world in range(wanted.worlds):
+        found += [SuccessJob(name, None, seed, out, world=world) for seed in seeds for name in online]
+    return [job for job in found if not job.world or _builds_on_model(config, job.method)]
 
 
-def _of_demonstrations(
-    method: str, demos: int, seed: int, out: Path, labels: Sequence[int], supervised: bool
-) -> list[SuccessJob]:
-    """One job, or one for each number of labels: the first one's policy serves them all, unless its latents are
-    `supervised` by the labels."""
-    if not labels or not METHODS[method].decodes:
-        return [SuccessJob(method, demos, seed, out)]
-    own = {labels[0], *(labels if supervised else ())}
-    return [SuccessJob(method, demos, seed, out, n, None if n in own else labels[0]) for n in labels]
+def _builds_on_model(config: ExperimentConfig, method: str) -> bool:
+    """Whether it builds on a world model or a model of videos that jobs share, of which there may be several."""
+    return METHODS[method].slots or shared_model(config, method) is not None
+
+
+def _of_demonstrations(job: SuccessJob, labels: Sequence[int], config: ExperimentConfig) -> list[SuccessJob]:
+    """The job, or one for each number of labels: the first one's policy serves them all, unless its latents are
+    supervised by the labels."""
+    if not labels or not METHODS[job.method].decodes:
+        return [job]
+    own = {labels[0], *(labels if _supervised(config, job.method) else ())}
+    return [replace(job, labels=n, policy_of=None if n in own else labels[0]) for n in labels]
 
 
 def _supervised(config: ExperimentConfig, method: str) -> bool:
@@ -125,9 +135,18 @@ def latent_models(config: ExperimentConfig) -> dict[str, str]:
     return {model.name: name for name in config.compare.methods if (model := shared_model(config, name))}
 
 
-def model_folder(out: Path, stage: str) -> Path:
-    """Run folder of such a model in a comparison: `OUT/lapo_world`, `OUT/caddy_world`."""
-    return out / f"{stage.removesuffix('_model')}_world"
+def model_folder(out: Path, stage: str, world: int = 0) -> Path:
+    """Run folder of such a model in a comparison: `OUT/lapo_world`, `OUT/caddy_world`, `OUT/lapo_world_1`."""
+    return numbered(out / f"{stage.removesuffix('_model')}_world", world)
+
+
+def numbered(folder: Path, world: int) -> Path:
+    return folder.with_name(f"{folder.name}_{world}") if world else folder
+
+
+def world_runs(config: ExperimentConfig) -> tuple[str, ...]:
+    """Runs of the world models that are named, `run` first, or empty; all, once they are there."""
+    return (config.run, *(part.strip() for part in config.compare.runs.split(",") if part.strip()))
 
 
 def success_config(config: ExperimentConfig, job: SuccessJob, world: str) -> ExperimentConfig:
@@ -140,7 +159,7 @@ def success_config(config: ExperimentConfig, job: SuccessJob, world: str) -> Exp
     policy = "" if job.policy_of is None else absolute(str(replace(job, labels=job.policy_of).run))
     own = {}
     if model := shared_model(config, job.method):
-        world_of = absolute(str(model_folder(job.out, model.name)))
+        world_of = absolute(str(model_folder(job.out, model.name, job.world)))
         own = {job.method: replace(getattr(config.baselines, job.method), world=world_of)}
     draw = None if job.online else job.seed
     return replace(
@@ -171,6 +190,7 @@ def success_record(job: SuccessJob, config: ExperimentConfig, parents: Mapping[s
         "evaluation_seed": config.compare.evaluation_seed,
         "protocols": list(job.protocols),
         "stage": job.stage,
+        **({"world": job.world} if job.world else {}),
         "processes": 1 if job.online else config.compare.processes,
         "fingerprint": fingerprint_of([result, config.compare.evaluation_seed, dict(parents)]),
         "config": to_dict(config),
@@ -197,7 +217,7 @@ def check_data(config: ExperimentConfig) -> ExperimentConfig:
 
 def check_demos(config: ExperimentConfig, episodes: int, where: str) -> None:
     """Refuse more demonstrations than there are, by a ConfigError."""
-    most = max(config.compare.demos)
+    most = config.compare.numbers[-1]
     if most > episodes:
         raise ConfigError(
             f"demos: got {most}, expected at most the {episodes} demonstrations of {where}: lower it or collect more"
@@ -207,21 +227,37 @@ def check_demos(config: ExperimentConfig, episodes: int, where: str) -> None:
 def prepare_shared(config: ExperimentConfig) -> ExperimentConfig:
     """Record, train or find what the jobs share, finished parts excepted; the config with `data` and `run` complete."""
     out, models = Path(config.out), latent_models(config)
-    world = uses_slots(config) and not config.run
+    world = uses_slots(config) and len([part for part in world_runs(config) if part]) < config.compare.worlds
     if uses_demos(config) or (world and config.collect.learn_from_demos):
         config = replace(config, data=_demos(config, out))
     if (world or any(METHODS[name].model for name in config.compare.methods)) and not config.data.root:
         config = replace(config, data=collect_videos(config, out))
-    if world:
-        model = str(out / "world_model")
-        for command in ("train-slots", "train-dynamics"):
-            train(command, replace(config, out=model, run=""))
-        config = replace(config, run=model)
+    if uses_slots(config):
+        runs = [_world(config, out, number) for number in range(config.compare.worlds)]
+        config = replace(config, run=runs[0], compare=replace(config.compare, runs=",".join(runs[1:])))
     for method in models.values():
         stage = shared_model(config, method)
         assert stage is not None
-        train_model(replace(config, method=method), stage, model_folder(out, stage.name))
+        for number in range(config.compare.worlds):
+            train_model(_of_world(config, method, number), stage, model_folder(out, stage.name, number))
     return config
+
+
+def _world(config: ExperimentConfig, out: Path, number: int) -> str:
+    """Run of a world model, which is trained where none is named."""
+    named = [part for part in world_runs(config) if part]
+    if number < len(named):
+        return named[number]
+    model = str(numbered(out / "world_model", number))
+    for command in ("train-slots", "train-dynamics"):
+        train(command, replace(config, out=model, run="", seed=config.seed + number))
+    return model
+
+
+def _of_world(config: ExperimentConfig, method: str, number: int) -> ExperimentConfig:
+    """What a model of videos is trained with beside the world model of that number."""
+    runs = world_runs(config)
+    return replace(config, method=method, run=runs[number if number < len(runs) else 0], seed=config.seed + number)
 
 
 def _known(config: ExperimentConfig) -> DataConfig:
@@ -247,7 +283,7 @@ def _episodes(root: str | Path) -> int:
 
 def _demos(config: ExperimentConfig, out: Path) -> DataConfig:
     """Enough demonstrations for the largest number; at least the preset's, so that the first ones stay the same."""
-    most, more = max(config.collect.expert_episodes, *config.compare.demos), config.collect.validation_episodes
+    most, more = max(config.collect.expert_episodes, *config.compare.numbers), config.collect.validation_episodes
     there = _episodes(out / RECORDED) if not config.data.demos and _recorded(out) else 0
     if there not in (0, most + more):
         most = there  # recorded for other numbers, or without ones to hold out
@@ -258,9 +294,15 @@ class Shared:
     """What was made or found: what jobs build on, and what the result says of it."""
 
     def __init__(self, config: ExperimentConfig) -> None:
-        self._world = Run.open(config.run).world_stages if uses_slots(config) else {}
-        self._source = config.run if is_pretrained(config.run) else Path(config.run).name
-        self._models = {stage: Run(model_folder(Path(config.out), stage)).own(stage) for stage in latent_models(config)}
+        runs = world_runs(config) if uses_slots(config) else ()
+        self._worlds = [(_source(run), Run.open(run).world_stages) for run in runs]
+        self._models = {
+            stage: [Run(model_folder(Path(config.out), stage, n)).own(stage) for n in range(config.compare.worlds)]
+            for stage in latent_models(config)
+        }
+        prints = [tuple(stage.fingerprint for stage in stages.values()) for _, stages in self._worlds]
+        if len(set(prints)) < len(prints):
+            raise ConfigError(f"compare.runs: got one world model twice among {', '.join(runs)}, expected others")
         self._demos = open_videos(config, config.data.demos, "compare") if uses_demos(config) else None
         self._supervised = {name for name in config.compare.methods if _supervised(config, name)}
         self._videos = open_videos(config, config.data.root, "compare").fingerprint if self._supervised else ""
@@ -268,25 +310,34 @@ class Shared:
     def parents(self, job: SuccessJob) -> dict[str, str]:
         """Fingerprints of the weights, by stage, and of the demonstrations that a job builds on."""
         method = METHODS[job.method]
-        prints = {name: stage.fingerprint for name, stage in self._world.items()} if method.slots else {}
+        world = self._worlds[job.world][1] if method.slots else {}
+        prints = {name: stage.fingerprint for name, stage in world.items()}
         if job.method in self._supervised:
             prints["videos"] = self._videos
         elif method.model:
-            prints[method.model.name] = self._models[method.model.name].fingerprint
+            prints[method.model.name] = self._models[method.model.name][job.world].fingerprint
         if job.demos is not None and self._demos is not None:
             prints["demos"] = first_demonstrations(self._demos, job.demos).fingerprint  # the draw is in its config
         return prints
 
     def plain(self) -> dict[str, Any]:
-        """`world_model` (null where no method builds on one), and the models of videos by stage, `latent_models`."""
-        world = None
-        if self._world:
-            world = {
-                "source": self._source,
-                "fingerprints": {name: stage.fingerprint for name, stage in self._world.items()},
-                "seconds": sum(float(stage.meta.get("seconds", 0.0)) for stage in self._world.values()),
-                "episodes": self._world["slots"].meta.get("episodes"),
+        """`world_models`, and the models of videos by stage, `latent_models`."""
+        worlds = [
+            {
+                "source": source,
+                "fingerprints": {name: stage.fingerprint for name, stage in stages.items()},
+                "seconds": sum(float(stage.meta.get("seconds", 0.0)) for stage in stages.values()),
+                "episodes": stages["slots"].meta.get("episodes"),
             }
+            for source, stages in self._worlds
+        ]
         kept = ("fingerprint", "seconds", "episodes")
-        models = {name: {key: stage.meta.get(key) for key in kept} for name, stage in self._models.items()}
-        return {"world_model": world, "latent_models": models}
+        models = {
+            name: [{key: stage.meta.get(key) for key in kept} for stage in stages]
+            for name, stages in self._models.items()
+        }
+        return {"world_models": worlds, "latent_models": models}
+
+
+def _source(run: str) -> str:
+    return run if is_pretrained(run) else Path(run).name

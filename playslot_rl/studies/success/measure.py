@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,16 +11,17 @@ from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
 from playslot_rl.config.methods import METHODS
 from playslot_rl.envs import gym_id
-from playslot_rl.errors import CheckpointError
+from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.held_out import held_out_seeds
-from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_references
 from playslot_rl.methods.training import check_method
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing
 from playslot_rl.storage.checkpoints import require_config
 from playslot_rl.studies.launch import Status, train
-from playslot_rl.studies.study import Evaluate, Record, count_parameters
+from playslot_rl.studies.study import Evaluate, Record, count_parameters, made_by
+from playslot_rl.studies.success.block import block_of, with_block
+from playslot_rl.studies.success.figure import success_figure
 from playslot_rl.studies.success.jobs import (
     Shared,
     SuccessJob,
@@ -30,16 +31,19 @@ from playslot_rl.studies.success.jobs import (
     success_jobs,
     success_record,
     uses_slots,
+    world_runs,
 )
-from playslot_rl.studies.success.page import success_figure, success_page
+from playslot_rl.studies.success.page import success_page
+from playslot_rl.studies.success.summary import across_tasks, differences, summarise
 
 
 def job_rows(job: SuccessJob, frame_skip: int, status: Status) -> list[dict[str, Any]]:
     """One row for each protocol of a job, finished or not; null where there is nothing to say.
 
-    Of its keys, `env_steps` are `frame_skip` times the `agent_steps`, `samples` optimiser steps times batch, `ci95` is
-    Wilson's, `kept_rows` the share of the demonstrations' rows that trimming left, and `curve` an online method's
-    learning curve, with both kinds of steps.
+    Of its keys, `outcomes` has a digit for each episode, 1 for a success, `commits` and `processors` are those that
+    trained and measured, `env_steps`  are `frame_skip` times the `agent_steps`, `samples` optimiser
+    steps times batch, `ci95` is Wilson's, `kept_rows` the share of the demonstrations' rows that trimming left, and
+    `curve` an online method's learning curve, with both kinds of steps.
     """
     done = status.status == "done"
     meta = json_or_nothing(job.run / job.stage / "checkpoint" / "meta.json") if done else {}
@@ -62,6 +66,7 @@ def job_rows(job: SuccessJob, frame_skip: int, status: Status) -> list[dict[str,
                 "protocol": protocol,
                 "demos": job.demos,
                 "labels": job.labels,
+                "world": job.world,
                 "seed": job.seed,
                 "status": status.status,
                 "error": status.error or None,
@@ -69,6 +74,7 @@ def job_rows(job: SuccessJob, frame_skip: int, status: Status) -> list[dict[str,
                 "success_rate": rate,
                 "successes": None if rate is None else round(rate * info["episodes"]),
                 "episodes": info.get("episodes"),
+                "outcomes": None if rate is None else "".join(str(int(e["success"])) for e in info["per_episode"]),
                 "ci95": info.get("ci95"),
                 "mean_steps_to_success": info.get("mean_steps_to_success"),
                 "train_seconds": meta.get("seconds", 0) + own_model_seconds(job) if meta else None,
@@ -77,6 +83,7 @@ def job_rows(job: SuccessJob, frame_skip: int, status: Status) -> list[dict[str,
                 "pretraining": meta.get("pretraining"),
                 "kept_rows": meta.get("kept_rows"),
                 "curve": learning_curve(job, frame_skip) if job.online else None,
+                **made_by(meta, status),
             }
         )
     return rows
@@ -104,46 +111,6 @@ def count_samples(job: SuccessJob, meta: Mapping[str, Any]) -> int | None:
     return None if batch is None or job.online or not meta else int(meta.get("steps", 0)) * int(batch)
 
 
-def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of finished jobs, pooled over training seeds.
-
-    Steps, seconds and `success_rate` are means over the seeds, `lowest` and `highest` rates of a seed.
-
-    `ci95` is Wilson's interval of that mean over the episodes of one seed: all seeds play the same ones, so that
-    pooling them would count an episode that is easy, or hard, for all of them several times.
-    """
-    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
-    for row in rows:
-        if row["success_rate"] is not None:
-            groups.setdefault((row["method"], row["protocol"], row["demos"], row["labels"]), []).append(row)
-    summary = []
-    for (method, protocol, demos, labels), group in groups.items():
-        rates = [r["success_rate"] for r in group]
-        summary.append(
-            {
-                "method": method,
-                "title": group[0]["title"],
-                "protocol": protocol,
-                "demos": demos,
-                "labels": labels,
-                **{key: _mean(r[key] for r in group) for key in ("agent_steps", "env_steps", "train_seconds")},
-                "seeds": sorted(r["seed"] for r in group),
-                "success_rate": sum(rates) / len(rates),
-                "ci95": list(wilson(sum(r["successes"] for r in group) / len(group), group[0]["episodes"])),
-                "lowest": min(rates),
-                "highest": max(rates),
-                "episodes": sum(r["episodes"] for r in group),
-                "labelled_demos": group[0]["labelled_demos"],
-            }
-        )
-    return summary
-
-
-def _mean(values: Iterable[float | None]) -> int | None:
-    known = [value for value in values if value is not None]
-    return round(sum(known) / len(known)) if known else None
-
-
 class SuccessMeasure:
     """See `playslot_rl.studies.study.Measure`; the config has `out`, and `run` names a world model, or none."""
 
@@ -163,13 +130,14 @@ class SuccessMeasure:
         self.config = check_data(self.config)
 
     def prepare(self) -> Mapping[SuccessJob, Record]:
-        self.config = config = prepare_shared(self.config)
+        self.config = config = prepare_shared(with_block(self.config))
         wanted, shared = config.compare, Shared(config)
-        plain = replace(
-            config, compare=CompareConfig(evaluation_seed=wanted.evaluation_seed, processes=wanted.processes)
-        )
+        own = CompareConfig(evaluation_seed=wanted.evaluation_seed, block=wanted.block, processes=wanted.processes)
+        plain, runs = replace(config, compare=own), world_runs(config)
         found = {
-            job: success_record(job, success_config(plain, job, config.run), shared.parents(job))
+            job: success_record(
+                job, success_config(plain, job, runs[min(job.world, len(runs) - 1)]), shared.parents(job)
+            )
             for job in success_jobs(config, Path(config.out))
         }
         self._references, self._shared = _references(config), shared.plain()
@@ -199,9 +167,15 @@ class SuccessMeasure:
             "seeds": list(own.seeds),
             "episodes": config.episodes,
             "evaluation_seed": own.evaluation_seed,
+            "block": block_of(config),
+            "videos": list(own.videos),
+            "worlds": own.worlds,
             "max_steps": config.env.max_steps,
             "jobs": len({row["name"] for row in rows}),
             "summary": summarise(rows),
+            "reference": own.reference if own.reference in own.methods else None,
+            "differences": differences(rows, own.reference),
+            "across_tasks": self._across_tasks(rows),
             "references": self._references,
             "rows": rows,
             **self._shared,
@@ -209,6 +183,13 @@ class SuccessMeasure:
             "frame_skip": config.env.frame_skip,
             "threads": config.threads,
         }
+
+    def _across_tasks(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+        others = [json_or_nothing(folder / "comparison.json") for folder in task_folders(self.config)]
+        if not others:
+            return None
+        return {"tasks": [self.config.env.name, *(other["env"] for other in others)],
+                "rows": across_tasks([{"rows": rows}, *others])}  # fmt: skip
 
     def sheets(self) -> Mapping[str, bytes]:
         return {}
@@ -223,16 +204,29 @@ def check_success(config: ExperimentConfig) -> None:
     gym_id(env.name)
     for method in config.compare.methods:
         check_method(config, method)
-    if not uses_slots(config) or not config.run:
-        return
-    for checkpoint in Run.open(config.run).world_stages.values():
-        require_config(checkpoint, {"env": {"image_size": env.image_size, "action_dim": env.action_dim}})
-        trained_on = checkpoint.config.get("env", {}).get("name")
-        if trained_on != env.name:
-            raise CheckpointError(
-                f"run={config.run}: got a world model of env={trained_on}, expected env={env.name}: leave run= "
-                "out to train one"
+    task_folders(config)
+    for run in world_runs(config) if uses_slots(config) else ():
+        for checkpoint in Run.open(run).world_stages.values() if run else ():
+            require_config(checkpoint, {"env": {"image_size": env.image_size, "action_dim": env.action_dim}})
+            trained_on = checkpoint.config.get("env", {}).get("name")
+            if trained_on != env.name:
+                raise CheckpointError(
+                    f"run={run}: got a world model of env={trained_on}, expected env={env.name}: leave it out to "
+                    "train one"
+                )
+
+
+def task_folders(config: ExperimentConfig) -> list[Path]:
+    """Folders of the comparisons of other tasks; a ConfigError where one is no finished comparison of this version."""
+    folders = [Path(part.strip()) for part in config.compare.tasks.split(",") if part.strip()]
+    for folder in folders:
+        rows = json_or_nothing(folder / "comparison.json").get("rows") or [{}]
+        if not all("outcomes" in row for row in rows):
+            raise ConfigError(
+                f"compare.tasks: got {folder} without outcomes in comparison.json, expected a comparison's folder: run "
+                "its command again, which computes nothing that is done"
             )
+    return folders
 
 
 def _references(config: ExperimentConfig) -> dict[str, dict[str, Any]]:

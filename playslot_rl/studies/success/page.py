@@ -1,76 +1,159 @@
-"""`comparison.md`, and `comparison.png` and `.svg`: success against demonstrations or labels and against environment
-steps, with footnotes."""
+"""`comparison.md`: success against demonstrations, labels or videos and against environment steps, with footnotes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 from playslot_rl.config.methods import METHODS, stage_title
 from playslot_rl.runtime.progress import format_seconds
-from playslot_rl.studies.study import FOOTNOTES, Result, machine_note, open_jobs_notes
-from playslot_rl.visualization.charts import Theme, legend, new_figure, step_axis, style_axes
+from playslot_rl.studies.study import FOOTNOTES, Result, machine_note, open_jobs_notes, origin_notes
 from playslot_rl.visualization.document import Block, Document, Linked, Notes, Section, Table, Text
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+UNITS = {"demos": "demonstrations", "labels": "labelled", "videos": "videos"}
+
+
+class Panel(NamedTuple):
+    """A table and a panel of the plot, over numbers of `axis`: `demos`, `labels` or `videos`. Rows of the summary,
+    of the differences and of the jobs have their number as `at`; None is one row for all of them.
+    """
+
+    title: str
+    heading: str
+    axis: str
+    alike: str
+    rows: Sequence[Result]
+    differences: Sequence[Result]
+    jobs: Sequence[Result]
 
 
 def success_page(result: Result) -> Document:
+    worlds, block = result["worlds"], result["block"]
+    levels = "world models, seeds and episodes" if worlds > 1 else "seeds and episodes, of one world model"
     lead = (
-        f"Preset `{result['preset']}`, training seeds {_list(result['seeds'])}, {result['episodes']} held-out episodes "
-        f"(block {result['evaluation_seed']} of the evaluation seeds, the same for every method and seed), at most "
-        f"{result['max_steps']} agent steps. Success is the mean over the training seeds; in brackets its 95 % Wilson "
-        "interval over the episodes, which all seeds share, and after it the lowest and the highest seed."
+        f"Preset `{result['preset']}`, world models {worlds}, training seeds {_list(result['seeds'])}, "
+        f"{result['episodes']} held-out episodes, the same for all, at most {result['max_steps']} agent steps. "
+        f"{_block(block)} Success is the mean over the trained policies; in brackets its 95 % bootstrap interval over "
+        f"{levels}, and the lowest and the highest policy."
     )
     sections = [
-        *(_by_labels if result["labels"] else _by_demonstrations)(result["summary"], len(result["seeds"])),
+        *(_section(panel, result) for panel in panels(result)),
         *_by_acting(result),
+        *_across_tasks(result),
         Section(FOOTNOTES, [Notes(_footnotes(result))]),
         Section("Every job", [_jobs(result["rows"])]),
     ]
-    title = f"{result['env']}: success against {'labels' if result['labels'] else 'demonstrations'}"
+    against = "videos" if result["videos"] else "labels" if result["labels"] else "demonstrations"
+    title = f"{result['env']}: success against {against}"
+    title += ", on a development block" if block["kind"] == "development" else ""
     return Document(title, lead, sections, [Linked("Success rate", "comparison.png")])
 
 
-def _by_demonstrations(summary: Sequence[Result], seeds: int) -> list[Section]:
-    rows = [row for row in summary if row["demos"] is not None]
+def _block(block: Result) -> str:
+    if block["kind"] == "development":
+        return (
+            f"**Block {block['number']} is a development block**: choices are made on it, so that these numbers are no "
+            "test (`compare.block=test`)."
+        )
+    when = f", drawn on {block['date']} at commit {block['commit'] or 'unknown'}" if "date" in block else ""
+    return f"Block {block['number']} is a test block{when}."
+
+
+def panels(result: Result) -> list[Panel]:
+    """One for each number of labels where videos are on the axis, for each number of videos where labels are, or one;
+    none where no method learns from demonstrations.
+    """
+    rows = [row for row in result["summary"] if row["demos"] is not None]
     if not rows:
         return []
-    return [Section("By demonstrations", [_success_table(rows, "demos", "demonstrations", seeds)])]
+    if result["videos"]:
+        return [_of_videos(result, rows, labels) for labels in sorted(result["labels"])]
+    if not result["labels"]:
+        jobs, apart = result["rows"], result["differences"]
+        sides = [[{**row, "at": row["demos"]} for row in side if row["demos"]] for side in (rows, apart, jobs)]
+        return [Panel("", "By demonstrations", "demos", "", sides[0], sides[1], sides[2])]
+    videos = sorted({row["demos"] for row in rows if not METHODS[row["method"]].labelled_only})
+    return [_of_labels(result, rows, number) for number in videos or [None]]
 
 
-def _by_labels(summary: Sequence[Result], seeds: int) -> list[Section]:
-    """A table for each number of videos: methods by labelled demonstrations, and the oracles, which see all actions."""
-    rows = [row for row in summary if row["demos"] is not None]
-    sections = []
-    for videos in sorted({row["demos"] for row in rows if not METHODS[row["method"]].labelled_only}) or [None]:
-        own = [row for row in rows if METHODS[row["method"]].labelled_only or row["demos"] == videos]
-        blocks: list[Block] = [_success_table(own, "labels", "labelled", seeds)]
-        ceiling = [f"{row['title']} {cell(row, seeds)}" for row in own if row["labels"] is None]
-        if ceiling:
-            blocks.append(Text(f"With the actions of all {videos}: {'; '.join(ceiling)}."))
-        sections.append(Section(f"By labelled demonstrations{f', of {videos} videos' if videos else ''}", blocks))
-    return sections
+def _of_labels(result: Result, rows: Sequence[Result], videos: int | None) -> Panel:
+    """Methods by labelled demonstrations of so many videos; oracles, which see all actions, are alike for all."""
+
+    def own(side: Sequence[Result]) -> list[Result]:
+        there = [row for row in side if row["demos"] == videos or METHODS[row["method"]].labelled_only]
+        return [{**row, "at": row["labels"]} for row in there]
+
+    heading = f"By labelled demonstrations{f', of {videos} videos' if videos else ''}"
+    all_of = f"With the actions of all {videos}"
+    apart = [{**row, "at": row["labels"]} for row in result["differences"] if row["demos"] == videos]
+    return Panel(f"{videos} videos" if videos else "", heading, "labels", all_of, own(rows), apart, own(result["rows"]))
 
 
-def _success_table(rows: Sequence[Result], key: str, unit: str, seeds: int) -> Table:
-    """Methods and protocols by `demos` or `labels`; rows without that number are left out."""
-    own = [row for row in rows if row[key] is not None]
-    numbers = sorted({row[key] for row in own})
-    cells = {(row["title"], row["protocol"], row[key]): cell(row, seeds) for row in own}
-    series = dict.fromkeys((row["title"], row["protocol"]) for row in own)
+def _of_videos(result: Result, rows: Sequence[Result], labels: int) -> Panel:
+    """Methods by unlabelled videos beside so many labels; what learns from the labels alone is alike for all."""
+
+    def own(side: Sequence[Result]) -> list[Result]:
+        there: list[Result] = []
+        for row in side:
+            alone = METHODS[row["method"]].labelled_only and "difference" not in row
+            at = None if alone or row["demos"] is None else row["demos"] - labels
+            if row["labels"] in (None, labels) and row["demos"] and (at is None or at in result["videos"]):
+                there.append({**row, "at": at})
+        return there
+
+    heading = f"By unlabelled videos, beside {labels} labelled demonstrations"
+    sides = own(rows), own(result["differences"]), own(result["rows"])
+    return Panel(f"{labels} labels", heading, "videos", "From the labels alone", *sides)
+
+
+def _section(panel: Panel, result: Result) -> Section:
+    blocks: list[Block] = [_table(panel.rows, panel.axis, [cell(row, result) for row in panel.rows])]
+    alike = [f"{row['title']} {cell(row, result)}" for row in panel.rows if row["at"] is None]
+    if alike:
+        blocks.append(Text(f"{panel.alike}: {'; '.join(alike)}."))
+    if panel.differences:
+        title = METHODS[result["reference"]].title
+        caption = (
+            f"Points more or less than {title} in simulation, on pairs of the same world model, seed and episode; bold "
+            "where the 95 % interval leaves out 0."
+        )
+        table = _table(panel.differences, panel.axis, [_points(row) for row in panel.differences])
+        blocks.append(Table([f"less {title}", *table.headers[1:]], table.rows, caption))
+    return Section(panel.heading, blocks)
+
+
+def _table(rows: Sequence[Result], axis: str, texts: Sequence[str]) -> Table:
+    """Methods and protocols by the number on the axis; rows without one are left out."""
+    cells = {(row["title"], row["protocol"], row["at"]): text for row, text in zip(rows, texts, strict=True)}
+    numbers = sorted({row["at"] for row in rows} - {None})
+    series = dict.fromkeys((row["title"], row["protocol"]) for row in rows if row["at"] is not None)
     body = [[f"{t}, {p}", *(cells.get((t, p, n), "–") for n in numbers)] for t, p in series]
-    return Table(["", *(f"{n} {unit}" for n in numbers)], body)
+    return Table(["", *(f"{n:,} {UNITS[axis]}" for n in numbers)], body)
+
+
+def _points(row: Result) -> str:
+    """`+35 (28 to 42)`, bold where 0 is left out."""
+    value, low, high = (f"{round(100 * number):+d}" for number in (row["difference"], *row["ci95"]))
+    text = f"{value} ({low} to {high})".replace("-", "−").replace("+0", "0")
+    return f"**{text}**" if row["leaves_out_0"] else text
+
+
+def _across_tasks(result: Result) -> list[Section]:
+    across = result["across_tasks"]
+    if not across:
+        return []
+    rows = [{**row, "at": row["labels"] or 0} for row in across["rows"]]
+    texts = [f"{100 * row['score']:.0f} ({' to '.join(f'{100 * end:.0f}' for end in row['ci95'])})" for row in rows]
+    table = _table(rows, "labels", texts)
+    caption = f"Interquartile mean in % over the policies of {_list(across['tasks'])}; 0 labels: it has no such number."
+    return [Section("Across tasks", [Table(table.headers, table.rows, caption)])]
 
 
 def _by_acting(result: Result) -> list[Section]:
     rows = [row for row in result["summary"] if row["demos"] is None]
     if not rows:
         return []
-    seeds = len(result["seeds"])
-    body = [[budgeted(row, result), _number(row["env_steps"]), cell(row, seeds)] for row in rows]
+    body = [[budgeted(row, result), _number(row["env_steps"]), cell(row, result)] for row in rows]
     return [Section("By acting", [Table(["", "environment steps", "success"], body)])]
 
 
@@ -82,14 +165,17 @@ def budgeted(row: Result, result: Result) -> str:
     return f"{row['title']}, {format_seconds(spent)} on {cores} core{'s' if cores > 1 else ''}"
 
 
-def cell(row: Result, seeds: int) -> str:
-    """Rate, interval and range of the seeds: `97 % (93 to 99; seeds 96 to 98)`; and how many of `seeds`, if not all."""
+def cell(row: Result, result: Result) -> str:
+    """Rate, interval and range: `97 % (93 to 99; seeds 96 to 98)`; and how many policies there are, if not all."""
     low, high = (100 * end for end in row["ci95"])
     text = f"{100 * row['success_rate']:.0f} % ({low:.0f} to {high:.0f}"
-    if len(row["seeds"]) > 1:
-        text += f"; seeds {100 * row['lowest']:.0f} to {100 * row['highest']:.0f}"
-    if len(row["seeds"]) < seeds:
-        text += f"; {len(row['seeds'])} of {seeds} seeds"
+    several = len(row["worlds"]) > 1
+    what = "policies" if several else "seeds"
+    if row["runs"] > 1:
+        text += f"; {what} {100 * row['lowest']:.0f} to {100 * row['highest']:.0f}"
+    wanted = len(result["seeds"]) * len({job["world"] for job in result["rows"] if job["method"] == row["method"]})
+    if row["runs"] < wanted:
+        text += f"; {row['runs']} of {wanted} {what}"
     return f"{text})"
 
 
@@ -119,7 +205,7 @@ def _footnotes(result: Result) -> list[str]:
     ):
         notes += [f"{what}: {'; '.join(parts)}."] if parts else []
     notes.append(_times(done, result))
-    notes += _shared(result)
+    notes += [*_shared(result), *origin_notes(rows)]
     return [*notes, *open_jobs_notes(rows, "jobs"), f"{machine_note(result)}."]
 
 
@@ -137,19 +223,21 @@ def _acting_cost(result: Result) -> list[str]:
 
 def _shared(result: Result) -> list[str]:
     """Models that were trained once, on unlabelled videos, for all demonstrations and seeds."""
-    notes, world = [], result.get("world_model")
+    notes = []
     rest = "the same for every number of demonstrations and every seed"
     if result["learn_from_demos"]:
         rest += "; the preset's own demonstrations are among them, as videos"
-    if world:
+    if result["videos"]:
+        rest += ", and in every column: the videos on the axis are those that a policy clones"
+    for world in result["world_models"]:
         notes.append(
             f"World model of the methods on slots ({world['source']}; slots {world['fingerprints']['slots']}): "
             f"{world['seconds']:.0f} s of training on {world['episodes']} videos without actions, {rest}."
         )
-    for stage, model in result["latent_models"].items():
+    for stage, models in result["latent_models"].items():
+        seconds = ", ".join(f"{model['seconds']:.0f}" for model in models)
         notes.append(
-            f"{stage_title(stage)}: {model['seconds']:.0f} s of training on {model['episodes']} videos without "
-            f"actions, {rest}."
+            f"{stage_title(stage)}: {seconds} s of training on {models[0]['episodes']} videos without actions, {rest}."
         )
     models = [METHODS[method].model for method in dict.fromkeys(row["method"] for row in result["rows"])]
     own = [model.title for model in models if model and model.labels and model.name not in result["latent_models"]]
@@ -240,118 +328,3 @@ def _number(value: object) -> str:
 
 def _list(values: Iterable[object]) -> str:
     return ", ".join(map(str, values))
-
-
-def success_figure(result: Result, theme: Theme) -> Figure:
-    """Draw what `comparison.json` holds.
-
-    A method has its colour and marker everywhere; imagination is dashed. Bars are 95 % Wilson intervals over the
-    episodes, which all seeds share, small dots are single seeds, the grey lines the references.
-    """
-    offline = [row for row in result["summary"] if row["demos"] is not None]
-    curves = [row for row in result["rows"] if row["curve"]]
-    final = [row for row in result["summary"] if row["demos"] is None]
-    online = bool(curves or final)
-    groups = _panels(result, offline) or ([] if online else [("", [])])
-    panels = len(groups) + int(online)
-    figure = new_figure(9.6 if panels > 1 else 6.4, 3.9)
-    for number, (title, rows) in enumerate(groups, 1):
-        axes = figure.add_subplot(1, panels, number)
-        axes.set_title(title, color=theme.text, fontsize=10)
-        _against(axes, rows, result["rows"], theme, "labels" if result["labels"] else "demos")
-        _finish(axes, result, theme)
-    if online:
-        axes = figure.add_subplot(1, panels, panels)
-        _steps(axes, curves, [{**row, "title": budgeted(row, result)} for row in final], theme)
-        _finish(axes, result, theme)
-    legend(figure, theme, loc="outside lower center", ncols=3, fontsize=9)
-    return figure
-
-
-def _panels(result: Result, offline: Sequence[Result]) -> list[tuple[str, Sequence[Result]]]:
-    """Title and rows of each panel of the methods that learn from demonstrations: by labels, one a number of videos."""
-    if not result["labels"]:
-        return [("", offline)] if offline else []
-    videos = sorted({row["demos"] for row in offline if not METHODS[row["method"]].labelled_only})
-    if not videos:
-        return [("", offline)] if offline else []
-    return [
-        (f"{n} videos", [row for row in offline if METHODS[row["method"]].labelled_only or row["demos"] == n])
-        for n in videos
-    ]
-
-
-def _against(axes: Axes, summary: Sequence[Result], rows: Sequence[Result], theme: Theme, key: str) -> None:
-    """Success over `demos` or `labels`; what has no such number, oracles among labels, is a line across."""
-    for row in (row for row in summary if row[key] is None):
-        colour = theme.series[METHODS[row["method"]].style.colour]
-        axes.axhline(100 * row["success_rate"], color=colour, linestyle="-.", linewidth=1.2, label=row["title"])
-    summary = [row for row in summary if row[key] is not None]
-    shown = {(row["method"], row["protocol"], row["demos"]) for row in summary}
-    series = list(dict.fromkeys((row["method"], row["protocol"], row["title"]) for row in summary))
-    numbers = sorted({row[key] for row in summary})
-    for index, (method, protocol, title) in enumerate(series):
-        style, own = METHODS[method].style, [r for r in summary if (r["method"], r["protocol"]) == (method, protocol)]
-        own.sort(key=lambda row: row[key])
-        # Side by side, so that equal rates do not hide each other; by a factor, since the axis is logarithmic.
-        aside = 1.035 ** (index - (len(series) - 1) / 2)
-        x, y = [row[key] * aside for row in own], [100 * row["success_rate"] for row in own]
-        below = [max(0.0, 100 * (row["success_rate"] - row["ci95"][0])) for row in own]
-        above = [max(0.0, 100 * (row["ci95"][1] - row["success_rate"])) for row in own]
-        dream = protocol == "imagination"
-        colour = theme.series[style.colour]
-        axes.errorbar(
-            x, y, [below, above], color=colour, marker=style.marker, markersize=6, linewidth=1.6,
-            linestyle="--" if dream else "-", markerfacecolor=theme.ground if dream else colour, capsize=2,
-            elinewidth=1.2, label=f"{title}, imagination" if dream else title,
-        )  # fmt: skip
-        single = [
-            r
-            for r in rows
-            if (r["method"], r["protocol"]) == (method, protocol)
-            and (method, protocol, r["demos"]) in shown
-            and r["success_rate"] is not None
-        ]
-        if len({row["seed"] for row in single}) > 1:
-            dots = [row[key] * aside for row in single]
-            axes.plot(dots, [100 * row["success_rate"] for row in single], ".", color=colour, markersize=4, alpha=0.5)
-    axes.set_xscale("log")
-    axes.set_xticks(numbers, [str(n) for n in numbers])
-    axes.minorticks_off()
-    axes.set_xlabel("labelled demonstrations" if key == "labels" else "demonstrations")
-
-
-def _steps(axes: Axes, curves: Sequence[Result], final: Sequence[Result], theme: Theme) -> None:
-    for method in dict.fromkeys(row["method"] for row in [*curves, *final]):
-        style = METHODS[method].style
-        colour = theme.series[style.colour]
-        own = [row for row in curves if row["method"] == method]
-        for row in own:
-            points = [p for p in row["curve"] if p.get("success_rate") is not None and p.get("env_steps") is not None]
-            x = [p["env_steps"] for p in points]
-            axes.plot(x, [100 * p["success_rate"] for p in points], color=colour, linewidth=1.2, alpha=0.6)
-        for end in (row for row in final if row["method"] == method and row["env_steps"] is not None):
-            low, high = end["ci95"]
-            error = [[100 * (end["success_rate"] - low)], [100 * (high - end["success_rate"])]]
-            axes.errorbar(
-                [end["env_steps"]], [100 * end["success_rate"]], error, color=colour, marker=style.marker,
-                markersize=7, linestyle="none", capsize=2, label=end["title"],
-            )  # fmt: skip
-        dots = [r for r in own if r["env_steps"] is not None and r["success_rate"] is not None]
-        if len(dots) > 1:
-            rates = [100 * r["success_rate"] for r in dots]
-            axes.plot([r["env_steps"] for r in dots], rates, ".", color=colour, markersize=4, alpha=0.5)
-        if not any(row["method"] == method and row["env_steps"] is not None for row in final):
-            axes.plot([], [], color=colour, marker=style.marker, label=(own or list(final))[0]["title"])
-    step_axis(axes)
-    axes.set_xlabel("environment steps (lines: development episodes)")
-
-
-def _finish(axes: Axes, result: Result, theme: Theme) -> None:
-    for name, line in (("expert", ":"), ("random", "--")):
-        rate = result["references"].get(name, {}).get("success_rate")
-        if rate is not None:
-            axes.axhline(100 * rate, color=theme.series[7], linestyle=line, linewidth=1.2, label=f"{name} actions")
-    axes.set_ylim(-3, 103)
-    axes.set_ylabel("success rate, %")
-    style_axes(axes, theme)

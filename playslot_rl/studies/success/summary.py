@@ -1,0 +1,150 @@
+"""Rows of finished jobs pooled over world models and policy seeds: rates, differences to a reference, over tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from playslot_rl.config.methods import METHODS
+from playslot_rl.evaluation.intervals import (
+    Outcomes,
+    hierarchical,
+    of_successes,
+    over_tasks,
+    paired,
+)
+
+Row = Mapping[str, Any]
+CELL = ("method", "protocol", "demos", "labels")
+"""What names a cell of the table."""
+
+
+def cells(rows: Iterable[Row]) -> dict[tuple[Any, ...], list[Row]]:
+    """Rows of finished jobs by cell: one for each world model and seed."""
+    found: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        if row["success_rate"] is not None:
+            found.setdefault(tuple(row[name] for name in CELL), []).append(row)
+    return found
+
+
+def outcomes_of(runs: Sequence[Row], seeds: Sequence[int]) -> Outcomes:
+    """Outcomes (W, S, E) of a cell's runs, 1 for a success; NaN where a seed has no run."""
+    worlds = sorted({run["world"] for run in runs})
+    found = np.full((len(worlds), len(seeds), len(runs[0]["outcomes"])), np.nan)
+    for run in runs:
+        if run["seed"] in seeds:
+            found[worlds.index(run["world"]), seeds.index(run["seed"])] = [int(one) for one in run["outcomes"]]
+    return found
+
+
+def summarise(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """One row a cell: steps, seconds and `success_rate` are means over its runs, `lowest` and `highest` rates of one.
+
+    `ci95` is over world models, policy seeds and episodes (`playslot_rl.evaluation.intervals`).
+    """
+    return [_summary(cell, runs) for cell, runs in cells(rows).items()]
+
+
+def _summary(cell: tuple[Any, ...], runs: Sequence[Row]) -> dict[str, Any]:
+    rates, seeds = [run["success_rate"] for run in runs], sorted({run["seed"] for run in runs})
+    return {
+        **dict(zip(CELL, cell, strict=True)),
+        "title": runs[0]["title"],
+        **{key: _mean(run[key] for run in runs) for key in ("agent_steps", "env_steps", "train_seconds")},
+        "worlds": sorted({run["world"] for run in runs}),
+        "seeds": seeds,
+        "runs": len(runs),
+        "success_rate": sum(rates) / len(rates),
+        "ci95": list(of_successes(outcomes_of(runs, seeds))),
+        "lowest": min(rates),
+        "highest": max(rates),
+        "episodes": sum(run["episodes"] for run in runs),
+        "labelled_demos": runs[0]["labelled_demos"],
+    }
+
+
+def _mean(values: Iterable[float | None]) -> int | None:
+    known = [value for value in values if value is not None]
+    return round(sum(known) / len(known)) if known else None
+
+
+def differences(rows: Sequence[Row], reference: str) -> list[dict[str, Any]]:
+    """Success of each cell less that of the reference method in simulation, on pairs of the same world model, seed and
+    episode; `demos` and `labels` are those of the pair, and `leaves_out_0` says that the interval does.
+
+    What learns from the labels alone meets the reference at every number of videos, an oracle at every number of
+    labels, and a method that acts at all of them.
+    """
+    found, known = [], cells(rows)
+    for other, there in known.items():
+        if other[:2] != (reference, "simulation"):
+            continue
+        for cell, runs in known.items():
+            if cell[:2] == other[:2] or not (at := _pair(cell, other)):
+                continue
+            seeds = sorted({run["seed"] for run in runs} & {run["seed"] for run in there})
+            if not seeds:
+                continue
+            outcomes = paired(*(outcomes_of(side, seeds) for side in _same_worlds(runs, there)))
+            low, high = hierarchical(outcomes, (-1.0, 1.0))
+            found.append(
+                {
+                    **dict(zip(CELL, (*cell[:2], *at), strict=True)),
+                    "title": runs[0]["title"],
+                    "seeds": seeds,
+                    "difference": float(np.nanmean(outcomes)),
+                    "ci95": [low, high],
+                    "leaves_out_0": low > 0 or high < 0,
+                }
+            )
+    return found
+
+
+def _pair(cell: tuple[Any, ...], reference: tuple[Any, ...]) -> tuple[Any, Any] | None:
+    """Demonstrations and labels at which two cells meet; None where they do not."""
+    demos, labels = (sorted({side[at] for side in (cell, reference)} - {None}) for at in (2, 3))
+    alone = [METHODS[side[0]].labelled_only for side in (cell, reference)]
+    if len(labels) > 1 or (len(demos) > 1 and not any(alone)):
+        return None
+    return (cell if alone[1] else reference)[2], labels[0] if labels else None
+
+
+def _same_worlds(runs: Sequence[Row], reference: Sequence[Row]) -> tuple[Sequence[Row], Sequence[Row]]:
+    """The runs of two cells on the world models that both have; all, where one of them has but one."""
+    worlds = [{run["world"] for run in side} for side in (runs, reference)]
+    if min(len(side) for side in worlds) == 1:
+        return runs, reference
+    common = worlds[0] & worlds[1]
+    first, second = ([run for run in side if run["world"] in common] for side in (runs, reference))
+    return first, second
+
+
+def across_tasks(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Interquartile means over the runs of all tasks, of methods and labels that are finished in each of them: `score`,
+    `ci95`, `runs`. Where a task has several numbers of demonstrations, the largest counts.
+    """
+    tasks = [_largest(result["rows"]) for result in results]
+    rows = []
+    for key in tasks[0]:
+        if not all(key in task for task in tasks):
+            continue
+        runs = [task[key] for task in tasks]
+        outcomes = [outcomes_of(side, sorted({run["seed"] for run in side})) for side in runs]
+        if any(np.isnan(one).any() for one in outcomes):
+            continue
+        score, interval = over_tasks(outcomes)
+        values = dict(zip(("method", "protocol", "labels"), key, strict=True))
+        rows.append(values | {"title": runs[0][0]["title"], "score": score, "ci95": list(interval)})
+    return rows
+
+
+def _largest(rows: Sequence[Row]) -> dict[tuple[Any, ...], list[Row]]:
+    known, most = cells(rows), dict[tuple[Any, ...], tuple[Any, ...]]()
+    for cell in known:
+        key = (*cell[:2], cell[3])
+        if key not in most or (cell[2] or 0) > (most[key][2] or 0):
+            most[key] = cell
+    return {key: known[cell] for key, cell in most.items()}
