@@ -17,8 +17,9 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 NOTEBOOK = sorted((DOCS / "notebook").glob("*.md"))
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if page not in NOTEBOOK]
-LIMITS = {"README.md": 1_200, "docs": 26_000, "notebook": 12_000}
-"""Words, at most."""
+KEYS = DOCS / "reference" / "keys.md"
+LIMITS = {"README.md": 1_200, "docs": 20_600, "notebook": 12_000, "keys": 6_500}
+"""Words, at most. The page of keys is made, looked up and grows with the methods: it has a limit of its own."""
 SOURCES = ("playslot_rl", "recipes", "envs", "collectors", "tests", "lerobot_policy_playslot", "docs", "results")
 SUFFIXES = {".py", ".md", ".yaml", ".toml", ".json"}
 RESULTS = {".json", ".jsonl", ".md", ".html", ".lock", ".safetensors"}
@@ -62,7 +63,13 @@ def generator() -> ModuleType:
 
 
 @pytest.mark.parametrize(
-    ("name", "pages"), [("README.md", [ROOT / "README.md"]), ("docs", PAGES), ("notebook", NOTEBOOK)]
+    ("name", "pages"),
+    [
+        ("README.md", [ROOT / "README.md"]),
+        ("docs", [page for page in PAGES if page != KEYS]),
+        ("notebook", NOTEBOOK),
+        ("keys", [KEYS]),
+    ],
 )
 def test_a_reader_finishes(name: str, pages: list[Path]) -> None:
     assert pages

@@ -220,7 +220,9 @@ def caddy() -> Part:
 
 
 def lapo() -> Part:
-    own = LAPOConfig(channels=(4, 8), hidden=16, groups=2, code_dim=4, codes=6, dead_threshold=1.5)
+    own = LAPOConfig(
+        channels=(4, 8), forward_channels=(4, 8), hidden=16, groups=4, code_dim=4, codes=6, dead_threshold=1.5
+    )
     with global_seed(0, 0, "test"):
         inverse, forward = InverseModel(own, 16).to(DEVICE), ForwardModel(own).to(DEVICE)
     return Part("lapo", LAPOModelStage(inverse, forward, clips(16, 2), _plain()), _plain())

@@ -12,7 +12,11 @@ from playslot_rl.config.methods import Load, Method, Style
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import COUNT, NOT_NEGATIVE, OPEN_FRACTION, RATE, Checked, at_least, between, role, was
 from playslot_rl.config.stage_spec import StageSpec
-from playslot_rl.config.stages import DECODING, StageConfig, clipped_stage
+from playslot_rl.config.stages import DECODING, OptimConfig, StageConfig
+from playslot_rl.errors import ConfigError
+
+Encoder = Literal["impala", "strided"]
+Targets = Literal["continuous", "quantised"]
 
 
 @dataclass(frozen=True)
@@ -21,12 +25,16 @@ class LAPOConfig(Checked):
     fine-tuning are `behaviour`'s, as for PlaySlot.
 
     Attributes:
-        channels: of the convolutional encoders; each halves the resolution.
+        encoder: `impala`, or `strided`, which is quicker.
+        channels: of the encoders; each halves the resolution.
+        forward_channels: of the forward model's U-Net; none: `channels`.
+        frames: that the inverse model sees; the forward model sees all but the last.
         hidden: width of the layer between an encoder and its output.
         groups: G codes that make up a latent action.
+        codebooks: that groups share equally.
         code_dim: width of each, so that a latent action has `groups * code_dim` numbers.
-        codes: K entries of the codebook, which the groups share.
-        decay: of the codebook's moving average.
+        codes: K entries of a codebook.
+        decay: of the codebooks' moving averages.
         dead_threshold: EMA cluster size under which a code is revived.
         commitment: weight beta of the commitment term.
         loss: of the latent policy and the action decoder: `l2` or `l1`.
@@ -41,41 +49,68 @@ class LAPOConfig(Checked):
     """
 
     group = "baselines.lapo."
+    encoder: Encoder = field(default="impala", metadata=was("strided"))
     channels: tuple[int, ...] = field(default=(64, 128, 128), metadata=COUNT)
+    forward_channels: tuple[int, ...] = field(default=(24, 48, 96, 192, 384, 768), metadata=was(()) | COUNT)
+    frames: int = field(default=3, metadata=was(2) | between(2, 3, "2 or 3"))
     hidden: int = field(default=256, metadata=COUNT)
     groups: int = field(default=8, metadata=at_least(1))
+    codebooks: int = field(default=2, metadata=was(1) | at_least(1))
     code_dim: int = field(default=16, metadata=COUNT)
     codes: int = field(default=64, metadata=at_least(2))
-    decay: float = field(default=0.99, metadata=OPEN_FRACTION)
+    decay: float = field(default=0.999, metadata=OPEN_FRACTION)
     dead_threshold: float = field(default=1.0, metadata=NOT_NEGATIVE)
     commitment: float = field(default=0.05, metadata=NOT_NEGATIVE)
     loss: Literal["l2", "l1"] = "l2"
-    targets: Literal["quantised", "continuous"] = field(default="continuous", metadata=was("quantised"))
+    targets: Targets = field(default="continuous", metadata=was("quantised"))
     shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
-    model: StageConfig = field(default_factory=lambda: clipped_stage(200_000, 3e-4, "cosine"))
-    policy: StageConfig = field(default_factory=lambda: clipped_stage(20_000, 2e-4, "constant"))
+    model: StageConfig = field(default_factory=lambda: _stage(50_000, 3e-4, 50, 2.0))
+    policy: StageConfig = field(default_factory=lambda: _stage(60_000, 2e-4, 1000, 0.0))
     decoder_steps: int = field(default=20_000, metadata=at_least(1))
     decoder_lr: float = field(default=2e-4, metadata=RATE)
     world: str = field(default="", metadata=role("machine", "folder"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(1 <= len(self.channels) <= 5, "baselines.lapo.channels", self.channels, "1 to 5 widths")
+        check(1 <= len(self.channels) <= 6, "baselines.lapo.channels", self.channels, "1 to 6 widths")
+        books = f"a divisor of groups {self.groups}"
+        check(self.groups % self.codebooks == 0, "baselines.lapo.codebooks", self.codebooks, books)
 
     @property
     def latent_dim(self) -> int:
         """Z = G times the width of a code."""
         return self.groups * self.code_dim
 
+    def check(self, name: str, config: ExperimentConfig) -> None:
+        """Refuse more halvings than frames have, by a ConfigError."""
+        size = config.env.image_size
+        for key in ("channels", "forward_channels"):
+            widths: tuple[int, ...] = getattr(self, key)
+            if size % 2 ** len(widths):
+                raise ConfigError(
+                    f"{name}.{key}: got {len(widths)} widths, each of which halves frames of env.image_size={size}, "
+                    "expected fewer: name those alone that fit"
+                )
+
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
         for part, stage in (("model", self.model), ("policy", self.policy)):
             yield windows(f"{name}.{part}", stage, frame_numbers(config))
-        weights = 9 * chain(3, *self.channels) + self.hidden * (self.channels[-1] + self.latent_dim)
+        weights = 9 * (chain(3, *self.channels) + chain(3, *self.forward_channels))
+        weights += self.hidden * (self.channels[-1] + self.latent_dim)
         yield Need((name,), "LAPO's weights", (weights + self.codes * self.code_dim) * WEIGHT)
 
 
+def _stage(steps: int, lr: float, warmup: int, clip: float) -> StageConfig:
+    """As the published code; its rates fall linearly."""
+    optim = OptimConfig(lr=lr, warmup_steps=warmup, schedule="cosine", grad_clip=clip)
+    return StageConfig(steps=steps, batch_size=128, optim=optim)
+
+
 NAME: Final = "lapo"
-SIZES: Final = ("channels", "hidden", "groups", "code_dim", "codes", "decay", "dead_threshold", "commitment")
+SIZES: Final = (
+    "encoder", "channels", "forward_channels", "frames", "hidden", "groups", "codebooks", "code_dim", "codes", "decay",
+    "dead_threshold", "commitment",
+)  # fmt: skip
 """Settings that inverse and forward model are built from."""
 _BUILT: Final = tuple(f"baselines.lapo.{key}" for key in SIZES)
 MODEL: Final = StageSpec(

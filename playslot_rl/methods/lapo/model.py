@@ -1,21 +1,24 @@
 """LAPO's inverse and forward model on pixels (Schmidt and Jiang, 2024, "Learning to Act without Actions", section 4),
 and the convolutional encoder that its three networks share in form (not in weights).
 
-    z_t = VQ(IDM(o_t, o_{t+1})),   o^_{t+1} = FDM(o_t, z_t)
+    z_t = VQ(IDM(o_{t-1}, o_t, o_{t+1})),   o^_{t+1} = FDM(o_{t-1}, o_t, z_t)
 
 The forward model sees the next frame only through z_t, whose few codes are the bottleneck: what they best carry is what
-the agent did.
+the agent did. Before an episode's first frame that frame stands again. Groups of z_t are looked up in `codebooks`
+codebooks, as many in each.
 
-Note: LAPO's inverse model also sees o_{t-1}; two frames make the latent comparable with InvDyn's. Each dimension of z
-is standardised over the batch (BatchNorm without weights) before it is quantised: pairs of frames differ little from
-each other, and otherwise all of them fall to one code, from which nothing is learned. The forward model predicts the
-change of the frame and starts from no change at all.
+Note: each dimension of z is standardised over the batch (BatchNorm without weights) before it is quantised: frames
+differ little from the next ones, and otherwise all of them fall to one code, from which nothing is learned. The forward
+model predicts the change of the frame and starts from no change at all. Where LAPO concatenates z to the maps, a linear
+map of it is added, which differs at the borders alone; its U-Net has BatchNorm and transposed convolutions.
 
-Shapes: B batch, C input channels, H W image height and width, G groups, Z = G times the width of a code.
+Shapes: B batch, F frames (`frames`), C input channels, H W image height and width, G groups, Z = G times the width of a
+code.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -25,9 +28,10 @@ from torch.nn import functional as F
 from playslot_rl.acting.actor import Actor, latent_actor
 from playslot_rl.frames import normalise
 from playslot_rl.methods.decoded_policy import DecodedPolicy
-from playslot_rl.methods.lapo.method import MODEL, NAME, LAPOConfig
+from playslot_rl.methods.lapo.method import MODEL, NAME, Encoder, LAPOConfig
 from playslot_rl.modules.quantizer import ActionQuantizer
 from playslot_rl.runs import Run
+from playslot_rl.storage.checkpoints import StageCheckpoint
 
 
 class ResidualBlock(nn.Module):
@@ -43,22 +47,36 @@ class ResidualBlock(nn.Module):
         return out
 
 
-class ConvEncoder(nn.Module):
-    """Levels of halved resolution: a strided 3x3 conv and a residual block (after IMPALA, Espeholt et al., 2018)."""
+def _level(kind: Encoder, ins: int, outs: int) -> nn.Sequential:
+    if kind == "strided":
+        return nn.Sequential(nn.Conv2d(ins, outs, 3, stride=2, padding=1), ResidualBlock(outs))
+    blocks = [ResidualBlock(outs) for _ in range(2)]
+    return nn.Sequential(nn.Conv2d(ins, outs, 3, padding=1), nn.MaxPool2d(3, stride=2, padding=1), *blocks)
 
-    def __init__(self, in_channels: int, channels: tuple[int, ...]) -> None:
+
+class ConvEncoder(nn.Module):
+    """Levels of halved resolution: of `impala` (Espeholt et al., 2018) a 3x3 conv, a maximum over 3x3 and two residual
+    blocks; `strided` has a conv of stride 2 and one block, a fifth of the arithmetic.
+    """
+
+    def __init__(self, in_channels: int, channels: tuple[int, ...], kind: Encoder = "strided") -> None:
         super().__init__()
         ins = (in_channels, *channels[:-1])
-        self.levels = nn.ModuleList(
-            nn.Sequential(nn.Conv2d(a, b, 3, stride=2, padding=1), ResidualBlock(b))
-            for a, b in zip(ins, channels, strict=True)
-        )
+        self.levels = nn.ModuleList(_level(kind, a, b) for a, b in zip(ins, channels, strict=True))
 
-    def forward(self, x: Tensor) -> list[Tensor]:
-        """(B, C, H, W) to the outputs of all levels, (B, channels[i], H / 2^(i+1), W / 2^(i+1)), after a ReLU."""
-        outputs = []
+    def forward(self, x: Tensor, start: Tensor | None = None) -> list[Tensor]:
+        """(B, C, H, W) to the outputs of all levels, (B, channels[i], H / 2^(i+1), W / 2^(i+1)), after a ReLU; `start`
+        (B, channels[0]) is added behind the first conv.
+        """
+        outputs: list[Tensor] = []
         for level in self.levels:
-            x = F.relu(level(x))
+            first, *rest = level.children()
+            x = first(x)
+            if start is not None and not outputs:
+                x = x + start[:, :, None, None]
+            for part in rest:
+                x = part(x)
+            x = F.relu(x)
             outputs.append(x)
         return outputs
 
@@ -66,11 +84,24 @@ class ConvEncoder(nn.Module):
 class EncoderMLP(nn.Module):
     """A ConvEncoder's last level, flattened, through one hidden layer: (B, C, H, W) to (B, out_dim)."""
 
-    def __init__(self, in_channels: int, channels: tuple[int, ...], image_size: int, hidden: int, out_dim: int) -> None:
+    def __init__(
+        self,
+        in_channels: int,
+        channels: tuple[int, ...],
+        image_size: int,
+        hidden: int,
+        out_dim: int,
+        kind: Encoder = "strided",
+    ) -> None:
         super().__init__()
-        self.encoder = ConvEncoder(in_channels, channels)
-        side = image_size // 2 ** len(channels)
-        self.mlp = nn.Sequential(nn.Linear(channels[-1] * side * side, hidden), nn.ReLU(), nn.Linear(hidden, out_dim))
+        self.encoder = ConvEncoder(in_channels, channels, kind)
+        width = channels[-1] * (image_size // 2 ** len(channels)) ** 2
+        self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, out_dim))
+
+    @classmethod
+    def of(cls, config: LAPOConfig, frames: int, image_size: int) -> EncoderMLP:
+        """Frames to LAPO's latent."""
+        return cls(3 * frames, config.channels, image_size, config.hidden, config.latent_dim, config.encoder)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.out(self.hidden(x))
@@ -87,8 +118,8 @@ class EncoderMLP(nn.Module):
 
 
 class Inferred(NamedTuple):
-    """Latent actions z, quantised straight-through, and as they were `before` (B, Z), their codes int64 (B, G), and the
-    commitment term, weight included (scalar).
+    """Latent actions z, quantised straight-through, and as they were `before` (B, Z), their codes int64 (B, G), each of
+    its own codebook, and the commitment term, weight included (scalar).
     """
 
     z: Tensor
@@ -98,32 +129,38 @@ class Inferred(NamedTuple):
 
 
 class InverseModel(nn.Module):
-    """IDM: two frames to a quantised latent action."""
+    """IDM: frames to a quantised latent action."""
 
     def __init__(self, config: LAPOConfig, image_size: int) -> None:
         super().__init__()
         self.config = config
-        self.network = EncoderMLP(6, config.channels, image_size, config.hidden, config.latent_dim)
+        self.network = EncoderMLP.of(config, config.frames, image_size)
         self.standardise = nn.BatchNorm1d(config.latent_dim, affine=False)
-        self.quantizer = ActionQuantizer(
-            config.code_dim, config.codes, config.decay, config.dead_threshold, config.commitment
-        )
+        sizes = config.code_dim, config.codes, config.decay, config.dead_threshold, config.commitment
+        self.quantizers = nn.ModuleList(ActionQuantizer(*sizes) for _ in range(config.codebooks))
 
-    def forward(self, first: Tensor, second: Tensor) -> Inferred:
-        """Frames (B, 3, H, W), uint8 or float [0, 1], to latent actions; the codebook moves in training mode."""
-        z = self.network(torch.cat((normalise(first), normalise(second)), dim=1)).float()
-        grouped = self.standardise(z).view(-1, self.config.groups, self.config.code_dim)
-        p, code, loss = self.quantizer(grouped)
-        return Inferred(p.flatten(1), grouped.flatten(1), code, loss)
+    def forward(self, frames: Tensor) -> Inferred:
+        """Frames (B, F, 3, H, W), uint8 or float [0, 1], to latent actions between the last two; the codebooks move in
+        training mode.
+        """
+        z = self.standardise(self.network(normalise(frames).flatten(1, 2)).float())
+        grouped = z.view(len(z), -1, self.config.code_dim)
+        parts = grouped.chunk(self.config.codebooks, dim=1)
+        found = [quantizer(part) for quantizer, part in zip(self.quantizers, parts, strict=True)]
+        p, code, losses = zip(*found, strict=True)
+        return Inferred(torch.cat(p, dim=1).flatten(1), z, torch.cat(code, dim=1), torch.stack(losses).mean())
 
 
 class ForwardModel(nn.Module):
-    """FDM: a frame and a latent action to the next frame, by a U-Net; the latent enters at its lowest resolution."""
+    """FDM: frames and a latent action to the next frame, by a U-Net; the latent enters at its input and at its lowest
+    resolution.
+    """
 
     def __init__(self, config: LAPOConfig) -> None:
         super().__init__()
-        channels = config.channels
-        self.encoder = ConvEncoder(3, channels)
+        channels = config.forward_channels or config.channels
+        self.encoder = ConvEncoder(3 * (config.frames - 1), channels, config.encoder)
+        self.to_input = nn.Linear(config.latent_dim, channels[0])
         self.to_map = nn.Linear(config.latent_dim, channels[-1])
         self.bottom = ResidualBlock(channels[-1])
         outs = (*channels[-2::-1], 3)
@@ -132,16 +169,18 @@ class ForwardModel(nn.Module):
         for parameter in self.ups[-1].parameters():
             nn.init.zeros_(parameter)
 
-    def forward(self, frame: Tensor, z: Tensor) -> Tensor:
-        """Frames (B, 3, H, W), uint8 or float [0, 1], and latents (B, Z) to next frames, float, about [0, 1]."""
-        frame = normalise(frame)
-        *skips, x = self.encoder(frame)
+    def forward(self, past: Tensor, z: Tensor) -> Tensor:
+        """Frames (B, F - 1, 3, H, W), uint8 or float [0, 1], and latents (B, Z) to next frames (B, 3, H, W), float,
+        about [0, 1].
+        """
+        past = normalise(past)
+        *skips, x = self.encoder(past.flatten(1, 2), self.to_input(z))
         x = self.bottom(x + self.to_map(z)[:, :, None, None])
         for i, up in enumerate(self.ups):
             x = F.pixel_shuffle(up(F.relu(x)), 2)
             if i < len(skips):
                 x = torch.cat((x, skips[-1 - i]), dim=1)
-        predicted: Tensor = frame + x
+        predicted: Tensor = past[:, -1] + x
         return predicted
 
 
@@ -150,7 +189,7 @@ class LAPOPolicy(nn.Module):
 
     def __init__(self, config: LAPOConfig, image_size: int) -> None:
         super().__init__()
-        self.network = EncoderMLP(3, config.channels, image_size, config.hidden, config.latent_dim)
+        self.network = EncoderMLP.of(config, 1, image_size)
 
     def forward(self, pixels: Tensor) -> Tensor:
         return self.decide(self.features(pixels))
@@ -163,9 +202,15 @@ class LAPOPolicy(nn.Module):
         return self.network.out(features[:, 0])
 
 
+def sizes(done: StageCheckpoint) -> LAPOConfig:
+    """Of a finished stage; the policies from before there was `encoder` are strided."""
+    own = done.group(LAPOConfig, NAME)
+    return own if "encoder" in done.config[NAME] else replace(own, encoder="strided")
+
+
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a finished run; a CheckpointError where it is missing, damaged, or of another inverse model."""
     done = run.stage(NAME, MODEL.name)
-    own, size = done.group(LAPOConfig, NAME), done.sizes[1].image_size
+    own, size = sizes(done), done.sizes[1].image_size
     parts = DecodedPolicy.load(done, lambda: LAPOPolicy(own, size), own.latent_dim, own.hidden, device)
     return latent_actor(parts.policy, parts.action_decoder)

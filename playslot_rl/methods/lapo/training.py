@@ -26,6 +26,7 @@ from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray
+from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import normalise
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.cloning import LatentCloning, cloning
@@ -34,6 +35,7 @@ from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolic
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
+from playslot_rl.runtime.shares import own_rows
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
 from playslot_rl.training.fit import Part
@@ -43,29 +45,44 @@ from playslot_rl.world_model import module_device
 BATCH = 64
 
 
+def with_past(pairs: IntArray, starts: IntArray, frames: int) -> IntArray:
+    """Rows (M, F) that end in those of pairs (M, 2): before an episode's first frame, one of `starts`, it again.
+
+    Example:
+        >>> with_past(np.array([[0, 1], [1, 2]]), np.array([0]), 3)
+        array([[0, 0, 1],
+               [0, 1, 2]])
+    """
+    first = pairs[:, :1]
+    before = np.where(np.isin(first, starts), first, first - 1)
+    return np.concatenate((before, pairs), axis=1) if frames == 3 else pairs
+
+
 class LAPOModelStage:
-    """Inverse and forward model together, trained in place on pairs of frames of unlabelled videos."""
+    """Inverse and forward model together, trained in place on pairs of frames of unlabelled videos, and those before
+    them.
+    """
 
     def __init__(self, inverse: InverseModel, forward: ForwardModel, clips: Clips, config: StageConfig) -> None:
         self.inverse, self.forward, self.clips, self.config = inverse, forward, clips, config
-        first, second = self._frames(self.clips.spread(self.clips.train_episodes))
-        self.still = max(1e-6, float((first - second).square().mean()))
+        frames = normalise(self._frames(self.clips.spread(self.clips.train_episodes)))
+        self.still = max(1e-6, float((frames[:, -2] - frames[:, -1]).square().mean()))
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
         return {"inverse": self.inverse, "forward": self.forward}
 
     def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        device = module_device(self.inverse)
-        return {keys.PIXELS: self.clips.batch("pairs", self.config.batch_size, generators, device)}
+        pairs = self.clips.sample(self.config.batch_size, generators.numpy("pairs"))
+        return {keys.PIXELS: self._frames(own_rows(pairs))}
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        first, second = normalise(batch[keys.PIXELS]).unbind(1)
-        with autocast(first.device.type, self.config.precision):
-            inferred = self.inverse(first, second)
-            predicted = self.forward(first, inferred.z)
-        image = (predicted.float() - second).square().mean() / self.still
-        used, perplexity = usage(inferred.code.detach(), self.inverse.config.codes)
+        frames = normalise(batch[keys.PIXELS])
+        with autocast(frames.device.type, self.config.precision):
+            inferred = self.inverse(frames)
+            predicted = self.forward(frames[:, :-1], inferred.z)
+        image = (predicted.float() - frames[:, -1]).square().mean() / self.still
+        used, perplexity = self._usage(inferred.code.detach())
         return {
             "loss": image + inferred.vq_loss,
             "loss_image": image,
@@ -78,19 +95,25 @@ class LAPOModelStage:
         """`unexplained`: error on held-out pairs over that of no change; `perplexity` of the codes (1 to K)."""
 
         def look(_: int, rows: IntArray) -> tuple[float, float, Tensor]:
-            first, second = self._frames(rows)
-            inferred = self.inverse(first, second)
-            error = float((self.forward(first, inferred.z) - second).square().sum())
-            return error, float((first - second).square().sum()), inferred.code
+            frames = normalise(self._frames(rows))
+            inferred = self.inverse(frames)
+            error = float((self.forward(frames[:, :-1], inferred.z) - frames[:, -1]).square().sum())
+            return error, float((frames[:, -2] - frames[:, -1]).square().sum()), inferred.code
 
         batches = np.array_split(self.clips.held_out, -(-len(self.clips.held_out) // BATCH))
         errors, stills, codes = zip(*spread(batches, look), strict=True)
-        _, perplexity = usage(torch.cat(codes), self.inverse.config.codes)
+        _, perplexity = self._usage(torch.cat(codes))
         return {"unexplained": sum(errors) / max(1e-6, sum(stills)), "perplexity": float(perplexity)}
 
-    def _frames(self, rows: IntArray) -> tuple[Tensor, Tensor]:
-        pixels = normalise(self.clips.pixels(rows, module_device(self.inverse)))
-        return pixels[:, 0], pixels[:, 1]
+    def _usage(self, code: Tensor) -> tuple[Tensor, Tensor]:
+        """Of codes (B, G), as `usage`, in the mean over the codebooks."""
+        own = self.inverse.config
+        used, perplexity = zip(*(usage(part, own.codes) for part in code.chunk(own.codebooks, dim=1)), strict=True)
+        return torch.stack(used).mean(), torch.stack(perplexity).mean()
+
+    def _frames(self, pairs: IntArray) -> Tensor:
+        rows = with_past(pairs, self.clips.source.starts, self.inverse.config.frames)
+        return self.clips.pixels(rows, module_device(self.inverse))
 
 
 @torch.no_grad()
@@ -99,13 +122,13 @@ def infer_latents(
     source: EpisodeFrames,
     moves: Transitions,
     device: torch.device | str = "cpu",
-    quantised: bool = True,
+    quantised: bool = False,
 ) -> Tensor:
     """Latent actions (M, Z) of transitions; the model in evaluation mode."""
     parts = []
     for rows in np.array_split(moves.rows, -(-len(moves.rows) // BATCH)):
-        pixels = source.pixels(np.stack((rows, rows + 1), axis=1)).to(device)
-        inferred = inverse(pixels[:, 0], pixels[:, 1])
+        seen = with_past(np.stack((rows, rows + 1), axis=1), source.starts, inverse.config.frames)
+        inferred = inverse(source.pixels(seen).to(device))
         parts.append(inferred.z if quantised else inferred.before)
     return torch.cat(parts)
 
@@ -134,7 +157,11 @@ class LAPOBehaviour(LatentCloning):
 
 def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseModel:
     own, (_, env) = model.group(LAPOConfig, NAME), model.sizes
-
+    if "codebooks" not in model.config[NAME]:
+        raise CheckpointError(
+            f"{model.path}: got LAPO's models of an earlier form (two frames, one codebook), expected those of this "
+            "version of playslot_rl: train them again, with another out="
+        )
     with torch.random.fork_rng(devices=[]):
         inverse, forward = InverseModel(own, env.image_size), ForwardModel(own)
     load_weights(model, {"inverse": inverse, "forward": forward})
@@ -144,6 +171,7 @@ def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseM
 def model(record: StageRecord) -> Training:
     config, device = record.config, record.device
     own: LAPOConfig = config.baselines.lapo
+    own.check("baselines.lapo", config)
     with global_seed(config.seed, 0, record.name):
         inverse, forward = InverseModel(own, config.env.image_size).to(device), ForwardModel(own).to(device)
     stage = LAPOModelStage(inverse, forward, record.clips(2, shown=256), own.model)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,66 +12,133 @@ from clips import moving_square
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import latent_actor
-from playslot_rl.config import ActionDecoderConfig, BehaviourStageConfig, OptimConfig, StageConfig
+from playslot_rl.config import ActionDecoderConfig, BehaviourStageConfig, OptimConfig, StageConfig, to_dict
+from playslot_rl.config.compose import compose
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import transitions
+from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.losses.behaviour import BehaviourLoss
-from playslot_rl.methods.lapo.method import LAPOConfig
-from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolicy
-from playslot_rl.methods.lapo.training import LAPOModelStage, infer_latents
+from playslot_rl.methods.lapo.method import Encoder, LAPOConfig
+from playslot_rl.methods.lapo.model import ConvEncoder, ForwardModel, InverseModel, LAPOPolicy, sizes
+from playslot_rl.methods.lapo.training import LAPOModelStage, infer_latents, load_inverse, with_past
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators, global_seed
+from playslot_rl.storage.checkpoints import save_stage
 from playslot_rl.training.stage import step_loss
 from playslot_rl.training.stage_behaviour import JointStage
 from playslot_rl.training.stage_regression import FrameInputs, RegressionStage, TakenInputs
 
-CONFIG = LAPOConfig(channels=(8, 16), hidden=32, groups=2, code_dim=4, codes=4)
+CONFIG = LAPOConfig(
+    encoder="strided", channels=(8, 16), forward_channels=(8, 16), hidden=32, groups=2, code_dim=4, codes=4, decay=0.99
+)
+
+
+Models = tuple[InverseModel, ForwardModel]
 
 
 @pytest.fixture
-def models() -> tuple[InverseModel, ForwardModel]:
+def models() -> Models:
     torch.manual_seed(0)
     return InverseModel(CONFIG, 32), ForwardModel(CONFIG)
 
 
-def test_a_latent_action_is_made_of_codes(models: tuple[InverseModel, ForwardModel]) -> None:
-    inverse, _ = models
-    inferred = inverse(torch.rand(6, 3, 32, 32), torch.rand(6, 3, 32, 32))
+def test_a_latent_action_is_made_of_codes_of_two_codebooks(models: Models) -> None:
+    inverse, frames = models[0], torch.rand(6, 3, 3, 32, 32)
+    inferred = inverse(frames)
     assert inferred.z.shape == (6, 8)
     assert inferred.code.shape == (6, 2)
-    inverse.eval()
-    inferred = inverse(torch.rand(6, 3, 32, 32), torch.rand(6, 3, 32, 32))
-    codes = inverse.quantizer.prototypes[inferred.code].flatten(1)
-    torch.testing.assert_close(inferred.z, codes, atol=1e-5, rtol=0)
+    inferred = inverse.eval()(frames)
+    books = [quantizer.prototypes for quantizer in inverse.quantizers]
+    assert len(books) == 2
+    codes = [book[inferred.code[:, number]] for number, book in enumerate(books)]
+    torch.testing.assert_close(inferred.z, torch.cat(codes, dim=1), atol=1e-5, rtol=0)
 
 
-def test_the_codebook_moves_in_training_only(models: tuple[InverseModel, ForwardModel]) -> None:
-    inverse, _ = models
-    frames = torch.rand(2, 6, 3, 32, 32)
-    inverse(*frames)
-    before = inverse.quantizer.prototypes.clone()
-    inverse.eval()(*frames)
-    assert torch.equal(inverse.quantizer.prototypes, before)
-    inverse.train()(*(frames * 0.5))
-    assert not torch.equal(inverse.quantizer.prototypes, before)
+def test_the_codebooks_move_in_training_only(models: Models) -> None:
+    inverse, frames = models[0], torch.rand(6, 3, 3, 32, 32)
+    inverse(frames)
+    before = [quantizer.prototypes.clone() for quantizer in inverse.quantizers]
+    inverse.eval()(frames)
+    assert all(torch.equal(q.prototypes, old) for q, old in zip(inverse.quantizers, before, strict=True))
+    inverse.train()(frames * 0.5)
+    assert not any(torch.equal(q.prototypes, old) for q, old in zip(inverse.quantizers, before, strict=True))
 
 
-def test_the_forward_model_starts_from_no_change(models: tuple[InverseModel, ForwardModel]) -> None:
-    _, forward = models
-    frame = torch.rand(2, 3, 32, 32)
-    assert torch.equal(forward(frame, torch.randn(2, 8)), frame)
+def test_the_inverse_model_sees_three_frames_and_the_forward_model_the_first_two(models: Models) -> None:
+    inverse, forward = models[0].eval(), models[1].eval()
+    with torch.no_grad():
+        for weights in forward.ups[-1].parameters():
+            weights.normal_(std=0.1)
+    frames, z = torch.rand(2, 3, 3, 32, 32), torch.randn(2, 8)
+    for seen in range(3):
+        other = frames.clone()
+        other[:, seen] = 1 - other[:, seen]
+        assert not torch.equal(inverse(other).before, inverse(frames).before)
+        assert torch.equal(forward(other[:, :-1], z), forward(frames[:, :-1], z)) == (seen == 2)
 
 
-def test_the_image_error_trains_the_inverse_model_through_the_latent(
-    models: tuple[InverseModel, ForwardModel],
-) -> None:
+def test_before_an_episodes_first_frame_it_stands_again() -> None:
+    source = moving_square(length=3)
+    moves = transitions(source)
+    rows = with_past(np.stack((moves.rows, moves.rows + 1), axis=1), source.starts, 3)
+    assert rows[:4].tolist() == [[0, 0, 1], [0, 1, 2], [3, 3, 4], [3, 4, 5]]
+    assert with_past(np.array([[3, 4]]), source.starts, 2).tolist() == [[3, 4]]
+
+
+def test_the_forward_model_starts_from_no_change(models: Models) -> None:
+    past = torch.rand(2, 2, 3, 32, 32)
+    assert torch.equal(models[1](past, torch.randn(2, 8)), past[:, -1])
+
+
+@pytest.mark.parametrize("place", ["to_input", "to_map"])
+def test_the_latent_enters_at_the_input_and_at_the_lowest_resolution(models: Models, place: str) -> None:
+    forward = models[1].eval()
+    for name in ("to_input", "to_map"):
+        if name != place:
+            torch.nn.init.zeros_(getattr(forward, name).weight)
+    with torch.no_grad():
+        for weights in forward.ups[-1].parameters():
+            weights.normal_(std=0.1)
+    past = torch.rand(1, 2, 3, 32, 32)
+    assert not torch.allclose(forward(past, torch.zeros(1, 8)), forward(past, torch.ones(1, 8)))
+
+
+@pytest.mark.parametrize("kind", ["strided", "impala"])
+def test_every_level_halves(kind: Encoder) -> None:
+    levels = ConvEncoder(6, (4, 8, 8), kind)(torch.rand(2, 6, 32, 32))
+    assert [tuple(level.shape) for level in levels] == [(2, 4, 16, 16), (2, 8, 8, 8), (2, 8, 4, 4)]
+
+
+def test_more_halvings_than_frames_have_are_refused() -> None:
+    config = compose(["preset=smoke", "env.image_size=32", "baselines.lapo.forward_channels=[4,4,4,4,4,4]"])
+    with pytest.raises(ConfigError, match=r"^baselines\.lapo\.forward_channels: got 6 widths, .*fewer"):
+        config.baselines.lapo.check("baselines.lapo", config)
+    with pytest.raises(ValueError, match=r"codebooks: got 3, expected a divisor of groups 8"):
+        LAPOConfig(codebooks=3)
+
+
+def test_a_policy_of_an_earlier_form_has_the_same_weights_and_models_of_one_are_refused(tmp_path: Path) -> None:
+    config = compose(["preset=smoke"])
+    old = {"channels": [8, 16], "hidden": 32, "groups": 2, "code_dim": 4, "codes": 4}
+    plain = {"env": to_dict(config.env), "model": to_dict(config.model), "lapo": old}
+    made = {"modules": {"x": LAPOPolicy(CONFIG, 32)}, "data": {}, "parents": {}, "metrics": {}, "steps": 1}
+    done = save_stage(tmp_path / "old", stage="lapo_model", config=plain, seconds=0.0, **made)  # type: ignore[arg-type]
+    own = sizes(done)
+    names = {"network.encoder.levels.0.0.weight", "network.encoder.levels.1.1.second.bias", "network.mlp.2.weight"}
+    assert names <= set(LAPOPolicy(own, 32).state_dict())
+    with pytest.raises(CheckpointError, match=r"LAPO's models of an earlier form .*train them again") as caught:
+        load_inverse(done, "cpu")
+    assert "\n" not in str(caught.value)
+
+
+def test_the_image_error_trains_the_inverse_model_through_the_latent(models: Models) -> None:
     inverse, forward = models
     with torch.no_grad():
         for weights in forward.ups[-1].parameters():
             weights.normal_(std=0.1)
-    first, second = torch.rand(4, 3, 32, 32), torch.rand(4, 3, 32, 32)
-    inferred = inverse(first, second)
-    (forward(first, inferred.z) - second).square().mean().backward()
+    frames = torch.rand(4, 3, 3, 32, 32)
+    inferred = inverse(frames)
+    (forward(frames[:, :-1], inferred.z) - frames[:, -1]).square().mean().backward()
     grads = [p.grad for p in inverse.network.parameters()]
     assert all(grad is not None for grad in grads)
     assert any(bool(grad.abs().sum() > 0) for grad in grads if grad is not None)
@@ -78,7 +146,7 @@ def test_the_image_error_trains_the_inverse_model_through_the_latent(
 
 @pytest.mark.integration
 def test_training_predicts_the_change_and_the_codes_tell_directions_apart(
-    models: tuple[InverseModel, ForwardModel],
+    models: Models,
 ) -> None:
     inverse, forward = models
     source = moving_square(episodes=24)
@@ -100,28 +168,26 @@ def test_training_predicts_the_change_and_the_codes_tell_directions_apart(
         assert stage.validate(config.steps)["unexplained"] < 0.6
     moves = transitions(source)
     assert source.actions is not None
-    frames = source.pixels(np.stack((moves.rows, moves.rows + 1), axis=1))
+    frames = source.pixels(with_past(np.stack((moves.rows, moves.rows + 1), axis=1), source.starts, 3))
     directions: dict[tuple[int, ...], list[bool]] = {}
-    for code, action in zip(
-        inverse(frames[:, 0], frames[:, 1]).code.tolist(), source.actions[moves.rows, 0], strict=True
-    ):
+    for code, action in zip(inverse(frames).code.tolist(), source.actions[moves.rows, 0], strict=True):
         directions.setdefault(tuple(code), []).append(bool(action > 0))
     told = sum(max(sum(group), len(group) - sum(group)) for group in directions.values())
-    assert len(directions) <= 8, "few enough for a majority to mean something"
+    assert len(directions) <= 12, "few enough for a majority to mean something"
     assert told / len(moves.rows) > 0.9
 
 
-def test_latents_of_transitions_are_in_the_order_of_their_rows(models: tuple[InverseModel, ForwardModel]) -> None:
+def test_latents_of_transitions_are_in_the_order_of_their_rows(models: Models) -> None:
     inverse, source = models[0].eval(), moving_square()
     moves = transitions(source)
     latents = infer_latents(inverse, source, moves)
     assert latents.shape == (len(moves.rows), 8)
-    frames = source.pixels(np.array([moves.rows[7], moves.rows[7] + 1]))
-    inferred = inverse(frames[:1], frames[1:])
-    torch.testing.assert_close(latents[7:8], inferred.z, atol=1e-5, rtol=0)
-    before = infer_latents(inverse, source, moves, quantised=False)  # baselines.lapo.targets=continuous
-    torch.testing.assert_close(before[7:8], inferred.before, atol=1e-5, rtol=0)
-    assert not torch.allclose(before, latents)
+    frames = source.pixels(moves.rows[7] + np.array([[-1, 0, 1]]))
+    inferred = inverse(frames)
+    torch.testing.assert_close(latents[7:8], inferred.before, atol=1e-5, rtol=0)
+    after = infer_latents(inverse, source, moves, quantised=True)  # baselines.lapo.targets=quantised
+    torch.testing.assert_close(after[7:8], inferred.z, atol=1e-5, rtol=0)
+    assert not torch.allclose(after, latents)
 
 
 def test_the_actor_decodes_the_policys_latent_and_what_it_saw() -> None:
