@@ -79,10 +79,12 @@ class SeededView(TensorView):
         self._episode_seed = self._redrawn = self._step = 0
 
     def view(self, observation: dict[str, npt.NDArray[Any]], info: dict[str, Any]) -> View:
-        """One observation, the expert's action for it, and which episode it belongs to."""
+        """One observation, the expert's action for it (zeros without one), and which episode it belongs to."""
+        task, space = task_env(self.env), self.action_space
+        expert = getattr(task, "has_expert", True)
         return {
             **super().view(observation, info),
-            keys.EXPERT_ACTION: task_env(self.env).expert_action(),
+            keys.EXPERT_ACTION: task.expert_action() if expert else np.zeros(space.shape or (), space.dtype),
             EPISODE_INDEX: np.array([self._running[0] if self._running else 0], np.int64),
             EPISODE_SEED: np.array([self._episode_seed], np.int64),
             EPISODE_STEP: np.array([self._step], np.int64),

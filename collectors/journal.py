@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, ExperimentConfig, RenderConfig, from_dict
 from playslot_rl.config.plain import flatten, nearest, to_dict
-from playslot_rl.envs import PROCEDURAL, gym_id
+from playslot_rl.envs import PROCEDURAL, check_task
 from playslot_rl.errors import CheckpointError, ConfigError, OutputError
 from playslot_rl.seeds.episodes import EPISODES, LARGEST_SEED, episode_seed
 from playslot_rl.storage.atomic import explain_write_errors, read_json, write_bytes, write_json
@@ -65,10 +65,7 @@ class CollectionSpec:
             hint = nearest(policy, OFFSETS, "policy=") or "; choose one of these"
             raise ConfigError(f"unknown policy: got {policy!r}, expected one of {', '.join(sorted(OFFSETS))}{hint}")
         if config.env.name not in PROCEDURAL:
-            from playslot_rl.envs import pixel_task
-
-            gym_id(config.env.name)
-            pixel_task.check_actions(config.env)
+            check_task(config.env, policy == "expert")
         elif policy != "random":
             raise ConfigError(
                 f"policy: got {policy} for env={config.env.name}, expected random: its shapes move by themselves; "

@@ -26,6 +26,7 @@ _OURS: Final = {
     "block_push_easy": ("PlaySlot/BlockPushEasy-v0", "playslot_rl.envs.block_push:BlockPushEnv"),
     "block_reach": ("PlaySlot/BlockReach-v0", "playslot_rl.envs.block_push:BlockReachEnv"),
     "block_pick": ("PlaySlot/BlockPick-v0", "playslot_rl.envs.block_push:BlockPickEnv"),
+    "gym": ("PlaySlot/Gym-v0", "playslot_rl.envs.gym_task:GymTask"),
 }
 
 
@@ -53,6 +54,10 @@ RECORDED = ("sketchy", "video")
 
 EASY: Final = BlocksConfig(distractors=0, colour="mediumblue")
 """One cube, always of the same colour."""
+
+
+GYM: Final = EnvConfig("gym", frame_skip=1, max_steps=50, warmup_steps=0)
+"""Any registered Gymnasium environment; `id` and `action_dim` are to be set."""
 
 
 def block_config(name: str, blocks: BlocksConfig) -> EnvConfig:
@@ -110,7 +115,7 @@ def task_config(env: EnvConfig | str | None = None) -> EnvConfig:
     """A task's config, given itself or by its name, with the settings that `env=NAME` has; None means ButtonPress.
     A ConfigError for an unknown name, or something else."""
     if isinstance(env, str):
-        default = "", EnvConfig(env)
+        default = "", GYM if env == GYM.name else EnvConfig(env)
         name = gym_id(env)
         return TASKS[env].env if env in TASKS else block_ids().get(name, default)[1]
     given: Any = EnvConfig() if env is None else env
@@ -141,14 +146,46 @@ def task_env(env: gym.Env[Any, Any]) -> PixelTask:
     return cast("PixelTask", env.unwrapped)
 
 
-def task_metadata(env: EnvConfig) -> dict[str, Any]:
-    """Gymnasium's metadata of a task, without making it: `control_hz`, `task` (a sentence), `action` (its numbers)."""
-    name = gym_id(env.name)
+def _creator(name: str) -> Any:
+    """What makes the environments of a configured name."""
+    found = gym_id(name)
     import gymnasium
     from gymnasium.envs.registration import load_env_creator
 
-    entry_point = gymnasium.spec(name).entry_point
-    creator: Any = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    entry_point = gymnasium.spec(found).entry_point
+    return load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+
+
+def check_task(env: EnvConfig, expert: bool = False, success: bool = False) -> None:
+    """Refuse, by a ConfigError, a task that there is not, another width than its actions', and one without an expert,
+    or a measure of success, where one is asked for.
+    """
+    creator = _creator(env.name)
+    from playslot_rl.envs.pixel_task import ACTION_DIM, check_actions
+
+    width = getattr(creator, "actions_of", None)
+    check_actions(env, ACTION_DIM if width is None else width(env))
+    if env.name == GYM.name:
+        from playslot_rl.envs import gym_task
+
+        if expert:
+            gym_task.require_expert(env)
+        if success:
+            gym_task.require_success(env)
+
+
+def has_parts(env: EnvConfig) -> bool:
+    """Whether a simulated task knows which object each pixel shows."""
+    if env.name != GYM.name:
+        return True
+    from playslot_rl.envs.gym_task import facts
+
+    return facts(env.id).parts
+
+
+def task_metadata(env: EnvConfig) -> dict[str, Any]:
+    """Gymnasium's metadata of a task, without making it: `control_hz`, `task` (a sentence), `action` (its numbers)."""
+    creator = _creator(env.name)
     describe = getattr(creator, "metadata_of", None)  # a family of tasks says what is to be done in each
     metadata: dict[str, Any] = creator.metadata if describe is None else describe(env)
     return metadata

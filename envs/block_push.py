@@ -144,6 +144,7 @@ class BlockEnv(PixelTask):
         "action": "grip displacement x, y, z in units of 0.05 m and gripper effort (used by Pick only)",
     }
     """`control_hz` counts environment steps: an agent step of `frame_skip` of them takes `frame_skip / 25` seconds."""
+    distance_seen = 0.7
     still = ("robot0:base_link", "robot0:torso_lift_link", "robot0:torso_fixed_link")
 
     layout: Layout
@@ -171,7 +172,7 @@ class BlockEnv(PixelTask):
         if render.quality == "fast":
             lighten(model)
         still = Still(self._simulation.data, STILL, SCREEN)
-        self._make_renderer = partial(FrameRenderer, model, CAMERA, self.config.image_size, render, still)
+        self._make_renderer = partial(FrameRenderer, model, CAMERA, self.config.image_size, render, still=still)
 
     def _begin(self, rng: np.random.Generator) -> None:
         self.layout = draw_layout(rng, self.variant, self.config.blocks, self._simulation.start_grip)

@@ -29,7 +29,7 @@ class ButtonPressEnv(PixelTask):
     gripper's effort. The reward of an agent step is the mean of its environment steps' (0 to 10).
     """
 
-    still = PEDESTAL
+    still, distance_seen = PEDESTAL, CAMERA.distance
     metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it so)
         "render_modes": ["rgb_array"],
         "render_fps": 16,

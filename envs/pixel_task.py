@@ -1,6 +1,6 @@
 """What our simulated tasks share: spaces, seeding, warm-up, agent steps and frames that are drawn only when wanted.
 
-Shapes: A = 4, S = 4, H = W = `EnvConfig.image_size`.
+Shapes: A = 4, S = 4 (a subclass may have others), H = W = `EnvConfig.image_size`.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from itertools import chain
 from typing import Any, ClassVar, Final, cast
 
 import gymnasium as gym
@@ -18,6 +19,7 @@ import numpy.typing as npt
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig
 from playslot_rl.envs.rendering import FrameRenderer, import_mujoco
+from playslot_rl.envs.variation import Variation
 from playslot_rl.errors import ConfigError
 
 ACTION_DIM: Final = 4
@@ -37,11 +39,11 @@ class Observation(dict[str, npt.NDArray[Any]]):
         return self[keys.STATE]
 
 
-def check_actions(env: EnvConfig) -> None:
-    """Refuse an `env.action_dim` other than 4 by a ConfigError."""
-    if env.action_dim != ACTION_DIM:
+def check_actions(env: EnvConfig, actions: int = ACTION_DIM) -> None:
+    """Refuse an `env.action_dim` other than the task's by a ConfigError."""
+    if env.action_dim != actions:
         raise ConfigError(
-            f"env.action_dim: got {env.action_dim}, expected {ACTION_DIM} for {env.name}: leave env.action_dim out"
+            f"env.action_dim: got {env.action_dim}, expected {actions} for {env.name}: leave env.action_dim out"
         )
 
 
@@ -60,29 +62,51 @@ class PixelTask(gym.Env[Observation, Action]):
 
     _simulation: Any  # MuJoCo's `model` and `data`, and `close`; made by the subclass, as is the next one
     _make_renderer: Callable[[], FrameRenderer]
+    solves = True
+    """Whether success is measured; else the return is."""
+    has_expert = True
+    distance_seen: float = 1.0
+    """Metres from the camera to the middle of what happens."""
     still: ClassVar[tuple[str, ...]] = ()
     """Bodies of an object that stay where they are and look like ground."""
 
-    def __init__(self, config: EnvConfig, render_mode: str | None) -> None:
-        check_actions(config)
+    def __init__(
+        self, config: EnvConfig, render_mode: str | None, *, actions: int = ACTION_DIM, state: int = STATE_DIM
+    ) -> None:
+        check_actions(config, actions)
         self.config, self.render_mode = config, render_mode
         size = config.image_size
         space = gym.spaces.Dict(
             {
                 keys.PIXELS: gym.spaces.Box(0, 255, (size, size, 3), np.uint8),
-                keys.STATE: gym.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32),
+                keys.STATE: gym.spaces.Box(-np.inf, np.inf, (state,), np.float32),
             }
         )
         self.observation_space = cast(gym.Space[Observation], space)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (actions,), np.float32)
         self._frame: Frame | None = None
-        self._steps = 0
+        self._steps = self.episode = 0
         self.draw_steps = self.draw_resets = True
+        self._variation: Variation | None = None
+
+    @classmethod
+    def actions_of(cls, config: EnvConfig) -> int:
+        """Width A of the actions of the task with this config."""
+        del config
+        return ACTION_DIM
 
     @cached_property
     def _renderer(self) -> FrameRenderer:
         """Made with the first episode: a process that is forked from one with a GL context cannot draw."""
-        return self._make_renderer()
+        variation = self.config.variation
+        if not variation.on:
+            return self._make_renderer()
+        make: Any = self._make_renderer
+        renderer: FrameRenderer = make(still=None, at_rest=False) if variation.shake else make()
+        (arm, *others), model = list(self.objects()) or [()], self._simulation.model
+        self._variation = Variation(variation, model, {*arm, *chain(*others)}, {*arm}, self.distance_seen)
+        renderer.vary(self._variation)
+        return renderer
 
     def open_renderer(self) -> None:
         """Make the GL context now, not with the first episode; a RenderError where there is none."""
@@ -119,6 +143,8 @@ class PixelTask(gym.Env[Observation, Action]):
 
     def draw(self) -> Frame:
         """Draw the present state anew: uint8 (H, W, 3). `render` returns the frame that was last observed."""
+        if self._variation is not None:
+            self._variation.step = self._steps
         return self._renderer(self._simulation.data)
 
     @abstractmethod
@@ -161,21 +187,23 @@ class PixelTask(gym.Env[Observation, Action]):
         del options
         self.open_renderer()
         super().reset(seed=seed)
-        episode = int(self.np_random.integers(2**31)) if seed is None else seed
-        task, warmup = (np.random.default_rng(s) for s in np.random.SeedSequence(episode).spawn(2))
+        self.episode = int(self.np_random.integers(2**31)) if seed is None else seed
+        task, warmup = (np.random.default_rng(s) for s in np.random.SeedSequence(self.episode).spawn(2))
         self._begin(task)
+        if self._variation is not None:
+            self._variation.begin(self.episode, self._renderer.side)
         for _ in range(self.config.warmup_steps):
-            self._simulate(warmup.uniform(-1.0, 1.0, ACTION_DIM).astype(np.float32))
+            self._simulate(warmup.uniform(-1.0, 1.0, self.action_space.shape).astype(np.float32))
         self._steps = 0
         return self._observe(self.draw_resets), {"success": self._solved()}
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One agent step of an action (4,), clipped to [-1, 1]; a ValueError where it is of another shape, or not
+        """One agent step of an action (A,), clipped to [-1, 1]; a ValueError where it is of another shape, or not
         finite.
         """
-        action = np.asarray(action, np.float32)
-        if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
-            raise ValueError(f"action: got {action!r}, expected {ACTION_DIM} finite numbers in [-1, 1]")
+        action, shape = np.asarray(action, np.float32), self.action_space.shape
+        if action.shape != shape or not np.isfinite(action).all():
+            raise ValueError(f"action: got {action!r}, expected {self.config.action_dim} finite numbers in [-1, 1]")
         reward, success = self._simulate(np.clip(action, -1.0, 1.0))
         self._steps += 1
         return self._observe(self.draw_steps), reward, False, self._steps >= self.config.max_steps, {"success": success}

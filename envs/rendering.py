@@ -27,6 +27,8 @@ from playslot_rl.errors import RenderError
 if TYPE_CHECKING:
     import mujoco
 
+    from playslot_rl.envs.variation import Variation
+
 CURE = "set MUJOCO_GL to egl, osmesa or glfw and install that library (Debian/Ubuntu: apt-get install libegl1 libgl1)"
 
 
@@ -110,19 +112,29 @@ def box_mean(frame: npt.NDArray[np.uint8], factor: int) -> npt.NDArray[np.uint8]
     return mean
 
 
+def box_sized(picture: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.uint8]:
+    """A picture (H, W, 3) of any size by area averaging: uint8 (size, size, 3)."""
+    if picture.shape[:2] == (size, size):
+        return picture.copy()
+    from PIL import Image
+
+    return np.asarray(Image.fromarray(picture).resize((size, size), Image.Resampling.BOX)).copy()
+
+
 class FrameRenderer:
-    """Draws the scene of one MuJoCo model from a viewpoint, or a camera of the model, by its name, that is at rest in
-    the world; of `still` parts, which never move, `fast` draws only what it can see. A RenderError without a GL
-    backend.
+    """Draws the scene of one MuJoCo model from a viewpoint, or a camera of the model, by its name; of one that is
+    `at_rest` in the world, and of `still` parts, which never move, `fast` draws only what it can see. A RenderError
+    without a GL backend.
     """
 
     def __init__(
         self,
         model: mujoco.MjModel,
-        camera: Camera | str,
+        camera: Camera | str | mujoco.MjvCamera,
         size: int,
         config: RenderConfig,
         still: Still | None = None,
+        at_rest: bool = True,
     ) -> None:
         mj = import_mujoco()
         fast = config.quality == "fast"
@@ -145,6 +157,8 @@ class FrameRenderer:
         if fast:
             for flag in (mj.mjtRndFlag.mjRND_SHADOW, mj.mjtRndFlag.mjRND_REFLECTION):
                 self._renderer.scene.flags[flag] = 0
+        self._variation: Variation | None = None
+        self._model, self._number = model, model.camera(camera).id if isinstance(camera, str) else -1
         self._camera: Any = camera
         if isinstance(camera, Camera):
             self._camera = view = mj.MjvCamera()
@@ -152,7 +166,7 @@ class FrameRenderer:
             view.distance, view.azimuth, view.elevation = camera.distance, camera.azimuth, camera.elevation
             view.lookat[:] = camera.lookat
         self._culler: FrustumCuller | None = None
-        if fast:
+        if fast and at_rest:
             data = mj.MjData(model)
             mj.mj_forward(model, data)
             self._renderer.update_scene(data, self._camera)
@@ -160,6 +174,8 @@ class FrameRenderer:
 
     def __call__(self, data: mujoco.MjData) -> npt.NDArray[np.uint8]:
         """Draw one frame: uint8 [0, 255] of shape (H, W, 3)."""
+        if self._variation is not None:
+            return self._varied(data, self._variation)
         if self._culler is None:
             self._renderer.update_scene(data, self._camera)
         else:
@@ -173,14 +189,45 @@ class FrameRenderer:
             return frame.copy()
         return box_mean(frame, self._factor)
 
-    def parts(self, data: mujoco.MjData) -> npt.NDArray[np.int32]:
-        """The part at the centre of each pixel: int32 (H, W, 2), its number and `mjtObj` type; -1 where none."""
+    def vary(self, variation: Variation) -> None:
+        """Draw with a variation from now on."""
+        self._variation = variation
+
+    @property
+    def side(self) -> int:
+        """Of a frame before boxes are averaged."""
+        return self.size * self._factor
+
+    def _varied(self, data: mujoco.MjData, variation: Variation) -> npt.NDArray[np.uint8]:
+        mj = import_mujoco()
+        with variation.shaken(data, self._camera, self._number):
+            frame: npt.NDArray[np.uint8] = self._drawn(data).copy()
+            if variation.paints:
+                frame = variation.painted(frame, self._segmented(data), int(mj.mjtObj.mjOBJ_GEOM))
+        return frame if self._factor == 1 else box_mean(frame, self._factor)
+
+    def _drawn(self, data: mujoco.MjData) -> npt.NDArray[Any]:
+        """The scene as it is, and what a variation puts into it."""
+        self._renderer.update_scene(data, self._camera)
+        if self._variation is not None:
+            self._variation.add(import_mujoco(), self._renderer.scene)
+        found: npt.NDArray[Any] = self._renderer.render()
+        return found
+
+    def _segmented(self, data: mujoco.MjData) -> npt.NDArray[np.int32]:
+        """The part at each pixel that is drawn: its number and `mjtObj` type, -1 where none."""
         self._renderer.enable_segmentation_rendering()
         try:
-            self._renderer.update_scene(data, self._camera)
-            found: npt.NDArray[np.int32] = self._renderer.render()
+            return self._drawn(data)
         finally:
             self._renderer.disable_segmentation_rendering()
+
+    def parts(self, data: mujoco.MjData) -> npt.NDArray[np.int32]:
+        """The part at the centre of each pixel: int32 (H, W, 2), its number and `mjtObj` type; -1 where none."""
+        with contextlib.ExitStack() as stack:
+            if self._variation is not None:
+                stack.enter_context(self._variation.shaken(data, self._camera, self._number))
+            found = self._segmented(data)
         middle = self._factor // 2
         return found[middle :: self._factor, middle :: self._factor].copy()
 

@@ -21,10 +21,12 @@ def main(config: ExperimentConfig) -> None:
     write the report.
     """
     from playslot_rl.collectors.collection import collect_demos
-    from playslot_rl.envs import gym_id
+    from playslot_rl.envs import check_task
 
     began = time.monotonic()
-    gym_id(config.env.name)  # one without a simulator is refused before anything is written
+    check_task(
+        config.env, expert=not config.data.demos
+    )  # one without a simulator is refused before anything is written
     name = config.out or "runs/demo"
     if config.seed > LARGEST_SEED - FIRST_SEED:
         raise ConfigError(

@@ -111,7 +111,7 @@ def once(config: ExperimentConfig) -> bool:
     if stored is None:
         main(config, report=False)
         return True
-    print(f"{protocol}: measured before, {100 * stored['success_rate']:.0f} % success, skipped", flush=True)
+    print(f"{protocol}: measured before, {rate(stored)}, skipped", flush=True)
     return False
 
 
@@ -123,6 +123,13 @@ def run_with_policy(config: ExperimentConfig, command: str = "evaluate") -> Run:
     return run
 
 
+def rate(row: dict[str, Any]) -> str:
+    """Success, or the return where none is measured."""
+    if row["success_rate"] is None:
+        return f"return {row['mean_return']:.2f}"
+    return f"{100 * row['success_rate']:.0f} % success"
+
+
 def describe(result: dict[str, Any], run: Path) -> str:
     """The result in a few lines."""
     title = METHODS[result["method"]].title
@@ -131,6 +138,7 @@ def describe(result: dict[str, Any], run: Path) -> str:
     lines = []
     for name, row in rows:
         if row["success_rate"] is None:
+            lines += [f"{name:>22}: {rate(row)}"] if "mean_return" in row else []
             continue
         low, high = row["ci95"]
         steps = row.get("mean_steps_to_success")

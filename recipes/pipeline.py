@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from playslot_rl.config import DataConfig, ExperimentConfig
-from playslot_rl.envs import PROCEDURAL, gym_id
+from playslot_rl.envs import PROCEDURAL, check_task, has_parts
 from playslot_rl.recipes import evaluate, inspect, objects, train_dynamics, train_policy, train_slots
 from playslot_rl.runs.opening import run_to_write
 
@@ -21,7 +21,7 @@ def main(config: ExperimentConfig) -> None:
     began = time.monotonic()
     behaves = config.env.name not in PROCEDURAL
     if behaves:
-        gym_id(config.env.name)  # refused now, not after hours of training
+        check_task(config.env, expert=not config.data.demos)  # refused now, not after hours of training
     name = config.out or config.run or f"runs/{config.env.name}_{config.preset}"
     config = replace(config, out=name, run="")
     run = run_to_write(config)
@@ -34,7 +34,7 @@ def main(config: ExperimentConfig) -> None:
         stage.main(config)
         print(f"{stage.__name__.rsplit('.', 1)[-1]}: {time.monotonic() - since:.0f} s", flush=True)
     inspect.main_if_needed(replace(config, run=name, out="", episodes=None))
-    if behaves:
+    if behaves and has_parts(config.env):
         objects.score_slots_if_needed(config, run_to_write(config))
     evaluate.main_if_needed(replace(config, run=name, out=""))
     print(f"pipeline: {time.monotonic() - began:.0f} s, report {folder / 'report.html'}", flush=True)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.methods import METHODS
 from playslot_rl.config.planning import GoalName
-from playslot_rl.envs import gym_id
+from playslot_rl.envs import check_task
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes.evaluate import run_with_policy
 from playslot_rl.runs.opening import require_task, run_of_pretrained
@@ -32,7 +32,7 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.acting.planners import search_size
 
     run = run_with_policy(config, "plan")
-    gym_id(config.env.name)  # refuses what has no simulator
+    check_task(config.env, expert=True, success=True)  # refuses what has no simulator
     frame_skip = config.env.frame_skip
     try:
         sizes = {goals: search_size(config.plan, goals, frame_skip) for goals in config.plan.goals}

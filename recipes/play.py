@@ -84,7 +84,7 @@ def simulated_starts(config: ExperimentConfig, world: WorldModel) -> SimulatedSt
 
     if config.env.name not in ENVIRONMENTS:
         return None
-    require_task(config, world.env, SAME_TASK[1:])
+    require_task(config, world.env, SAME_TASK[2:])
     metadata = task_metadata(config.env)
     fps = metadata["control_hz"] / config.env.frame_skip
     maker = task_maker(config.env, config.render)

@@ -8,7 +8,7 @@ Shapes: E episodes in lock-step, n of them still running, T agent steps, A actio
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol, Self
 
@@ -71,14 +71,20 @@ LookOn = Callable[[Moment], None]
 
 @dataclass(frozen=True)
 class Outcome:
-    """The seed an episode ran with, whether the task was solved within the step limit, agent steps to the first success
-    (from 1; None without one), and seeds passed over because the episode started solved.
+    """The seed an episode ran with, whether the task was solved within the step limit (None where a task measures no
+    success: its rewards are summed in `total` instead), agent steps to the first success (from 1; None without one),
+    and seeds passed over because the episode started solved.
     """
 
     seed: int
-    success: bool
+    success: bool | None
     steps: int | None
     redrawn: int
+    total: float | None = None
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON; `total` only where there is no success."""
+        return {name: value for name, value in asdict(self).items() if name != "total" or value is not None}
 
 
 class TaskPool:
@@ -191,7 +197,7 @@ class _LockStep:
             task.draw_steps = actor.looks == "always" or (draw and look_on is not None)
         self.started = [start_episode(task, seed, stride) for task, seed in zip(self.tasks, seeds, strict=True)]
         self.frames = [frame for frame, _, _ in self.started]
-        self.rewards = np.zeros(len(seeds), np.float32)
+        self.rewards, self.totals = np.zeros(len(seeds), np.float32), np.zeros(len(seeds))
         self.solved: list[int | None] = [None] * len(seeds)
         self.loop = ClosedLoop(actor)
         self.loop.reset([seed for _, seed, _ in self.started])
@@ -210,10 +216,15 @@ class _LockStep:
                 self.look_on(Moment(step, episodes, frames, self.rewards[running].copy(), seen))
             if seen is not None and not last:
                 self._execute(running, seen, step + 1)
-        return [
-            Outcome(seed, steps is not None, steps, redrawn)
-            for (_, seed, redrawn), steps in zip(self.started, self.solved, strict=True)
-        ]
+        found = []
+        for task, (_, seed, redrawn), steps, total in zip(
+            self.tasks, self.started, self.solved, self.totals.tolist(), strict=True
+        ):
+            solves = getattr(task, "solves", True)
+            found.append(
+                Outcome(seed, steps is not None if solves else None, steps, redrawn, None if solves else total)
+            )
+        return found
 
     def _observe(self, running: Sequence[int], step: int) -> TensorDict:
         """What the actor reads of the running episodes."""
@@ -231,5 +242,6 @@ class _LockStep:
         for i, action in zip(running, actions, strict=True):
             observation, reward, _, _, info = self.tasks[i].step(action)
             self.frames[i], self.rewards[i] = observation["pixels"], reward
+            self.totals[i] += float(reward)
             if info["success"] and self.solved[i] is None:
                 self.solved[i] = step

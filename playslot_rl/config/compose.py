@@ -30,6 +30,7 @@ from playslot_rl.errors import ConfigError, first_line
 
 PLAIN_ENV: Final = "button_press"
 """The task whose values one that another package brings starts from: it asks nothing of the model."""
+FITTED: Final = "playslot_rl.envs.gym_task:fitted"
 METHOD_KEYS: Final = ("method", "compare.methods", "compare.reference")
 CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
@@ -91,6 +92,8 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         else:
             groups = tuple(f"{group}={pairs[group]}" for group in GROUPS if group in pairs)
             config = from_dict(ExperimentConfig, _merge(_presets(groups), _typed(pairs)))
+            if config.env.id and "env.action_dim" not in pairs:  # only the environment knows
+                config = dataclasses.replace(config, env=plugins.call(FITTED, config.env))
         require_machine(config, {key: value for key, value in pairs.items() if key not in GROUPS})
     except ConfigError:
         raise

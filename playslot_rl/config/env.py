@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import Checked, at_least, between, within
+from playslot_rl.config.roles import SEED, UNSAID, Checked, at_least, between, within
 
 Rgb = tuple[int, int, int]
+
+STRENGTH: Final = between(0, 1, "0 (off) to 1")
 
 COLOURS: Final[dict[str, Rgb]] = {
     "lime": (0, 255, 0),
@@ -95,6 +97,35 @@ class BlocksConfig(Checked):
 
 
 @dataclass(frozen=True)
+class VariationConfig(Checked):
+    """What changes in the picture and not in the task, drawn for each episode; all of it is off by default.
+
+    Attributes:
+        background: a drifting pattern instead of sky, floor and walls.
+        textures: a pattern over the table.
+        shake: how far the camera shakes, 1 by up to 4 degrees.
+        light: how much its strength and colour change, over time too.
+        colours: how far robot, table and ground take random colours; 1 whole.
+        object: something moves before the scene, which nothing can touch.
+        seed: other numbers for the same episodes.
+    """
+
+    group = "env.variation."
+    background: bool = field(default=False, metadata=UNSAID)
+    textures: bool = field(default=False, metadata=UNSAID)
+    shake: float = field(default=0.0, metadata=UNSAID | STRENGTH)
+    light: float = field(default=0.0, metadata=UNSAID | STRENGTH)
+    colours: float = field(default=0.0, metadata=UNSAID | STRENGTH)
+    object: bool = field(default=False, metadata=UNSAID)
+    seed: int = field(default=0, metadata=UNSAID | SEED)
+
+    @property
+    def on(self) -> bool:
+        """Whether anything changes."""
+        return replace(self, seed=0) != VariationConfig()
+
+
+@dataclass(frozen=True)
 class EnvConfig(Checked):
     """The task.
 
@@ -107,6 +138,10 @@ class EnvConfig(Checked):
         warmup_steps: random agent steps after each reset, before the first observation.
         grid: settings of `grid_shapes`.
         blocks: settings of the `block_*` environments.
+        variation: what changes in the picture and not in the task.
+        id: of `env=gym`: a registered Gymnasium environment, `FetchReach-v4`, or `package:Id` after importing one.
+        camera: of `env=gym` with MuJoCo: a camera's name, or `distance,azimuth,elevation,x,y,z`; empty is its own.
+        expert: of `env=gym`: `package.module:function`, from its own observation, info and a generator to its action.
     """
 
     group = "env."
@@ -118,8 +153,17 @@ class EnvConfig(Checked):
     warmup_steps: int = field(default=12, metadata=at_least(0, "0 or more", 10_000))
     grid: GridConfig = field(default_factory=GridConfig)
     blocks: BlocksConfig = field(default_factory=BlocksConfig)
+    variation: VariationConfig = field(default=VariationConfig(), metadata=UNSAID)
+    id: str = field(default="", metadata=UNSAID)
+    camera: str = field(default="", metadata=UNSAID)
+    expert: str = field(default="", metadata=UNSAID)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for key in ("id", "camera", "expert"):
+            value = getattr(self, key)
+            check(self.name == "gym" or not value, f"env.{key}", value, f"none with env={self.name}: it is of env=gym")
+        drawn = self.name not in ("grid_shapes", "sketchy", "video") or not self.variation.on
+        check(drawn, "env.variation", self.variation, f"nothing with env={self.name}, which no simulator draws")
         used = self.name.startswith("block_") or self.blocks == BlocksConfig()
         check(used, "env.blocks", self.blocks, f"no changes with env.name={self.name}, which has no blocks")

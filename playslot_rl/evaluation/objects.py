@@ -231,10 +231,12 @@ def match_slots(truth: Labels, predicted: Labels, objects: int, slots: int) -> n
 
 
 def segmented_episode(env: Any, seed: int, steps: int) -> Segmented:
-    """The scripted expert's episode of a `PixelTask`, T steps long."""
+    """The scripted expert's episode of a `PixelTask`, T steps long; random actions where it has none."""
     frames, labels = [env.reset(seed=seed)[0]["pixels"]], [env.segment()]
+    drawn, width = np.random.default_rng(seed), env.action_space.shape
     for _ in range(steps):
-        frames.append(env.step(env.expert_action())[0]["pixels"])
+        action = env.expert_action() if env.has_expert else drawn.uniform(-1, 1, width).astype(np.float32)
+        frames.append(env.step(action)[0]["pixels"])
         labels.append(env.segment())
     return np.stack(frames), np.stack(labels)
 

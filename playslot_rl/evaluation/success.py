@@ -11,10 +11,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import platform
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -39,6 +40,8 @@ POLICY_PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("si
 PROTOCOLS = (*POLICY_PROTOCOLS, "replay")
 REFERENCES = ("random", "expert", "slot_oracle")
 DEFAULT_EPISODES = 50
+NOTHING: Final[dict[str, Any]] = {"success_rate": None, "ci95": None, "mean_steps_to_success": None}
+"""Of an actor that there is not, or a task without success."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +175,7 @@ def measure(
         "references_protocol": "simulation (closed loop), on the same seeds",
         "max_steps": config.env.max_steps,
         "redrawn": sum(e.redrawn for e in outcome),
-        "per_episode": [asdict(e) for e in outcome],
+        "per_episode": [e.plain() for e in outcome],
         "seed": seed,
         **task_facts(config, seed),
         "wall_seconds": round(wall, 2),
@@ -239,7 +242,13 @@ def hardware() -> dict[str, Any]:
 
 
 def summary(episodes: Sequence[Outcome]) -> dict[str, Any]:
-    """`success_rate` (0 to 1), `ci95` (Wilson) and `mean_steps_to_success` (agent steps; None without a success)."""
+    """`success_rate` (0 to 1), `ci95` (Wilson) and `mean_steps_to_success` (agent steps; None without a success); where
+    no success is measured these are None, and there are `mean_return`, of agent steps' rewards, and its standard error.
+    """
+    if any(e.success is None for e in episodes):
+        totals = np.array([e.total for e in episodes], np.float64)
+        error = float(totals.std(ddof=1) / math.sqrt(len(totals))) if len(totals) > 1 else None
+        return {**NOTHING, "mean_return": float(totals.mean()), "return_error": error}
     steps = [e.steps for e in episodes if e.steps is not None]
     return {
         "success_rate": len(steps) / len(episodes),
@@ -261,17 +270,18 @@ def run_references(
     `cache` is a JSON file that both protocols of a run share. The oracle's result is in it by the weights of oracle and
     SAVi that `oracle_fingerprint` names; empty, it is not cached.
     """
-    actors: dict[str, Actor] = {
-        "random": RandomActor(config.env.max_steps, config.env.action_dim),
-        "expert": ExpertActor(),
-    }
+    actors: dict[str, Actor] = {"random": RandomActor(config.env.max_steps, config.env.action_dim)}
+    results: dict[str, dict[str, Any]] = {}
+    if getattr(pool.take(1)[0], "has_expert", True):
+        actors["expert"] = ExpertActor()
+    else:
+        results["expert"] = dict(NOTHING)
     if oracle is not None:
         actors["slot_oracle"] = oracle
     stored: dict[str, dict[str, Any]] = {}
     if cache is not None and cache.is_file():
         with contextlib.suppress(json.JSONDecodeError):  # only a cache: run the references again
             stored = json.loads(cache.read_text())
-    results: dict[str, dict[str, Any]] = {}
     for name, actor in actors.items():
         weights = oracle_fingerprint if name == "slot_oracle" else name
         what = [weights, to_dict(config.env), to_dict(config.render), list(seeds)]
@@ -280,7 +290,7 @@ def run_references(
             stored[key] = summary(run_episodes(pool, actor, seeds))
         results[name] = stored[key]
     if oracle is None:
-        results["slot_oracle"] = {"success_rate": None, "ci95": None, "mean_steps_to_success": None}
+        results["slot_oracle"] = dict(NOTHING)
     if cache is not None:
         kept = {k: v for k, v in stored.items() if oracle_fingerprint or not k.startswith("slot_oracle")}
         write_json(cache, kept)

@@ -17,7 +17,7 @@ from playslot_rl.data.demonstrations import (
     require_finite,
     require_labelled,
 )
-from playslot_rl.envs import gym_id
+from playslot_rl.envs import check_task
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.methods.online.config import OnlineConfig
 from playslot_rl.runs import Run
@@ -157,7 +157,7 @@ def require_online(config: ExperimentConfig, online: OnlineConfig, method: str) 
             f"method={method}: got {here().world} processes, expected one: it learns by acting; start it without "
             "torchrun or accelerate launch"
         )
-    gym_id(config.env.name)
+    check_task(config.env, success=True)
     if config.env.name.startswith("block_") and config.env.blocks.reward != "dense":
         raise ConfigError(
             f"env.blocks.reward: got {config.env.blocks.reward} with method={method}, expected dense: "

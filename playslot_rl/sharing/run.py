@@ -97,7 +97,7 @@ def read_results(run: Run, source: dict[str, Any]) -> list[Result]:
             continue
         try:
             info = json.loads(path.read_text())
-            if info["fingerprints"] == source["fingerprints"]:
+            if info["fingerprints"] == source["fingerprints"] and info["success_rate"] is not None:
                 results.append(_result(info))
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(

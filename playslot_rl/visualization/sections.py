@@ -128,7 +128,8 @@ def success_section(given: ReportInput) -> Section:
         for name, result, _, count in rows:
             steps = result.get("mean_steps_to_success")
             taken = "–" if steps is None else f"{steps:.1f}"
-            cells.append([name, percent(result["success_rate"]), interval(result["ci95"]), taken, count])
+            said = f"return {result['mean_return']:.2f}" if "mean_return" in result else percent(result["success_rate"])
+            cells.append([name, said, interval(result["ci95"]), taken, count])
         headers = ["", "success rate", "95 % interval", "mean steps to success", "episodes"]
         blocks.append(Table(headers, cells, "Wilson intervals. References run closed-loop on the same seeds."))
         drawn = [
@@ -146,7 +147,8 @@ def success_section(given: ReportInput) -> Section:
                 " Expert's videos: their latents instead of the policy's, decoded and executed without looking; "
                 "what fails is lost by the decoder."
             )
-        blocks.append(chart("success", lambda theme: success_chart(drawn, theme), f"Success rates. {alt}.", ways))
+        if drawn:
+            blocks.append(chart("success", lambda theme: success_chart(drawn, theme), f"Success rates. {alt}.", ways))
     for protocol in POLICY_PROTOCOLS:
         if protocol not in results:
             command = given.command("evaluate", f"protocol={protocol}")

@@ -26,7 +26,10 @@ from playslot_rl.errors import ConfigError
 from playslot_rl.methods.dreamer.method import DreamerConfig
 
 PRESETS = ["compact", "compact_gpu", "paper", "smoke"]
-ENVS = ["block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "grid_shapes", "sketchy", "video"]
+ENVS = [
+    "block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "grid_shapes", "gym", "sketchy",
+    "video",
+]  # fmt: skip
 
 
 def store(config: ExperimentConfig, run: Path) -> Path:

@@ -170,4 +170,4 @@ def play(
     arrived = torch.from_numpy(received).T.unsqueeze(-1).contiguous()
     values = {**frames.to_dict(), keys.REWARD: arrived, keys.IS_FIRST: first, keys.IS_LAST: last}
     returns = tuple(received.sum(axis=0, dtype=np.float64).tolist())
-    return PlayedEpisodes(TensorDict(values, frames.batch_size), returns, tuple(o.success for o in outcomes))
+    return PlayedEpisodes(TensorDict(values, frames.batch_size), returns, tuple(bool(o.success) for o in outcomes))

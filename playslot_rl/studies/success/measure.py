@@ -10,7 +10,7 @@ from typing import Any
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
 from playslot_rl.config.methods import METHODS
-from playslot_rl.envs import gym_id
+from playslot_rl.envs import check_task
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.held_out import held_out_seeds
 from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_references
@@ -30,6 +30,7 @@ from playslot_rl.studies.success.jobs import (
     success_config,
     success_jobs,
     success_record,
+    uses_demos,
     uses_slots,
     world_runs,
 )
@@ -76,6 +77,7 @@ def job_rows(job: SuccessJob, frame_skip: int, status: Status) -> list[dict[str,
                 "episodes": info.get("episodes"),
                 "outcomes": None if rate is None else "".join(str(int(e["success"])) for e in info["per_episode"]),
                 "ci95": info.get("ci95"),
+                **({"mean_return": info["mean_return"]} if "mean_return" in info else {}),
                 "mean_steps_to_success": info.get("mean_steps_to_success"),
                 "train_seconds": meta.get("seconds", 0) + own_model_seconds(job) if meta else None,
                 "evaluation_seconds": info.get("wall_seconds"),
@@ -156,7 +158,8 @@ class SuccessMeasure:
 
     def said(self, rows: Sequence[Mapping[str, Any]]) -> str:
         known = [row for row in rows if row["success_rate"] is not None]
-        return ", ".join(f"{100 * row['success_rate']:.0f} % in {row['protocol']}" for row in known)
+        returns = [f"return {row['mean_return']:.2f} in {row['protocol']}" for row in rows if "mean_return" in row]
+        return ", ".join([*(f"{100 * row['success_rate']:.0f} % in {row['protocol']}" for row in known), *returns])
 
     def result(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         config, own = self.config, self.config.compare
@@ -201,7 +204,7 @@ def check_success(config: ExperimentConfig) -> None:
     finished world model, or one of another task.
     """
     env = config.env
-    gym_id(env.name)
+    check_task(env, expert=not config.data.demos and uses_demos(config))
     for method in config.compare.methods:
         check_method(config, method)
     task_folders(config)

@@ -40,6 +40,7 @@ def success_page(result: Result) -> Document:
         *(_section(panel, result) for panel in panels(result)),
         *_by_acting(result),
         *_across_tasks(result),
+        *_returns(result),
         Section(FOOTNOTES, [Notes(_footnotes(result))]),
         Section("Every job", [_jobs(result["rows"])]),
     ]
@@ -295,11 +296,33 @@ def _times(rows: Sequence[Result], result: Result) -> str:
     return f"Time: {'; '.join([*parts, whole])}."
 
 
+def _returns(result: Result) -> list[Section]:
+    """Of a task without success: mean return over the seeds; empty for others."""
+    groups: dict[tuple[str, ...], list[float]] = {}
+    for row in result["rows"]:
+        if "mean_return" in row:
+            name = (row["title"], row["protocol"], _number(row["demos"]), _number(row["labels"]))
+            groups.setdefault(name, []).append(row["mean_return"])
+    if not groups:
+        return []
+    body = [
+        [*name, f"{sum(found) / len(found):.2f} ({min(found):.2f} to {max(found):.2f})"]
+        for name, found in groups.items()
+    ]
+    return [Section("Return", [Table(["", "protocol", "demonstrations", "labels", "return (of the seeds)"], body)])]
+
+
 def _reference(value: Result) -> str:
     if value["success_rate"] is None:
-        return "not run"
+        return f"return {value['mean_return']:.2f}" if "mean_return" in value else "not run"
     low, high = value["ci95"]
     return f"{100 * value['success_rate']:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
+
+
+def _outcome(row: Result) -> str:
+    if row["success_rate"] is None:
+        return f"return {row['mean_return']:.2f}" if "mean_return" in row else "–"
+    return f"{row['successes']} of {row['episodes']}"
 
 
 def _jobs(rows: Sequence[Result]) -> Table:
@@ -309,7 +332,7 @@ def _jobs(rows: Sequence[Result]) -> Table:
             row["name"],
             row["protocol"],
             row["status"],
-            "–" if row["success_rate"] is None else f"{row['successes']} of {row['episodes']}",
+            _outcome(row),
             _number(row["labelled_demos"]),
             _number(row["env_steps"]),
             "–" if row["train_seconds"] is None else f"{row['train_seconds']:.0f} s",

@@ -1,0 +1,197 @@
+"""Any registered Gymnasium environment as a task."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gym_examples
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from playslot_rl import keys
+from playslot_rl.collectors.episodes import record
+from playslot_rl.collectors.journal import CollectionSpec
+from playslot_rl.config import EnvConfig, RenderConfig
+from playslot_rl.config.compose import compose
+from playslot_rl.envs import check_task, make_env, task_metadata
+from playslot_rl.envs.gym_task import GymTask
+from playslot_rl.errors import ConfigError
+
+ROBOTS = {"FetchReach-v4": 4, "PointMaze_UMaze-v3": 2, "AdroitHandDoor-v1": 28}
+LINE = gym_examples.register("Line-v0")
+
+
+def line(**changes: Any) -> EnvConfig:
+    return replace(EnvConfig("gym", 32, 1, 1, 8, 0, id=LINE), **changes)
+
+
+def made(config: EnvConfig) -> GymTask:
+    task = make_env(config).unwrapped
+    assert isinstance(task, GymTask)
+    return task
+
+
+@pytest.mark.parametrize(("name", "width"), ROBOTS.items())
+def test_a_registered_robot_is_a_task(name: str, width: int) -> None:
+    """Reset, a step, a frame that is no flat colour, drawn as often as wanted without a change."""
+    config = compose(["env=gym", f"env.id={name}", "env.image_size=32"]).env
+    assert config.action_dim == width
+    task = made(config)
+    first, _ = task.reset(seed=3)
+    assert first["pixels"].std() > 5
+    observation, reward, *_, info = task.step(np.full(width, 0.5, np.float32))
+    np.testing.assert_array_equal(task.draw(), observation["pixels"])
+    assert np.isfinite(reward)
+    assert task.solves
+    assert info["success"] is False
+    np.testing.assert_array_equal(task.reset(seed=3)[0]["pixels"], first["pixels"])
+    assert not np.array_equal(task.reset(seed=4)[0][keys.STATE], first[keys.STATE])
+    assert task.segment().max() >= 1
+    task.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "width"), ROBOTS.items())
+def test_its_episodes_do_not_depend_on_being_looked_at(name: str, width: int) -> None:
+    config = compose(["env=gym", f"env.id={name}", "env.image_size=32", "env.frame_skip=2"]).env
+    task, actions, ends = made(config), np.random.default_rng(0).uniform(-1, 1, (50, width)).astype(np.float32), []
+    for draw in (True, False):
+        task.draw_steps = draw
+        task.reset(seed=1)
+        for action in actions:
+            observation, _, _, truncated, _ = task.step(action)
+        assert truncated
+        ends.append(observation[keys.STATE])
+    np.testing.assert_array_equal(*ends)
+    task.close()
+
+
+def test_actions_are_stretched_over_the_box_and_experts_scaled_back() -> None:
+    task = made(line(expert="gym_examples:to_the_right"))
+    task.reset(seed=0)
+    for given, meant in ((-1.0, -2.0), (0.0, 1.0), (1.0, 4.0)):
+        task.step(np.array([given], np.float32))
+        assert task.inner.unwrapped.taken == pytest.approx(meant)  # type: ignore[attr-defined]
+    action = task.expert_action()
+    np.testing.assert_array_equal(task.expert_action(), action)
+    assert action == pytest.approx(0.0, abs=0.02)
+    task.step(action)
+    assert not np.array_equal(task.expert_action(), action)
+    task.close()
+
+
+def test_one_that_draws_itself_is_area_averaged_and_rests_where_it_ended() -> None:
+    task = made(line(max_steps=20))
+    frame = task.reset(seed=0)[0]["pixels"]
+    assert frame.shape == (32, 32, 3)
+    assert frame.mean() == pytest.approx(task.inner.render().mean(), abs=2.0)  # type: ignore[union-attr]
+    rewards = [task.step(np.ones(1, np.float32))[1] for _ in range(20)]
+    assert rewards[0] == 1.0
+    assert rewards[-1] == 0.0
+    assert task.inner.unwrapped.place > gym_examples.GOAL  # type: ignore[attr-defined]
+    task.close()
+
+
+def test_without_a_measure_of_success_episodes_have_a_return() -> None:
+    from playslot_rl.acting.actor import ExpertActor, RandomActor
+    from playslot_rl.acting.episodes import TaskPool, run_episodes
+    from playslot_rl.evaluation.success import run_references, summary
+
+    with TaskPool(line(), RenderConfig()) as pool:
+        outcomes = run_episodes(pool, RandomActor(8, 1), [1, 2])
+        config = compose(["preset=smoke", "env=gym", f"env.id={LINE}", "env.image_size=32", "env.max_steps=8"])
+        references = run_references(None, config, [1, 2], pool)
+    assert [(o.success, o.steps, o.total) for o in outcomes] == [(None, None, 8.0)] * 2
+    assert summary(outcomes)["success_rate"] is None
+    assert summary(outcomes)["mean_return"] == 8.0
+    assert references["expert"]["success_rate"] is None
+    assert "mean_return" not in references["expert"]
+    with TaskPool(line(expert="gym_examples:to_the_right"), RenderConfig()) as pool:
+        assert run_episodes(pool, ExpertActor(), [1])[0].plain() == {
+            "seed": 1, "success": None, "steps": None, "redrawn": 0, "total": 8.0,
+        }  # fmt: skip
+
+
+def test_the_users_expert_solves_the_users_task() -> None:
+    config = compose(
+        ["env=gym", "env.id=FetchReach-v4", "env.expert=gym_examples:reach", "env.image_size=32", "preset=smoke"]
+    )
+    spec = CollectionSpec.make(config, "expert", 1, 12, 0)
+    (episode,) = record(spec, [0])
+    assert episode.success.any()
+    assert episode.states.shape == (13, 16)
+    assert task_metadata(config.env)["control_hz"] == 25
+
+
+@pytest.mark.integration
+def test_random_videos_need_no_expert(tmp_path: Path) -> None:
+    from playslot_rl.recipes import collect
+
+    arguments = ["env=gym", f"env.id={LINE}", "env.image_size=32", "preset=smoke", "policy=random", "episodes=2"]
+    collect.main(compose([*arguments, "workers=1", f"out={tmp_path / 'set'}"]))
+    assert (tmp_path / "set" / "meta" / "info.json").is_file()
+
+
+UNBOUNDED = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            ["env.id=FetchReech-v4"],
+            r"got 'FetchReech-v4', expected a registered id; the nearest are FetchReach\S+, .*, .*",
+        ),
+        (["env.id=LineDiscrete-v0"], r"got actions Discrete\(2\), expected a Box of real numbers"),
+        (["env.id=LineUnbounded-v0"], "expected bounds below and above"),
+        (["env.id=LineBlind-v0"], r"got render_modes \['human'\], expected rgb_array among them"),
+        (["env.id=LineBroken-v0"], "expected an environment that can be made"),
+        ([f"env.id={LINE}", "env.expert=gym_examples:nobody"], "env.expert: got 'gym_examples:nobody'"),
+        ([f"env.id={LINE}", "env.expert=gym_examples:NOTHING"], "no function"),
+    ],
+)
+def test_what_cannot_be_a_task_is_refused_in_one_line(given: list[str], message: str) -> None:
+    gym_examples.register("LineDiscrete-v0", space=gym.spaces.Discrete(2))
+    gym_examples.register("LineUnbounded-v0", space=UNBOUNDED)
+    gym_examples.register("LineBlind-v0", modes=["human"])
+    gym_examples.register("LineBroken-v0", unknown=1)
+    with pytest.raises(ConfigError, match=message) as caught:
+        compose(["env=gym", *given])
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (line(id=""), "env.id: got nothing"),
+        (line(action_dim=3), "env.action_dim: got 3, expected 1"),
+        (line(camera="front"), "env.camera: got 'front', expected none"),
+        (line(id="FetchReach-v4", action_dim=4, camera="hed_camera_rgb"), "did you mean env.camera=head_camera_rgb"),
+        (line(id=gym_examples.register("LineGrey-v0", picture=np.zeros((4, 4)))), r"got float64 \(4, 4\) from render"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(config: EnvConfig, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        make_env(config).reset(seed=0)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_expert_or_success_that_there_is_not_is_refused_where_it_is_asked_for() -> None:
+    config = compose(["env=gym", f"env.id={LINE}", "preset=smoke"])
+    check_task(config.env)
+    with pytest.raises(ConfigError, match=r"env\.expert: got nothing with env\.id=Line-v0"):
+        CollectionSpec.make(config, "expert", 1, 2, 0)
+    with pytest.raises(ConfigError, match="whose info says no success"):
+        check_task(config.env, success=True)
+    wrong = made(line(expert="gym_examples:too_many"))
+    wrong.reset(seed=0)
+    with pytest.raises(ConfigError, match="expected 1 finite numbers"):
+        wrong.expert_action()
+
+
+def test_its_keys_are_its_own() -> None:
+    with pytest.raises(ConfigError, match=r"env\.id: got 'FetchReach-v4', expected none with env=button_press"):
+        compose(["env.id=FetchReach-v4"])
