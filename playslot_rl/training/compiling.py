@@ -54,6 +54,15 @@ def has_compiler() -> bool:
     return bool(os.environ.get("CXX")) or any(map(shutil.which, COMPILERS))
 
 
+def require_compiler(key: str) -> None:
+    """Refuse a setting that compiles, by a ConfigError, where there is no C++ compiler."""
+    if not has_compiler():
+        raise ConfigError(
+            f"{key}=true: got no C++ compiler, expected g++ or clang++ on the PATH: install one (Debian, Ubuntu: "
+            f"apt-get install g++), or leave {key} out"
+        )
+
+
 def compile_parts(modules: Mapping[str, nn.Module], key: str) -> None:
     """Compile what the networks call step by step, in place; names stay: the methods that a network names in `compiled`
     (SAVi's encoder with keys and values, and its decoder), else its parts.
@@ -61,11 +70,7 @@ def compile_parts(modules: Mapping[str, nn.Module], key: str) -> None:
     Whole networks draw random numbers from generators, which torch.compile cannot trace; their parts do not. A
     ConfigError with the dotted name of the setting, `key`, where there is no C++ compiler.
     """
-    if not has_compiler():
-        raise ConfigError(
-            f"{key}=true: got no C++ compiler, expected g++ or clang++ on the PATH: install one (Debian, Ubuntu: "
-            f"apt-get install g++), or leave {key} out"
-        )
+    require_compiler(key)
     for module, name in _parts(modules):
         setattr(module, name, torch.compile(getattr(module, name), dynamic=False if name != "forward" else None))
 

@@ -280,9 +280,9 @@ def test_roles_say_what_each_key_counts_for() -> None:
     assert keys_of(SlotsStageConfig, "free") == looking | {
         "compile", "execution", "optim.accumulate", "segmented_episodes"
     }  # fmt: skip
-    assert keys_of(DreamerConfig, "free") == {"minutes", "replay_on_disk", "evaluate_every"} | looking - {
-        "validate_every"
-    }
+    assert keys_of(DreamerConfig, "free") == {
+        "minutes", "replay_on_disk", "evaluate_every", "compile_train_step", "cudagraph"
+    } | looking - {"validate_every"}  # fmt: skip
     call = {"out", "run", "episodes", "policy", "protocol", "workers", "collector", "device", "export"}
     call |= {"adopt", "minutes", "plan", "play", "port"}
     assert keys_of(ExperimentConfig, "call") == call

@@ -22,11 +22,13 @@ from torchrl.objectives.utils import ValueEstimators
 from torchrl.trainers.algorithms import DreamerV3OptimizationStepper, DreamerV3Optimizer
 
 from playslot_rl import keys
+from playslot_rl.errors import ConfigError
 from playslot_rl.losses.common import total_loss
 from playslot_rl.methods.dreamer.method import DreamerConfig
 from playslot_rl.methods.dreamer.networks import BINS, UNIMIX, DreamerNetworks, act, actor_module
 from playslot_rl.methods.online.loop import OnlineTraining
 from playslot_rl.seeds.draws import StepGenerators, global_seed
+from playslot_rl.training.compiling import require_compiler
 from playslot_rl.training.record import StageRecord
 
 
@@ -148,17 +150,17 @@ class DreamerLearner:
     stored: tuple[str, ...] = (keys.PIXELS,)
 
     def __init__(self, networks: DreamerNetworks, config: DreamerConfig) -> None:
-        self.networks = networks
-        self.loss = build_loss(networks, config).to(next(networks.parameters()).device)
+        self.networks, device = networks, next(networks.parameters()).device
+        self._prepared = not require_device(config, device)
+        self.loss = build_loss(networks, config).to(device)
         self._optimizer = DreamerV3Optimizer(self.loss.parameters(), lr=config.lr, warmup_steps=config.warmup)
         self._stepper = DreamerV3OptimizationStepper(
             self.loss,
             self._optimizer,
             SoftUpdate(self.loss.value_loss, tau=config.critic_rate),
-            compile_train_step=False,
-            cudagraph=False,
+            compile_train_step=config.compile_train_step,
+            cudagraph=config.cudagraph,
         )
-
         self._slow = _Slow(self.loss)
 
     @property
@@ -177,10 +179,29 @@ class DreamerLearner:
         return act(self.networks, memory, generator if explore else None)
 
     def update(self, batch: TensorDict, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """One step; TorchRL draws from the global generators, which the loop has seeded."""
-        values = self._stepper.step(None, records(batch, self.networks))
+        """One step, which waits for no value; TorchRL draws from the global generators, which the loop has seeded."""
+        record = records(batch, self.networks)
+        if not self._prepared:
+            self._stepper.warmup(record)  # compiles and records; moves neither weights nor generators
+            self._prepared = True
+        values = self._stepper.step(None, record)
         numbers = {str(key): value.reshape(()) for key, value in values.items() if value.numel() == 1}
         return {"loss": total_loss(numbers), **numbers}
+
+
+def require_device(config: DreamerConfig, device: torch.device) -> bool:
+    """Whether a step is compiled or recorded; a ConfigError where that cannot be on a device.
+
+    Note: TorchRL can compile it on a CPU, too, but seven minutes were not enough for networks of test size.
+    """
+    asked = [key for key in ("compile_train_step", "cudagraph") if getattr(config, key)]
+    for key in asked:
+        if device.type != "cuda":
+            name = f"{config.group}{key}"
+            raise ConfigError(f"{name}=true: got device {device.type}, expected cuda: leave {name} out")
+    if config.compile_train_step:
+        require_compiler(f"{config.group}compile_train_step")
+    return bool(asked)
 
 
 class _Slow(nn.Module):

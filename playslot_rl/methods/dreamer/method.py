@@ -10,7 +10,18 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.machine import FLOAT, WEIGHT, Need, chain
 from playslot_rl.config.methods import Load, Method, Style
 from playslot_rl.config.plain import check
-from playslot_rl.config.roles import COUNT, LAYERS, NOT_NEGATIVE, OPEN_FRACTION, above_zero, at_least, between, within
+from playslot_rl.config.roles import (
+    COUNT,
+    LAYERS,
+    NOT_NEGATIVE,
+    OPEN_FRACTION,
+    above_zero,
+    at_least,
+    between,
+    role,
+    was,
+    within,
+)
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.methods.online.config import SHARE, OnlineConfig
 
@@ -41,6 +52,8 @@ class DreamerConfig(OnlineConfig):
         lmbda: of the lambda returns.
         entropy: weight of the actor's entropy.
         critic_rate: of the slow critic's moving average.
+        compile_train_step: losses and gradients as compiled kernels; needs a GPU and a C++ compiler.
+        cudagraph: losses and gradients as one CUDA graph; needs a GPU.
     """
 
     update_ratio: float = field(default=0.25, metadata=above_zero())
@@ -67,6 +80,8 @@ class DreamerConfig(OnlineConfig):
     lmbda: float = field(default=0.95, metadata=between(0, 1, "0 to 1"))
     entropy: float = field(default=3e-4, metadata=NOT_NEGATIVE)
     critic_rate: float = field(default=0.02, metadata=SHARE)
+    compile_train_step: bool = field(default=False, metadata=role("free") | was(False))
+    cudagraph: bool = field(default=False, metadata=role("free") | was(False))
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -5,10 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 from dreamer_parts import A, Parts, random_batch, tiny
+from tensordict import TensorDict
 
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig
 from playslot_rl.errors import ConfigError
+from playslot_rl.methods.dreamer import learner as module
 from playslot_rl.methods.dreamer.learner import DreamerLearner
 from playslot_rl.methods.dreamer.networks import DreamerNetworks
 from playslot_rl.seeds.draws import StepGenerators, global_seed
@@ -104,6 +106,30 @@ def test_filtering_frame_by_frame_is_the_rollout_of_the_sequence(parts: Parts) -
             _, belief = parts.networks.filter(state, belief, action, batch[keys.PIXELS][:, frame], None)
             assert torch.allclose(belief, out["next", "belief"][:, frame], atol=1e-5)
             memory = memory.update({"state": out["next", "state"][:, frame], "belief": belief})
+
+
+@pytest.mark.parametrize("key", ["compile_train_step", "cudagraph"])
+def test_a_step_is_neither_compiled_nor_recorded_without_a_gpu(key: str) -> None:
+    with pytest.raises(
+        ConfigError, match=f"^baselines.dreamer.{key}=true: got device cpu, expected cuda: leave .* out$"
+    ):
+        DreamerLearner(DreamerNetworks(tiny(), EnvConfig()), tiny(**{key: True}))
+
+
+def test_a_step_that_is_compiled_or_recorded_is_prepared_once_on_what_it_learns_from(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As on a GPU: TorchRL refuses a step that was not."""
+    monkeypatch.setattr(module, "require_device", lambda config, device: True)
+    agent, warmed = learner(), list[tuple[int, ...]]()
+
+    def warmup(sample: TensorDict) -> None:
+        warmed.append(tuple(sample.batch_size))
+
+    monkeypatch.setattr(agent._stepper, "warmup", warmup)
+    for number in range(2):
+        step(agent, number)
+    assert warmed == [tuple(random_batch(0).batch_size)]
 
 
 @pytest.mark.parametrize("size, mults", [(24, (1, 2)), (32, (1, 1, 1, 1, 1, 1))])
