@@ -53,9 +53,10 @@ class CompareVideoConfig(Checked):
         objects: with `env=grid_shapes`, numbers of objects: one comparison each, and one table of all.
         clips: clips of these that are scored, at most.
         pictures: of so many of them the predictions are drawn.
-        budget_minutes: wall-clock budget of each training, from its measured steps a second; 0: the preset's steps.
-        rates: factors of the preset's learning rate, of which each method takes the best on validation clips; one of
-            them means no choice.
+        budget_minutes: wall-clock budget of each training, from its measured steps a second, models on frames with
+            SAVi's time on top; 0: the preset's steps.
+        rates: factors of the preset's learning rate, of which each method takes the best on validation clips; the grid
+            is widened, twice at most, where that is at its edge. One of them means no choice.
         trial_steps: steps of each trial, which is the training in small: its phases are as much shorter.
         processes, launcher, hydra: as for `compare`.
     """

@@ -63,10 +63,18 @@ def test_what_a_model_was_told_of_the_future_is_a_column(finished: Path) -> None
 
 
 def test_a_training_says_what_it_cost_and_whether_it_was_done(finished: Path) -> None:
+    page = (finished / "video.md").read_text()
+    assert "**After the preset's steps**, and SAVi's" in page
+    assert "| training | parameters | steps | time | with SAVi's |" in page
+    assert "Every job is of one kind of processor" in page
     for job in result(finished)["jobs"]:
         assert job["status"] == "done"
         assert job["parameters"] > 0
-        assert [trial["rate"] for trial in job["tried"]] == [1.0, 3.0]
+        rates = [trial["rate"] for trial in job["tried"]]
+        assert rates == sorted(rates)
+        assert {1.0, 3.0} < set(rates), "with two of them the best one is at an edge"
+        assert job["at_edge"] == (job["rate"] in (rates[0], rates[-1]))
+        assert ("at the edge of those tried" in page) >= job["at_edge"]
         assert job["rate"] == max(job["tried"], key=lambda trial: trial["psnr"])["rate"]
         assert job["validation_psnr"] is not None
 
@@ -154,7 +162,8 @@ def test_a_method_that_fails_leaves_a_row_that_says_so(finished: Path, tmp_path:
     jobs = {job["name"]: job for job in result(tmp_path / "out")["jobs"]}
     assert {name: job["status"] for name, job in jobs.items()} == {"svg-s0": "failed", "slotformer-s0": "done"}
     assert jobs["slotformer-s0"]["rate"] == 1
-    assert [trial["psnr"] is None for trial in jobs["slotformer-s0"]["tried"]] == [False, True]
+    tried = {trial["rate"]: trial["psnr"] for trial in jobs["slotformer-s0"]["tried"]}
+    assert (tried[1.0] is None, tried[1e30]) == (False, None)
     page = (tmp_path / "out" / "video.md").read_text()
     assert "**svg-s0: failed.**" in page
     assert "1e+30: failed" in page

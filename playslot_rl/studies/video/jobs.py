@@ -220,9 +220,12 @@ def _with_context(config: ExperimentConfig, method: str, frames: int) -> Experim
     return config
 
 
-def video_record(job: VideoJob, config: ExperimentConfig, parents: Mapping[str, str], lpips: bool) -> dict[str, Any]:
+def video_record(
+    job: VideoJob, config: ExperimentConfig, parents: Mapping[str, str], lpips: bool, slots_seconds: float = 0.0
+) -> dict[str, Any]:
     """What the job's file says: with its own config, and what names it: fingerprints of the slots and the videos that
-    it builds on, and whether there are weights for LPIPS, since scores without it are not those with it.
+    it builds on, and whether there are weights for LPIPS, since scores without it are not those with it. What SAVi took
+    names no job: comparisons from before it counted go on.
     """
     own = to_dict(config.compare_video)
     asked = {key: own[key] for key in own if key not in NOT_OF_A_JOB}
@@ -243,6 +246,7 @@ def video_record(job: VideoJob, config: ExperimentConfig, parents: Mapping[str, 
         "out": absolute(str(job.out)),
         "asked": asked,
         "processes": config.compare_video.processes,
+        **({"slots_seconds": slots_seconds} if slots_seconds else {}),
         "fingerprint": fingerprint(config.seed),
         "choice": fingerprint(TRIAL_SEED),
         "config": to_dict(config),

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import ExperimentConfig, from_dict
+from playslot_rl.config.compare_video import method_of
 from playslot_rl.envs import RECORDED
 from playslot_rl.errors import ConfigError, PlaySlotError
 from playslot_rl.evaluation.intervals import hierarchical
@@ -22,7 +23,7 @@ from playslot_rl.evaluation.video import open_lpips
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing, write_json, write_text
 from playslot_rl.studies.launch import Status
-from playslot_rl.studies.study import Evaluate, Record, count_parameters, run_study
+from playslot_rl.studies.study import Evaluate, Record, count_parameters, made_by, run_study
 from playslot_rl.studies.video.jobs import VideoJob, check_variants, video_config, video_jobs, video_record
 from playslot_rl.studies.video.page import objects_page, video_figure, video_page, video_sheet
 from playslot_rl.studies.video.shared import (
@@ -33,10 +34,11 @@ from playslot_rl.studies.video.shared import (
     prepare_videos,
     score_references,
     sheet_name,
+    slots_seconds,
     test_sets,
     true_frames,
 )
-from playslot_rl.studies.video.training import VideoTraining, require_begun_alike
+from playslot_rl.studies.video.training import VideoTraining, beyond, require_begun_alike
 from playslot_rl.visualization.document import to_markdown
 from playslot_rl.visualization.grid import png
 
@@ -50,8 +52,8 @@ FALLING = 0.05
 def training_row(job: VideoJob, status: Status) -> dict[str, Any]:
     """One training; null where there is nothing to say.
 
-    Of its keys, `rate` and `tried` are factors of the learning rate, `perceptual` says that CADDY's loss had that term,
-    and `scores` are clip by clip.
+    Of its keys, `rate` and `tried` are factors of the learning rate, `at_edge` says that the best one is the smallest
+    or the largest, `perceptual` that CADDY's loss had that term, and `scores` are clip by clip.
     """
     done = json_or_nothing(job.scores) if status.status == "done" else {}
     curve = [row["psnr"] for row in done.get("validation", [])]
@@ -68,6 +70,9 @@ def training_row(job: VideoJob, status: Status) -> dict[str, Any]:
         "train_seconds": done.get("train_seconds"),
         "rate": done.get("choice", {}).get("rate"),
         "tried": done.get("choice", {}).get("tried"),
+        "at_edge": beyond(done.get("choice", {}).get("tried") or []) is not None,
+        "on_slots": method_of(job.method).slots,
+        **made_by(done.get("made", {}), status),
         "perceptual": done.get("perceptual"),
         "validation_psnr": curve[-1] if curve else None,
         "still_improving": curve[-1] - curve[-2] > FALLING if len(curve) > 1 else None,
@@ -150,7 +155,8 @@ class VideoMeasure:
         self.config = config = prepare_slots(config)
         parents, found = parent_prints(config), dict[VideoJob, Record]()
         for job in video_jobs(config, Path(config.out)):
-            found[job] = video_record(job, video_config(config, job, config.run), parents, not self._lpips_reason)
+            own = video_config(config, job, config.run)
+            found[job] = video_record(job, own, parents, not self._lpips_reason, slots_seconds(config))
         require_begun_alike(found, config.compare_video)
         self._references, self._truth = score_references(config, parents), true_frames(config)
         self._jobs = list(found)
@@ -188,6 +194,7 @@ class VideoMeasure:
             "summary": summarise_video(rows, self._references),
             "jobs": [{key: value for key, value in row.items() if key != "scores"} for row in rows],
             "test": own.test,
+            "slots_seconds": slots_seconds(config),
             "slots_of": "" if config.run == str(out / "world_model") else config.run,
             "test_recorded": str(out / "data" / "test") in own.test,
             "perceptual": any(row["perceptual"] for row in rows),

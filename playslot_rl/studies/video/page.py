@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.runtime.progress import format_seconds
-from playslot_rl.studies.study import FOOTNOTES, Result, machine_note, open_jobs_notes
+from playslot_rl.studies.study import FOOTNOTES, Result, machine_note, open_jobs_notes, origin_notes
 from playslot_rl.studies.video.shared import RECONSTRUCTION, sheet_name
 from playslot_rl.visualization.charts import Theme, legend, new_figure, style_axes, style_of
 from playslot_rl.visualization.document import Block, Document, Linked, Notes, Section, Table
@@ -38,8 +38,14 @@ PAPER = {
 
 
 def video_page(result: Result) -> Document:
-    trained = result["trained"]
+    trained, budget = result["trained"], result["budget_minutes"]
+    after = f"After {budget:g} minutes of training" if budget else "After the preset's steps"
     lead = (
+        f"**{after}**, and SAVi's {format_seconds(result['slots_seconds'])} for models on slots. "
+        if result["slots_seconds"]
+        else f"**{after}.** "
+    )
+    lead += (
         f"Preset `{result['preset']}`, training seeds {', '.join(map(str, result['seeds']))}; clips of "
         f"{trained['seed_frames']} and {trained['predicted_frames']} frames in training, the same videos for every "
         f"method. Tested on {result['predicted_frames']} predicted frames of clips of episodes that no training and "
@@ -128,7 +134,7 @@ def _trainings(result: Result) -> Table:
     body = []
     for job in result["jobs"]:
         if job["status"] != "done":
-            body.append([job["name"], job["status"], "–", "–", "–", "–", job["error"] or "–"])
+            body.append([job["name"], job["status"], "–", "–", "–", "–", "–", job["error"] or "–"])
             continue
         tried = ", ".join(f"{trial['rate']:g}: {_trial(trial)}" for trial in job["tried"] or [])
         improving = {True: "still rising", False: "no longer rising", None: "one validation"}[job["still_improving"]]
@@ -139,12 +145,14 @@ def _trainings(result: Result) -> Table:
                 f"{job['parameters']:,}",
                 f"{job['steps']:,}",
                 format_seconds(job["train_seconds"]),
-                f"{job['rate']:g}",
+                format_seconds(job["train_seconds"] + (result["slots_seconds"] if job["on_slots"] else 0.0)),
+                f"{job['rate']:g}{', at the edge of those tried' if job['at_edge'] else ''}",
                 tried or "–",
                 ended,
             ]
         )
-    return Table(["training", "parameters", "steps", "time", "learning rate, factor", "tried", "validation"], body)
+    headers = ["training", "parameters", "steps", "time", "with SAVi's", "learning rate, factor", "tried", "validation"]
+    return Table(headers, body)
 
 
 def _trial(trial: Result) -> str:
@@ -174,7 +182,7 @@ def _notes(result: Result) -> list[str]:
         notes.append(
             f"CADDY's perceptual loss: {'on' if result['perceptual'] else 'off, there were no VGG19 weights'}."
         )
-    notes += open_jobs_notes(result["jobs"], "trainings")
+    notes += [*origin_notes(result["jobs"]), *open_jobs_notes(result["jobs"], "trainings")]
     return [*notes, f"{machine_note(result)}; {format_seconds(result['seconds'])} in all."]
 
 

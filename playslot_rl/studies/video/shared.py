@@ -164,6 +164,11 @@ def prepare_slots(config: ExperimentConfig) -> ExperimentConfig:
     return replace(config, run=model)
 
 
+def slots_seconds(config: ExperimentConfig) -> float:
+    """Seconds that the SAVi of the models on slots was trained for; 0 without one."""
+    return float(Run.open(config.run).stage("slots").meta.get("seconds", 0.0)) if uses_slots(config) else 0.0
+
+
 def parent_prints(config: ExperimentConfig) -> dict[str, str]:
     """Fingerprints of the videos, the tests and the SAVi that all trainings have in common."""
     parents = {"videos": open_videos(config, config.data.root, "compare-video").fingerprint}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -41,6 +41,8 @@ from playslot_rl.studies.video.shared import sheet_name, tested_clips
 
 TRAINED_WITH: Final = ("trained_seed", "trained_frames", "tested")
 """Settings that a trial and a training are made with."""
+WIDENED: Final = 2
+"""How often the grid of learning rates is widened where the best one is at its edge."""
 TRIED_WITH: Final = (*TRAINED_WITH, "trial_steps")
 """And those of a trial alone."""
 
@@ -102,6 +104,25 @@ def _other(name: str, got: Any, old: Any, folder: Path) -> CheckpointError:
     )
 
 
+def beyond(tried: Sequence[Mapping[str, Any]]) -> float | None:
+    """The factor of a learning rate that is tried next, a step of the grid past the best one where that is at the edge;
+    None where it is not, where none ended, or there is no grid.
+
+    Example:
+        >>> beyond([{"rate": 1.0, "psnr": 20.0}, {"rate": 3.0, "psnr": 21.0}])
+        9.0
+    """
+    order = sorted(tried, key=lambda trial: float(trial["rate"]))
+    ended = [trial for trial in order if trial["psnr"] is not None]
+    if not ended or len(order) < 2:
+        return None
+    best = max(ended, key=lambda trial: float(trial["psnr"]))
+    rates = [float(trial["rate"]) for trial in order]
+    if best is order[0]:
+        return float(f"{rates[0] ** 2 / rates[1]:.3g}")
+    return float(f"{rates[-1] ** 2 / rates[-2]:.3g}") if best is order[-1] else None
+
+
 class VideoTraining:
     """A job under way: what its file says, as it is trained and scored."""
 
@@ -137,19 +158,27 @@ class VideoTraining:
         return in_steps(with_training(config, job.method, optim=optim), job.method, int(stored["steps"]))
 
     def _tried(self, config: ExperimentConfig) -> dict[str, Any]:
-        """The factor of the learning rate, the steps, and the trials that led to them."""
+        """The factor of the learning rate, the steps, and the trials that led to them.
+
+        `budget_minutes` are of the training; SAVi's own time counts, so that models on frames get as much on top.
+        """
         asked, steps = self._asked, int(training_of(config, self._job.method).steps)
         if not makes_trials(asked):
             return {"rate": asked.rates[0], "steps": steps, "tried": []}
         small = in_steps(replace(config, seed=TRIAL_SEED), self._job.method, asked.trial_steps)
         tried = [self._trial(small, rate) for rate in asked.rates]
+        for _ in range(WIDENED):
+            if (further := beyond(tried)) is not None:
+                tried.append(self._trial(small, further))
+        tried.sort(key=lambda trial: float(trial["rate"]))
         ended = [trial for trial in tried if trial["psnr"] is not None]
         if not ended:
             raise TrainingError(f"compare_video.rates={','.join(map(str, asked.rates))}: {tried[0]['error']}")
         best = max(ended, key=lambda trial: float(trial["psnr"]))
         seconds = min(float(trial["seconds_a_step"]) for trial in ended)
         if asked.budget_minutes and seconds:
-            steps = max(1, round(60 * asked.budget_minutes / seconds))
+            spent = 0.0 if method_of(self._job.method).slots else float(self._record.get("slots_seconds", 0.0))
+            steps = max(1, round((60 * asked.budget_minutes + spent) / seconds))
         return {"rate": best["rate"], "steps": steps, "tried": tried}
 
     def _trial(self, config: ExperimentConfig, rate: float) -> dict[str, Any]:
@@ -210,4 +239,5 @@ def _of_training(job: VideoJob, done: StageCheckpoint, score_seconds: float) -> 
         "score_seconds": round(score_seconds, 1),
         "choice": json_or_nothing(job.choice),
         "perceptual": done.meta.get("perceptual"),
+        "made": {key: done.meta.get(key, "") for key in ("commit", "processor")},
     }
