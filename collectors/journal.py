@@ -94,7 +94,7 @@ class CollectionSpec:
         So a data set made before a task with settings of its own was added is still the same collection.
         """
         values, default = to_dict(self), to_dict(EnvConfig())
-        values["env"] = {k: v for k, v in values["env"].items() if not isinstance(v, dict) or v != default[k]}
+        values["env"] = {k: v for k, v in values["env"].items() if not isinstance(v, dict) or v != default.get(k)}
         return values
 
     def difference(self, stored: object) -> str:

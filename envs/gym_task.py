@@ -254,6 +254,7 @@ class GymTask(PixelTask):
         if self._mujoco:
             self.inner.reset(seed=0)  # a camera over the middle of the scene is over what the first episode shows
             view, at_rest = _view(core, self._simulation.model, config.camera)
+            self.distance_seen = float(getattr(view, "distance", self._simulation.model.stat.extent / 2))
             self._make_renderer = partial(
                 FrameRenderer, self._simulation.model, view, config.image_size, render or RenderConfig(),
                 at_rest=at_rest,

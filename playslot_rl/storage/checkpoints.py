@@ -193,7 +193,9 @@ def require_config(checkpoint: StageCheckpoint, wanted: Mapping[str, Any], typed
     """Check that the parts of a config in `wanted`, such as `{"model": {"savi": ...}}`, are those of a checkpoint; a
     CheckpointError names the first key that differs, as `typed` (see `first_difference`).
     """
-    stored, keys = flatten(checkpoint.config), flatten(wanted).keys()
+    stored, keys = flatten(checkpoint.config), set(flatten(wanted))
+    if "env.name" in keys:  # the whole task, also what is not said of it
+        keys |= {key for key in stored if key.startswith("env.")}
     difference = first_difference({key: stored[key] for key in stored.keys() & keys}, wanted, typed)
     if difference is not None:
         key, old, new = difference

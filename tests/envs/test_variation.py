@@ -124,6 +124,29 @@ def test_an_environment_that_closes_leaves_no_trace() -> None:
     first.close()
 
 
+def test_what_is_collected_has_it_and_the_same_actions() -> None:
+    from playslot_rl.collectors.episodes import record
+    from playslot_rl.collectors.journal import CollectionSpec
+
+    episodes = []
+    for more in ([], ["env.variation.background=true"]):
+        spec = CollectionSpec.make(compose(["env=block_push_easy", "preset=smoke", *more]), "expert", 1, 3, 0)
+        episodes += record(spec, [0])
+        assert ("variation" in spec.to_dict()["env"]) == bool(more)
+    np.testing.assert_array_equal(episodes[1].actions, episodes[0].actions)
+    assert not np.array_equal(episodes[1].frames, episodes[0].frames)
+
+
+def test_a_gymnasium_robot_has_it() -> None:
+    task = make_env(compose(["env=gym", "env.id=PointMaze_UMaze-v3", "env.image_size=32"]).env).unwrapped
+    varied = make_env(replace(task.config, variation=VariationConfig(**ALL))).unwrapped
+    first, other = task.reset(seed=0)[0], varied.reset(seed=0)[0]
+    np.testing.assert_array_equal(first[keys.STATE], other[keys.STATE])
+    assert (first["pixels"] != other["pixels"]).any(axis=-1).mean() > 0.3
+    task.close()
+    varied.close()
+
+
 def test_off_is_unsaid() -> None:
     assert "variation" not in to_dict(EnvConfig())
     on = replace(EnvConfig(), variation=VariationConfig(shake=0.5))

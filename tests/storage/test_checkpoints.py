@@ -232,6 +232,17 @@ def test_a_changed_config_names_the_key(run: Path) -> None:
     assert one_line(caught)
 
 
+def test_a_task_that_is_compared_whole_is_compared_in_what_is_unsaid(run: Path) -> None:
+    """A policy that learned by acting under a variation is none of the plain task."""
+    path, env = checkpoint_folder(run, "slots"), to_dict(tiny_config())["env"]
+    require_config(read_stage(path, "slots"), {"env": env})
+    edit(path / "config.json", env={**env, "variation": {"shake": 0.5}})
+    varied = read_stage(path, "slots")
+    require_config(varied, {"env": {"image_size": env["image_size"]}})
+    with pytest.raises(CheckpointError, match=r"^env\.variation\.shake: got nothing, expected 0\.5"):
+        require_config(varied, {"env": env})
+
+
 def test_a_world_model_from_before_predictors_had_a_kind_is_cocvps() -> None:
     wanted = {"model": {"predictor": to_dict(tiny_config())["model"]["predictor"]}}
     old = {"model": {"predictor": {key: v for key, v in wanted["model"]["predictor"].items() if key != "kind"}}}
