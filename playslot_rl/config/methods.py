@@ -112,6 +112,7 @@ _OURS: Final[Mapping[str, str]] = {
     "diffusion": "lerobot_policy.method:DIFFUSION",
     "lapo": "lapo.method:LAPO",
     "laom": "laom.method:LAOM",
+    "clam": "clam.method:CLAM",
     "dreamer": "dreamer.method:DREAMER",
     "sold": "sold.method:SOLD",
     "caddy_policy": "caddy.method:CADDY_POLICY",

@@ -35,7 +35,7 @@ LOOPS = (
 
 CHECKED: dict[str, str] = {
     f"baselines.{method}.world": "read by playslot_rl.methods.training of whatever method builds on a model"
-    for method in ("lapo", "laom", "caddy_policy", "caddy_oracle")
+    for method in ("lapo", "laom", "clam", "caddy_policy", "caddy_oracle")
 }
 """Keys that say something although no computation reads them."""
 

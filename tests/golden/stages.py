@@ -29,10 +29,16 @@ from playslot_rl.training import record as records
 from playslot_rl.training.record import StageRecord
 
 BASELINES = (
-    "slot_oracle", "resnet_oracle", "lapo", "laom", "dreamer", "sold", "caddy_policy", "caddy_oracle", "svg",
+    "slot_oracle", "resnet_oracle", "lapo", "laom", "clam", "dreamer", "sold", "caddy_policy", "caddy_oracle", "svg",
     "caddy", "slotformer", "ocvp_seq", "act", "diffusion",
 )  # fmt: skip
-ON_A_MODEL = {"lapo": "lapo_model", "caddy_policy": "caddy", "caddy_oracle": "caddy"}
+ON_A_MODEL = {
+    "lapo": "lapo_model",
+    "laom": "laom_model",
+    "clam": "clam_model",
+    "caddy_policy": "caddy",
+    "caddy_oracle": "caddy",
+}
 WHOLE = ("button_press", "compact")
 """Task and preset that are written out; the others only where they differ."""
 OTHERS = (

@@ -44,9 +44,10 @@ RATES = {
     "slot_oracle": "behaviour.optim.lr",
     "lapo_model": "baselines.lapo.model.optim.lr",
     "laom_model": "baselines.laom.model.optim.lr",
+    "clam_model": "baselines.clam.model.optim.lr",
     "dreamer": "baselines.dreamer.lr",
     "sold": "baselines.sold.actor_lr",
-    **{name: f"baselines.{name}.policy.optim.lr" for name in ("lapo", "laom", "caddy_policy", "caddy_oracle")},
+    **{name: f"baselines.{name}.policy.optim.lr" for name in ("lapo", "laom", "clam", "caddy_policy", "caddy_oracle")},
 }
 """Where a stage's learning rate is typed, if not in `baselines.STAGE.optim.lr`."""
 

@@ -1,4 +1,4 @@
-"""The labels are part of what LAOM's model is: another draw, or another number, is another model; none are none."""
+"""Labels are part of what LAOM's and CLAM's models are: another draw, or another number, is another model."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from playslot_rl.training import record as records
 from playslot_rl.training.record import StageRecord
 
 SHARED = ("preset=smoke", "env=button_press", "data.root=videos", "data.demos=demos", "device=cpu")
-SUPERVISED = {"laom": "baselines.laom.label_weight"}
+SUPERVISED = ("laom", "clam")
 OUT = Path("out")
 
 

@@ -1,0 +1,1 @@
+"""CLAM: continuous latent actions, learned together with their decoder."""

@@ -1,0 +1,77 @@
+"""CLAM: inverse and forward model and action decoder together, then a latent policy; its settings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.machine import WEIGHT, Need, chain, frame_numbers, windows
+from playslot_rl.config.methods import Load, Method, Style
+from playslot_rl.config.plain import check
+from playslot_rl.config.roles import COUNT, Checked, above_zero, between, role
+from playslot_rl.config.stage_spec import StageSpec
+from playslot_rl.config.stages import StageConfig, clipped_stage
+
+
+@dataclass(frozen=True)
+class CLAMConfig(Checked):
+    """Sizes and schedule of CLAM.
+
+    Attributes:
+        channels: of the encoders; each halves the resolution.
+        hidden: width of layers.
+        latent_dim: of latent actions.
+        label_weight: of the labelled actions in the model's loss.
+        loss: of the policy, `l2` or `l1`.
+        shift: of frames in the policy's training, pixels.
+        model: training of the model and the decoder.
+        policy: training of the latent policy.
+        world: run of CLAM with the same labels whose model is taken; empty trains one.
+    """
+
+    group = "baselines.clam."
+    channels: tuple[int, ...] = field(default=(64, 128, 128), metadata=COUNT)
+    hidden: int = field(default=256, metadata=COUNT)
+    latent_dim: int = field(default=8, metadata=COUNT)
+    label_weight: float = field(default=1.0, metadata=above_zero())
+    loss: Literal["l2", "l1"] = "l2"
+    shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
+    model: StageConfig = field(default_factory=lambda: clipped_stage(200_000, 3e-4, "cosine"))
+    policy: StageConfig = field(default_factory=lambda: clipped_stage(100_000, 3e-4, "constant"))
+    world: str = field(default="", metadata=role("machine", "folder"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(1 <= len(self.channels) <= 5, "baselines.clam.channels", self.channels, "1 to 5 widths")
+
+    def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
+        for part, stage in (("model", self.model), ("policy", self.policy)):
+            yield windows(f"{name}.{part}", stage, frame_numbers(config))
+        weights = 9 * chain(9, *self.channels) + self.hidden * (self.channels[-1] + self.latent_dim)
+        yield Need((name,), "CLAM's weights", weights * WEIGHT)
+
+
+NAME: Final = "clam"
+_BUILT: Final = tuple(f"baselines.clam.{key}" for key in ("channels", "hidden", "latent_dim", "label_weight"))
+_SHARED: Final = ("model.action_decoder", "behaviour.trim_pixels", "behaviour.trim_margin", *_BUILT)
+MODEL: Final = StageSpec(
+    "clam_model",
+    keys=_SHARED,
+    settings=("baselines.clam.model",),
+    labels="baselines.clam.label_weight",
+    parts="playslot_rl.methods.clam.training:model",
+    title="CLAM's model and decoder",
+)
+POLICY: Final = StageSpec(
+    NAME,
+    keys=(*_SHARED, "baselines.clam.loss", "baselines.clam.shift"),
+    settings=("behaviour.labelled_demos", "baselines.clam.policy"),
+    parents=("clam_model",),
+    data="demos",
+    parts="playslot_rl.methods.clam.training:policy",
+)
+CLAM: Final = Method(
+    NAME, ("CLAM",), Style(5, "*"), CLAMConfig, (MODEL, POLICY), Load(actor="playslot_rl.methods.clam.model:load_actor")
+)
