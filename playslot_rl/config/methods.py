@@ -110,6 +110,7 @@ _OURS: Final[Mapping[str, str]] = {
     "resnet_bc": "resnet_oracle.method:RESNET_BC",
     "act": "lerobot_policy.method:ACT",
     "diffusion": "lerobot_policy.method:DIFFUSION",
+    "autoencoder_bc": "autoencoder.method:AUTOENCODER_BC",
     "lapo": "lapo.method:LAPO",
     "laom": "laom.method:LAOM",
     "clam": "clam.method:CLAM",

@@ -14,10 +14,10 @@ from playslot_rl.studies.video.jobs import video_config, video_jobs, video_recor
 OUT = Path("/comparison")
 PARENTS = {"slots": "a", "dynamics": "b", "demos": "c", "videos": "d"}
 ACTING = (
-    "playslot,slot_oracle,resnet_oracle,slot_bc,resnet_bc,act,diffusion,lapo,laom,clam,"
+    "playslot,slot_oracle,resnet_oracle,slot_bc,resnet_bc,act,diffusion,autoencoder_bc,lapo,laom,clam,"
     "dreamer,sold,caddy_policy,caddy_oracle"
 )
-UNLABELLED = ACTING.replace("slot_bc,resnet_bc,act,diffusion,", "")
+UNLABELLED = ACTING.replace("slot_bc,resnet_bc,act,diffusion,autoencoder_bc,", "")
 CHOICES: dict[str, tuple[str, ...]] = {
     "all methods": (f"methods={ACTING}", "demos=4,8", "labels=2,4", "seeds=0,1"),
     "no labels": (f"methods={UNLABELLED}", "demos=8", "seeds=2", "preset=smoke"),

@@ -30,7 +30,7 @@ from playslot_rl.training.record import StageRecord
 
 BASELINES = (
     "slot_oracle", "resnet_oracle", "lapo", "laom", "clam", "dreamer", "sold", "caddy_policy", "caddy_oracle", "svg",
-    "caddy", "slotformer", "ocvp_seq", "act", "diffusion",
+    "caddy", "slotformer", "ocvp_seq", "act", "diffusion", "autoencoder_bc",
 )  # fmt: skip
 ON_A_MODEL = {
     "lapo": "lapo_model",
@@ -38,6 +38,7 @@ ON_A_MODEL = {
     "clam": "clam_model",
     "caddy_policy": "caddy",
     "caddy_oracle": "caddy",
+    "autoencoder_bc": "autoencoder",
 }
 WHOLE = ("button_press", "compact")
 """Task and preset that are written out; the others only where they differ."""

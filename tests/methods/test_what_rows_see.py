@@ -54,6 +54,7 @@ TABLE = {
     "resnet_bc": Sees(False, "all", "frames"),
     "act": Sees(False, "all", "frames"),
     "diffusion": Sees(False, "all", "frames"),
+    "autoencoder_bc": Sees(True, "all", "frames"),
     "lapo": Sees(True, "some", "frames", state=True),
     "laom": Sees(True, "some", "frames", state=True),
     "clam": Sees(True, "some", "frames"),

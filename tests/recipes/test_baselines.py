@@ -15,7 +15,17 @@ from playslot_rl.config.compose import compose
 
 pytestmark = pytest.mark.integration
 
-METHODS = ("slot_oracle", "resnet_oracle", "act", "diffusion", "lapo", "laom", "caddy_policy", "caddy_oracle")
+METHODS = (
+    "slot_oracle",
+    "resnet_oracle",
+    "act",
+    "diffusion",
+    "autoencoder_bc",
+    "lapo",
+    "laom",
+    "caddy_policy",
+    "caddy_oracle",
+)
 
 
 def _command(method: str, shared_run: Path, out: Path, *more: object) -> tuple[str, ...]:
@@ -50,6 +60,7 @@ def _meta(run: Path, stage: str) -> dict[str, Any]:
         ("resnet_oracle", 4),
         ("act", 4),
         ("diffusion", 4),
+        ("autoencoder_bc", 4),
         ("lapo", 3),
         ("laom", 3),
         ("caddy_policy", 3),

@@ -1,0 +1,1 @@
+"""Autoencoder BC: real actions cloned from the frozen features of an autoencoder of unlabelled videos."""
