@@ -184,7 +184,7 @@ def rate_words(policy: SharedPolicyConfig) -> str:
 
 def use(policy: SharedPolicyConfig, experiment: ExperimentConfig | None = None) -> str:
     """The paragraph on LeRobot's programs, as Markdown."""
-    if policy.env.name not in ENVIRONMENTS:
+    if policy.env.name not in ENVIRONMENTS or policy.env.id:  # LeRobot makes only tasks with a name
         return REAL.format(camera=policy.camera, rate=rate_words(policy))
     known = experiment or ExperimentConfig()
     own, task = policy.env, compose([f"env={policy.env.name}"]).env
