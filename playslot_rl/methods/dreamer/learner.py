@@ -101,7 +101,9 @@ def build_loss(networks: DreamerNetworks, config: DreamerConfig) -> DreamerV3Los
     )
     # TorchRL 0.14.1 hands its estimator a TensorDict without batch size, whose time is then taken to be the last axis,
     # of length one: without `time_dim` the lambda returns are one-step returns.
-    actor.make_value_estimator(ValueEstimators.TDLambda, gamma=config.gamma, lmbda=config.lmbda, time_dim=-2)
+    # Its vectorised returns wait for the lengths of episodes, so that no graph could hold them.
+    returns = {"gamma": config.gamma, "lmbda": config.lmbda, "time_dim": -2, "vectorized": False}
+    actor.make_value_estimator(ValueEstimators.TDLambda, **returns)
     value = DreamerV3ValueLoss(
         critic, value_loss="two_hot", num_value_bins=BINS, actor_loss=actor, slow_critic_regularization=1.0
     )
@@ -179,7 +181,9 @@ class DreamerLearner:
         return act(self.networks, memory, generator if explore else None)
 
     def update(self, batch: TensorDict, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """One step, which waits for no value; TorchRL draws from the global generators, which the loop has seeded."""
+        """One step; TorchRL draws from the global generators, which the loop has seeded. Of what it computes only the
+        replayed returns wait for the device, and these not where they are compiled or recorded.
+        """
         record = records(batch, self.networks)
         if not self._prepared:
             self._stepper.warmup(record)  # compiles and records; moves neither weights nor generators

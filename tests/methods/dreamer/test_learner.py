@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from dreamer_parts import A, Parts, random_batch, tiny
 from tensordict import TensorDict
+from torch.utils._python_dispatch import TorchDispatchMode
+from torchrl.objectives import dreamer_v3
 
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig
@@ -130,6 +134,21 @@ def test_a_step_that_is_compiled_or_recorded_is_prepared_once_on_what_it_learns_
     for number in range(2):
         step(agent, number)
     assert warmed == [tuple(random_batch(0).batch_size)]
+
+
+class _Waits(TorchDispatchMode):
+    """Refuses what needs a value on the host."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        assert not any(wait in func.name() for wait in ("_local_scalar_dense", "nonzero", "masked_select")), func.name()
+        return func(*args, **(kwargs or {}))
+
+
+def test_a_step_as_it_is_recorded_waits_for_no_value(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dreamer_v3, "_is_dynamo_compiling", lambda: True)  # as of a graph TorchRL asks, too
+    agent = learner()
+    with global_seed(0, 0), _Waits():
+        agent.update(random_batch(0), StepGenerators(0, 0))
 
 
 @pytest.mark.parametrize("size, mults", [(24, (1, 2)), (32, (1, 1, 1, 1, 1, 1))])
