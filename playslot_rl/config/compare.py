@@ -90,7 +90,12 @@ class CompareConfig(Checked):
         seed = self.evaluation_seed
         check(not frozen or self.block == "test", "compare.evaluation_seed", seed, "compare.block=test with a test's")
         known = ", ".join(self.methods)
-        check(self.reference in ("playslot", *self.methods), "compare.reference", self.reference, f"one of {known}")
+        check(
+            self.reference in (type(self).reference, *self.methods),
+            "compare.reference",
+            self.reference,
+            f"one of {known}",
+        )
         alone = [name for name in self.methods if METHODS[name].labelled_only]
         check(bool(self.labels) or not alone, "labels", self.labels, f"some numbers with methods={','.join(alone)}")
         online = self.online_seeds
