@@ -98,8 +98,9 @@ class Method:
     @property
     def model(self) -> StageSpec | None:
         """The model of unlabelled videos that it trains first, for itself and for any number of demonstrations."""
-        found = [stage for stage in self.stages[:-1] if stage.name in self.last.parents and not stage.parents]
-        return None if self.slots or not found else found[0]
+        shared = ("slots", "dynamics")  # of a world model
+        found = [s for s in self.stages[:-1] if s.name in self.last.parents and s.name not in shared]
+        return found[0] if found else None
 
 
 _OURS: Final[Mapping[str, str]] = {
@@ -112,6 +113,7 @@ _OURS: Final[Mapping[str, str]] = {
     "diffusion": "lerobot_policy.method:DIFFUSION",
     "autoencoder_bc": "autoencoder.method:AUTOENCODER_BC",
     "lapo": "lapo.method:LAPO",
+    "lapo_slots": "lapo.slots_method:LAPO_SLOTS",
     "laom": "laom.method:LAOM",
     "clam": "clam.method:CLAM",
     "dreamer": "dreamer.method:DREAMER",

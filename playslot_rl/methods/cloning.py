@@ -70,6 +70,9 @@ class LatentCloning(ABC):
     """An nn.Module that `Decides`."""
     decoder: ActionDecoder
 
+    noise: float = 0.0
+    """Deviation of what is added to the features that the decoder learns from."""
+
     kind: type[RegressionStage] = RegressionStage
     """Of the policy's stage."""
 
@@ -125,7 +128,7 @@ class LatentCloning(ABC):
             self.config.behaviour,
             parsed=True,
             imagined=False,
-            slot_noise=0.0,
+            slot_noise=self.noise,
             loss=self.loss,
             batch_size=self.schedule.batch_size,
             precision=self.schedule.precision,
@@ -211,6 +214,8 @@ def cloning(
     policy: StageConfig,
     decoder_steps: int,
     decoder_lr: float,
+    at: str = "",
+    views: int = 1,
 ) -> Training:
     """Latent policy, then action decoder, then both; the policy is taken over where another run has trained it.
 
@@ -219,7 +224,7 @@ def cloning(
     """
     config, name, split = record.config, record.name, record.demos
     labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
-    group = f"baselines.{name}"
+    group, schedule = at or f"baselines.{name}", at or f"baselines.{name}.policy"
 
     def part(folder: str, stage: Stage, steps: int, lr: float) -> Part:
         kind = folder.partition("_")[0]
@@ -227,14 +232,14 @@ def cloning(
         own = replace(policy, steps=steps, optim=replace(policy.optim, lr=lr))
         renamed = {"steps": f"{typed}_steps", "optim.lr": f"{typed}_lr"}
         of = "action_decoder" if folder == "decoder" else folder
-        return Part(f"{name}.{of}", stage, own, folder, f"{group}.policy", renamed, labelled)
+        return Part(f"{name}.{of}", stage, own, folder, schedule, renamed, labelled)
 
     def parts() -> Iterator[Part]:
         clone = behaviour.policy_stage()
-        yield Part(f"{name}.policy", clone, policy, group=f"{group}.policy")
+        yield Part(f"{name}.policy", clone, policy, group=schedule)
         yield from behaviour.decoding(clone, part, decoder_steps, decoder_lr)
 
-    said, extra = cloned(name, split, len(behaviour.trained.actions), config.behaviour.labelled_demos)
+    said, extra = cloned(name, split, len(behaviour.trained.actions), config.behaviour.labelled_demos, views)
     return Training(
         parts(),
         behaviour.device,

@@ -24,7 +24,7 @@ from playslot_rl.runs import Run
 from playslot_rl.runs.opening import require_parent, run_to_write
 from playslot_rl.runtime.processes import here
 from playslot_rl.seeds.episodes import EPISODES
-from playslot_rl.storage.checkpoints import StageCheckpoint, require_config, require_whole
+from playslot_rl.storage.checkpoints import StageCheckpoint, require_config, require_parents, require_whole
 from playslot_rl.training.pace import Pace
 from playslot_rl.training.record import StageRecord, run_stage
 
@@ -64,11 +64,20 @@ def train(config: ExperimentConfig) -> StageCheckpoint:
     if method.model is None:
         return train_stage(method.last, config, run)
     parents, sizes = dict[str, StageCheckpoint](), method.last.sizes
-    groups = {"model": plugins.call(sizes, config, config.model)} if sizes else {}
-    record = StageRecord(
-        method.last, run.folder, config, parents, groups, lambda: run.take(parents[record.spec.parents[0]])
-    )
-    parents[method.model.name] = _model(method.model, record, run)
+    model, world = config.model, Run.of(config, run.folder) if method.slots else None
+    if world is not None:
+        parents["slots"] = world.stage("slots")
+        require_parent(config, run, parents["slots"], "image_size")
+        model = replace(model, savi=parents["slots"].sizes[0].savi)
+
+    def ready() -> None:
+        run.take(parents[own.name])
+        if world is not None:
+            run.build_on(world)
+
+    groups = {"model": plugins.call(sizes, config, model)} if sizes else {}
+    record, own = StageRecord(method.last, run.folder, config, parents, groups, ready), method.model
+    parents[own.name] = _model(own, record, run)
     return run_stage(record, partial(plugins.call, record.spec.parts, record))
 
 
@@ -99,7 +108,8 @@ def train_stage(spec: StageSpec, config: ExperimentConfig, run: Run, pace: Pace 
 def train_model(config: ExperimentConfig, spec: StageSpec, folder: Path) -> StageCheckpoint:
     """Train the model of unlabelled videos that methods build on into a run, or find it there; raises as `train`."""
     method = spec.name if spec.name in METHODS else config.method
-    return train_stage(spec, replace(config, method=method, out=str(folder), run=""), Run(folder))
+    world = config.run if spec.parents else ""
+    return train_stage(spec, replace(config, method=method, out=str(folder), run=world), Run(folder))
 
 
 def _model(spec: StageSpec, record: StageRecord, run: Run) -> StageCheckpoint:
@@ -115,7 +125,7 @@ def _model(spec: StageSpec, record: StageRecord, run: Run) -> StageCheckpoint:
     require_finite(record.demos, count)
     world = getattr(getattr(config.baselines, config.method), "world", "")
     if not world:
-        if not run.has(spec.name):
+        if not run.has(spec.name) and not spec.parents:
             _require_moving(record, count)
         return train_model(config, spec, run.folder)
     other = Run(Path(world))
@@ -127,6 +137,7 @@ def _model(spec: StageSpec, record: StageRecord, run: Run) -> StageCheckpoint:
     model = other.own(spec.name)
     require_whole(model)
     require_parent(config, run, model, "image_size")
+    require_parents(model, {name: record.parents[name] for name in spec.parents})
     shared = [key for key in record.spec.keys if key in spec.keys]
     wanted = StageRecord(replace(spec, keys=tuple(shared), settings=()), run.folder, config).finishes()
     require_config(model, wanted, record.spec.typed)

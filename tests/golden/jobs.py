@@ -14,7 +14,7 @@ from playslot_rl.studies.video.jobs import video_config, video_jobs, video_recor
 OUT = Path("/comparison")
 PARENTS = {"slots": "a", "dynamics": "b", "demos": "c", "videos": "d"}
 ACTING = (
-    "playslot,slot_oracle,resnet_oracle,slot_bc,resnet_bc,act,diffusion,autoencoder_bc,lapo,laom,clam,"
+    "playslot,slot_oracle,resnet_oracle,slot_bc,resnet_bc,act,diffusion,autoencoder_bc,lapo,lapo_slots,laom,clam,"
     "dreamer,sold,caddy_policy,caddy_oracle"
 )
 UNLABELLED = ACTING.replace("slot_bc,resnet_bc,act,diffusion,autoencoder_bc,", "")

@@ -29,8 +29,8 @@ from playslot_rl.training import record as records
 from playslot_rl.training.record import StageRecord
 
 BASELINES = (
-    "slot_oracle", "resnet_oracle", "lapo", "laom", "clam", "dreamer", "sold", "caddy_policy", "caddy_oracle", "svg",
-    "caddy", "slotformer", "ocvp_seq", "act", "diffusion", "autoencoder_bc",
+    "slot_oracle", "resnet_oracle", "lapo", "lapo_slots", "laom", "clam", "dreamer", "sold", "caddy_policy",
+    "caddy_oracle", "svg", "caddy", "slotformer", "ocvp_seq", "act", "diffusion", "autoencoder_bc",
 )  # fmt: skip
 ON_A_MODEL = {
     "lapo": "lapo_model",

@@ -45,6 +45,8 @@ RATES = {
     "lapo_model": "baselines.lapo.model.optim.lr",
     "autoencoder": "baselines.autoencoder_bc.model.optim.lr",
     "autoencoder_bc": "baselines.autoencoder_bc.policy.optim.lr",
+    "lapo_slots_model": "baselines.lapo_slots.model.optim.lr",
+    "lapo_slots": "behaviour.optim.lr",
     "laom_model": "baselines.laom.model.optim.lr",
     "clam_model": "baselines.clam.model.optim.lr",
     "dreamer": "baselines.dreamer.lr",

@@ -64,11 +64,11 @@ def test_traits_follow_from_stages() -> None:
         return {name for name, method in METHODS.items() if getattr(method, trait)}
 
     assert named("online") == {"dreamer", "sold"}
-    assert named("slots") == {"playslot", "slot_oracle", "slot_bc", "sold", "slotformer", "ocvp_seq"}
-    assert named("decodes") == {"playslot", "lapo", "laom", "clam", "caddy_policy"}
+    assert named("slots") == {"playslot", "lapo_slots", "slot_oracle", "slot_bc", "sold", "slotformer", "ocvp_seq"}
+    assert named("decodes") == {"playslot", "lapo", "lapo_slots", "laom", "clam", "caddy_policy"}
     assert named("labelled_only") == {"slot_bc", "resnet_bc", "act", "diffusion", "autoencoder_bc"}
     assert {name: m.model.name for name, m in METHODS.items() if m.model} == {
-        "lapo": "lapo_model", "laom": "laom_model", "clam": "clam_model",
+        "lapo": "lapo_model", "lapo_slots": "lapo_slots_model", "laom": "laom_model", "clam": "clam_model",
         "caddy_policy": "caddy", "caddy_oracle": "caddy", "autoencoder_bc": "autoencoder",
     }  # fmt: skip
     assert named("imagines") == {"playslot"}

@@ -73,7 +73,13 @@ def test_only_methods_on_slots_get_the_world_model() -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "folder"), [("lapo", "lapo_world"), ("caddy_policy", "caddy_world"), ("caddy_oracle", "caddy_world")]
+    ("method", "folder"),
+    [
+        ("lapo", "lapo_world"),
+        ("lapo_slots", "lapo_slots_world"),
+        ("caddy_policy", "caddy_world"),
+        ("caddy_oracle", "caddy_world"),
+    ],
 )
 def test_a_model_of_videos_is_made_once_for_all_jobs_that_build_on_it(method: str, folder: str) -> None:
     config = compared(f"methods=slot_oracle,{method}")

@@ -20,16 +20,11 @@ Targets = Literal["continuous", "quantised"]
 
 
 @dataclass(frozen=True)
-class LAPOConfig(Checked):
-    """Sizes and schedule of LAPO. The action decoder's size is `model.action_decoder`; inputs, state, labels and
-    fine-tuning are `behaviour`'s, as for PlaySlot.
+class LatentConfig(Checked):
+    """Latent actions, on frames or on slots.
 
     Attributes:
-        encoder: `impala`, or `strided`, which is quicker.
-        channels: of the encoders; each halves the resolution.
-        forward_channels: of the forward model's U-Net; none: `channels`.
         frames: that the inverse model sees; the forward model sees all but the last.
-        hidden: width of the layer between an encoder and its output.
         groups: G codes that make up a latent action.
         codebooks: that groups share equally.
         code_dim: width of each, so that a latent action has `groups * code_dim` numbers.
@@ -37,23 +32,13 @@ class LAPOConfig(Checked):
         decay: of the codebooks' moving averages.
         dead_threshold: EMA cluster size under which a code is revived.
         commitment: weight beta of the commitment term.
-        loss: of the latent policy and the action decoder: `l2` or `l1`.
         targets: latents that policy and decoder learn from, `continuous` (before quantisation, as LAPO's code) or
             `quantised`.
-        shift: shift of frames in the latent policy's training, pixels.
         model: training of inverse and forward model.
-        policy: training of the latent policy.
-        decoder_steps: optimiser steps of the action decoder.
-        decoder_lr: its base learning rate; the rest is as for the policy.
-        world: another run of LAPO whose inverse and forward model are taken; empty trains them on `data.root`.
+        world: another run of the method whose inverse and forward model are taken; empty trains them on `data.root`.
     """
 
-    group = "baselines.lapo."
-    encoder: Encoder = field(default="impala", metadata=was("strided"))
-    channels: tuple[int, ...] = field(default=(64, 128, 128), metadata=COUNT)
-    forward_channels: tuple[int, ...] = field(default=(24, 48, 96, 192, 384, 768), metadata=was(()) | COUNT)
     frames: int = field(default=3, metadata=was(2) | between(2, 3, "2 or 3"))
-    hidden: int = field(default=256, metadata=COUNT)
     groups: int = field(default=8, metadata=at_least(1))
     codebooks: int = field(default=2, metadata=was(1) | at_least(1))
     code_dim: int = field(default=16, metadata=COUNT)
@@ -61,25 +46,52 @@ class LAPOConfig(Checked):
     decay: float = field(default=0.999, metadata=OPEN_FRACTION)
     dead_threshold: float = field(default=1.0, metadata=NOT_NEGATIVE)
     commitment: float = field(default=0.05, metadata=NOT_NEGATIVE)
-    loss: Literal["l2", "l1"] = "l2"
     targets: Targets = field(default="continuous", metadata=was("quantised"))
-    shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
     model: StageConfig = field(default_factory=lambda: _stage(50_000, 3e-4, 50, 2.0))
-    policy: StageConfig = field(default_factory=lambda: _stage(60_000, 2e-4, 1000, 0.0))
-    decoder_steps: int = field(default=20_000, metadata=at_least(1))
-    decoder_lr: float = field(default=2e-4, metadata=RATE)
     world: str = field(default="", metadata=role("machine", "folder"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(1 <= len(self.channels) <= 6, "baselines.lapo.channels", self.channels, "1 to 6 widths")
         books = f"a divisor of groups {self.groups}"
-        check(self.groups % self.codebooks == 0, "baselines.lapo.codebooks", self.codebooks, books)
+        check(self.groups % self.codebooks == 0, f"{self.group}codebooks", self.codebooks, books)
 
     @property
     def latent_dim(self) -> int:
         """Z = G times the width of a code."""
         return self.groups * self.code_dim
+
+
+@dataclass(frozen=True)
+class LAPOConfig(LatentConfig):
+    """Sizes and schedule of LAPO. The action decoder's size is `model.action_decoder`; inputs, state, labels and
+    fine-tuning are `behaviour`'s, as for PlaySlot.
+
+    Attributes:
+        encoder: `impala`, or `strided`, which is quicker.
+        channels: of the encoders; each halves the resolution.
+        forward_channels: of the forward model's U-Net; none: `channels`.
+        hidden: width of the layer between an encoder and its output.
+        loss: of the latent policy and the action decoder: `l2` or `l1`.
+        shift: shift of frames in the latent policy's training, pixels.
+        policy: training of the latent policy.
+        decoder_steps: optimiser steps of the action decoder.
+        decoder_lr: its base learning rate; the rest is as for the policy.
+    """
+
+    group = "baselines.lapo."
+    encoder: Encoder = field(default="impala", metadata=was("strided"))
+    channels: tuple[int, ...] = field(default=(64, 128, 128), metadata=COUNT)
+    forward_channels: tuple[int, ...] = field(default=(24, 48, 96, 192, 384, 768), metadata=was(()) | COUNT)
+    hidden: int = field(default=256, metadata=COUNT)
+    loss: Literal["l2", "l1"] = "l2"
+    shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
+    policy: StageConfig = field(default_factory=lambda: _stage(60_000, 2e-4, 1000, 0.0))
+    decoder_steps: int = field(default=20_000, metadata=at_least(1))
+    decoder_lr: float = field(default=2e-4, metadata=RATE)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(1 <= len(self.channels) <= 6, "baselines.lapo.channels", self.channels, "1 to 6 widths")
 
     def check(self, name: str, config: ExperimentConfig) -> None:
         """Refuse more halvings than frames have, by a ConfigError."""
@@ -107,10 +119,8 @@ def _stage(steps: int, lr: float, warmup: int, clip: float) -> StageConfig:
 
 
 NAME: Final = "lapo"
-SIZES: Final = (
-    "encoder", "channels", "forward_channels", "frames", "hidden", "groups", "codebooks", "code_dim", "codes", "decay",
-    "dead_threshold", "commitment",
-)  # fmt: skip
+QUANTISED: Final = ("frames", "groups", "codebooks", "code_dim", "codes", "decay", "dead_threshold", "commitment")
+SIZES: Final = ("encoder", "channels", "forward_channels", "hidden", *QUANTISED)
 """Settings that inverse and forward model are built from."""
 _BUILT: Final = tuple(f"baselines.lapo.{key}" for key in SIZES)
 MODEL: Final = StageSpec(

@@ -28,7 +28,7 @@ from torch.nn import functional as F
 from playslot_rl.acting.actor import Actor, latent_actor
 from playslot_rl.frames import normalise
 from playslot_rl.methods.decoded_policy import DecodedPolicy
-from playslot_rl.methods.lapo.method import MODEL, NAME, Encoder, LAPOConfig
+from playslot_rl.methods.lapo.method import MODEL, NAME, Encoder, LAPOConfig, LatentConfig
 from playslot_rl.modules.quantizer import ActionQuantizer
 from playslot_rl.runs import Run
 from playslot_rl.storage.checkpoints import StageCheckpoint
@@ -128,27 +128,34 @@ class Inferred(NamedTuple):
     vq_loss: Tensor
 
 
-class InverseModel(nn.Module):
-    """IDM: frames to a quantised latent action."""
+class QuantisedInverse(nn.Module):
+    """IDM: what `network` makes of frames, (B, Z), to a quantised latent action."""
 
-    def __init__(self, config: LAPOConfig, image_size: int) -> None:
+    def __init__(self, config: LatentConfig, network: nn.Module) -> None:
         super().__init__()
-        self.config = config
-        self.network = EncoderMLP.of(config, config.frames, image_size)
+        self.config, self.network = config, network
         self.standardise = nn.BatchNorm1d(config.latent_dim, affine=False)
         sizes = config.code_dim, config.codes, config.decay, config.dead_threshold, config.commitment
         self.quantizers = nn.ModuleList(ActionQuantizer(*sizes) for _ in range(config.codebooks))
 
     def forward(self, frames: Tensor) -> Inferred:
-        """Frames (B, F, 3, H, W), uint8 or float [0, 1], to latent actions between the last two; the codebooks move in
-        training mode.
-        """
-        z = self.standardise(self.network(normalise(frames).flatten(1, 2)).float())
+        """Frames (B, F, ...) to latent actions between the last two; the codebooks move in training mode."""
+        z = self.standardise(self.network(frames).float())
         grouped = z.view(len(z), -1, self.config.code_dim)
         parts = grouped.chunk(self.config.codebooks, dim=1)
         found = [quantizer(part) for quantizer, part in zip(self.quantizers, parts, strict=True)]
         p, code, losses = zip(*found, strict=True)
         return Inferred(torch.cat(p, dim=1).flatten(1), z, torch.cat(code, dim=1), torch.stack(losses).mean())
+
+
+class InverseModel(QuantisedInverse):
+    """IDM on frames (B, F, 3, H, W), uint8 or float [0, 1]."""
+
+    def __init__(self, config: LAPOConfig, image_size: int) -> None:
+        super().__init__(config, EncoderMLP.of(config, config.frames, image_size))
+
+    def forward(self, frames: Tensor) -> Inferred:
+        return super().forward(normalise(frames).flatten(1, 2))
 
 
 class ForwardModel(nn.Module):

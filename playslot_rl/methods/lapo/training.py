@@ -14,9 +14,11 @@ Shapes: B batch, H W image height and width, M transitions, Z latent-action widt
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -24,6 +26,7 @@ from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig, StageConfig
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
+from playslot_rl.data.device_rows import DeviceRows
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray
 from playslot_rl.errors import CheckpointError
@@ -31,7 +34,7 @@ from playslot_rl.frames import normalise
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.cloning import LatentCloning, cloning
 from playslot_rl.methods.lapo.method import NAME, LAPOConfig
-from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolicy
+from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolicy, QuantisedInverse
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
@@ -60,11 +63,24 @@ def with_past(pairs: IntArray, starts: IntArray, frames: int) -> IntArray:
 
 class LAPOModelStage:
     """Inverse and forward model together, trained in place on pairs of frames of unlabelled videos, and those before
-    them.
+    them; on the frames' `slots` (F, N, D) where these are given.
     """
 
-    def __init__(self, inverse: InverseModel, forward: ForwardModel, clips: Clips, config: StageConfig) -> None:
+    def __init__(
+        self,
+        inverse: QuantisedInverse,
+        forward: nn.Module,
+        clips: Clips,
+        config: StageConfig,
+        slots: npt.NDArray[np.float32] | None = None,
+    ) -> None:
         self.inverse, self.forward, self.clips, self.config = inverse, forward, clips, config
+        device = module_device(inverse)
+        self.key = keys.PIXELS
+        self.read: Callable[[IntArray], Tensor] = partial(clips.pixels, device=device)
+        if slots is not None:
+            resident = DeviceRows(lambda rows: torch.from_numpy(slots[rows]), len(slots), device, clips.resident)
+            self.key, self.read = keys.SLOTS, resident
         frames = normalise(self._frames(self.clips.spread(self.clips.train_episodes)))
         self.still = max(1e-6, float((frames[:, -2] - frames[:, -1]).square().mean()))
 
@@ -74,10 +90,10 @@ class LAPOModelStage:
 
     def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         pairs = self.clips.sample(self.config.batch_size, generators.numpy("pairs"))
-        return {keys.PIXELS: self._frames(own_rows(pairs))}
+        return {self.key: self._frames(own_rows(pairs))}
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        frames = normalise(batch[keys.PIXELS])
+        frames = normalise(batch[self.key])
         with autocast(frames.device.type, self.config.precision):
             inferred = self.inverse(frames)
             predicted = self.forward(frames[:, :-1], inferred.z)
@@ -112,23 +128,23 @@ class LAPOModelStage:
         return torch.stack(used).mean(), torch.stack(perplexity).mean()
 
     def _frames(self, pairs: IntArray) -> Tensor:
-        rows = with_past(pairs, self.clips.source.starts, self.inverse.config.frames)
-        return self.clips.pixels(rows, module_device(self.inverse))
+        return self.read(with_past(pairs, self.clips.source.starts, self.inverse.config.frames))
 
 
 @torch.no_grad()
 def infer_latents(
-    inverse: InverseModel,
+    inverse: QuantisedInverse,
     source: EpisodeFrames,
     moves: Transitions,
     device: torch.device | str = "cpu",
     quantised: bool = False,
+    read: Callable[[IntArray], Tensor] | None = None,
 ) -> Tensor:
-    """Latent actions (M, Z) of transitions; the model in evaluation mode."""
+    """Latent actions (M, Z) of transitions, from frames or what `read` gives of rows; the model in evaluation mode."""
     parts = []
     for rows in np.array_split(moves.rows, -(-len(moves.rows) // BATCH)):
         seen = with_past(np.stack((rows, rows + 1), axis=1), source.starts, inverse.config.frames)
-        inferred = inverse(source.pixels(seen).to(device))
+        inferred = inverse((read or source.pixels)(seen).to(device))
         parts.append(inferred.z if quantised else inferred.before)
     return torch.cat(parts)
 
@@ -162,8 +178,15 @@ def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseM
             f"{model.path}: got LAPO's models of an earlier form (two frames, one codebook), expected those of this "
             "version of playslot_rl: train them again, with another out="
         )
+    return restored(model, lambda: (InverseModel(own, env.image_size), ForwardModel(own)), device)
+
+
+def restored[Inverse: nn.Module](
+    model: StageCheckpoint, build: Callable[[], tuple[Inverse, nn.Module]], device: torch.device | str
+) -> Inverse:
+    """The inverse model of two that are stored together, frozen."""
     with torch.random.fork_rng(devices=[]):
-        inverse, forward = InverseModel(own, env.image_size), ForwardModel(own)
+        inverse, forward = build()
     load_weights(model, {"inverse": inverse, "forward": forward})
     return inverse.to(device).eval().requires_grad_(False)
 
@@ -174,10 +197,15 @@ def model(record: StageRecord) -> Training:
     own.check("baselines.lapo", config)
     with global_seed(config.seed, 0, record.name):
         inverse, forward = InverseModel(own, config.env.image_size).to(device), ForwardModel(own).to(device)
-    stage = LAPOModelStage(inverse, forward, record.clips(2, shown=256), own.model)
+    return on_pairs(record, LAPOModelStage(inverse, forward, record.clips(2, shown=256), own.model))
+
+
+def on_pairs(record: StageRecord, stage: LAPOModelStage) -> Training:
+    """The training of inverse and forward model, by its settings `baselines.METHOD.model`."""
+    part = Part(f"baselines.{record.name.removesuffix('_model')}.model", stage, stage.config)
     return Training(
-        [Part("baselines.lapo.model", stage, own.model)],
-        device,
+        [part],
+        record.device,
         lambda metrics: (
             f"{record.name}: {100 * metrics.get('unexplained', float('nan')):.0f} % of the change left on held-out "
             f"pairs, {record.folder}"

@@ -1,0 +1,92 @@
+"""Trainings of LAPO on slots: inverse and forward model on parsed videos; then PlaySlot's policy and decoder on their
+latents, as `behaviour` says.
+
+    L = mean (S^_{t+1} - S_{t+1})^2 / mean (S_t - S_{t+1})^2 + L_VQ
+
+Shapes: M transitions, F frames, N slots, D slot width, Z latent-action width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from playslot_rl.config import StageConfig
+from playslot_rl.data.cache import Cache
+from playslot_rl.data.demonstrations import Transitions, moving_slots, real_actions, transitions
+from playslot_rl.data.slot_cache import slot_cache
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.losses.behaviour import BehaviourLoss
+from playslot_rl.methods.cloning import LatentCloning, Seen, cloning
+from playslot_rl.methods.lapo.slots import SlotForward, SlotInverse
+from playslot_rl.methods.lapo.slots_method import MODEL, LAPOSlotsConfig
+from playslot_rl.methods.lapo.training import LAPOModelStage, infer_latents, on_pairs, restored
+from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.seeds.draws import global_seed
+from playslot_rl.training.demonstrated import demonstration_views
+from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.stage_regression import TensorInputs
+
+
+def model(record: StageRecord) -> Training:
+    config, device, slots = record.config, record.device, record.parents["slots"]
+    own: LAPOSlotsConfig = config.baselines.lapo_slots
+    savi = record.world.load_savi(device)
+    sizes = own, config.model.policy, savi.config.slot_dim
+    with global_seed(config.seed, 0, record.name):
+        inverse, forward = SlotInverse(*sizes).to(device), SlotForward(*sizes).to(device)
+    place, progress = Cache.of(config.data), config.logging.progress
+    cached = slot_cache(record.data, savi, slots.fingerprint, place, device, progress)
+    return on_pairs(record, LAPOModelStage(inverse, forward, record.clips(2, shown=256), own.model, cached))
+
+
+class LAPOSlotsBehaviour(LatentCloning):
+    """See `LatentCloning`: on slots, of what moves in them, and with shifted copies."""
+
+    def __init__(self, record: StageRecord) -> None:
+        config, device, demos = record.config, record.device, record.demos
+        own: LAPOSlotsConfig = config.baselines.lapo_slots
+        savi = record.world.load_savi(device)
+        width = savi.config.slot_dim
+        sizes = own, config.model.policy, width
+        self.own, self.noise, self.whole = own, config.behaviour.slot_noise, demos.trained
+        self.inverse = restored(record.parents[MODEL.name], lambda: (SlotInverse(*sizes), SlotForward(*sizes)), device)
+        views, others = demonstration_views(config, demos, savi, record.prints["slots"])
+        self.views, self.others = [frames for frames, _ in views], [frames for frames, _ in others]
+        self.parsed = {id(frames): slots for frames, slots in (*views, *others)}
+        schedule = StageConfig(**{part.name: getattr(config.behaviour, part.name) for part in fields(StageConfig)})
+        super().__init__(config, demos, device, 0, schedule, config.behaviour.loss)
+        with global_seed(config.seed, 0, record.name):
+            self.policy = LatentPolicy(config.model.policy, width, own.latent_dim).to(device)
+            self.decoder = self.new_decoder(own.latent_dim, width)
+
+    def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
+        slots = self.parsed[id(source)]
+        quantised = self.own.targets == "quantised"
+        read = lambda rows: torch.from_numpy(slots[rows])  # noqa: E731
+        return infer_latents(self.inverse, source, moves, self.device, quantised, read)
+
+    def criterion(self) -> BehaviourLoss:
+        return BehaviourLoss(self.policy, self.loss)
+
+    def _seen(self, source: EpisodeFrames, shift: int = 0) -> Seen:  # noqa: ARG002
+        own, views = self.config.behaviour, self.views if source is self.whole else self.others
+        moves = [moving_slots(transitions(v), self.parsed[id(v)], own.trim, own.trim_margin) for v in views]
+        slots = [torch.from_numpy(self.parsed[id(v)][m.rows]) for v, m in zip(views, moves, strict=True)]
+        latents = [self.infer(v, m) for v, m in zip(views, moves, strict=True)]
+        width = self.config.env.action_dim
+        actions = [real_actions(v, m.rows, width) for v, m in zip(views, moves, strict=True)]
+        parts = ([getattr(m, name) for m in moves] for name in ("rows", "episode", "step"))
+        rows, episode, step = map(np.concatenate, parts)
+        joined = Transitions(rows, episode, step, moves[0].lengths)
+        inputs = TensorInputs(torch.cat(slots).to(self.device), self.noise, "policy_noise")
+        return Seen(inputs, torch.cat(latents), torch.cat(actions).to(self.device), joined)
+
+
+def policy(record: StageRecord) -> Training:
+    own, behaviour = record.config.behaviour, LAPOSlotsBehaviour(record)
+    views = len(behaviour.views)
+    return cloning(record, behaviour, behaviour.schedule, own.decoder_steps, own.decoder_lr, "behaviour", views)
