@@ -89,6 +89,8 @@ class CompareConfig(Checked):
         frozen = self.evaluation_seed >= TEST_BLOCKS
         seed = self.evaluation_seed
         check(not frozen or self.block == "test", "compare.evaluation_seed", seed, "compare.block=test with a test's")
+        drawn = frozen or self.block == "development" or seed == CompareConfig.evaluation_seed
+        check(drawn, "compare.evaluation_seed", seed, f"none, or {TEST_BLOCKS} and above, with compare.block=test")
         known = ", ".join(self.methods)
         check(
             self.reference in (type(self).reference, *self.methods),

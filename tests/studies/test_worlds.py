@@ -101,6 +101,7 @@ def test_videos_are_counted_on_top_of_the_labelled_ones() -> None:
         (["videos=-1", "labels=5"], "videos: got -1, expected numbers of 0 or more"),
         (["worlds=0"], "worlds: got 0, expected 1 to 100"),
         (["methods=lapo", "compare.reference=slot_oracle"], "reference: got 'slot_oracle', expected one of lapo"),
+        (["compare.block=test", "compare.evaluation_seed=7"], "evaluation_seed: got 7, expected none, or 2147483648"),
         ([f"compare.evaluation_seed={TEST_BLOCKS}"], "evaluation_seed: got 2147483648, expected compare.block=test"),
     ],
 )
