@@ -33,7 +33,7 @@ FREE_BYTES = 16 * 2**20  # less free space than this after a failed export is re
 
 
 def repo_id(spec: CollectionSpec) -> str:
-    return f"playslot_rl/{spec.env.name}_{spec.policy}"
+    return f"playslot_rl/{spec.env.full_name}_{spec.policy}"
 
 
 def features(spec: CollectionSpec, state_dim: int) -> dict[str, dict[str, Any]]:

@@ -7,9 +7,13 @@ loaded when first used.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
+from playslot_rl.config.metaworld import DEFAULT as DEFAULT_TASK
+from playslot_rl.config.metaworld import NAME as METAWORLD
+from playslot_rl.config.metaworld import TASKS as METAWORLD_TASKS
 from playslot_rl.config.plain import nearest
 from playslot_rl.config.tasks import TASKS
 from playslot_rl.errors import ConfigError
@@ -21,7 +25,8 @@ if TYPE_CHECKING:
     from playslot_rl.envs.pixel_task import PixelTask
 
 _OURS: Final = {
-    "button_press": ("PlaySlot/ButtonPress-v0", "playslot_rl.envs.button_press:ButtonPressEnv"),
+    "button_press": ("PlaySlot/ButtonPress-v0", "playslot_rl.envs.metaworld:MetaWorldEnv"),
+    METAWORLD: ("PlaySlot/MetaWorld-v0", "playslot_rl.envs.metaworld:MetaWorldEnv"),
     "block_push": ("PlaySlot/BlockPush-v0", "playslot_rl.envs.block_push:BlockPushEnv"),
     "block_push_easy": ("PlaySlot/BlockPushEasy-v0", "playslot_rl.envs.block_push:BlockPushEnv"),
     "block_reach": ("PlaySlot/BlockReach-v0", "playslot_rl.envs.block_push:BlockReachEnv"),
@@ -60,6 +65,16 @@ GYM: Final = EnvConfig("gym", frame_skip=1, max_steps=50, warmup_steps=0)
 """Any registered Gymnasium environment; `id` and `action_dim` are to be set."""
 
 
+def metaworld_config(task: str = DEFAULT_TASK) -> EnvConfig:
+    """As many agent steps of five environment steps as the task's expert takes, without warm-up; a ConfigError for an
+    unknown task."""
+    try:
+        made = EnvConfig(METAWORLD, warmup_steps=0, task=task)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    return replace(made, max_steps=METAWORLD_TASKS[made.task].steps)
+
+
 def block_config(name: str, blocks: BlocksConfig) -> EnvConfig:
     """25 agent steps of two environment steps, without warm-up."""
     return EnvConfig(name, frame_skip=2, max_steps=25, warmup_steps=0, blocks=blocks)
@@ -87,6 +102,7 @@ def register() -> None:
     from gymnasium.envs.registration import registry
 
     wanted: dict[str, tuple[str, dict[str, Any]]] = {name: (entry, {}) for name, entry in _OURS.values()}
+    wanted[_OURS[METAWORLD][0]] = _OURS[METAWORLD][1], {"env": metaworld_config()}
     wanted.update({name: (entry, {"env": config}) for name, (entry, config) in block_ids().items()})
     for name, (entry, kwargs) in wanted.items():
         if name not in registry:
@@ -112,8 +128,10 @@ def gym_id(name: str) -> str:
 
 
 def task_config(env: EnvConfig | str | None = None) -> EnvConfig:
-    """A task's config, given itself or by its name, with the settings that `env=NAME` has; None means ButtonPress.
-    A ConfigError for an unknown name, or something else."""
+    """A task's config, given itself or by its name, with the settings that `env=NAME` has (Meta-World's also as
+    `metaworld/TASK`); None means ButtonPress. A ConfigError for an unknown name, or something else."""
+    if isinstance(env, str) and env.partition("/")[0] == METAWORLD:
+        return metaworld_config(env.partition("/")[2] or DEFAULT_TASK)
     if isinstance(env, str):
         default = "", GYM if env == GYM.name else EnvConfig(env)
         name = gym_id(env)

@@ -31,7 +31,7 @@ class LeRobotTask(gym.Wrapper[Observation, npt.NDArray[np.float32], Any, npt.NDA
         self._config = task_config(env)
         super().__init__(make_env(self._config, render).unwrapped)
         described = task_metadata(self._config)
-        self.task, self.task_description = self._config.name, str(described["task"])
+        self.task, self.task_description = self._config.full_name, str(described["task"])
         self._max_episode_steps = self._config.max_steps
         self.metadata = {**described, "render_fps": frames_a_second(self._config)}
         inner: Any = self.env.observation_space

@@ -15,7 +15,7 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.studies.success.jobs import world_runs
     from playslot_rl.studies.success.measure import SuccessMeasure
 
-    out = config.out or f"runs/compare_{config.env.name}_{config.preset}"
+    out = config.out or f"runs/compare_{config.env.full_name}_{config.preset}"
     run = Run.of(config).name if config.run else ""  # `pretrained` is the task's own
     runs = ",".join(Run.of(replace(config, run=further)).name for further in world_runs(config)[1:])
     compare = replace(config.compare, runs=runs)

@@ -17,7 +17,7 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.studies.video.measure import VideoMeasure, each_number
 
     run = Run.of(config).name if config.run else ""  # `pretrained` is the task's own
-    config = replace(config, out=config.out or f"runs/video_{config.env.name}_{config.preset}", run=run)
+    config = replace(config, out=config.out or f"runs/video_{config.env.full_name}_{config.preset}", run=run)
     if config.compare_video.objects:
         each_number(config)
     else:

@@ -22,7 +22,7 @@ def main(config: ExperimentConfig) -> None:
     behaves = config.env.name not in PROCEDURAL
     if behaves:
         check_task(config.env, expert=not config.data.demos)  # refused now, not after hours of training
-    name = config.out or config.run or f"runs/{config.env.name}_{config.preset}"
+    name = config.out or config.run or f"runs/{config.env.full_name}_{config.preset}"
     config = replace(config, out=name, run="")
     run = run_to_write(config)
     folder = run.folder

@@ -16,7 +16,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Final, cast
 
-from playslot_rl.config import ExperimentConfig, from_dict, plugins, to_dict
+from playslot_rl.config import ExperimentConfig, from_dict, metaworld, plugins, to_dict
 from playslot_rl.config.arguments import require_digits, require_folders, require_once, require_plain
 from playslot_rl.config.baselines import known_methods
 from playslot_rl.config.machine import require_machine
@@ -91,7 +91,7 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
             config = _from_run(Path(run), pairs)
         else:
             groups = tuple(f"{group}={pairs[group]}" for group in GROUPS if group in pairs)
-            config = from_dict(ExperimentConfig, _merge(_presets(groups), _typed(pairs)))
+            config = from_dict(ExperimentConfig, _with_task(_presets(groups), _typed(pairs)))
             if config.env.id and "env.action_dim" not in pairs:  # only the environment knows
                 config = dataclasses.replace(config, env=plugins.call(FITTED, config.env))
         require_machine(config, {key: value for key, value in pairs.items() if key not in GROUPS})
@@ -248,6 +248,14 @@ def _presets(groups: tuple[str, ...]) -> dict[str, Any]:
     return values if task is None else _merge(values, {"env": to_dict(task.env), "model": dict(task.model)})
 
 
+def _with_task(values: dict[str, Any], typed: Mapping[str, Any]) -> dict[str, Any]:
+    """What a preset says, changed by the task of several that one environment has, and then by what was typed."""
+    env = _merge(values["env"], typed.get("env", {}))
+    if env["name"] == metaworld.NAME:
+        values = _merge(values, metaworld.preset_values(str(env["task"]), values["preset"]))
+    return _merge(values, typed)
+
+
 def _multiplied(values: Mapping[str, Any], factors: Mapping[str, Any]) -> dict[str, Any]:
     """Values times factors of the same nesting; integers are rounded, and none that was above 0 falls to it."""
     found = dict(values)
@@ -344,7 +352,7 @@ def spelled(config: ExperimentConfig, command: str) -> list[str]:
     ConfigError where none do: `run` is of another preset or task, and the command takes its config.
     """
     continues = command in CONTINUES and config.run != "" and not is_pretrained(config.run)
-    base = [] if continues else [f"env={config.env.name}", f"preset={config.preset}"]
+    base = [] if continues else [*config.env.typed, f"preset={config.preset}"]
     base += [f"{key}={value}" for key, value in (("run", config.run), ("out", config.out)) if value]
     known, wanted = flatten(to_dict(compose(base, command))), flatten(to_dict(config))
     changed = [f"{key}={_text(value)}" for key, value in wanted.items() if known.get(key) != value]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
+from playslot_rl.config import metaworld
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import SEED, UNSAID, Checked, at_least, between, within
 
@@ -142,6 +143,7 @@ class EnvConfig(Checked):
         id: of `env=gym`: a registered Gymnasium environment, `FetchReach-v4`, or `package:Id` after importing one.
         camera: of `env=gym` with MuJoCo: a camera's name, or `distance,azimuth,elevation,x,y,z`; empty is its own.
         expert: of `env=gym`: `package.module:function`, from its own observation, info and a generator to its action.
+        task: which task of `metaworld`: `drawer-open`, or another of its fifty.
     """
 
     group = "env."
@@ -157,6 +159,17 @@ class EnvConfig(Checked):
     id: str = field(default="", metadata=UNSAID)
     camera: str = field(default="", metadata=UNSAID)
     expert: str = field(default="", metadata=UNSAID)
+    task: str = field(default="", metadata=UNSAID)
+
+    @property
+    def full_name(self) -> str:
+        """The name, and the task where that has several, as folders and reports call it."""
+        return f"{self.name}_{self.task}" if self.task else self.name
+
+    @property
+    def typed(self) -> list[str]:
+        """The arguments that choose it."""
+        return [f"env={self.name}", *([f"env.task={self.task}"] if self.task else [])]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -165,5 +178,9 @@ class EnvConfig(Checked):
             check(self.name == "gym" or not value, f"env.{key}", value, f"none with env={self.name}: it is of env=gym")
         drawn = self.name not in ("grid_shapes", "sketchy", "video") or not self.variation.on
         check(drawn, "env.variation", self.variation, f"nothing with env={self.name}, which no simulator draws")
+        if self.name == metaworld.NAME:
+            object.__setattr__(self, "task", metaworld.task_name(self.name, self.task))
+        else:
+            check(not self.task, "env.task", self.task, f"none with env.name={self.name}: it is for env=metaworld")
         used = self.name.startswith("block_") or self.blocks == BlocksConfig()
         check(used, "env.blocks", self.blocks, f"no changes with env.name={self.name}, which has no blocks")

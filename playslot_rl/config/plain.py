@@ -34,15 +34,17 @@ def shortened(value: object) -> str:
     return text if len(text) <= 200 else f"{text[:160]}... ({len(text)} characters)"
 
 
-def nearest(text: str, known: Iterable[str], prefix: str = "") -> str:
-    """The end of a message about an unknown name: the known one that it may be meant for, if one is near.
+def nearest(text: str, known: Iterable[str], prefix: str = "", most: int = 1) -> str:
+    """The end of a message about an unknown name: the known one that it may be meant for, if one is near; with `most`
+    above 1 the nearest of all, near or not.
 
     Examples:
         >>> nearest("smol", ["smoke", "paper"], "preset=")
         '; did you mean preset=smoke?'
     """
-    near = difflib.get_close_matches(text, [str(name) for name in known], n=1)
-    return f"; did you mean {prefix}{near[0]}?" if near else ""
+    near = difflib.get_close_matches(text, [str(name) for name in known], most, 0.6 if most == 1 else 0.0)
+    meant = " or ".join(f"{prefix}{name}" for name in near)
+    return f"; did you mean {meant}?" if near else ""
 
 
 def to_dict(config: Any) -> dict[str, Any]:

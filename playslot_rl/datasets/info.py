@@ -121,4 +121,5 @@ def _source(contents: Contents) -> dict[str, Any] | None:
         return {"command": record["made_by"], "of": names}
     spec = record.get("spec") or {}
     env = spec.get("env") or {}
-    return {"policy": spec.get("policy"), "task": env.get("name"), "seed": spec.get("seed"), "noise": spec.get("noise")}
+    task = "_".join(filter(None, (env.get("name"), env.get("task"))))
+    return {"policy": spec.get("policy"), "task": task or None, "seed": spec.get("seed"), "noise": spec.get("noise")}

@@ -68,7 +68,7 @@ def _made(note: dict[str, Any]) -> dict[str, str]:
     spec = note.get("spec") or {}
     env = spec.get("env") or {}
     rows = {
-        "environment": env.get("name"),
+        "environment": " ".join(filter(None, (env.get("name"), env.get("task")))),
         "policy": spec.get("policy"),
         "noise on the expert's actions": spec.get("noise"),
         "agent steps an episode": spec.get("steps"),

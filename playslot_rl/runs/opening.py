@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 STAGE_LOCK: Final = "training.lock"
 """Of the command that trains a stage, in the stage's folder."""
-SAME_TASK: Final = ("name", "id", "image_size", "action_dim")
+SAME_TASK: Final = ("name", "task", "id", "image_size", "action_dim")
 """Of an environment: what it shares with the one that a policy was trained for."""
 _KNOWN: Final = ("slots", "dynamics", "policy", "world_model.json", "adopt.json")
 """What a run folder without `config.json` may hold."""

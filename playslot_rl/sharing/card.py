@@ -58,7 +58,7 @@ def make_card(
         "license": LICENCE,
         "library_name": "lerobot",
         "pipeline_tag": "robotics",
-        "tags": [*TAGS, env.name],
+        "tags": [*TAGS, env.full_name],
         "model_name": name,
     }
     parameters = sum(p.numel() for part in shared_modules(agent).values() for p in part.parameters())
@@ -76,7 +76,7 @@ def make_card(
     return Template(Path(__file__).with_name("card.md").read_text()).substitute(
         front=front_matter(header, MARK),
         name=name,
-        env=env.name,
+        env=env.full_name,
         parameters=f"{parameters:,}",
         task=facts_table(_task(policy)),
         data=facts_table(_data(policy.source)),

@@ -117,7 +117,7 @@ def _from_recordings(config: ExperimentConfig, source: Mapping[str, Any]) -> lis
 
 
 def _base(config: ExperimentConfig) -> list[str]:
-    return [f"env={config.env.name}", f"preset={config.preset}"]
+    return [*config.env.typed, f"preset={config.preset}"]
 
 
 def _seeded(seed: int | None) -> list[str]:
@@ -140,7 +140,7 @@ def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
     environment is not one of this version.
     """
     free, machine, folders = (keys_of(ExperimentConfig, role) for role in ("free", "machine", "folder"))
-    preset = flatten(to_dict(compose([f"env={config.env.name}", f"preset={config.preset}"])))
+    preset = flatten(to_dict(compose([*config.env.typed, f"preset={config.preset}"])))
     found = []
     for key, value in flatten(to_dict(config)).items():
         group, _, name = key.rpartition(".")
@@ -187,14 +187,15 @@ def use(policy: SharedPolicyConfig, experiment: ExperimentConfig | None = None) 
     if policy.env.name not in ENVIRONMENTS or policy.env.id:  # LeRobot makes only tasks with a name
         return REAL.format(camera=policy.camera, rate=rate_words(policy))
     known = experiment or ExperimentConfig()
-    own, task = policy.env, compose([f"env={policy.env.name}"]).env
+    own, task = policy.env, compose(policy.env.typed).env
     options = {
         "image_size": (own.image_size, 64),
         "quality": (known.render.quality, "fast"),
         "frame_skip": (own.frame_skip * policy.stride, task.frame_skip),
         "episode_length": (-(-own.max_steps // policy.stride), task.max_steps),
     }
-    command = ["lerobot-eval", "--policy.path=THIS_FOLDER", "--env.type=playslot", f"--env.task={own.name}"]
+    task_name = "/".join(filter(None, (own.name, own.task)))
+    command = ["lerobot-eval", "--policy.path=THIS_FOLDER", "--env.type=playslot", f"--env.task={task_name}"]
     command += [f"--env.{name}={value}" for name, (value, default) in options.items() if value != default]
     if policy.camera != keys.FEATURE_IMAGE:
         command.append(f"--rename_map={json.dumps({keys.FEATURE_IMAGE: policy.camera})}")

@@ -95,7 +95,7 @@ class SharedPolicyConfig:
             "output_features": outputs,
             "device": "cpu",
             "license": LICENCE,
-            "tags": [*TAGS, self.env.name],
+            "tags": [*TAGS, self.env.full_name],
             "env": to_dict(self.env),
             "model": to_dict(self.model),
             "resize": self.resize,

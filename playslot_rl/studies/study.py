@@ -266,7 +266,7 @@ class Study[J: Job]:
     def _result(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         config, made = self._measure.config, provenance()
         return {
-            "env": config.env.name,
+            "env": config.env.full_name,
             "preset": config.preset,
             **self._measure.result(rows),
             "seconds": round(self._spent + time.monotonic() - self._began, 1),

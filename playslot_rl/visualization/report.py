@@ -90,7 +90,7 @@ def build(given: ReportInput) -> Document:
     if meta.get("demos") is not None and meta.get("labelled_demos") is not None:
         used = f": {meta['demos']} demonstration videos, the real actions of {meta['labelled_demos']} of them"
     lead = (
-        f"Task `{given.config.env.name}`, preset `{given.config.preset}`, seed {given.config.seed}. A policy "
+        f"Task `{given.config.env.full_name}`, preset `{given.config.preset}`, seed {given.config.seed}. A policy "
         f"learned from unlabelled videos through a PlaySlot world model{used}."
     )
     return Document(f"PlaySlot report: {given.run.resolve().name}", lead, sections)

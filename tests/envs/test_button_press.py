@@ -12,31 +12,31 @@ import pytest
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.envs import make_env, task_env
-from playslot_rl.envs.button_press import ButtonPressEnv
+from playslot_rl.envs.metaworld import MetaWorldEnv
 from playslot_rl.errors import ConfigError
 
 
 @pytest.fixture(scope="module")
-def env() -> Iterator[ButtonPressEnv]:
+def env() -> Iterator[MetaWorldEnv]:
     made = make_env().unwrapped
-    assert isinstance(made, ButtonPressEnv)
+    assert isinstance(made, MetaWorldEnv)
     yield made
     made.close()
 
 
-def episode(env: ButtonPressEnv, seed: int, steps: int = 4) -> np.ndarray:
+def episode(env: MetaWorldEnv, seed: int, steps: int = 4) -> np.ndarray:
     frames = [env.reset(seed=seed)[0]["pixels"]]
     frames += [env.step(env.expert_action())[0]["pixels"] for _ in range(steps)]
     return np.stack(frames)
 
 
-def test_same_seed_repeats_the_same_frames_whatever_came_before(env: ButtonPressEnv) -> None:
+def test_same_seed_repeats_the_same_frames_whatever_came_before(env: MetaWorldEnv) -> None:
     first = episode(env, 5)
     episode(env, 6)
     np.testing.assert_array_equal(episode(env, 5), first)
 
 
-def test_seeds_move_the_button_and_the_arm(env: ButtonPressEnv) -> None:
+def test_seeds_move_the_button_and_the_arm(env: MetaWorldEnv) -> None:
     boxes, hands = [], []
     for seed in range(4):
         observation, _ = env.reset(seed=seed)
@@ -47,7 +47,7 @@ def test_seeds_move_the_button_and_the_arm(env: ButtonPressEnv) -> None:
 
 
 @pytest.mark.integration
-def test_warm_up_is_independent_of_the_buttons_place(env: ButtonPressEnv) -> None:
+def test_warm_up_is_independent_of_the_buttons_place(env: MetaWorldEnv) -> None:
     # The two streams of an episode must not share their numbers.
     places, hands = [], []
     for seed in range(24):
@@ -57,7 +57,7 @@ def test_warm_up_is_independent_of_the_buttons_place(env: ButtonPressEnv) -> Non
     assert abs(np.corrcoef(places, hands)[0, 1]) < 0.6
 
 
-def test_expert_presses_the_button_and_the_clip_goes_on(env: ButtonPressEnv) -> None:
+def test_expert_presses_the_button_and_the_clip_goes_on(env: MetaWorldEnv) -> None:
     env.reset(seed=11)
     solved, ended = [], []
     for _ in range(env.config.max_steps):
@@ -84,7 +84,7 @@ def test_passes_gymnasiums_checker() -> None:
 
 
 @pytest.mark.integration
-def test_registered_id_makes_the_same_environment(env: ButtonPressEnv) -> None:
+def test_registered_id_makes_the_same_environment(env: MetaWorldEnv) -> None:
     import gymnasium
 
     made = gymnasium.make("playslot_rl.envs:PlaySlot/ButtonPress-v0")
@@ -94,7 +94,7 @@ def test_registered_id_makes_the_same_environment(env: ButtonPressEnv) -> None:
 
 
 @pytest.mark.parametrize("action", [np.zeros(3), np.array([0, 0, np.nan, 0])])
-def test_bad_actions_are_refused(env: ButtonPressEnv, action: np.ndarray) -> None:
+def test_bad_actions_are_refused(env: MetaWorldEnv, action: np.ndarray) -> None:
     env.reset(seed=0)
     with pytest.raises(ValueError, match="expected 4 finite numbers"):
         env.step(action)
@@ -111,7 +111,7 @@ def test_wrong_action_width_is_refused() -> None:
 
 
 @pytest.mark.integration
-def test_fast_rendering_looks_like_full_quality(env: ButtonPressEnv) -> None:
+def test_fast_rendering_looks_like_full_quality(env: MetaWorldEnv) -> None:
     full = make_env(EnvConfig(), RenderConfig(quality="full"))
     a = env.reset(seed=2)[0]["pixels"].astype(float)
     b = full.reset(seed=2)[0]["pixels"].astype(float)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.envs.button_press import ButtonPressEnv
 from playslot_rl.envs.culling import FrustumCuller
+from playslot_rl.envs.metaworld import MetaWorldEnv
 from playslot_rl.envs.rendering import Camera, FrameRenderer
 
 pytestmark = pytest.mark.integration
@@ -44,7 +44,7 @@ def test_geoms_behind_and_beside_the_camera_are_unseen_and_one_across_the_edge_i
 
 
 def test_frames_of_button_press_are_the_same_with_and_without_culling(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = ButtonPressEnv(EnvConfig(warmup_steps=3))
+    env = MetaWorldEnv(EnvConfig(warmup_steps=3))
     hidden = []
     try:
         for seed in range(4):

@@ -14,6 +14,7 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 import playslot_rl.config as ours
+from playslot_rl.envs import task_config
 from playslot_rl.envs.lerobot import CAMERA, LeRobotTask, frames_a_second
 
 IMAGE = f"{OBS_IMAGES}.{CAMERA}"
@@ -26,7 +27,8 @@ class PlaySlotEnv(EnvConfig):
     """A task of playslot_rl.
 
     Attributes:
-        task: `button_press`, `block_push`, `block_push_easy`, `block_reach` or `block_pick`.
+        task: `button_press`, `block_push`, `block_push_easy`, `block_reach`, `block_pick`, or one of Meta-World's,
+            `metaworld/drawer-open`.
         episode_length: longest episode in agent steps; None takes the task's own.
         frame_skip: environment steps of an agent step; None takes the task's own. A policy that was trained on one
             frame in three acts at a third of the rate: three times as many.
@@ -53,9 +55,7 @@ class PlaySlotEnv(EnvConfig):
 
     def task_config(self) -> ours.EnvConfig:
         """The task's settings in playslot_rl, with the changes made here."""
-        from playslot_rl.config.compose import compose
-
-        env = replace(compose([f"env={self.task}"]).env, image_size=self.image_size)
+        env = replace(task_config(str(self.task)), image_size=self.image_size)
         longest, skip = self.episode_length or env.max_steps, self.frame_skip or env.frame_skip
         return replace(env, max_steps=longest, frame_skip=skip)
 

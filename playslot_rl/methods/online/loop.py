@@ -193,7 +193,7 @@ class _Run:
         seeds = self._development_seeds()
         values = {
             "method": METHODS[self.config.method].title,
-            "env": self.config.env.name,
+            "env": self.config.env.full_name,
             "episodes": len(seeds),
             "first_seed": seeds[0],
             "random": self.state.random,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl.acting.episodes import TaskPool
-from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
+from playslot_rl.config import CompareConfig, EnvConfig, ExperimentConfig, from_dict
 from playslot_rl.config.methods import METHODS
 from playslot_rl.envs import check_task
 from playslot_rl.errors import CheckpointError, ConfigError
@@ -191,7 +191,7 @@ class SuccessMeasure:
         others = [json_or_nothing(folder / "comparison.json") for folder in task_folders(self.config)]
         if not others:
             return None
-        return {"tasks": [self.config.env.name, *(other["env"] for other in others)],
+        return {"tasks": [self.config.env.full_name, *(other["env"] for other in others)],
                 "rows": across_tasks([{"rows": rows}, *others])}  # fmt: skip
 
     def sheets(self) -> Mapping[str, bytes]:
@@ -211,11 +211,11 @@ def check_success(config: ExperimentConfig) -> None:
     for run in world_runs(config) if uses_slots(config) else ():
         for checkpoint in Run.open(run).world_stages.values() if run else ():
             require_config(checkpoint, {"env": {"image_size": env.image_size, "action_dim": env.action_dim}})
-            trained_on = checkpoint.config.get("env", {}).get("name")
-            if trained_on != env.name:
+            trained_on = checkpoint.group(EnvConfig, "env").typed
+            if trained_on != env.typed:
                 raise CheckpointError(
-                    f"run={run}: got a world model of env={trained_on}, expected env={env.name}: leave it out to "
-                    "train one"
+                    f"run={run}: got a world model of {' '.join(trained_on)}, expected {' '.join(env.typed)}: "
+                    "leave it out to train one"
                 )
 
 

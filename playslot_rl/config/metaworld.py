@@ -1,0 +1,106 @@
+"""Meta-World's fifty tasks: what each asks for, and for how many agent steps an episode of it lasts."""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+from playslot_rl.config.plain import check, nearest
+
+NAME: Final = "metaworld"
+VERSION: Final = "-v3"
+BUTTON_PRESS: Final = "button_press"
+"""The one task with an environment name of its own."""
+DEFAULT: Final = "drawer-open"
+
+
+class Member(NamedTuple):
+    """A task.
+
+    Attributes:
+        steps: agent steps of five environment steps, enough for its expert.
+        sentence: what is to be done.
+    """
+
+    steps: int
+    sentence: str
+
+
+TASKS: Final[dict[str, Member]] = {
+    "assembly": Member(20, "Pick up the nut and put it on the peg."),
+    "basketball": Member(30, "Put the ball into the basket."),
+    "bin-picking": Member(35, "Carry the cube from one bin to the other."),
+    "box-close": Member(30, "Put the lid on the box."),
+    "button-press": Member(20, "Press the red button."),
+    "button-press-topdown": Member(20, "Press the red button from above."),
+    "button-press-topdown-wall": Member(20, "Press the red button behind the wall from above."),
+    "button-press-wall": Member(20, "Reach over the wall and press the red button."),
+    "coffee-button": Member(20, "Press the button of the coffee machine."),
+    "coffee-pull": Member(20, "Pull the mug away from the coffee machine to the goal."),
+    "coffee-push": Member(20, "Push the mug under the coffee machine."),
+    "dial-turn": Member(25, "Turn the dial."),
+    "disassemble": Member(40, "Take the nut off the peg."),
+    "door-close": Member(20, "Close the door."),
+    "door-lock": Member(30, "Turn the lock of the door down."),
+    "door-open": Member(25, "Open the door."),
+    "door-unlock": Member(20, "Turn the lock of the door aside."),
+    "drawer-close": Member(20, "Push the drawer shut."),
+    "drawer-open": Member(20, "Pull the drawer open."),
+    "faucet-close": Member(20, "Turn the faucet clockwise."),
+    "faucet-open": Member(20, "Turn the faucet counter-clockwise."),
+    "hammer": Member(30, "Hit the nail with the hammer."),
+    "hand-insert": Member(20, "Put the cube into the hole with the hand."),
+    "handle-press": Member(20, "Press the handle down."),
+    "handle-press-side": Member(20, "Press the handle down from the side."),
+    "handle-pull": Member(40, "Pull the handle up."),
+    "handle-pull-side": Member(40, "Pull the handle up from the side."),
+    "lever-pull": Member(20, "Pull the lever up."),
+    "peg-insert-side": Member(40, "Put the peg into the hole in the side of the box."),
+    "peg-unplug-side": Member(35, "Pull the peg out of the box."),
+    "pick-out-of-hole": Member(30, "Lift the cube out of the hole to the goal."),
+    "pick-place": Member(20, "Lift the puck to the goal."),
+    "pick-place-wall": Member(25, "Lift the puck over the wall to the goal."),
+    "plate-slide": Member(20, "Slide the plate into the net."),
+    "plate-slide-back": Member(20, "Slide the plate out of the net."),
+    "plate-slide-back-side": Member(20, "Slide the plate sideways out of the net."),
+    "plate-slide-side": Member(20, "Slide the plate sideways into the net."),
+    "push": Member(20, "Push the puck to the goal."),
+    "push-back": Member(20, "Pull the block back to the goal."),
+    "push-wall": Member(20, "Push the puck round the wall to the goal."),
+    "reach": Member(20, "Move the hand to the goal."),
+    "reach-wall": Member(20, "Move the hand over the wall to the goal."),
+    "shelf-place": Member(25, "Put the cube on the shelf."),
+    "soccer": Member(30, "Push the ball into the goal."),
+    "stick-pull": Member(35, "Pull the thermos to the goal with the stick."),
+    "stick-push": Member(20, "Push the thermos to the goal with the stick."),
+    "sweep": Member(25, "Sweep the cube off the table."),
+    "sweep-into": Member(20, "Sweep the cube into the hole."),
+    "window-close": Member(20, "Slide the window shut."),
+    "window-open": Member(20, "Slide the window open."),
+}
+
+
+def task_name(env: str, task: str) -> str:
+    """The task of an environment's name and `env.task`, either of which may end in `-v3`; a ValueError where there is
+    none of that name, with the three nearest.
+    """
+    if env == BUTTON_PRESS:
+        return "button-press"
+    found = task.removesuffix(VERSION)
+    hint = nearest(found, TASKS, most=3)
+    check(found in TASKS, "env.task", task, f"one of Meta-World's {len(TASKS)} (docs/reference/environments.md){hint}")
+    return found
+
+
+def preset_values(task: str, preset: str) -> dict[str, Any]:
+    """What a task changes in a preset: the length of its episodes, and of all that is as long as they are."""
+    task = task.removesuffix(VERSION)
+    if preset == "smoke" or task not in TASKS:
+        return {}
+    steps = TASKS[task].steps
+    values = {
+        "env": {"max_steps": steps},
+        "collect": {"random_steps": steps, "expert_steps": steps},
+        "model": {"predictor": {"context": steps + 4}},  # past it imagination evicts frames and falls apart
+    }
+    rollout = {"dynamics": {"predicted_frames": steps - 2}}
+    return values if preset == "paper" else values | rollout

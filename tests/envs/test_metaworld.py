@@ -1,0 +1,142 @@
+"""Meta-World's tasks: each is drawn, solved by its expert, and the same whatever came before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from playslot_rl import keys
+from playslot_rl.config import EnvConfig, to_dict
+from playslot_rl.config.compose import compose, spelled
+from playslot_rl.config.metaworld import TASKS
+from playslot_rl.envs import make_env, task_config
+from playslot_rl.envs.metaworld import CAMERAS, MetaWorldEnv
+from playslot_rl.errors import ConfigError
+from playslot_rl.runs.opening import require_task
+
+QUICK = ("coffee-button", "drawer-open", "handle-press", "plate-slide", "reach")
+TRIES = 4
+"""Episodes of which an expert solves one at least."""
+
+
+def made(task: str) -> MetaWorldEnv:
+    env = make_env(f"metaworld/{task}").unwrapped
+    assert isinstance(env, MetaWorldEnv)
+    return env
+
+
+@pytest.fixture(scope="module")
+def reach() -> Iterator[MetaWorldEnv]:
+    env = made("reach")
+    yield env
+    env.close()
+
+
+def solved(env: MetaWorldEnv, seed: int) -> bool:
+    """Whether the expert solves an episode that does not start solved; only its first frame is drawn."""
+    _, info = env.reset(seed=seed)
+    assert not info["success"]
+    return any(env.step(env.expert_action())[4]["success"] for _ in range(env.config.max_steps))
+
+
+@pytest.mark.parametrize(
+    "task", [*QUICK, *(pytest.param(task, marks=pytest.mark.slow) for task in TASKS if task not in QUICK)]
+)
+def test_a_task_is_drawn_and_its_expert_solves_it(task: str) -> None:
+    env = made(task)
+    env.draw_steps = False
+    frame = env.reset(seed=0)[0][keys.PIXELS].copy()
+    labels = env.segment()
+    assert frame.shape == (64, 64, 3)
+    assert frame.std() > 10
+    assert {1, 2} <= set(np.unique(labels).tolist()), "the arm, and the first of the other things"
+    assert any(solved(env, seed) for seed in range(TRIES))
+    assert env.draw().tolist() != frame.tolist()
+    np.testing.assert_array_equal(env.reset(seed=0)[0][keys.PIXELS], frame)
+    env.close()
+
+
+def test_the_experts_look_ahead_leaves_the_simulation_alone(reach: MetaWorldEnv) -> None:
+    ends = []
+    for looks in (1, 3):
+        reach.reset(seed=3)
+        for _ in range(3):
+            actions = [reach.expert_action() for _ in range(looks)]
+            assert all(np.array_equal(action, actions[0]) for action in actions)
+            reach.step(np.array([0.5, -0.5, 0.2, 1.0], np.float32))
+        data = reach._simulation.data
+        ends.append(np.concatenate((data.qpos, data.qvel, data.qacc_warmstart, reach._full)))
+    np.testing.assert_array_equal(ends[0], ends[1])
+
+
+def test_a_goal_is_drawn_where_it_is(reach: MetaWorldEnv) -> None:
+    seen = []
+    for seed in range(4):
+        reach.reset(seed=seed)
+        goal = np.argwhere(reach.segment() == 1 + reach.objects().index(("goal",)))
+        assert len(goal)
+        seen.append((*goal.mean(axis=0), *reach._simulation._target_pos))
+    rows, places = np.array(seen)[:, :2], np.array(seen)[:, 2:]
+    assert np.ptp(rows, axis=0).max() > 3
+    assert np.ptp(places, axis=0).max() > 0.02
+
+
+@pytest.mark.integration
+def test_button_press_is_one_of_them() -> None:
+    frames = []
+    for config in (EnvConfig(), EnvConfig("metaworld", task="button-press")):
+        env = make_env(config)
+        env.reset(seed=5)
+        frames.append(env.step(env.unwrapped.expert_action())[0][keys.PIXELS])  # type: ignore[attr-defined]
+        env.close()
+    np.testing.assert_array_equal(frames[0], frames[1])
+
+
+def test_the_names_are_metaworlds_own() -> None:
+    from metaworld.env_dict import ENV_CLS_MAP
+    from metaworld.policies import ENV_POLICY_MAP
+
+    assert {f"{task}-v3" for task in TASKS} == set(ENV_CLS_MAP) == set(ENV_POLICY_MAP)
+    assert set(CAMERAS) < set(TASKS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("env=metaworld", "env.task=drawr-opn"), "did you mean drawer-open or drawer-close or door-open"),
+        (("env=metaworld", "env.task="), "env.task: got '', expected one of Meta-World's 50"),
+        (("env.task=drawer-open",), "env.task: got 'drawer-open', expected none with env.name=button_press"),
+    ],
+)
+def test_a_wrong_task_is_one_line(arguments: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as refused:
+        compose(arguments)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_task_brings_the_length_of_its_episodes() -> None:
+    for preset in ("compact", "compact_gpu", "paper"):
+        config = compose(["env=metaworld", "env.task=bin-picking-v3", f"preset={preset}"])
+        steps = TASKS["bin-picking"].steps
+        assert config.env == task_config("metaworld/bin-picking")
+        assert {config.env.max_steps, config.collect.random_steps, config.collect.expert_steps} == {steps}
+        assert config.model.predictor.context > steps
+    assert compose(["env=metaworld", "env.task=bin-picking", "env.max_steps=7"]).env.max_steps == 7
+    assert compose(["env=metaworld", "env.task=bin-picking", "preset=smoke"]).env.max_steps == 6
+
+
+def test_a_task_is_said_and_typed_again(tmp_path: Path) -> None:
+    config = compose(["env=metaworld", "env.task=bin-picking", "env.max_steps=20", f"out={tmp_path}"])
+    assert to_dict(config.env)["task"] == "bin-picking"
+    assert "task" not in to_dict(EnvConfig())
+    assert config.env.full_name == "metaworld_bin-picking"
+    assert compose(spelled(config, "collect"), "collect") == config
+
+
+def test_a_run_of_another_task_is_refused() -> None:
+    config = compose(["env=metaworld", "env.task=door-open"])
+    with pytest.raises(ConfigError, match=r"env\.task: got door-open, expected reach"):
+        require_task(config, task_config("metaworld/reach"))
