@@ -307,7 +307,7 @@ def test_roles_say_what_each_key_counts_for() -> None:
     machine |= {key for key in keys_of(ExperimentConfig, "free") if key.endswith(".execution")}
     machine |= {"data.cache_limit", "data.device", "data.workers"}
     named = {"data.root", "data.demos", "data.cache", "behaviour.policy_from"}
-    others = ("lapo", "lapo_slots", "laom", "clam", "caddy_policy", "caddy_oracle")
+    others = ("lapo", "lapo_slots", "laom", "clam", "autoencoder_bc", "caddy_policy", "caddy_oracle")
     named |= {f"baselines.{method}.world" for method in others}
     measures = {"data.held_out", "collect.validation_episodes"}
     assert keys_of(ExperimentConfig, "machine") == machine | named | measures
