@@ -363,8 +363,9 @@ def test_a_group_checks_its_ranges_under_its_own_name() -> None:
                 yield from groups(value, f"{prefix}{field.name}.")
 
     checked = {prefix: config for prefix, config in groups(compose()) if isinstance(config, Checked)}
-    shared = {f"baselines.{method}.model." for method in ("lapo", "lapo_slots", "laom", "clam")} | {
-        f"baselines.{method}.policy." for method in ("lapo", "laom", "clam", "caddy_policy", "caddy_oracle")
+    shared = {f"baselines.{method}.model." for method in ("autoencoder_bc", "lapo", "lapo_slots", "laom", "clam")} | {
+        f"baselines.{method}.policy."
+        for method in ("autoencoder_bc", "lapo", "laom", "clam", "caddy_policy", "caddy_oracle")
     }
     assert {prefix: config.group for prefix, config in checked.items()} == {
         prefix: "" if prefix in shared else "optim." if prefix.endswith(".optim.") else prefix for prefix in checked
