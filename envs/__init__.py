@@ -31,6 +31,8 @@ _OURS: Final = {
     "block_push_easy": ("PlaySlot/BlockPushEasy-v0", "playslot_rl.envs.block_push:BlockPushEnv"),
     "block_reach": ("PlaySlot/BlockReach-v0", "playslot_rl.envs.block_push:BlockReachEnv"),
     "block_pick": ("PlaySlot/BlockPick-v0", "playslot_rl.envs.block_push:BlockPickEnv"),
+    "dmc_ball_in_cup_catch": ("PlaySlot/DMCBallInCupCatch-v0", "playslot_rl.envs.dmc:DMControlTask"),
+    "dmc_cartpole_balance": ("PlaySlot/DMCCartpoleBalance-v0", "playslot_rl.envs.dmc:DMControlTask"),
     "gym": ("PlaySlot/Gym-v0", "playslot_rl.envs.gym_task:GymTask"),
 }
 
@@ -93,7 +95,22 @@ def block_ids() -> dict[str, tuple[str, EnvConfig]]:
     return {**found, "PlaySlot/BlockPushEasy-v0": ("playslot_rl.envs.block_push:BlockPushEnv", easy)}
 
 
+def dmc_config(name: str, actions: int) -> EnvConfig:
+    """500 agent steps of two environment steps, as published."""
+    return EnvConfig(name, action_dim=actions, frame_skip=2, max_steps=500, warmup_steps=0)
+
+
+def dmc_ids() -> dict[str, tuple[str, EnvConfig]]:
+    """Entry point and config of the ids of the DeepMind Control Suite (the extra `dmc`)."""
+    actions = {"dmc_ball_in_cup_catch": 2, "dmc_cartpole_balance": 1}
+    return {_OURS[name][0]: (_OURS[name][1], dmc_config(name, count)) for name, count in actions.items()}
+
+
 _PLAIN: Final[dict[str, Any]] = {"order_enforce": False, "disable_env_checker": True}
+
+
+def _settings() -> dict[str, tuple[str, EnvConfig]]:
+    return {**block_ids(), **dmc_ids()}
 
 
 def register() -> None:
@@ -103,7 +120,7 @@ def register() -> None:
 
     wanted: dict[str, tuple[str, dict[str, Any]]] = {name: (entry, {}) for name, entry in _OURS.values()}
     wanted[_OURS[METAWORLD][0]] = _OURS[METAWORLD][1], {"env": metaworld_config()}
-    wanted.update({name: (entry, {"env": config}) for name, (entry, config) in block_ids().items()})
+    wanted.update({name: (entry, {"env": config}) for name, (entry, config) in _settings().items()})
     for name, (entry, kwargs) in wanted.items():
         if name not in registry:
             gym_register(id=name, entry_point=entry, kwargs=kwargs, **_PLAIN)
@@ -135,7 +152,7 @@ def task_config(env: EnvConfig | str | None = None) -> EnvConfig:
     if isinstance(env, str):
         default = "", GYM if env == GYM.name else EnvConfig(env)
         name = gym_id(env)
-        return TASKS[env].env if env in TASKS else block_ids().get(name, default)[1]
+        return TASKS[env].env if env in TASKS else _settings().get(name, default)[1]
     given: Any = EnvConfig() if env is None else env
     if not isinstance(given, EnvConfig):
         known = ", ".join(sorted(ENVIRONMENTS))
@@ -174,6 +191,14 @@ def _creator(name: str) -> Any:
     return load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
 
 
+def without_expert(env: EnvConfig) -> ConfigError:
+    """What is raised where a task that has no expert is asked for its action."""
+    return ConfigError(
+        f"env={env.name}: got a task without an expert, expected one that shows how it is solved: it has a reward only "
+        "(method=dreamer)"
+    )
+
+
 def check_task(env: EnvConfig, expert: bool = False, success: bool = False) -> None:
     """Refuse, by a ConfigError, a task that there is not, another width than its actions', and one without an expert,
     or a measure of success, where one is asked for.
@@ -183,6 +208,8 @@ def check_task(env: EnvConfig, expert: bool = False, success: bool = False) -> N
 
     width = getattr(creator, "actions_of", None)
     check_actions(env, ACTION_DIM if width is None else width(env))
+    if expert and not getattr(creator, "has_expert", True):
+        raise without_expert(env)
     if env.name == GYM.name:
         from playslot_rl.envs import gym_task
 

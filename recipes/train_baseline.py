@@ -29,4 +29,16 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.methods.training import train
     from playslot_rl.visualization.charts import draw_curve
 
-    draw_curve(train(config).path.parent, method.name)
+    folder = train(config).path.parent
+    draw_curve(folder, method.name)
+    _hold_against_published(config, folder)
+
+
+def _hold_against_published(config: ExperimentConfig, folder: Path) -> None:
+    """Where its authors' curve on the task is known, a page with both."""
+    from playslot_rl.studies import published
+
+    if config.method == "dreamer" and config.env.name in published.DREAMER:
+        curve = published.read_curve(folder, config.env)
+        page = published.write_page({f"seed {config.seed}": curve}, config.env.name, folder)
+        print(f"{published.summary([curve], config.env.name)}; {page}", flush=True)

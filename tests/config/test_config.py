@@ -27,8 +27,8 @@ from playslot_rl.methods.dreamer.method import DreamerConfig
 
 PRESETS = ["compact", "compact_gpu", "paper", "smoke"]
 ENVS = [
-    "block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "grid_shapes", "gym", "metaworld",
-    "sketchy", "video",
+    "block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "dmc_ball_in_cup_catch",
+    "dmc_cartpole_balance", "grid_shapes", "gym", "metaworld", "sketchy", "video",
 ]  # fmt: skip
 
 

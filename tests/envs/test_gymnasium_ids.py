@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,14 @@ import pytest
 
 from playslot_rl.config import EnvConfig
 from playslot_rl.config.compose import compose
-from playslot_rl.envs import ENVIRONMENTS, block_ids, make_env, make_torchrl_env, task_config, task_env
+from playslot_rl.envs import ENVIRONMENTS, block_ids, dmc_ids, make_env, make_torchrl_env, task_config, task_env
 from playslot_rl.errors import ConfigError
 
 pytestmark = pytest.mark.integration
 
-IDS = sorted({name for name, _ in ENVIRONMENTS.values()} - {"PlaySlot/Gym-v0"} | set(block_ids()))
+SUITE = set(dmc_ids()) if find_spec("dm_control") else set()
+"""Ids of an optional package."""
+IDS = sorted({name for name, _ in ENVIRONMENTS.values()} - {"PlaySlot/Gym-v0", *dmc_ids()} | {*block_ids()} | SUITE)
 """All but the one that is nothing without `env.id`."""
 NAMES = [f"playslot_rl.envs:{name}" for name in IDS]
 SOME = NAMES[:1]
@@ -79,7 +82,7 @@ def fresh(source: str, names: list[str], folder: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize("names", [NAMES[::4], pytest.param(NAMES, marks=pytest.mark.slow)], ids=["some", "all"])
 def test_gymnasium_makes_every_id(names: list[str], tmp_path: Path) -> None:
-    assert len(NAMES) == 18
+    assert len(NAMES) == 18 + len(SUITE)
     shown = fresh(PLAY.replace("HOW", MAKE), names, tmp_path)
     assert list(shown) == names
     for name, (shape, total, _) in shown.items():
@@ -91,7 +94,7 @@ def test_gymnasium_makes_every_id(names: list[str], tmp_path: Path) -> None:
 
 def task_config_of(name: str) -> EnvConfig:
     """The task that an id names."""
-    found = block_ids().get(name.partition(":")[2])
+    found = {**block_ids(), **dmc_ids()}.get(name.partition(":")[2])
     return task_config("metaworld") if "MetaWorld" in name else EnvConfig() if found is None else found[1]
 
 
@@ -114,7 +117,7 @@ def test_gymnasium_makes_several_at_once(how: str, names: list[str], tmp_path: P
 @pytest.mark.slow
 def test_torchrl_makes_every_id(tmp_path: Path) -> None:
     shown = fresh(ROLLOUT, NAMES, tmp_path)
-    assert len(shown) == 18
+    assert len(shown) == 18 + len(SUITE)
     assert all(seen == [[2, 64, 64, 3], "torch.uint8", [2, 1]] for seen in shown.values())
 
 
@@ -141,7 +144,7 @@ def test_registering_loads_gymnasium_and_nothing_heavy() -> None:
         "print(sum(name.startswith('PlaySlot/') for name in gymnasium.registry), list(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("19 ")
+    assert done.stdout.startswith("21 ")
     for heavy in ("torch", "torchrl", "mujoco", "metaworld", "gymnasium_robotics"):
         assert f"'{heavy}'" not in done.stdout
 

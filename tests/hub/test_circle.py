@@ -28,7 +28,7 @@ EPISODES = 3
     [
         name if name in ("button_press", "grid_shapes") else pytest.param(name, marks=pytest.mark.slow)
         for name in (*ENVIRONMENTS, *PROCEDURAL)
-        if name != "gym"
+        if name != "gym" and not name.startswith("dmc_")
     ],
 )
 def test_the_whole_circle(name: str, hub: FakeHub, client: Client, tmp_path: Path) -> None:
