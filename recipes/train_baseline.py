@@ -38,7 +38,7 @@ def _hold_against_published(config: ExperimentConfig, folder: Path) -> None:
     """Where its authors' curve on the task is known, a page with both."""
     from playslot_rl.studies import published
 
-    if config.method == "dreamer" and config.env.name in published.DREAMER:
+    if config.env.name in published.CURVES.get(config.method, {}):
         curve = published.read_curve(folder, config.env)
         page = published.write_page({f"seed {config.seed}": curve}, config.env.name, folder)
         print(f"{published.summary([curve], config.env.name)}; {page}", flush=True)

@@ -8,6 +8,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -60,7 +61,8 @@ def test_the_readme_names_every_command_of_the_pipeline() -> None:
 
 
 @pytest.mark.parametrize(("page", "command"), EVERY, ids=[f"{page}: {command}" for page, command in EVERY])
-def test_a_documented_command_is_accepted(page: str, command: str) -> None:
+def test_a_documented_command_is_accepted(page: str, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "my_experts", SimpleNamespace(reach=print))  # the user's own
     words = [word for word in shlex.split(command) if not re.fullmatch(r"[A-Z_]+=\S*", word)]
     program, rest = Path(words[0]).name, words[1:]
     if program == "make":

@@ -72,6 +72,8 @@ DREAMER: Final[Mapping[str, tuple[Band, ...]]] = {
     ),
 }  # fmt: skip
 """DreamerV3's by task (`SOURCE`), around 10,000, 20,000, ... frames."""
+CURVES: Final = {"dreamer": DREAMER}
+"""By method."""
 
 
 def read_curve(folder: Path, env: EnvConfig) -> list[tuple[int, float]]:

@@ -195,9 +195,10 @@ def test_every_method_that_reads_labels_gives_the_robots_units(
     simulated: tuple[Path, Path], tmp_path: Path, frames: np.ndarray[Any, Any], method: str
 ) -> None:
     (arm, world), run = simulated, tmp_path / "run"
-    own = f"run={world}" if METHODS[method].slots else f"data.root={arm}"
+    kind = METHODS[method]
+    own = [f"run={world}"] * kind.slots + [f"data.root={arm}"] * (not kind.slots or kind.model is not None)
     command = ("train-baseline", f"method={method}") if method != "playslot" else ("train-policy",)
-    command = (*command, "preset=smoke", f"data.demos={arm}", f"out={run}", own)
+    command = (*command, "preset=smoke", f"data.demos={arm}", f"out={run}", *own)
     done, stage = smoke(*command), method_stage(method)
     assert f"{stage}: actions: {NAMES[0]} " in done.out
     actor = plugins.call(METHODS[method].load.actor, Run.open(run))

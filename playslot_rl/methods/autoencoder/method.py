@@ -71,7 +71,7 @@ POLICY: Final = StageSpec(
 AUTOENCODER_BC: Final = Method(
     NAME,
     ("Autoencoder BC",),
-    Style(3, "<"),
+    Style(3, "8"),
     AutoencoderBCConfig,
     (MODEL, POLICY),
     Load(actor="playslot_rl.methods.autoencoder.network:load_actor"),

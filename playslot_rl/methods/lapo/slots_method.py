@@ -46,6 +46,6 @@ POLICY: Final = StageSpec(
     sizes="playslot_rl.methods.cloning:sizes",
 )  # fmt: skip
 LAPO_SLOTS: Final = Method(
-    NAME, ("LAPO on slots",), Style(5, "D"), LAPOSlotsConfig, (MODEL, POLICY),
+    NAME, ("LAPO on slots",), Style(5, "$S$"), LAPOSlotsConfig, (MODEL, POLICY),
     Load(actor="playslot_rl.methods.lapo.slots:load_actor"),
 )  # fmt: skip
