@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from playslot_rl.data.cache import note_read
+from playslot_rl.data.neighbours import in_batches
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import drawn_demonstrations, episode_range, first_demonstrations
 from playslot_rl.errors import DataError
@@ -159,8 +160,7 @@ class Transitions:
         """
         if not threshold:
             return self
-        parts = np.array_split(self.rows, -(-len(self.rows) // FRAMES_AT_ONCE))
-        moved = torch.cat([motion(rows) for rows in parts])
+        moved = torch.cat([motion(rows) for rows in in_batches(self.rows, FRAMES_AT_ONCE)])
         kept = moving_rows(moved, torch.from_numpy(self.step), threshold, margin, key).numpy()
         return replace(self, rows=self.rows[kept], episode=self.episode[kept], step=self.step[kept])
 
@@ -296,7 +296,7 @@ def label_demonstrations(
     labels: tuple[Tensor, ...] = ()
     for steps in np.unique(moves.lengths):
         same = np.nonzero(moves.lengths == steps)[0]
-        for chosen in np.array_split(same, -(-len(same) // EPISODES_AT_ONCE)):
+        for chosen in in_batches(same, EPISODES_AT_ONCE):
             frames = source.starts[episodes[chosen]][:, None] + np.arange(steps + 1)
             places = torch.from_numpy(of_kept[first[chosen][:, None] + np.arange(steps)])
             found, kept = _label(model, source, slots, frames, device), places >= 0

@@ -14,6 +14,7 @@ import torch
 
 from playslot_rl.config import DataConfig
 from playslot_rl.data.demonstrations import probed_actions
+from playslot_rl.data.neighbours import in_batches
 from playslot_rl.data.slot_cache import parse_episodes
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.errors import DataError
@@ -115,7 +116,7 @@ def health_lines(model: WorldModel, parsed: ParsedEpisodes) -> tuple[list[Line],
     frames = min(HEALTH_FRAMES, int(parsed.source.lengths[parsed.tested_episodes].max()))
     rows, pixels, _ = parsed.windows(frames, HEALTH_CLIPS)
     health = SlotHealth(n)
-    for some in np.array_split(np.arange(len(rows)), -(-len(rows) // CLIPS_AT_ONCE)):
+    for some in in_batches(np.arange(len(rows)), CLIPS_AT_ONCE):
         decoded = model.savi.decode(torch.from_numpy(parsed.slots[rows[some]]).to(device))
         health.add(normalise(parsed.source.pixels(pixels[some]).to(device)), decoded.frames, decoded.masks)
     values = health.values()

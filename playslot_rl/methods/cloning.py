@@ -35,7 +35,8 @@ from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.training.demonstrated import cloned, policy_taken_over
 from playslot_rl.training.fit import Part
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage import Stage
 from playslot_rl.training.stage_behaviour import JointStage, after_cloning
 from playslot_rl.training.stage_regression import (
@@ -98,9 +99,11 @@ class LatentCloning(ABC):
         """What the policy reads of frames: themselves."""
         return frames
 
-    @abstractmethod
     def criterion(self) -> BehaviourLoss:
-        """What compares the policy's outputs and the inferred latents."""
+        """What compares the policy's outputs and the inferred latents; the policy reads frames."""
+        criterion = BehaviourLoss(self.policy, self.loss)
+        criterion.set_keys(observation=keys.PIXELS)
+        return criterion
 
     def policy_stage(self) -> RegressionStage:
         """Latent actions from frames of all demonstrations, no action read."""

@@ -26,7 +26,8 @@ from playslot_rl.runtime.processes import here
 from playslot_rl.seeds.episodes import EPISODES
 from playslot_rl.storage.checkpoints import StageCheckpoint, require_config, require_parents, require_whole
 from playslot_rl.training.pace import Pace
-from playslot_rl.training.record import StageRecord, run_stage
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import run_stage
 
 
 @runtime_checkable

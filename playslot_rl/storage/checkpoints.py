@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import nn
@@ -84,6 +84,18 @@ class StageCheckpoint:
         whole: dict[str, nn.Module] = {parts: network} if isinstance(parts, str) else {}
         load_weights(self, whole or {name: getattr(network, name) for name in parts})
         return network.to(device).eval().requires_grad_(False)
+
+    def restore_several[*Networks](
+        self, names: Sequence[str], build: Callable[[], tuple[*Networks]], device: torch.device | str = "cpu"
+    ) -> tuple[*Networks]:
+        """As `restore`, of networks that are stored side by side under these names."""
+        with torch.random.fork_rng(devices=[]):
+            networks = build()
+        modules = dict(zip(names, cast(tuple[nn.Module, ...], networks), strict=True))
+        load_weights(self, modules)
+        for module in modules.values():
+            module.to(device).eval().requires_grad_(False)
+        return networks
 
 
 def checkpoint_folder(run: Path, stage: str) -> Path:

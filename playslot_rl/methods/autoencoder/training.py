@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -15,6 +14,7 @@ from playslot_rl import keys
 from playslot_rl.config import StageConfig
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import require_finite
+from playslot_rl.data.neighbours import in_batches
 from playslot_rl.data.windows import IntArray
 from playslot_rl.frames import normalise, psnr
 from playslot_rl.methods.autoencoder.method import NAME, AutoencoderBCConfig
@@ -26,10 +26,10 @@ from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.checkpoints import load_weights
 from playslot_rl.training.demonstrated import cloned
 from playslot_rl.training.fit import Part
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.world_model import module_device
 
-BATCH = 64
 STANDARDISED = 1024
 """Rows, at most, whose code says its mean and deviation."""
 
@@ -61,8 +61,7 @@ class AutoencoderStage:
             pixels = normalise(self.clips.pixels(rows[:, 0], module_device(self.network)))
             return psnr((self.network(pixels) - pixels).square().mean(dim=(1, 2, 3)))
 
-        held_out = self.clips.held_out
-        found = spread(np.array_split(held_out, -(-len(held_out) // BATCH)), look)
+        found = spread(in_batches(self.clips.held_out), look)
         return {"psnr": float(torch.cat(found).mean())}
 
 

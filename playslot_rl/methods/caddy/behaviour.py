@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -27,6 +26,7 @@ from torch.nn import functional as F
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
+from playslot_rl.data.neighbours import in_batches, pairs_at
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.caddy.heads import ORACLE, POLICY, MovesHead, StateHead, load_model, states_of
@@ -40,7 +40,8 @@ from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.training.demonstrated import cloned
 from playslot_rl.training.fit import Part
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage_regression import (
     FrameInputs,
     Inputs,
@@ -48,8 +49,6 @@ from playslot_rl.training.stage_regression import (
     unexplained,
 )
 from playslot_rl.world_model import module_device
-
-BATCH = 64
 
 
 class StateInputs:
@@ -152,9 +151,8 @@ def oracle_stage(
 def infer_moves(model: CADDY, source: EpisodeFrames, moves: Transitions) -> Tensor:
     """Moves (M, K + Z) of transitions, a one-hot action and a variability each; the model in evaluation mode."""
     parts = []
-    for rows in np.array_split(moves.rows, -(-len(moves.rows) // BATCH)):
-        pairs = source.pixels(np.stack((rows, rows + 1), axis=1)).to(module_device(model))
-        latents = model.infer(pairs)
+    for pairs in in_batches(pairs_at(moves.rows)):
+        latents = model.infer(source.pixels(pairs).to(module_device(model)))
         parts.append(torch.cat((latents.a, latents.v), dim=-1)[:, 0])
     return torch.cat(parts)
 

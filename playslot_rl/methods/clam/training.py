@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -25,27 +24,27 @@ from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
+from playslot_rl.data.neighbours import Ends, in_batches, pairs_at, with_past
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray
 from playslot_rl.frames import normalise
-from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.clam.method import NAME, CLAMConfig
 from playslot_rl.methods.clam.model import CLAMPolicy, Forward, Inverse
 from playslot_rl.methods.cloning import LatentCloning
-from playslot_rl.methods.supervised import Ends, LabelledMoves
+from playslot_rl.methods.lapo.training import on_pairs
+from playslot_rl.methods.supervised import LabelledMoves
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
 from playslot_rl.runtime.shares import own_rows
 from playslot_rl.seeds.draws import StepGenerators, global_seed
-from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
+from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.training.demonstrated import cloned
 from playslot_rl.training.fit import Part
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage_regression import RegressionStage, apart, together
 from playslot_rl.world_model import module_device
-
-BATCH = 64
 
 
 class CLAMStage:
@@ -57,7 +56,7 @@ class CLAMStage:
     ) -> None:  # fmt: skip
         self.inverse, self.forward, self.decoder = inverse, forward, decoder
         self.clips, self.labelled, self.config, self.ends = clips, labelled, config, Ends.of(clips.source)
-        frames = self._frames(clips.spread(clips.train_episodes)[:, 0])
+        frames = self._frames(clips.spread(clips.train_episodes))
         self.still = max(1e-6, float((frames[:, 2] - frames[:, 1]).square().mean()))
 
     @property
@@ -66,9 +65,9 @@ class CLAMStage:
 
     def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         count = self.config.model.batch_size
-        rows = triples(self.ends, self.clips.sample(count, generators.numpy("moves"))[:, 0])
+        rows = with_past(self.clips.sample(count, generators.numpy("moves")), self.ends)
         known, actions = self.labelled.draw(count, generators)
-        frames = self.labelled.pixels(own_rows(triples(self.labelled.ends, known)))
+        frames = self.labelled.pixels(own_rows(with_past(pairs_at(known), self.labelled.ends)))
         videos = self.clips.pixels(own_rows(rows), module_device(self.inverse))
         return together({"videos": {keys.PIXELS: videos}, "labelled": {keys.PIXELS: frames, keys.ACTION: actions}})
 
@@ -86,21 +85,15 @@ class CLAMStage:
         """`unexplained`: error on held-out frames over that of no change."""
 
         def look(_: int, rows: IntArray) -> tuple[float, float]:
-            frames = self._frames(rows[:, 0])
+            frames = self._frames(rows)
             error = self.forward(frames[:, :2], self.inverse(frames)) - frames[:, 2]
             return float(error.square().sum()), float((frames[:, 2] - frames[:, 1]).square().sum())
 
-        batches = np.array_split(self.clips.held_out, -(-len(self.clips.held_out) // BATCH))
-        errors, stills = zip(*spread(batches, look), strict=True)
+        errors, stills = zip(*spread(in_batches(self.clips.held_out), look), strict=True)
         return {"unexplained": sum(errors) / max(1e-6, sum(stills))}
 
-    def _frames(self, rows: IntArray) -> Tensor:
-        return normalise(self.clips.pixels(triples(self.ends, rows), module_device(self.inverse)))
-
-
-def triples(ends: Ends, rows: IntArray) -> IntArray:
-    """Rows (B, 3) of the frame before each of `rows` (B,), of itself, and of the next."""
-    return np.stack((ends.before(rows), rows, rows + 1), axis=1)
+    def _frames(self, pairs: IntArray) -> Tensor:
+        return normalise(self.clips.pixels(with_past(pairs, self.ends), module_device(self.inverse)))
 
 
 @torch.no_grad()
@@ -108,9 +101,8 @@ def infer_latents(
     inverse: Inverse, source: EpisodeFrames, moves: Transitions, device: torch.device | str = "cpu"
 ) -> Tensor:
     """Latent actions (M, Z) of transitions; the model in evaluation mode."""
-    ends = Ends.of(source)
-    parts = np.array_split(moves.rows, -(-len(moves.rows) // BATCH))
-    return torch.cat([inverse(source.pixels(triples(ends, rows)).to(device)) for rows in parts])
+    ends, parts = Ends.of(source), in_batches(pairs_at(moves.rows))
+    return torch.cat([inverse(source.pixels(with_past(pairs, ends)).to(device)) for pairs in parts])
 
 
 class PolicyStage(RegressionStage):
@@ -140,19 +132,16 @@ class CLAMBehaviour(LatentCloning):
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
         return infer_latents(self.inverse, source, moves, self.device)
 
-    def criterion(self) -> BehaviourLoss:
-        criterion = BehaviourLoss(self.policy, self.own.loss)
-        criterion.set_keys(observation=keys.PIXELS)
-        return criterion
-
 
 def load_model(model: StageCheckpoint, device: torch.device | str) -> tuple[Inverse, ActionDecoder]:
     own, (sizes, env) = model.group(CLAMConfig, NAME), model.sizes
-    with torch.random.fork_rng(devices=[]):
-        inverse, forward = Inverse(own, env.image_size), Forward(own)
-        decoder = ActionDecoder(sizes.action_decoder, own.latent_dim, env.action_dim)
-    load_weights(model, {"inverse": inverse, "forward": forward, "action_decoder": decoder})
-    return inverse.to(device).eval().requires_grad_(False), decoder.to(device).eval().requires_grad_(False)
+
+    def build() -> tuple[Inverse, Forward, ActionDecoder]:
+        decoder = sizes.action_decoder, own.latent_dim, env.action_dim
+        return Inverse(own, env.image_size), Forward(own), ActionDecoder(*decoder)
+
+    inverse, _, decoder = model.restore_several(("inverse", "forward", "action_decoder"), build, device)
+    return inverse, decoder
 
 
 def model(record: StageRecord) -> Training:
@@ -164,15 +153,8 @@ def model(record: StageRecord) -> Training:
         decoder = ActionDecoder(config.model.action_decoder, own.latent_dim, config.env.action_dim).to(device)
     labelled = LabelledMoves(record.labelled, config, device)
     stage = CLAMStage(inverse, forward, decoder, record.clips(2, shown=256), labelled, own)
-    return Training(
-        [Part("baselines.clam.model", stage, own.model)],
-        device,
-        lambda metrics: (
-            f"{record.name}: {100 * metrics.get('unexplained', float('nan')):.0f} % of the change left on held-out "
-            f"frames, {config.behaviour.labelled_demos} labelled, {record.folder}"
-        ),
-        extra={"episodes": record.data.episodes},
-    )
+    known = config.behaviour.labelled_demos
+    return on_pairs(record, stage, own.model, f"change left on held-out frames, {known} labelled")
 
 
 def policy(record: StageRecord) -> Training:

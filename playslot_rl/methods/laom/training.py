@@ -16,6 +16,7 @@ Shapes: B batch, H W image height and width, M transitions, Z latent-action widt
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import torch
@@ -25,25 +26,25 @@ from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
+from playslot_rl.data.neighbours import Ends, in_batches, pairs_at
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray
 from playslot_rl.frames import normalise
-from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.cloning import LatentCloning, cloning
 from playslot_rl.methods.laom.method import NAME, LAOMConfig
 from playslot_rl.methods.laom.model import LAOMPolicy, LatentActions, Target
-from playslot_rl.methods.supervised import Ends, LabelledMoves, jittered
+from playslot_rl.methods.lapo.training import on_pairs
+from playslot_rl.methods.supervised import LabelledMoves, jittered
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
 from playslot_rl.runtime.shares import averaged, own_rows, share
 from playslot_rl.seeds.draws import StepGenerators, global_seed
-from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
-from playslot_rl.training.fit import Part
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.storage.checkpoints import StageCheckpoint
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage_regression import apart, together
 from playslot_rl.world_model import module_device
 
-BATCH = 64
 RATE = 0.05
 """Of the average of the features' change."""
 
@@ -56,7 +57,7 @@ class LAOMStage:
     ) -> None:
         self.model, self.target, self.clips, self.labelled, self.config = model, target, clips, labelled, config
         self.ends = Ends.of(clips.source)
-        change = [self.target(*self._frames(rows)) for rows in self._batches(clips.spread(clips.train_episodes))]
+        change = [self.target(*self._frames(rows)) for rows in in_batches(clips.spread(clips.train_episodes))]
         self.target.change.fill_(max(1e-6, float(torch.cat(change).square().mean())))
         self._seen = torch.zeros_like(self.target.change)
 
@@ -106,7 +107,7 @@ class LAOMStage:
             error = self.model.change(h, self.model.infer(h, later)) - wanted
             return float(error.square().sum()), float(wanted.square().sum())
 
-        errors, stills = zip(*spread(self._batches(self.clips.held_out), look), strict=True)
+        errors, stills = zip(*spread(in_batches(self.clips.held_out), look), strict=True)
         return {"unexplained": sum(errors) / max(1e-12, sum(stills))}
 
     def _later(self, ends: Ends, rows: IntArray, generators: StepGenerators, stream: str) -> IntArray:
@@ -125,21 +126,14 @@ class LAOMStage:
         pixels = normalise(self.clips.pixels(rows, module_device(self.model)))
         return pixels[:, 0], pixels[:, 1]
 
-    @staticmethod
-    def _batches(rows: IntArray) -> list[IntArray]:
-        return np.array_split(rows, -(-len(rows) // BATCH))
-
 
 @torch.no_grad()
 def infer_latents(
     model: LatentActions, source: EpisodeFrames, moves: Transitions, device: torch.device | str = "cpu"
 ) -> Tensor:
     """Latent actions (M, Z) of transitions, one step each; the model in evaluation mode."""
-    parts = []
-    for rows in np.array_split(moves.rows, -(-len(moves.rows) // BATCH)):
-        pixels = source.pixels(np.stack((rows, rows + 1), axis=1)).to(device)
-        parts.append(model(pixels[:, 0], pixels[:, 1]))
-    return torch.cat(parts)
+    frames = (source.pixels(pairs).to(device) for pairs in in_batches(pairs_at(moves.rows)))
+    return torch.cat([model(*pixels.unbind(1)) for pixels in frames])
 
 
 class LAOMBehaviour(LatentCloning):
@@ -158,11 +152,6 @@ class LAOMBehaviour(LatentCloning):
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
         return infer_latents(self.model, source, moves, self.device)
 
-    def criterion(self) -> BehaviourLoss:
-        criterion = BehaviourLoss(self.policy, self.own.loss)
-        criterion.set_keys(observation=keys.PIXELS)
-        return criterion
-
 
 def built(own: LAOMConfig, image_size: int, action_dim: int) -> tuple[LatentActions, Target]:
     """The model and its target encoder, untrained."""
@@ -172,10 +161,9 @@ def built(own: LAOMConfig, image_size: int, action_dim: int) -> tuple[LatentActi
 
 def load_model(model: StageCheckpoint, device: torch.device | str) -> LatentActions:
     own, (_, env) = model.group(LAOMConfig, NAME), model.sizes
-    with torch.random.fork_rng(devices=[]):
-        latents, target = built(own, env.image_size, env.action_dim)
-    load_weights(model, {"model": latents, "target": target})
-    return latents.to(device).eval().requires_grad_(False)
+    build = partial(built, own, env.image_size, env.action_dim)
+    latents, _ = model.restore_several(("model", "target"), build, device)
+    return latents
 
 
 def model(record: StageRecord) -> Training:
@@ -185,15 +173,8 @@ def model(record: StageRecord) -> Training:
         latents, target = built(own, config.env.image_size, config.env.action_dim)
     labelled = None if record.labelled is None else LabelledMoves(record.labelled, config, device)
     stage = LAOMStage(latents.to(device), target.to(device), record.clips(2, shown=256), labelled, own)
-    return Training(
-        [Part("baselines.laom.model", stage, own.model)],
-        device,
-        lambda metrics: (
-            f"{record.name}: {100 * metrics.get('unexplained', float('nan')):.0f} % of the features' change left on "
-            f"held-out pairs, {0 if labelled is None else config.behaviour.labelled_demos} labelled, {record.folder}"
-        ),
-        extra={"episodes": record.data.episodes},
-    )
+    known = 0 if labelled is None else config.behaviour.labelled_demos
+    return on_pairs(record, stage, own.model, f"features' change left on held-out pairs, {known} labelled")
 
 
 def policy(record: StageRecord) -> Training:

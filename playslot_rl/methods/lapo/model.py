@@ -18,7 +18,9 @@ code.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -158,17 +160,23 @@ class InverseModel(QuantisedInverse):
         return super().forward(normalise(frames).flatten(1, 2))
 
 
-class ForwardModel(nn.Module):
-    """FDM: frames and a latent action to the next frame, by a U-Net; the latent enters at its input and at its lowest
-    resolution.
+class ChangeUNet(nn.Module):
+    """A U-Net whose lowest maps a latent is added to, at the start without output; with `start` it is added behind the
+    first conv, too.
     """
 
-    def __init__(self, config: LAPOConfig) -> None:
+    def __init__(
+        self,
+        in_channels: int,
+        channels: tuple[int, ...],
+        latent_dim: int,
+        kind: Encoder = "strided",
+        start: bool = False,
+    ) -> None:
         super().__init__()
-        channels = config.forward_channels or config.channels
-        self.encoder = ConvEncoder(3 * (config.frames - 1), channels, config.encoder)
-        self.to_input = nn.Linear(config.latent_dim, channels[0])
-        self.to_map = nn.Linear(config.latent_dim, channels[-1])
+        self.encoder = ConvEncoder(in_channels, channels, kind)
+        self.to_input = nn.Linear(latent_dim, channels[0]) if start else None
+        self.to_map = nn.Linear(latent_dim, channels[-1])
         self.bottom = ResidualBlock(channels[-1])
         outs = (*channels[-2::-1], 3)
         ins = (channels[-1], *(2 * c for c in channels[-2::-1]))
@@ -176,27 +184,38 @@ class ForwardModel(nn.Module):
         for parameter in self.ups[-1].parameters():
             nn.init.zeros_(parameter)
 
-    def forward(self, past: Tensor, z: Tensor) -> Tensor:
-        """Frames (B, F - 1, 3, H, W), uint8 or float [0, 1], and latents (B, Z) to next frames (B, 3, H, W), float,
-        about [0, 1].
-        """
-        past = normalise(past)
-        *skips, x = self.encoder(past.flatten(1, 2), self.to_input(z))
+    def change(self, x: Tensor, z: Tensor) -> Tensor:
+        """Maps (B, C, H, W) and latents (B, Z) to the change of a frame, (B, 3, H, W)."""
+        *skips, x = self.encoder(x, None if self.to_input is None else self.to_input(z))
         x = self.bottom(x + self.to_map(z)[:, :, None, None])
         for i, up in enumerate(self.ups):
             x = F.pixel_shuffle(up(F.relu(x)), 2)
             if i < len(skips):
                 x = torch.cat((x, skips[-1 - i]), dim=1)
-        predicted: Tensor = past[:, -1] + x
-        return predicted
+        return x
 
 
-class LAPOPolicy(nn.Module):
-    """LAPO's latent policy: frames (B, 3, H, W), uint8 or float [0, 1], to latent actions (B, Z)."""
+class ForwardModel(ChangeUNet):
+    """FDM: frames and a latent action, which enters at the input and at the lowest resolution, to the next frame."""
 
-    def __init__(self, config: LAPOConfig, image_size: int) -> None:
+    def __init__(self, config: LAPOConfig) -> None:
+        channels = config.forward_channels or config.channels
+        super().__init__(3 * (config.frames - 1), channels, config.latent_dim, config.encoder, start=True)
+
+    def forward(self, past: Tensor, z: Tensor) -> Tensor:
+        """Frames (B, F - 1, 3, H, W), uint8 or float [0, 1], and latents (B, Z) to next frames (B, 3, H, W), float,
+        about [0, 1].
+        """
+        past = normalise(past)
+        return past[:, -1] + self.change(past.flatten(1, 2), z)
+
+
+class PixelPolicy(nn.Module):
+    """A latent policy: frames (B, 3, H, W), uint8 or float [0, 1], to latent actions (B, Z)."""
+
+    def __init__(self, network: EncoderMLP) -> None:
         super().__init__()
-        self.network = EncoderMLP.of(config, 1, image_size)
+        self.network = network
 
     def forward(self, pixels: Tensor) -> Tensor:
         return self.decide(self.features(pixels))
@@ -209,6 +228,26 @@ class LAPOPolicy(nn.Module):
         return self.network.out(features[:, 0])
 
 
+class LAPOPolicy(PixelPolicy):
+    """LAPO's."""
+
+    def __init__(self, config: LAPOConfig, image_size: int) -> None:
+        super().__init__(EncoderMLP.of(config, 1, image_size))
+
+
+def pixel_actor(
+    done: StageCheckpoint,
+    policy: Callable[[int], PixelPolicy],
+    latent_dim: int,
+    hidden: int,
+    device: torch.device | str,
+) -> Actor:
+    """The actor of a finished policy, which `policy` builds for frames of a size, and of the decoder beside it."""
+    build = partial(policy, done.sizes[1].image_size)
+    parts = DecodedPolicy.load(done, build, latent_dim, hidden, device)
+    return latent_actor(parts.policy, parts.action_decoder)
+
+
 def sizes(done: StageCheckpoint) -> LAPOConfig:
     """Of a finished stage; the policies from before there was `encoder` are strided."""
     own = done.group(LAPOConfig, NAME)
@@ -218,6 +257,5 @@ def sizes(done: StageCheckpoint) -> LAPOConfig:
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a finished run; a CheckpointError where it is missing, damaged, or of another inverse model."""
     done = run.stage(NAME, MODEL.name)
-    own, size = sizes(done), done.sizes[1].image_size
-    parts = DecodedPolicy.load(done, lambda: LAPOPolicy(own, size), own.latent_dim, own.hidden, device)
-    return latent_actor(parts.policy, parts.action_decoder)
+    own = sizes(done)
+    return pixel_actor(done, partial(LAPOPolicy, own), own.latent_dim, own.hidden, device)

@@ -23,11 +23,12 @@ from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.cloning import LatentCloning, Seen, cloning
 from playslot_rl.methods.lapo.slots import SlotForward, SlotInverse
 from playslot_rl.methods.lapo.slots_method import MODEL, LAPOSlotsConfig
-from playslot_rl.methods.lapo.training import LAPOModelStage, infer_latents, on_pairs, restored
+from playslot_rl.methods.lapo.training import TWO, LAPOModelStage, infer_latents, on_pairs
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.demonstrated import demonstration_views
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage_regression import TensorInputs
 
 
@@ -40,7 +41,8 @@ def model(record: StageRecord) -> Training:
         inverse, forward = SlotInverse(*sizes).to(device), SlotForward(*sizes).to(device)
     place, progress = Cache.of(config.data), config.logging.progress
     cached = slot_cache(record.data, savi, slots.fingerprint, place, device, progress)
-    return on_pairs(record, LAPOModelStage(inverse, forward, record.clips(2, shown=256), own.model, cached))
+    stage = LAPOModelStage(inverse, forward, record.clips(2, shown=256), own.model, cached)
+    return on_pairs(record, stage, own.model)
 
 
 class LAPOSlotsBehaviour(LatentCloning):
@@ -53,7 +55,8 @@ class LAPOSlotsBehaviour(LatentCloning):
         width = savi.config.slot_dim
         sizes = own, config.model.policy, width
         self.own, self.noise, self.whole = own, config.behaviour.slot_noise, demos.trained
-        self.inverse = restored(record.parents[MODEL.name], lambda: (SlotInverse(*sizes), SlotForward(*sizes)), device)
+        done = record.parents[MODEL.name]
+        self.inverse, _ = done.restore_several(TWO, lambda: (SlotInverse(*sizes), SlotForward(*sizes)), device)
         views, others = demonstration_views(config, demos, savi, record.prints["slots"])
         self.views, self.others = [frames for frames, _ in views], [frames for frames, _ in others]
         self.parsed = {id(frames): slots for frames, slots in (*views, *others)}

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -27,11 +28,11 @@ from playslot_rl.config import ExperimentConfig, StageConfig
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
 from playslot_rl.data.device_rows import DeviceRows
+from playslot_rl.data.neighbours import Ends, in_batches, pairs_at, with_past
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray
 from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import normalise
-from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.cloning import LatentCloning, cloning
 from playslot_rl.methods.lapo.method import NAME, LAPOConfig
 from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolicy, QuantisedInverse
@@ -40,25 +41,15 @@ from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
 from playslot_rl.runtime.shares import own_rows
 from playslot_rl.seeds.draws import StepGenerators, global_seed
-from playslot_rl.storage.checkpoints import StageCheckpoint, load_weights
+from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.training.fit import Part
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
+from playslot_rl.training.stage import Stage
 from playslot_rl.world_model import module_device
 
-BATCH = 64
-
-
-def with_past(pairs: IntArray, starts: IntArray, frames: int) -> IntArray:
-    """Rows (M, F) that end in those of pairs (M, 2): before an episode's first frame, one of `starts`, it again.
-
-    Example:
-        >>> with_past(np.array([[0, 1], [1, 2]]), np.array([0]), 3)
-        array([[0, 0, 1],
-               [0, 1, 2]])
-    """
-    first = pairs[:, :1]
-    before = np.where(np.isin(first, starts), first, first - 1)
-    return np.concatenate((before, pairs), axis=1) if frames == 3 else pairs
+TWO: Final = ("inverse", "forward")
+"""As inverse and forward model are stored."""
 
 
 class LAPOModelStage:
@@ -81,6 +72,7 @@ class LAPOModelStage:
         if slots is not None:
             resident = DeviceRows(lambda rows: torch.from_numpy(slots[rows]), len(slots), device, clips.resident)
             self.key, self.read = keys.SLOTS, resident
+        self.ends = Ends.of(clips.source)
         frames = normalise(self._frames(self.clips.spread(self.clips.train_episodes)))
         self.still = max(1e-6, float((frames[:, -2] - frames[:, -1]).square().mean()))
 
@@ -116,8 +108,7 @@ class LAPOModelStage:
             error = float((self.forward(frames[:, :-1], inferred.z) - frames[:, -1]).square().sum())
             return error, float((frames[:, -2] - frames[:, -1]).square().sum()), inferred.code
 
-        batches = np.array_split(self.clips.held_out, -(-len(self.clips.held_out) // BATCH))
-        errors, stills, codes = zip(*spread(batches, look), strict=True)
+        errors, stills, codes = zip(*spread(in_batches(self.clips.held_out), look), strict=True)
         _, perplexity = self._usage(torch.cat(codes))
         return {"unexplained": sum(errors) / max(1e-6, sum(stills)), "perplexity": float(perplexity)}
 
@@ -128,7 +119,7 @@ class LAPOModelStage:
         return torch.stack(used).mean(), torch.stack(perplexity).mean()
 
     def _frames(self, pairs: IntArray) -> Tensor:
-        return self.read(with_past(pairs, self.clips.source.starts, self.inverse.config.frames))
+        return self.read(with_past(pairs, self.ends, self.inverse.config.frames))
 
 
 @torch.no_grad()
@@ -141,10 +132,9 @@ def infer_latents(
     read: Callable[[IntArray], Tensor] | None = None,
 ) -> Tensor:
     """Latent actions (M, Z) of transitions, from frames or what `read` gives of rows; the model in evaluation mode."""
-    parts = []
-    for rows in np.array_split(moves.rows, -(-len(moves.rows) // BATCH)):
-        seen = with_past(np.stack((rows, rows + 1), axis=1), source.starts, inverse.config.frames)
-        inferred = inverse((read or source.pixels)(seen).to(device))
+    ends, parts = Ends.of(source), []
+    for pairs in in_batches(pairs_at(moves.rows)):
+        inferred = inverse((read or source.pixels)(with_past(pairs, ends, inverse.config.frames)).to(device))
         parts.append(inferred.z if quantised else inferred.before)
     return torch.cat(parts)
 
@@ -165,11 +155,6 @@ class LAPOBehaviour(LatentCloning):
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
         return infer_latents(self.inverse, source, moves, self.device, self.own.targets == "quantised")
 
-    def criterion(self) -> BehaviourLoss:
-        criterion = BehaviourLoss(self.policy, self.own.loss)
-        criterion.set_keys(observation=keys.PIXELS)
-        return criterion
-
 
 def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseModel:
     own, (_, env) = model.group(LAPOConfig, NAME), model.sizes
@@ -178,17 +163,8 @@ def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseM
             f"{model.path}: got LAPO's models of an earlier form (two frames, one codebook), expected those of this "
             "version of playslot_rl: train them again, with another out="
         )
-    return restored(model, lambda: (InverseModel(own, env.image_size), ForwardModel(own)), device)
-
-
-def restored[Inverse: nn.Module](
-    model: StageCheckpoint, build: Callable[[], tuple[Inverse, nn.Module]], device: torch.device | str
-) -> Inverse:
-    """The inverse model of two that are stored together, frozen."""
-    with torch.random.fork_rng(devices=[]):
-        inverse, forward = build()
-    load_weights(model, {"inverse": inverse, "forward": forward})
-    return inverse.to(device).eval().requires_grad_(False)
+    inverse, _ = model.restore_several(TWO, lambda: (InverseModel(own, env.image_size), ForwardModel(own)), device)
+    return inverse
 
 
 def model(record: StageRecord) -> Training:
@@ -197,18 +173,18 @@ def model(record: StageRecord) -> Training:
     own.check("baselines.lapo", config)
     with global_seed(config.seed, 0, record.name):
         inverse, forward = InverseModel(own, config.env.image_size).to(device), ForwardModel(own).to(device)
-    return on_pairs(record, LAPOModelStage(inverse, forward, record.clips(2, shown=256), own.model))
+    return on_pairs(record, LAPOModelStage(inverse, forward, record.clips(2, shown=256), own.model), own.model)
 
 
-def on_pairs(record: StageRecord, stage: LAPOModelStage) -> Training:
-    """The training of inverse and forward model, by its settings `baselines.METHOD.model`."""
-    part = Part(f"baselines.{record.name.removesuffix('_model')}.model", stage, stage.config)
+def on_pairs(
+    record: StageRecord, stage: Stage, schedule: StageConfig, what: str = "change left on held-out pairs"
+) -> Training:
+    """The training of a model of latent actions by `schedule`, `baselines.METHOD.model`; `what` is `unexplained`."""
     return Training(
-        [part],
+        [Part(f"baselines.{record.name.removesuffix('_model')}.model", stage, schedule)],
         record.device,
         lambda metrics: (
-            f"{record.name}: {100 * metrics.get('unexplained', float('nan')):.0f} % of the change left on held-out "
-            f"pairs, {record.folder}"
+            f"{record.name}: {100 * metrics.get('unexplained', float('nan')):.0f} % of the {what}, {record.folder}"
         ),
         extra={"episodes": record.data.episodes},
     )

@@ -34,7 +34,8 @@ from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.training.demonstrated import cloned
 from playslot_rl.training.fit import Part
 from playslot_rl.training.optimizer import build_adam
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage_regression import HELD_OUT, FrameInputs, unexplained
 
 VALIDATED = 128

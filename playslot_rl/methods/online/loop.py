@@ -224,7 +224,7 @@ class _Run:
 
 @dataclass(frozen=True)
 class OnlineTraining:
-    """See `playslot_rl.training.record.Prepared`.
+    """See `playslot_rl.training.run_stage.Prepared`.
 
     Attributes:
         learner: on its device.

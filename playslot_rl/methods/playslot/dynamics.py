@@ -9,7 +9,8 @@ from playslot_rl.config import DynamicsStageConfig
 from playslot_rl.runtime.processes import here
 from playslot_rl.training.fit import Part
 from playslot_rl.training.patience import patience_of
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage_dynamics import DynamicsStage, dynamics_on_slots
 
 

@@ -19,7 +19,8 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.demonstrated import cloned, demonstration_views, policy_taken_over
 from playslot_rl.training.fit import Part
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage import Stage
 from playslot_rl.training.stage_behaviour import CloneStage, FinetuneStage, after_cloning, cloning_settings
 from playslot_rl.world_model import Agent

@@ -10,7 +10,8 @@ from playslot_rl.runtime.processes import here
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.fit import Part
 from playslot_rl.training.patience import patience_of
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage_slots import SlotsStage, warm_start
 
 

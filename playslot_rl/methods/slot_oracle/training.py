@@ -10,7 +10,8 @@ from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.demonstrated import ParsedVideos, cloned, demonstration_views
 from playslot_rl.training.fit import Part
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage_behaviour import oracle_stage
 
 

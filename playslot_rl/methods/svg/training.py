@@ -30,7 +30,8 @@ from playslot_rl.runs import Run
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
 from playslot_rl.seeds.draws import StepGenerators, step_generator
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.world_model import module_device
 
 

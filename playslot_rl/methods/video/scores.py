@@ -14,6 +14,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from playslot_rl.data.neighbours import in_batches
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray
 from playslot_rl.evaluation.video import frame_scores
@@ -68,7 +69,7 @@ def score_clips(
     found: dict[str, list[Tensor]] = {"psnr": [], "ssim": [], "lpips": []}
     pictures: list[npt.NDArray[np.uint8]] = []
     order = np.roll(np.arange(len(rows)), -1)
-    for part in np.array_split(np.arange(len(rows)), -(-len(rows) // BATCH)):
+    for part in in_batches(np.arange(len(rows)), BATCH):
         frames = normalise(source.pixels(rows[part]).to(device))
         donors = normalise(source.pixels(rows[order[part]]).to(device)) if shuffled else None
         actions = None

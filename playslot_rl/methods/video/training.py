@@ -17,7 +17,8 @@ from playslot_rl.runs import Run
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.fit import Part
 from playslot_rl.training.patience import Patience, patience_of
-from playslot_rl.training.record import StageRecord, Training
+from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage import Stage
 from playslot_rl.training.stage_dynamics import dynamics_on_slots
 from playslot_rl.world_model import WorldModel

@@ -15,11 +15,12 @@ from playslot_rl.config import StageConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import transitions
+from playslot_rl.data.neighbours import Ends
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import drawn_demonstrations, first_demonstrations
 from playslot_rl.methods.laom.method import LAOMConfig
 from playslot_rl.methods.laom.training import LAOMStage, built, infer_latents
-from playslot_rl.methods.supervised import Ends, LabelledMoves, jittered
+from playslot_rl.methods.supervised import LabelledMoves, jittered
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.training.stage import step_loss
 

@@ -1,0 +1,112 @@
+"""A stage is trained: what there is to train, part after part, and one way to carry it out, or to find it finished."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import torch
+from torch import nn
+
+from playslot_rl.data.demonstrations import transitions
+from playslot_rl.modules.action_range import range_of
+from playslot_rl.runtime.processes import here, wait
+from playslot_rl.storage.checkpoints import StageCheckpoint
+from playslot_rl.training.fit import Part, fit
+from playslot_rl.training.record import StageRecord
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a stage that is not finished trains, and what it says of itself afterwards.
+
+    Attributes:
+        parts: one after the other; made as they are reached, so that a later one may need an earlier one trained. The
+            metrics of all but the first are called after their folder (`decoder_unexplained`).
+        device: of their generators.
+        line: the closing line, from the metrics.
+        extra: more plain values for `meta.json`.
+        identity: further plain values that a half-finished stage must share.
+        adopt: takes over another run's training before the first step; called by the first of several processes.
+    """
+
+    parts: Iterable[Part]
+    device: torch.device
+    line: Callable[[Mapping[str, float]], str]
+    extra: Mapping[str, Any] = field(default_factory=dict)
+    identity: Mapping[str, Any] = field(default_factory=dict)
+    adopt: Callable[[], None] | None = None
+
+    def carry_out(self, record: StageRecord, begin: Callable[[], None]) -> StageCheckpoint:
+        """See `Prepared`."""
+        return _train(record, self, begin)
+
+
+class Prepared(Protocol):
+    """What a stage that is not finished trains."""
+
+    def carry_out(self, record: StageRecord, begin: Callable[[], None]) -> StageCheckpoint:
+        """Train, carrying on where it was left, and save.
+
+        Args:
+            record: what the stage is.
+            begin: called before the first step, when nothing speaks against it.
+        """
+
+
+def run_stage(record: StageRecord, prepare: Callable[[], Prepared]) -> StageCheckpoint:
+    """Train a stage, carrying on where it was left, and save it; a finished one is said to be skipped.
+
+    Args:
+        record: what the stage is.
+        prepare: makes what is trained; called only if the stage is not finished.
+
+    Raises:
+        CheckpointError: it was begun or finished otherwise.
+        OutputError: another command trains it, or as `fit`.
+        TrainingError, KeyboardInterrupt: as `fit`.
+    """
+    done = record.finished()
+    wait()  # until all have looked
+    if done is not None:
+        return done
+    with record.training() as begin:
+        return prepare().carry_out(record, begin)
+
+
+def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -> StageCheckpoint:
+    if training.adopt is not None:
+        begin()
+        if here().first:
+            training.adopt()
+        wait()
+    modules: dict[str, nn.Module] = {}
+    metrics: dict[str, float] = {}
+    steps, seconds, clocked = 0, 0.0, False
+    limits = record.limits
+    if limits is not None and here().first:
+        shown = record.data.require_actions()[transitions(record.data).rows]
+        print(f"{record.name}: {limits.line(shown)}", flush=True)
+    for part in training.parts:
+        if limits is not None:
+            for known in filter(None, map(range_of, part.stage.modules.values())):
+                limits.give(known)
+        state, _ = fit(
+            part,
+            record.folder,
+            seed=record.config.seed,
+            device=training.device,
+            logging=record.config.logging,
+            identity={**record.resumes(), **training.identity},
+            typed=record.spec.typed,
+            ready=begin,
+        )
+        prefix = f"{part.folder}_" if part.folder else ""
+        metrics |= {f"{prefix}{key}": value for key, value in state.metrics.items()}
+        modules |= part.stage.modules
+        steps, seconds = steps or state.step, seconds + state.seconds
+        clocked = clocked or state.planned not in (0, part.config.steps)
+    done = record.save(modules, metrics, steps, seconds, {**training.extra, **({"clocked": True} if clocked else {})})
+    print(training.line(metrics), flush=True)
+    return done
