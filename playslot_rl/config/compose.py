@@ -41,6 +41,8 @@ COMPARISONS: Final = {
     "compare-video": ("methods", "seeds", "vary", "values", "objects", "processes"),
 }
 """Commands with a group of their own in the config, and its keys that go without its name."""
+SHORT: Final = {"expert": "env.expert"}
+"""Keys that go without the name of their group in every command."""
 NAMES: Final = {"plan": {"planner": PLANNERS, "proposal": PROPOSALS, "goals": GOALS}}
 """Commands with keys of their group that go without its name, and take one name, several with commas, or `all`."""
 PRETRAINED: Final = "pretrained"
@@ -139,15 +141,17 @@ def _method_names(key: str, value: str) -> str:
 
 
 def _short_keys(overrides: Sequence[str], command: str) -> list[str]:
-    """The short keys of a command as those of its group in the config: `demos=10,50` as `compare.demos=[10,50]`,
-    `planner=all` as `plan.planner=[cem,...]`, `hydra.launcher=joblib` as `compare.launcher=joblib`; other `hydra.` keys
-    of a comparison are gathered, as they are, in `compare.hydra`.
+    """The short keys of a command by their full names in the config: `expert=` as `env.expert`, `demos=10,50` as
+    `compare.demos=[10,50]`, `planner=all` as `plan.planner=[cem,...]`, `hydra.launcher=joblib` as
+    `compare.launcher=joblib`; other `hydra.` keys of a comparison are gathered, as they are, in `compare.hydra`.
     """
     kept, hydra = [], []
     group, lists, named = command.replace("-", "_"), COMPARISONS.get(command, ()), NAMES.get(command, {})
     for argument in overrides:
         key, equals, value = argument.partition("=")
         name = key.strip().lstrip("+")
+        if equals and name in SHORT:
+            argument = f"{SHORT[name]}={value}"
         own, inside = name.removeprefix(f"{group}."), _unquote(value.strip()).removeprefix("[").removesuffix("]")
         if equals and own in named:
             kept.append(f"{group}.{own}=[{','.join(named[own]) if inside == 'all' else inside}]")

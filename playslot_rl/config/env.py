@@ -142,7 +142,8 @@ class EnvConfig(Checked):
         variation: what changes in the picture and not in the task.
         id: of `env=gym`: a registered Gymnasium environment, `FetchReach-v4`, or `package:Id` after importing one.
         camera: of `env=gym` with MuJoCo: a camera's name, or `distance,azimuth,elevation,x,y,z`; empty is its own.
-        expert: of `env=gym`: `package.module:function`, from its own observation, info and a generator to its action.
+        expert: of `env=gym`, typed `expert=`: `package.module:function`, from its own observation, info and a generator
+            to its action.
         task: which task of `metaworld`: `drawer-open`, or another of its fifty.
     """
 

@@ -116,9 +116,9 @@ def test_without_a_measure_of_success_episodes_have_a_return() -> None:
 
 
 def test_the_users_expert_solves_the_users_task() -> None:
-    config = compose(
-        ["env=gym", "env.id=FetchReach-v4", "env.expert=gym_examples:reach", "env.image_size=32", "preset=smoke"]
-    )
+    typed = ["env=gym", "env.id=FetchReach-v4", "env.image_size=32", "preset=smoke"]
+    config = compose([*typed, "expert=gym_examples:reach"], "collect")
+    assert config == compose([*typed, "env.expert=gym_examples:reach"], "collect")
     spec = CollectionSpec.make(config, "expert", 1, 12, 0)
     (episode,) = record(spec, [0])
     assert episode.success.any()
