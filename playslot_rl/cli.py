@@ -123,14 +123,15 @@ def _alone(name: str) -> int:
 
 
 def _run(name: str, options: argparse.Namespace) -> int:
-    from playslot_rl.config.compose import compose
+    from playslot_rl.config.compose import compose_each
 
     try:
-        config = compose(options.overrides, name)
+        configs = compose_each(options.overrides, name)
     except ConfigError as error:
         if _debugging():
             raise
         return _fail(name, str(error), 2)
+    config = configs[0]
     # Before anything imports mujoco, which needs a display by default; the same backend everywhere, the same frames.
     if sys.platform == "linux":
         os.environ.setdefault("MUJOCO_GL", "egl")
@@ -157,7 +158,7 @@ def _run(name: str, options: argparse.Namespace) -> int:
     if name == "bench":
         recipe.main(config, json_path=options.json)
     else:
-        recipe.main(config)
+        recipe.main(*configs)
     processes.stop()
     return 0
 

@@ -178,14 +178,16 @@ COMMANDS: Final[dict[str, Command]] = {
         "episodes, and writes OUT/comparison.json, .md, .png and .svg. What is done is reused, so the same command "
         "carries on after a stop and tries what failed again. Here demos=, labels=, seeds= and methods= are lists; "
         "labels= makes it a table by labelled demonstrations, beside slot_bc and resnet_bc on these alone, and videos= "
-        "one by unlabelled videos. worlds= are world models, compare.block=test a fresh block of episodes. The world "
-        "model is run=, or trained once into OUT/world_model; data are data.root and data.demos, or recorded once "
-        "into OUT/data. Jobs run one after the other, or by a Hydra launcher: hydra.launcher=joblib, submitit_local, "
+        "one by unlabelled videos. envs= are tasks, each compared in OUT/TASK, and a table over all. worlds= are world "
+        "models, compare.block=test a fresh block of episodes. The world model is run=, or trained once into "
+        "OUT/world_model; data are data.root and data.demos, or recorded once into OUT/data. Jobs run one after the "
+        "other, or by a Hydra launcher: hydra.launcher=joblib, submitit_local, "
         "submitit_slurm or ray, with its own keys as hydra.launcher.KEY=VALUE.",
         (
             "playslot compare run=pretrained demos=10,50,100,150 seeds=0,1,2 out=runs/comparison",
             "playslot compare run=pretrained demos=150 labels=2,5,25 methods=playslot,lapo,slot_bc out=runs/labels",
             "playslot compare env=block_push_easy methods=playslot,slot_oracle demos=100,600 seeds=0 out=runs/blocks",
+            "playslot compare envs=metaworld/drawer-open,block_push_easy demos=100 labels=5 out=runs/tasks",
             "playslot compare run=pretrained hydra.launcher=joblib hydra.launcher.n_jobs=2 out=runs/comparison",
         ),
         f"env run episodes workers {TRAINED} compare {MADE} collector {STAGES} baselines evaluation",

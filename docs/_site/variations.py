@@ -18,7 +18,7 @@ from playslot_rl.config.env import VariationConfig
 from playslot_rl.envs import make_env, task_config
 
 OUT = Path(__file__).resolve().parents[1] / "images" / "variation.png"
-TASKS = ("button_press", "block_push_easy")
+TASKS = ("button_press", "metaworld/drawer-open", "block_push_easy")
 EACH: dict[str, dict[str, Any]] = {
     "plain": {},
     "background": {"background": True},

@@ -22,10 +22,12 @@ LAUNCHERS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class CompareConfig(Checked):
-    """What is compared. On the command line of `playslot compare` the keys are `methods=`, `demos=`, `labels=`,
-    `videos=`, `worlds=`, `seeds=`, `processes=` and `hydra.launcher=`, without the group's name.
+    """What is compared. On the command line of `playslot compare` the keys are `envs=`, `methods=`, `demos=`,
+    `labels=`, `videos=`, `worlds=`, `seeds=`, `processes=` and `hydra.launcher=`, without the group's name.
 
     Attributes:
+        envs: tasks, instead of `env`: `block_push_easy`, `metaworld/drawer-open`, `gym/FetchReach-v4`, each compared
+            in a folder of its own.
         methods: names of `playslot_rl.config.methods`.
         demos: numbers of demonstrations, for the methods that learn from them.
         labels: numbers of labelled demonstrations. Those with latent actions learn from the videos of all `demos`
@@ -39,13 +41,14 @@ class CompareConfig(Checked):
         evaluation_seed: block of evaluation episodes, the same for all; from 2^31 on a test's.
         block: `test` takes one that nobody has seen, drawn once for the folder.
         reference: method whose differences to the others are shown.
-        tasks: comparisons of other tasks, separated by commas, for the interquartile mean over all.
+        tasks: finished comparisons of other tasks, separated by commas, for the table over all.
         processes: that each training runs on, by torchrun; methods that act learn in one, and evaluation is in one.
         launcher: Hydra launcher that runs the jobs; empty runs them one after the other.
         hydra: further overrides for Hydra, such as `hydra.launcher.n_jobs=2`.
     """
 
     group = "compare."
+    envs: tuple[str, ...] = field(default=(), metadata=UNSAID)
     methods: tuple[str, ...] = ("playslot", "lapo", "slot_oracle", "resnet_oracle", "dreamer", "sold")
     demos: tuple[int, ...] = field(default=(10, 50, 100, 150), metadata=at_least(1, "numbers of at least 1"))
     labels: tuple[int, ...] = field(default=(), metadata=at_least(1, "numbers of at least 1"))
@@ -72,7 +75,7 @@ class CompareConfig(Checked):
             require_method("methods", name)
         still = [name for name in self.methods if not METHODS[name].acts]
         check(not still, "methods", ",".join(still), "methods that act; `playslot compare-video` compares predictions")
-        for name in ("labels", "videos"):
+        for name in ("envs", "labels", "videos"):
             values = getattr(self, name)
             check(len(set(values)) == len(values), name, values, "each one once")
         most = max(self.labels, default=0)

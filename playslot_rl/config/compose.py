@@ -37,7 +37,7 @@ GROUPS: Final = ("env", "preset")
 CONTINUES: Final = frozenset({"evaluate", "export", "inspect", "plan", "play", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
 COMPARISONS: Final = {
-    "compare": ("methods", "demos", "labels", "videos", "worlds", "seeds", "processes"),
+    "compare": ("envs", "methods", "demos", "labels", "videos", "worlds", "seeds", "processes"),
     "compare-video": ("methods", "seeds", "vary", "values", "objects", "processes"),
 }
 """Commands with a group of their own in the config, and its keys that go without its name."""
@@ -103,6 +103,25 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         raise ConfigError(str(error)) from error
     _check_choice("env", config.env.name)
     return config
+
+
+def compose_each(overrides: Sequence[str], command: str = "") -> list[ExperimentConfig]:
+    """The config of a command, or with `envs=metaworld/drawer-open,block_push_easy` one for each task; a ConfigError as
+    of `compose`, and for keys that are of one task.
+    """
+    pairs = dict(argument.partition("=")[::2] for argument in _short_keys(overrides, command))
+    names = pairs.get("compare.envs", "").strip().removeprefix("[").removesuffix("]")
+    if command != "compare" or not names.strip():
+        return [compose(overrides, command)]
+    for key in ("env", "env.task", "env.id", "data.root", "data.demos"):
+        if key in pairs:
+            raise ConfigError(f"{key}: got {pairs[key]} with envs=, expected none: it is of one task")
+    found = []
+    for task in names.split(","):
+        env, slash, own = _unquote(task.strip()).partition("/")
+        chosen = [f"{'env.id' if env == 'gym' else 'env.task'}={own}"] if slash else []
+        found.append(compose([*overrides, f"env={env}", *chosen], command))
+    return found
 
 
 def _parse(overrides: Sequence[str]) -> dict[str, str]:

@@ -165,7 +165,8 @@ class EnvConfig(Checked):
     @property
     def full_name(self) -> str:
         """The name, and the task where that has several, as folders and reports call it."""
-        return f"{self.name}_{self.task}" if self.task else self.name
+        own = self.task or self.id.replace("/", "_").replace(":", "_")
+        return f"{self.name}_{own}" if own else self.name
 
     @property
     def typed(self) -> list[str]:

@@ -253,28 +253,35 @@ class Study[J: Job]:
         measure, rows = self._measure, [row for job in self._jobs for row in self._measure.rows(job, self._status(job))]
         result = self._result(rows)
         page = measure.page(result)
-        write_json(self._out / f"{measure.name}.json", result)
-        write_text(self._out / f"{measure.name}.md", to_markdown(page))
-        if pictures:
-            for kind in ("png", "svg"):
-                plot = figure_bytes(measure.figure(result, LIGHT), LIGHT, kind)
-                write_bytes(self._out / f"{measure.name}.{kind}", plot)
-            for name, sheet in measure.sheets().items():
-                write_bytes(self._out / f"{name}.png", sheet)
+        write_result(self._out / measure.name, result, page, measure.figure if pictures else None)
+        for name, sheet in measure.sheets().items() if pictures else ():
+            write_bytes(self._out / f"{name}.png", sheet)
         return page, list(dict.fromkeys(str(row["name"]) for row in rows if row["status"] != "done"))
 
     def _result(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        config, made = self._measure.config, provenance()
+        config = self._measure.config
         return {
             "env": config.env.full_name,
             "preset": config.preset,
             **self._measure.result(rows),
             "seconds": round(self._spent + time.monotonic() - self._began, 1),
-            "command": made["command"],
-            "commit": made["commit"],
-            "version": made["version"],
-            "hardware": hardware(),
+            **origin(),
         }
+
+
+def origin() -> dict[str, Any]:
+    """`command`, `commit`, `version` and `hardware` of this process."""
+    made = provenance()
+    return {**{key: made[key] for key in ("command", "commit", "version")}, "hardware": hardware()}
+
+
+def write_result(place: Path, result: Result, page: Document, figure: Callable[[Result, Theme], Figure] | None) -> None:
+    """Write `PLACE.json` and `.md`, and with a figure `.png` and `.svg`."""
+    write_json(place.with_suffix(".json"), result)
+    write_text(place.with_suffix(".md"), to_markdown(page))
+    if figure is not None:
+        for kind in ("png", "svg"):
+            write_bytes(place.with_suffix(f".{kind}"), figure_bytes(figure(result, LIGHT), LIGHT, kind))
 
 
 def run_study[J: Job](measure: Measure[J]) -> None:
@@ -285,26 +292,39 @@ def run_study[J: Job](measure: Measure[J]) -> None:
         PlaySlotError: a job failed; the others have finished, and the page says so.
         KeyboardInterrupt: Ctrl-C; the same command carries on.
     """
-    began, out, command = time.monotonic(), Path(measure.config.out), measure.command
+    check_study(measure)
+    if failed := compute_study(measure):
+        raise PlaySlotError(failed)
+
+
+def check_study[J: Job](measure: Measure[J]) -> None:
+    """Refuse what cannot be measured, before anything is written or computed."""
     launch.require_launcher(measure.launcher[0])
     measure.check()
-    launch.open_comparison(out)
+    launch.open_comparison(Path(measure.config.out))
+
+
+def compute_study[J: Job](measure: Measure[J]) -> str:
+    """What is left of `run_study` after its checks; which jobs failed, in one line, or nothing."""
+    began, out, command = time.monotonic(), Path(measure.config.out), measure.command
     with launch.comparison_lock(out):
         jobs = measure.prepare()
         study = Study(measure, jobs, began)
         study.run()
         page, left = study.write()
-    print(_tables(page), flush=True)
+    print(tables(page), flush=True)
     path = out / f"{measure.name}.md"
     print(f"{command}: {time.monotonic() - began:.0f} s, {path}", flush=True)
-    if left:
-        raise PlaySlotError(
-            f"{command}: {len(left)} of {len(jobs)} {measure.unit} failed ({', '.join(left)}), the others finished; "
-            f"{path} says why, and the same command tries them again"
-        )
+    if not left:
+        return ""
+    return (
+        f"{command}: {len(left)} of {len(jobs)} {measure.unit} failed ({', '.join(left)}), the others finished; "
+        f"{path} says why, and the same command tries them again"
+    )
 
 
-def _tables(page: Document) -> str:
+def tables(page: Document) -> str:
+    """Those of a page, as Markdown, up to its footnotes."""
     text = to_markdown(page).partition(f"## {FOOTNOTES}")[0]
     return "\n".join(line for line in text.splitlines() if line.startswith("|"))
 

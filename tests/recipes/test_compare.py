@@ -241,6 +241,36 @@ def test_from_nothing_data_and_world_model_are_made_once(tmp_path: Path, started
     assert {name: contents(out / name) for name in shared} == shared
 
 
+@pytest.mark.slow
+def test_two_tasks_have_a_folder_each_and_a_table_over_both(tmp_path: Path, started: list[str]) -> None:
+    out, tasks = tmp_path / "out", ("block_push_easy", "metaworld_drawer-open")
+    command = ["compare", "preset=smoke", "envs=block_push_easy,metaworld/drawer-open", "methods=slot_bc,resnet_bc",
+               "demos=3", "labels=2", "compare.reference=slot_bc", f"out={out}", "episodes=2", *ONE_CORE]  # fmt: skip
+    done = playslot(*command)
+    assert (done.code, done.err) == (0, "")
+    assert started == ["slot_bc-d2-l2-s0", "resnet_bc-d2-l2-s0"] * 2
+    prints = {_result(out / task)["world_models"][0]["fingerprints"]["slots"] for task in tasks}
+    assert len(prints) == 2, "a world model each"
+    found = _result(out)["across_tasks"]
+    assert found["tasks"] == list(tasks)
+    for task in tasks:
+        own = [row for row in found["summary"] if row["env"] == task]
+        assert own == [{"env": task, **row} for row in _result(out / task)["summary"]]
+    assert [(row["method"], row["labels"]) for row in found["rows"]] == [("slot_bc", 2), ("resnet_bc", 2)]
+    assert "| interquartile mean | " in done.out.rpartition("compare: ")[0]
+    assert {path.suffix[1:] for path in out.glob("comparison.*")} == {"json", "md", "png", "svg", "lock"}
+
+    # As after a kill in the middle of the second task: what is done stays, the rest is computed.
+    started.clear()
+    (out / tasks[1] / "jobs" / "resnet_bc-d2-l2-s0.status.json").unlink()
+    (out / "comparison.json").unlink()
+    kept = contents(out / tasks[1] / "world_model")
+    assert playslot(*command).code == 0
+    assert started == ["resnet_bc-d2-l2-s0"]
+    assert contents(out / tasks[1] / "world_model") == kept
+    assert _result(out)["across_tasks"] == found
+
+
 def _process(command: list[str]) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "playslot_rl", *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

@@ -27,7 +27,7 @@ from playslot_rl.studies.success.jobs import (
     success_record,
     world_runs,
 )
-from playslot_rl.studies.success.measure import job_rows, task_folders
+from playslot_rl.studies.success.measure import job_rows, task_results
 from playslot_rl.studies.success.page import success_page
 from playslot_rl.studies.success.summary import across_tasks, differences, summarise
 from playslot_rl.visualization.charts import LIGHT
@@ -229,4 +229,4 @@ def test_the_interquartile_mean_is_over_the_policies_of_all_tasks(tmp_path: Path
 def test_a_comparison_of_before_outcomes_is_refused_among_tasks(tmp_path: Path) -> None:
     write_json(tmp_path / "comparison.json", {"rows": [{"name": "old"}]})
     with pytest.raises(ConfigError, match=r"compare\.tasks: got .* without outcomes in comparison\.json, expected"):
-        task_folders(compared(f"compare.tasks={tmp_path}"))
+        task_results(compared(f"compare.tasks={tmp_path}"))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from playslot_rl.config.methods import METHODS
 from playslot_rl.studies.study import Result
 from playslot_rl.studies.success.page import Panel, budgeted, panels
-from playslot_rl.visualization.charts import Theme, legend, new_figure, step_axis, style_axes
+from playslot_rl.visualization.charts import Theme, legend, new_figure, panel_grid, step_axis, style_axes
 
 AXES = {"demos": "demonstrations", "labels": "labelled demonstrations", "videos": "unlabelled videos of demonstrations"}
 
@@ -38,6 +38,18 @@ def success_figure(result: Result, theme: Theme) -> Figure:
         axes = figure.add_subplot(1, count, count)
         _steps(axes, curves, [{**row, "title": budgeted(row, result)} for row in final], theme)
         _finish(axes, result, theme)
+    legend(figure, theme, loc="outside lower center", ncols=3, fontsize=9)
+    return figure
+
+
+def tasks_figure(results: Mapping[str, Result], theme: Theme) -> Figure:
+    """The first panel of the figure of every task that learns from demonstrations."""
+    shown = {task: found[0] for task, result in results.items() if (found := panels(result))}
+    figure, places = panel_grid(max(1, len(shown)), 4.2, 3.2)
+    for axes, (task, panel) in zip(places, shown.items(), strict=False):
+        axes.set_title(task, color=theme.text, fontsize=10)
+        _against(axes, panel, theme)
+        _finish(axes, results[task], theme)
     legend(figure, theme, loc="outside lower center", ncols=3, fontsize=9)
     return figure
 

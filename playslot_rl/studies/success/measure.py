@@ -35,7 +35,8 @@ from playslot_rl.studies.success.jobs import (
     world_runs,
 )
 from playslot_rl.studies.success.page import success_page
-from playslot_rl.studies.success.summary import across_tasks, differences, summarise
+from playslot_rl.studies.success.summary import differences, summarise
+from playslot_rl.studies.success.task_table import joint_table
 
 
 def job_rows(job: SuccessJob, frame_skip: int, status: Status) -> list[dict[str, Any]]:
@@ -163,6 +164,8 @@ class SuccessMeasure:
 
     def result(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         config, own = self.config, self.config.compare
+        summary, reference = summarise(rows), own.reference if own.reference in own.methods else None
+        others, here = task_results(config), {"env": config.env.full_name, "rows": rows, "summary": summary}
         return {
             "methods": list(own.methods),
             "demos": list(own.demos),
@@ -175,10 +178,10 @@ class SuccessMeasure:
             "worlds": own.worlds,
             "max_steps": config.env.max_steps,
             "jobs": len({row["name"] for row in rows}),
-            "summary": summarise(rows),
-            "reference": own.reference if own.reference in own.methods else None,
+            "summary": summary,
+            "reference": reference,
             "differences": differences(rows, own.reference),
-            "across_tasks": self._across_tasks(rows),
+            "across_tasks": joint_table([here, *others], reference) if others else None,
             "references": self._references,
             "rows": rows,
             **self._shared,
@@ -186,13 +189,6 @@ class SuccessMeasure:
             "frame_skip": config.env.frame_skip,
             "threads": config.threads,
         }
-
-    def _across_tasks(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-        others = [json_or_nothing(folder / "comparison.json") for folder in task_folders(self.config)]
-        if not others:
-            return None
-        return {"tasks": [self.config.env.full_name, *(other["env"] for other in others)],
-                "rows": across_tasks([{"rows": rows}, *others])}  # fmt: skip
 
     def sheets(self) -> Mapping[str, bytes]:
         return {}
@@ -207,7 +203,7 @@ def check_success(config: ExperimentConfig) -> None:
     check_task(env, expert=not config.data.demos and uses_demos(config))
     for method in config.compare.methods:
         check_method(config, method)
-    task_folders(config)
+    task_results(config)
     for run in world_runs(config) if uses_slots(config) else ():
         for checkpoint in Run.open(run).world_stages.values() if run else ():
             require_config(checkpoint, {"env": {"image_size": env.image_size, "action_dim": env.action_dim}})
@@ -219,17 +215,17 @@ def check_success(config: ExperimentConfig) -> None:
                 )
 
 
-def task_folders(config: ExperimentConfig) -> list[Path]:
-    """Folders of the comparisons of other tasks; a ConfigError where one is no finished comparison of this version."""
+def task_results(config: ExperimentConfig) -> list[dict[str, Any]]:
+    """Comparisons of other tasks; a ConfigError where a folder holds no finished one of this version."""
     folders = [Path(part.strip()) for part in config.compare.tasks.split(",") if part.strip()]
-    for folder in folders:
-        rows = json_or_nothing(folder / "comparison.json").get("rows") or [{}]
-        if not all("outcomes" in row for row in rows):
+    results = [json_or_nothing(folder / "comparison.json") for folder in folders]
+    for folder, result in zip(folders, results, strict=True):
+        if not all("outcomes" in row for row in result.get("rows") or [{}]):
             raise ConfigError(
                 f"compare.tasks: got {folder} without outcomes in comparison.json, expected a comparison's folder: run "
                 "its command again, which computes nothing that is done"
             )
-    return folders
+    return results
 
 
 def _references(config: ExperimentConfig) -> dict[str, dict[str, Any]]:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from playslot_rl.config.methods import METHODS, stage_title
 from playslot_rl.runtime.progress import format_seconds
 from playslot_rl.studies.study import FOOTNOTES, Result, machine_note, open_jobs_notes, origin_notes
+from playslot_rl.studies.success.task_table import task_sections
 from playslot_rl.visualization.document import Block, Document, Linked, Notes, Section, Table, Text
 
 UNITS = {"demos": "demonstrations", "labels": "labelled", "videos": "videos"}
@@ -39,7 +40,7 @@ def success_page(result: Result) -> Document:
     sections = [
         *(_section(panel, result) for panel in panels(result)),
         *_by_acting(result),
-        *_across_tasks(result),
+        *(task_sections(result["across_tasks"]) if result["across_tasks"] else []),
         *_returns(result),
         Section(FOOTNOTES, [Notes(_footnotes(result))]),
         Section("Every job", [_jobs(result["rows"])]),
@@ -137,17 +138,6 @@ def _points(row: Result) -> str:
     value, low, high = (f"{round(100 * number):+d}" for number in (row["difference"], *row["ci95"]))
     text = f"{value} ({low} to {high})".replace("-", "−").replace("+0", "0")
     return f"**{text}**" if row["leaves_out_0"] else text
-
-
-def _across_tasks(result: Result) -> list[Section]:
-    across = result["across_tasks"]
-    if not across:
-        return []
-    rows = [{**row, "at": row["labels"] or 0} for row in across["rows"]]
-    texts = [f"{100 * row['score']:.0f} ({' to '.join(f'{100 * end:.0f}' for end in row['ci95'])})" for row in rows]
-    table = _table(rows, "labels", texts)
-    caption = f"Interquartile mean in % over the policies of {_list(across['tasks'])}; 0 labels: it has no such number."
-    return [Section("Across tasks", [Table(table.headers, table.rows, caption)])]
 
 
 def _by_acting(result: Result) -> list[Section]:

@@ -126,9 +126,9 @@ def across_tasks(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Interquartile means over the runs of all tasks, of methods and labels that are finished in each of them: `score`,
     `ci95`, `runs`. Where a task has several numbers of demonstrations, the largest counts.
     """
-    tasks = [_largest(result["rows"]) for result in results]
+    tasks = [largest(result["rows"]) for result in results]
     rows = []
-    for key in tasks[0]:
+    for key in tasks[0] if tasks else ():
         if not all(key in task for task in tasks):
             continue
         runs = [task[key] for task in tasks]
@@ -141,7 +141,8 @@ def across_tasks(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
-def _largest(rows: Sequence[Row]) -> dict[tuple[Any, ...], list[Row]]:
+def largest(rows: Sequence[Row]) -> dict[tuple[Any, ...], list[Row]]:
+    """Rows by method, protocol and labels, of the largest number of demonstrations that it has."""
     known, most = cells(rows), dict[tuple[Any, ...], tuple[Any, ...]]()
     for cell in known:
         key = (*cell[:2], cell[3])

@@ -1,0 +1,166 @@
+"""Comparisons of several tasks: what each is, the table over them, and that one that fails stops no other."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from jobs_on_disk import comparison, finish
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.compose import compose, compose_each
+from playslot_rl.errors import ConfigError, PlaySlotError
+from playslot_rl.recipes import compare
+from playslot_rl.storage.atomic import write_json
+from playslot_rl.studies.launch import comparison_lock, read_status
+from playslot_rl.studies.success import tasks
+from playslot_rl.studies.success.jobs import SuccessJob, success_jobs
+from playslot_rl.studies.success.measure import SuccessMeasure, job_rows
+from playslot_rl.studies.success.page import success_page
+from playslot_rl.studies.success.task_table import joint_table
+from playslot_rl.visualization.document import to_markdown
+
+TWO = "envs=metaworld/door-open,block_push_easy"
+
+
+def each(*typed: str) -> list[ExperimentConfig]:
+    return compose_each(["preset=compact", "methods=playslot,slot_bc", "demos=20", "labels=5", *typed], "compare")
+
+
+def test_each_task_has_its_own_settings_and_all_that_was_typed() -> None:
+    door, push = each(TWO, "env.variation.shake=0.5", "episodes=7")
+    assert [config.env.full_name for config in (door, push)] == ["metaworld_door-open", "block_push_easy"]
+    assert (door.env.max_steps, push.env.max_steps) == (25, 25)
+    assert (door.env.frame_skip, push.env.frame_skip) == (5, 2)
+    assert {(config.env.variation.shake, config.episodes) for config in (door, push)} == {(0.5, 7)}
+    alone = compose(["preset=compact", "env=block_push_easy"])
+    assert (push.model, push.behaviour, push.collect) == (alone.model, alone.behaviour, alone.collect)
+    assert [config.compare.labels for config in each("envs=button_press")] == [(5,)]
+
+
+def test_a_gymnasium_id_is_a_task_of_its_own() -> None:
+    (config,) = each("envs=gym/FetchReach-v4")
+    assert (config.env.id, config.env.full_name) == ("FetchReach-v4", "gym_FetchReach-v4")
+
+
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        (
+            ["envs=block_push_easy,metaworld/drawer-opn"],
+            "got 'drawer-opn', .* did you mean drawer-open or drawer-close",
+        ),
+        (["envs=block_push_easy,block_psh"], "unknown env 'block_psh': .* did you mean env=block_push"),
+        (["envs=block_push_easy/red"], r"env\.task: got 'red', expected none with env\.name=block_push_easy"),
+        (["envs=button_press,button_press"], r"envs: got .*, expected each one once"),
+        ([TWO, "env=button_press"], "env: got button_press with envs=, expected none: it is of one task"),
+        ([TWO, "data.demos=data/expert"], r"data\.demos: got data/expert with envs=, expected none"),
+    ],
+)
+def test_what_cannot_be_a_list_of_tasks_is_one_line(typed: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as error:
+        each(*typed)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("names", ["metaworld/push,metaworld/push-v3", "block_push_easy,grid_shapes"])
+def test_what_no_command_can_compare_is_refused_before_anything_is_written(names: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"which are metaworld_push, expected|env=grid_shapes: got an environment"):
+        compare.main(*each(f"envs={names}", f"out={tmp_path / 'out'}"))
+    assert not (tmp_path / "out").exists()
+
+
+def ended(folder: Path, env: str, playslot: tuple[int, int], slot_bc: tuple[int, int]) -> dict[str, Any]:
+    """A comparison of two seeds, 10 episodes each."""
+    folder = folder / env
+    jobs = [finish(SuccessJob("playslot", 20, n, folder, 5), {"simulation": playslot[n]}) for n in (0, 1)]
+    jobs += [finish(SuccessJob("slot_bc", 5, n, folder, 5), {"simulation": slot_bc[n]}) for n in (0, 1)]
+    jobs += [finish(SuccessJob("slot_oracle", 20, 0, folder), {"simulation": 10})] if env == "easy" else []
+    rows = [row for job in jobs for row in job_rows(job, 5, read_status(job.file))]
+    return {**comparison(folder, [row for row in rows if row["protocol"] == "simulation"]), "env": env, "labels": [5]}
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> list[dict[str, Any]]:
+    return [ended(tmp_path, "easy", (10, 8), (5, 3)), ended(tmp_path, "hard", (2, 4), (3, 3))]
+
+
+def test_the_table_over_tasks_has_every_rate_and_the_mean_of_the_middle_half(results: list[dict[str, Any]]) -> None:
+    joint = joint_table(results, "playslot")
+    rates = {(row["env"], row["method"], row["labels"]): row["success_rate"] for row in joint["summary"]}
+    assert rates == {
+        ("easy", "playslot", 5): 0.9, ("easy", "slot_bc", 5): 0.4, ("easy", "slot_oracle", None): 1.0,
+        ("hard", "playslot", 5): pytest.approx(0.3), ("hard", "slot_bc", 5): pytest.approx(0.3),
+    }  # fmt: skip
+    scores = {row["method"]: row["score"] for row in joint["rows"]}
+    assert scores == {
+        "playslot": pytest.approx(0.6),  # the middle two of 20, 40, 80 and 100 %
+        "slot_bc": pytest.approx(0.3),  # of 30, 30, 30 and 50 %
+    }, "the oracle is not finished in both"
+    for row in joint["rows"]:
+        assert row["ci95"][0] < row["score"] < row["ci95"][1]
+    assert joint["ahead"] == [{"labels": 5, "ahead": ["easy"], "behind": ["hard"]}], "equal is not ahead"
+
+
+def test_the_page_of_tasks_shows_them(results: list[dict[str, Any]], tmp_path: Path) -> None:
+    page = to_markdown(success_page({**results[0], "across_tasks": joint_table(results, "playslot")}))
+    table = page.partition("## Over tasks, with 5 labelled demonstrations")[2]
+    assert "| success, % | PlaySlot | Slot BC |" in table
+    assert "| easy | 90 (" in table
+    assert "| interquartile mean | 60 (" in table
+    assert "PlaySlot is ahead of all methods on the labels alone in 1 of 2 tasks; not in hard." in table
+    assert "| hard | – |" in page.partition("## Over tasks\n")[2], "the oracle was not measured there"
+
+
+def test_jobs_of_each_task_lie_in_its_folder(tmp_path: Path) -> None:
+    measures = tasks._measures(each(TWO, "seeds=0"), tmp_path)
+    files = [
+        job.file for measure in measures.values() for job in success_jobs(measure.config, Path(measure.config.out))
+    ]
+    names = ["slot_bc-d5-l5-s0.json", "playslot-d20-l5-s0.json"]
+    assert files == [
+        tmp_path / task / "jobs" / name for task in ("metaworld_door-open", "block_push_easy") for name in names
+    ]
+
+
+def test_a_task_that_fails_stops_no_other_and_the_table_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, turns = tmp_path / "out", list[str]()
+    broken = {"metaworld_door-open"}
+
+    def stub(measure: SuccessMeasure) -> str:
+        env = measure.config.env.full_name
+        turns.append(env)
+        if env in broken:
+            raise ConfigError("no such world model")
+        write_json(out / env / "comparison.json", ended(out, env, (10, 8), (5, 3)))
+        return ""
+
+    monkeypatch.setattr(tasks, "compute_study", stub)
+    command = each(TWO, f"out={out}")
+    with pytest.raises(
+        PlaySlotError, match=r"^compare: 1 of 2 tasks failed \(metaworld_door-open\), the others finished"
+    ):
+        compare.main(*command)
+    assert turns == ["metaworld_door-open", "block_push_easy"]
+    found = json.loads((out / "comparison.json").read_text())
+    assert (found["across_tasks"]["tasks"], found["errors"]) == (["block_push_easy"], {turns[0]: "no such world model"})
+    assert "**metaworld_door-open: no such world model**" in (out / "comparison.md").read_text()
+    broken.clear()
+    compare.main(*command)
+    found = json.loads((out / "comparison.json").read_text())
+    assert (found["across_tasks"]["tasks"], found["errors"]) == (turns[:2], {})
+    assert {path.name for path in out.glob("comparison.*")} == {
+        f"comparison.{e}" for e in ("json", "lock", "md", "png", "svg")
+    }
+    with comparison_lock(out), pytest.raises(PlaySlotError, match="that another comparison works on"):
+        compare.main(*command)
+
+
+def test_the_folder_of_one_tasks_comparison_is_none_for_several(tmp_path: Path) -> None:
+    (tmp_path / "jobs").mkdir()
+    with pytest.raises(PlaySlotError, match="got the comparison of one task, expected none, or one of envs="):
+        compare.main(*each(TWO, f"out={tmp_path}"))
