@@ -70,7 +70,7 @@ def _command_parser(name: str) -> argparse.ArgumentParser:
 
     command = COMMANDS[name]
     examples = "\n".join(f"  {example}" for example in command.examples)
-    flag = " [--json FILE]" if name == "bench" else ""
+    flag = {"bench": " [--json FILE]", "models": " [--json]"}.get(name, "")
     parser = _Parser(
         prog=f"playslot {name}",
         usage=f"playslot {name} [key=value ...]{flag}",
@@ -81,6 +81,8 @@ def _command_parser(name: str) -> argparse.ArgumentParser:
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="changes one value of the config")
     if name == "bench":
         parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures to FILE")
+    if name == "models":
+        parser.add_argument("--json", action="store_true", help="print a list of objects")
     return parser
 
 
@@ -139,6 +141,11 @@ def _run(name: str, options: argparse.Namespace) -> int:
         from playslot_rl.recipes import doctor
 
         return doctor.main(config)
+    if name == "models":
+        from playslot_rl.recipes import models
+
+        models.main(config, as_json=options.json)
+        return 0
     from playslot_rl.config.weights import data_roots, is_remote
     from playslot_rl.envs.rendering import import_mujoco
     from playslot_rl.runtime import processes

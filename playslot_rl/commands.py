@@ -225,6 +225,12 @@ COMMANDS: Final[dict[str, Command]] = {
         ("playslot bench", "playslot bench --json bench.json", "playslot bench device=cuda --json gpu.json"),
         "preset device threads",
     ),
+    "models": Command(
+        "the models that ship: task, data, steps, time, PSNR, FG-ARI, success, licence",
+        "Lists the models that ship, or the one that run= names, with their numbers and how they were made.",
+        ("playslot models", "playslot models run=pretrained/block_push", "playslot models --json"),
+        "run",
+    ),
     "doctor": Command(
         "what works on this machine, and the cure for what does not",
         "Checks Python, torch and device, the GL backend by rendering a frame, PyAV and FFmpeg, disk, cores and cache "

@@ -35,6 +35,7 @@ COMMANDS = [
     "compare-video",
     "demo",
     "bench",
+    "models",
     "doctor",
 ]
 KEYS = {
@@ -55,6 +56,7 @@ KEYS = {
     "compare-video": "run= seed= methods= seeds= vary= values= objects= hydra.launcher= compare_video. metrics.",
     "demo": "episodes= seed= out= collect. behaviour.",
     "bench": "preset= device= threads=",
+    "models": "run=",
     "doctor": "device= out= data.cache=",
 }
 """Keys and groups of which the help of each command has a line."""

@@ -15,9 +15,12 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any, Final
 
+from playslot_rl.sharing.models import shipped_table
+
 ROOT: Final = Path(__file__).resolve().parents[2]
 MARKED: Final = re.compile(r"<!-- results:([\w/]+) -->\n.*?<!-- /results -->", re.DOTALL)
 MADE: Final = "made"
+SHIPPED: Final = ROOT / "playslot_rl" / "pretrained"
 
 Table = dict[str, Any]
 """`columns`, `rows` and `made`; sometimes `views`."""
@@ -26,9 +29,11 @@ Table = dict[str, Any]
 def load_tables(folder: Path) -> dict[str, Table]:
     """All tables of all files, by name. Numbers keep the digits that the file gives them."""
     tables: dict[str, Table] = {}
-    for path in sorted(folder.glob("*.json")):
+    for path in sorted([*folder.glob("*.json"), *(SHIPPED.glob("*.json") if folder == ROOT / "results" else ())]):
         read = json.loads(path.read_text(), parse_float=Decimal, parse_int=Decimal)
         for name, table in read["tables"].items():
+            if name == "shipped_models":
+                table = _decimal(shipped_table())
             if name in tables:
                 raise ValueError(f"{path.name}: got a second table {name!r}")
             for row in table["rows"]:
@@ -65,6 +70,11 @@ def markdown(table: Table) -> str:
     columns = table["columns"]
     lines = [[column["title"] for column in columns], ["---"] * len(columns)]
     lines += [[cell(value, column) for value, column in zip(row, columns, strict=True)] for row in table["rows"]]
+    if table.get("transposed"):
+        head, mark, *rows = lines
+        first, *others = zip(head, *rows, strict=True)
+        shown = (line for line, column in zip(others, columns[1:], strict=True) if not column.get("hidden"))
+        lines = [list(first), mark[:1] * len(first), *map(list, shown)]
     return "\n".join(_line(line) for line in lines)
 
 
@@ -133,6 +143,11 @@ def main() -> None:
         if after != before:
             page.write_text(after)
             print(page.relative_to(ROOT))
+
+
+def _decimal(table: Table) -> Table:
+    read: Table = json.loads(json.dumps(table), parse_float=Decimal, parse_int=Decimal)
+    return read
 
 
 def _usual(values: list[str | None]) -> str | None:

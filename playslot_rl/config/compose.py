@@ -252,7 +252,7 @@ def _assignments(pairs: Mapping[str, str]) -> list[str]:
 def _presets(groups: tuple[str, ...]) -> dict[str, Any]:
     """What the YAML files of the chosen groups say; a plain nested dict, not to be changed. A fifth of a second.
 
-    A preset with `of` and `times` is that preset, for this task, with numbers multiplied.
+    A preset with `of` and `times` is that preset, for this task, with numbers multiplied, and others set (`sets`).
     """
     from hydra import compose as hydra_compose
     from hydra import initialize_config_module
@@ -267,7 +267,8 @@ def _presets(groups: tuple[str, ...]) -> dict[str, Any]:
     values = cast("dict[str, Any]", composed)
     if "times" in values:
         base = _presets(tuple(f"{group}={name}" for group, name in {**chosen, "preset": values["of"]}.items()))
-        return _multiplied(_merge(to_dict(ExperimentConfig()), base), values["times"]) | {"preset": values["preset"]}
+        grown = _multiplied(_merge(to_dict(ExperimentConfig()), base), values["times"])
+        return _merge(grown, values.get("sets", {})) | {"preset": values["preset"]}
     return values if task is None else _merge(values, {"env": to_dict(task.env), "model": dict(task.model)})
 
 
@@ -280,17 +281,18 @@ def _with_task(values: dict[str, Any], typed: Mapping[str, Any]) -> dict[str, An
 
 
 def _multiplied(values: Mapping[str, Any], factors: Mapping[str, Any]) -> dict[str, Any]:
-    """Values times factors of the same nesting; integers are rounded, and none that was above 0 falls to it."""
-    found = dict(values)
-    for key, factor in factors.items():
-        value = values[key]
-        if isinstance(factor, Mapping):
-            found[key] = _multiplied(value, factor)
-        elif isinstance(value, int):
-            found[key] = max(min(value, 1), round(value * factor))
-        else:
-            found[key] = value * factor
-    return found
+    """Values times factors of the same nesting, lists number by number; integers are rounded, and none that was above 0
+    falls to it.
+    """
+
+    def times(value: Any, factor: Any) -> Any:
+        if isinstance(value, Mapping):
+            return _multiplied(value, factor)
+        if isinstance(value, list | tuple):
+            return [times(one, factor) for one in value]
+        return max(min(value, 1), round(value * factor)) if isinstance(value, int) else value * factor
+
+    return {**values, **{key: times(values[key], factor) for key, factor in factors.items()}}
 
 
 def _typed(pairs: Mapping[str, str]) -> dict[str, Any]:

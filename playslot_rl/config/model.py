@@ -11,11 +11,13 @@ from playslot_rl.config.roles import (
     LAYERS,
     NOT_NEGATIVE,
     OPEN_FRACTION,
+    UNSAID,
     Checked,
     at_least,
     below_one,
     between,
     was,
+    within,
 )
 
 LatentMode = Literal["hybrid", "discrete", "continuous", "ground_truth", "none"]
@@ -37,6 +39,7 @@ class SAViConfig(Checked):
         decoder_channels: channels of the decoder.
         decoder_position: `linear` (a linear map of the coordinates; paper) or, for `pixel_shuffle`, `learned` (a free
             8x8 map is added, so that a still background does not have to be made out of ramps).
+        decoder_start: side of the map from which `pixel_shuffle` goes upwards, 8 or 16.
         collapse: use the collapsed first layer of the broadcast decoder (exact; `false` computes it plainly).
         first_iterations: Slot Attention iterations on an episode's first frame.
         iterations: iterations on every later frame.
@@ -58,6 +61,9 @@ class SAViConfig(Checked):
     decoder: Literal["broadcast", "pixel_shuffle"] = "broadcast"
     decoder_channels: tuple[int, ...] = field(default=(64, 64, 64, 64), metadata=COUNT)
     decoder_position: Literal["linear", "learned"] = "linear"
+    decoder_start: int = field(
+        default=8, metadata=was(8) | UNSAID | within(lambda value: value in (8, 16), "8 or 16", 8, 16)
+    )
     collapse: bool = True
     first_iterations: int = field(default=3, metadata=LAYERS)
     iterations: int = field(default=1, metadata=LAYERS)
@@ -79,6 +85,8 @@ class SAViConfig(Checked):
         position = self.decoder_position == "linear" or self.decoder == "pixel_shuffle"
         linear = f"linear with model.savi.decoder={self.decoder}"
         check(position, "model.savi.decoder_position", self.decoder_position, linear)
+        upwards = self.decoder_start == 8 or self.decoder == "pixel_shuffle"
+        check(upwards, "model.savi.decoder_start", self.decoder_start, f"8 with model.savi.decoder={self.decoder}")
         divides = self.slot_dim % heads == 0
         check(divides, "model.savi.transition_heads", heads, f"a divisor of slot_dim {self.slot_dim}")
 

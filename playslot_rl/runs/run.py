@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from playslot_rl.config import DataConfig, EnvConfig, ExperimentConfig, ModelConfig, from_dict, to_dict
 from playslot_rl.config.compose import PRETRAINED, near_run, stored_config
+from playslot_rl.config.plain import nearest
 from playslot_rl.data.contents import with_full_cameras
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import read_json, write_bytes, write_json
@@ -42,8 +43,8 @@ def pretrained_folder(env: str = "button_press") -> Path:
     names = sorted(path.parents[2].name for path in root.glob("*/dynamics/checkpoint/meta.json"))
     if env not in names:
         raise CheckpointError(
-            f"no pretrained world model for env={env}, expected one of: {', '.join(names) or 'none'}; "
-            "train one by `playslot pipeline`"
+            f"no pretrained world model for env={env}, expected one of: {', '.join(names) or 'none'}"
+            f"{nearest(env, names, f'{PRETRAINED}/') or '; train one by `playslot pipeline`'}"
         )
     return root / env
 

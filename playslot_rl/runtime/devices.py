@@ -51,6 +51,13 @@ def processor() -> str:
     return ", ".join([*kinds, torch.cuda.get_device_name()] if torch.cuda.is_available() else kinds)
 
 
+def device_name(device: torch.device) -> str:
+    """What computes there: a GPU's name, or the processor's."""
+    import torch
+
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else processor().partition(", ")[0]
+
+
 def to_device(values: Tensor, device: torch.device) -> Tensor:
     """The values on a device; the host does not wait for the copy to a GPU."""
     if device.type == "cuda" and values.device.type == "cpu":

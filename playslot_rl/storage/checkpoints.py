@@ -206,8 +206,9 @@ def require_config(checkpoint: StageCheckpoint, wanted: Mapping[str, Any], typed
     CheckpointError names the first key that differs, as `typed` (see `first_difference`).
     """
     stored, keys = flatten(checkpoint.config), set(flatten(wanted))
-    if "env.name" in keys:  # the whole task, also what is not said of it
-        keys |= {key for key in stored if key.startswith("env.")}
+    for group, key in (("env.", "env.name"), ("model.savi.", "model.savi.n_slots")):
+        if key in keys:  # the whole task or SAVi, also what is not said of it
+            keys |= {name for name in stored if name.startswith(group)}
     difference = first_difference({key: stored[key] for key in stored.keys() & keys}, wanted, typed)
     if difference is not None:
         key, old, new = difference

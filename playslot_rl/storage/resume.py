@@ -23,6 +23,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import earlier
 from playslot_rl.errors import CheckpointError, OutputError
+from playslot_rl.runtime.devices import device_name
 from playslot_rl.storage.atomic import read_json, write_json
 from playslot_rl.storage.folders import new_folder, remove_leftovers
 from playslot_rl.storage.tensors import load_into, load_modules, load_tensors, module_tensors, save_tensors
@@ -76,11 +77,16 @@ def first_difference(
 class TrainingCheckpoints:
     """The `checkpoints` folder of a stage, whose `identity`, nested plain values, must be equal for a resumed run to be
     the same run. Saving on a full disk raises an OutputError; the earlier checkpoints stay.
+
+    Attributes:
+        sittings: what each process before this one added: `steps`, `seconds` and the `device`. Steps that were lost
+            with a kill count nowhere.
     """
 
     def __init__(self, folder: Path, identity: Mapping[str, Any], typed: Callable[[str], str] = str) -> None:
         self.folder, self.typed = folder, typed
         self.identity: dict[str, Any] = json.loads(json.dumps(identity))
+        self.sittings: list[dict[str, Any]] = []
 
     def saved(self) -> list[Path]:
         """Checkpoint folders, oldest first."""
@@ -134,7 +140,14 @@ class TrainingCheckpoints:
         with new_folder(final, replace=True) as temporary:
             for name, tensors in files.items():
                 save_tensors(temporary / f"{name}.safetensors", tensors)
-            write_json(temporary / "state.json", {"format": FORMAT, **state, "identity": self.identity})
+            device = next((value.device for value in files["modules"].values()), torch.device("cpu"))
+            own = {
+                "steps": step - sum(sitting["steps"] for sitting in self.sittings),
+                "seconds": state["seconds"] - sum(sitting["seconds"] for sitting in self.sittings),
+                "device": device_name(device),
+            }
+            kept = {"identity": self.identity, "sittings": [*self.sittings, own]}
+            write_json(temporary / "state.json", {"format": FORMAT, **state, **kept})
         for old in self.saved()[:-KEPT]:
             shutil.rmtree(old)
         return final
@@ -165,7 +178,18 @@ class TrainingCheckpoints:
                 f"{key}: got {new}, expected {old}, with which {self.folder.parent} was begun: "
                 f"set {key} back, use another out=, or delete that folder"
             )
+        before = {"steps": stored["step"], "seconds": stored["seconds"], "device": ""}  # of a time that kept none
+        self.sittings = stored.get("sittings", [before])
         return last, stored
+
+
+def sittings_of(checkpoints: Path, training: str) -> list[dict[str, Any]]:
+    """What each process added to a training (`steps`, `seconds`, `device`), as its newest checkpoint says; empty where
+    there is none. `training` is put before them.
+    """
+    newest = max(checkpoints.glob("step_*/state.json"), default=None)
+    found = [] if newest is None else read_json(newest).get("sittings", [])
+    return [{"training": training, **sitting} for sitting in found]
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer, names: Sequence[str] = ()) -> dict[str, Tensor]:

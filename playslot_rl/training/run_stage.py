@@ -13,6 +13,7 @@ from playslot_rl.data.demonstrations import transitions
 from playslot_rl.modules.action_range import range_of
 from playslot_rl.runtime.processes import here, wait
 from playslot_rl.storage.checkpoints import StageCheckpoint
+from playslot_rl.storage.resume import sittings_of
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.record import StageRecord
 
@@ -84,6 +85,7 @@ def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -
     modules: dict[str, nn.Module] = {}
     metrics: dict[str, float] = {}
     steps, seconds, clocked = 0, 0.0, False
+    sittings: list[dict[str, Any]] = []
     limits = record.limits
     if limits is not None and here().first:
         shown = record.data.require_actions()[transitions(record.data).rows]
@@ -107,6 +109,8 @@ def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -
         modules |= part.stage.modules
         steps, seconds = steps or state.step, seconds + state.seconds
         clocked = clocked or state.planned not in (0, part.config.steps)
-    done = record.save(modules, metrics, steps, seconds, {**training.extra, **({"clocked": True} if clocked else {})})
+        sittings += sittings_of(record.folder / part.folder / "checkpoints", part.name)
+    extra = {**training.extra, "sittings": sittings, **({"clocked": True} if clocked else {})}
+    done = record.save(modules, metrics, steps, seconds, extra)
     print(training.line(metrics), flush=True)
     return done

@@ -214,7 +214,7 @@ def test_a_comparison_on_other_machines_is_left_to_them() -> None:
         compose(["hydra.launcher=joblib", *slurm[1:2]], "compare")
 
 
-@pytest.mark.parametrize("preset", ["smoke", "compact", "paper"])
+@pytest.mark.parametrize("preset", ["smoke", "compact", "gpu", "paper"])
 def test_shipped_presets_and_stored_runs_are_never_refused_for_memory(
     preset: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

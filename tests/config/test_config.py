@@ -19,13 +19,16 @@ from playslot_rl.config import (
     from_dict,
     to_dict,
 )
+from playslot_rl.config.baselines import baselines_of
 from playslot_rl.config.compose import choices, compose
 from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import UNSAID, Checked, keys_of, naming, without
 from playslot_rl.errors import ConfigError
 from playslot_rl.methods.dreamer.method import DreamerConfig
 
-PRESETS = ["compact", "compact_gpu", "paper", "smoke"]
+AS_COMPACT = ("resnet_oracle", "caddy_policy", "caddy_oracle")
+"""Trained on labels, or on the latents of a model: at `gpu` as at `compact`."""
+PRESETS = ["compact", "compact_gpu", "gpu", "paper", "smoke"]
 ENVS = [
     "block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "dmc_ball_in_cup_catch",
     "dmc_cartpole_balance", "grid_shapes", "gym", "metaworld", "sketchy", "video",
@@ -81,6 +84,25 @@ def test_the_preset_for_a_gpu_sees_as_many_clips_in_larger_batches(env: str) -> 
     assert (large.behaviour, large.model, large.baselines) == (small.behaviour, small.model, small.baselines)
     typed = compose([f"env={env}", "preset=compact_gpu", "slots.steps=7", "dynamics.optim.lr=3"])
     assert (typed.slots.steps, typed.dynamics.optim.lr, typed.slots.batch_size) == (7, 3, 64)
+
+
+@pytest.mark.parametrize("env", ENVS)
+def test_the_preset_of_an_hour_is_compact_of_the_task_made_wider_and_trained_longer(env: str) -> None:
+    typed = [f"env={env}", *(["env.task=bin-picking"] if env == "metaworld" else [])]
+    small, large = (compose([*typed, f"preset={preset}"]) for preset in ("compact", "gpu"))
+    assert large.env == small.env
+    assert large.behaviour == small.behaviour  # what a task was found to want
+    assert large.dynamics.predicted_frames == small.dynamics.predicted_frames
+    for key in ("n_slots", "decoder_position", "transition_start", "initial"):
+        assert getattr(large.model.savi, key) == getattr(small.model.savi, key)
+    assert large.model.predictor.context == small.model.predictor.context
+    assert large.model.savi.slot_dim == 2 * small.model.savi.slot_dim
+    assert large.slots.steps * large.slots.batch_size >= 10 * small.slots.steps * small.slots.batch_size
+    assert large.slots.start_from == ""  # what ships has other sizes
+    assert bool(large.slots.zoom_steps) == bool(small.slots.start_from)
+    assert large.data.drawn == (env == "grid_shapes")
+    for name, rival in baselines_of(large).items():
+        assert dataclasses.asdict(rival) != dataclasses.asdict(getattr(small.baselines, name)) or name in AS_COMPACT
 
 
 def test_a_run_from_before_compiling_was_left_open_keeps_what_it_says(tmp_path: Path) -> None:
@@ -148,7 +170,7 @@ def test_a_folder_in_the_home_folder_may_be_written_with_a_tilde(monkeypatch: py
     [
         (
             "preset=smol",
-            "unknown preset 'smol': expected one of compact, compact_gpu, paper, smoke; did you mean preset=smoke",
+            "unknown preset 'smol': expected one of compact, compact_gpu, gpu, paper, smoke; did you mean preset=smoke",
         ),
         ("env=kitchen", "unknown env 'kitchen': expected one of .*button_press"),
         ("env.name=kitchen", "unknown env 'kitchen'"),

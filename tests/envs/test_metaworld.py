@@ -118,7 +118,7 @@ def test_a_wrong_task_is_one_line(arguments: tuple[str, ...], message: str) -> N
 
 
 def test_a_task_brings_the_length_of_its_episodes() -> None:
-    for preset in ("compact", "compact_gpu", "paper"):
+    for preset in ("compact", "compact_gpu", "gpu", "paper"):
         config = compose(["env=metaworld", "env.task=bin-picking-v3", f"preset={preset}"])
         steps = TASKS["bin-picking"].steps
         assert config.env == task_config("metaworld/bin-picking")

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 TIMES = re.compile(r"(^|_)(seconds|began|started|ended|time|used|pulled|created|rate_fps|steps_per_second)(_|$)")
 """Keys of JSON files whose values are times."""
-OF_THE_DAY = ("command", "commit", "machine")
+OF_THE_DAY = ("command", "commit", "machine", "sittings")
 SPENT = re.compile(r"\b\d+(\.\d+)? ?(s|ms|min|h|seconds|minutes)\b")
 PASSING = (".lock", ".log")
 """Names of a fingerprint's cache are made of times, too."""

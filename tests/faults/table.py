@@ -147,6 +147,7 @@ TABLE: Final[dict[str, Row]] = {
 NOT_HERE: Final[dict[str, str]] = {
     "play": "recordings are made by a hand on a page: tests/play/test_recording.py",
     "bench": "one file, written at once, of numbers that no two runs share: tests/speed/test_bench.py",
+    "models": "writes nothing",
     "doctor": "writes nothing that stays",
     "dataset info": "writes nothing",
     "dataset verify": "writes nothing",

@@ -161,6 +161,10 @@ def test_a_killed_stage_ends_with_the_weights_of_one_that_was_not(
         train(CASES[name], out, world, f"{CASES[name].rate}=0.5")
     train(CASES[name], out, world)
     assert Run(out).own(name).fingerprint == Run(whole).own(name).fingerprint
+    meta = Run(out).own(name).meta
+    own = [one for one in meta["sittings"] if one["training"] == meta["sittings"][0]["training"]]
+    assert sum(one["steps"] for one in own) == meta["steps"]
+    assert sum(one["seconds"] for one in meta["sittings"]) == pytest.approx(meta["seconds"], abs=0.06)
 
 
 @pytest.mark.parametrize("name", LEARNED)

@@ -80,7 +80,7 @@ def test_videos_are_seen_where_a_model_of_them_is_built_on(name: str) -> None:
 DECODES = [name for name in TABLE if METHODS[name].decodes and hasattr(METHODS[name].config, "decoder_steps")]
 
 
-@pytest.mark.parametrize("preset", ["compact", "paper"])
+@pytest.mark.parametrize("preset", ["compact", "gpu", "paper"])
 @pytest.mark.parametrize("env", ["button_press", "block_push_easy", "block_push", "block_reach", "block_pick"])
 def test_policy_and_decoder_see_as_many_samples_as_playslots(env: str, preset: str) -> None:
     config = compose([f"env={env}", f"preset={preset}"])

@@ -75,6 +75,24 @@ def test_the_memory_format_changes_no_value() -> None:
         torch.testing.assert_close(got, expected)
 
 
+@pytest.mark.parametrize("size", [32, 64])
+def test_a_later_start_has_as_many_convolutions_and_a_finer_map(size: int) -> None:
+    torch.manual_seed(0)
+    widths = (8, 12, 6)[: 2 if size == 32 else 3]
+    early, late = (PixelShuffleDecoder(size, 16, widths, True, start) for start in (8, 16))
+    assert len(late.convs) == len(early.convs) == len(widths)
+    assert late.position_map is not None
+    assert late.position_map.shape == (1, 8, 16, 16)
+    slots = torch.randn(3, 16)
+    assert late(slots).shape == early(slots).shape == (3, 4, size, size)
+    with torch.no_grad():
+        before = late(slots)
+        late.position_map[..., 15, 15] += 1.0
+        changed = (late(slots) - before).abs().amax(dim=(0, 1)) > 0
+    assert changed[-1, -1]
+    assert not changed[: size // 2].any()
+
+
 def configs() -> dict[str, SAViConfig]:
     shared = {"n_slots": 3, "slot_dim": 16, "encoder_channels": (8, 8), "token_dim": 16, "corrector_mlp": 16}
     rest = {"transition_heads": 2, "transition_mlp": 16}

@@ -98,6 +98,11 @@ def test_a_killed_stage_ends_with_the_weights_of_one_that_was_not(
     assert not [name for name in contents(killed) if ".tmp-" in name]
     meta = [json.loads((run / stage / "checkpoint" / "meta.json").read_text()) for run in (whole, killed)]
     assert meta[0]["metrics"] == meta[1]["metrics"]
+    counted = [[(one["training"], one["steps"]) for one in found["sittings"]] for found in meta]
+    assert len(counted[1]) == len(counted[0]) + 1  # the killed process, and the one that went on
+    for found, own in zip(meta, counted, strict=True):
+        assert sum(steps for training, steps in own if training == own[0][0]) == found["steps"]
+        assert sum(one["seconds"] for one in found["sittings"]) == pytest.approx(found["seconds"], abs=0.1)
 
 
 def test_an_interrupt_is_one_line_and_the_same_command_carries_on(

@@ -243,6 +243,14 @@ def test_a_task_that_is_compared_whole_is_compared_in_what_is_unsaid(run: Path) 
         require_config(varied, {"env": env})
 
 
+def test_a_savi_is_compared_in_what_is_unsaid(run: Path) -> None:
+    path, model = checkpoint_folder(run, "slots"), to_dict(tiny_config())["model"]
+    assert "decoder_start" not in model["savi"]
+    edit(path / "config.json", model={**model, "savi": {**model["savi"], "decoder_start": 16}})
+    with pytest.raises(CheckpointError, match=r"^model\.savi\.decoder_start: got nothing, expected 16"):
+        require_config(read_stage(path, "slots"), {"model": {"savi": model["savi"]}})
+
+
 def test_a_world_model_from_before_predictors_had_a_kind_is_cocvps() -> None:
     wanted = {"model": {"predictor": to_dict(tiny_config())["model"]["predictor"]}}
     old = {"model": {"predictor": {key: v for key, v in wanted["model"]["predictor"].items() if key != "kind"}}}

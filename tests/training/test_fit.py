@@ -23,8 +23,10 @@ import playslot_rl.storage.resume as resume_module
 from playslot_rl.config import LoggingConfig, Precision
 from playslot_rl.errors import CheckpointError, ConfigError, OutputError, TrainingError
 from playslot_rl.runtime import precision as precision_module
+from playslot_rl.runtime.devices import device_name
 from playslot_rl.runtime.precision import resolve_precision
 from playslot_rl.storage.atomic import lock
+from playslot_rl.storage.resume import sittings_of
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.logging import History
@@ -99,6 +101,39 @@ def test_a_run_killed_by_the_system_ends_with_the_same_weights(tmp_path: Path) -
     assert train(tmp_path / "killed")[2] >= 3
     train(tmp_path / "whole")
     assert_equal(tensors(tmp_path / "killed", 12), tensors(tmp_path / "whole", 12))
+
+
+def test_what_each_process_added_is_kept_and_adds_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for step in (4, 8):
+        with monkeypatch.context() as patch:
+            stop_at(patch, step, KeyboardInterrupt())
+            with pytest.raises(KeyboardInterrupt):
+                train(tmp_path)
+    _, state, _ = train(tmp_path)
+    found = sittings_of(tmp_path / "checkpoints", "toy")
+    assert [sitting["steps"] for sitting in found] == [3, 3, 6]  # a checkpoint every 3 steps
+    assert sum(sitting["seconds"] for sitting in found) == pytest.approx(state.seconds)
+    assert all(sitting["seconds"] > 0 for sitting in found)
+    assert {(sitting["training"], sitting["device"]) for sitting in found} == {
+        ("toy", device_name(torch.device("cpu")))
+    }
+    train(tmp_path)  # which has nothing left to do
+    assert sittings_of(tmp_path / "checkpoints", "toy") == found
+
+
+def test_a_training_from_before_sittings_were_kept_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        stop_at(patch, 8, KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            train(tmp_path)
+    path = tmp_path / "checkpoints" / "step_00000006" / "state.json"
+    stored = json.loads(path.read_text())
+    del stored["sittings"]
+    path.write_text(json.dumps(stored))
+    train(tmp_path)
+    first, second = sittings_of(tmp_path / "checkpoints", "toy")
+    assert (first["steps"], first["seconds"], first["device"]) == (6, stored["seconds"], "")
+    assert second["steps"] == 6
 
 
 def test_what_a_kill_left_half_written_is_removed(tmp_path: Path) -> None:

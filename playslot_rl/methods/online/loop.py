@@ -33,6 +33,7 @@ from playslot_rl.seeds.draws import StepGenerators, global_seed, step_generator
 from playslot_rl.seeds.episodes import episode_seed
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.checkpoints import StageCheckpoint
+from playslot_rl.storage.resume import sittings_of
 from playslot_rl.training.logging import Watch
 from playslot_rl.training.record import StageRecord
 
@@ -269,6 +270,7 @@ class OnlineTraining:
             "savi_steps": self.prior,
             "episodes": state.episodes,
             "random_policy": state.random,
+            "sittings": sittings_of(record.folder / "checkpoints", record.name),
             "parameters": sum(p.numel() for module in self.modules.values() for p in module.parameters()),
         }
         done = record.save(self.modules, state.metrics, state.updates, state.seconds, extra)

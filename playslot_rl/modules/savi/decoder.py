@@ -7,7 +7,8 @@ The first conv is linear, so conv(broadcast(s) + P) = conv0(broadcast(s)) + conv
 only 5 x 5 values a channel (two border rows, the inside, two border rows, and so for columns): the kernel summed over
 its part inside the image, applied to the slot. That is exact and removes most of the first layer's arithmetic.
 
-Pixel shuffle (compact): broadcast to 8x8, then a 3x3 conv and pixel shuffle for each doubling.
+Pixel shuffle (compact): broadcast to 8x8, then a 3x3 conv and pixel shuffle for each doubling; or to 16x16, and the
+first conv goes without.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from torch import Tensor, nn
 from playslot_rl.modules.savi.encoder import SoftPositionEmbedding
 
 BASE = 8
-"""Side of the map that the pixel-shuffle decoder starts from."""
+"""Side of the smallest map that the pixel-shuffle decoder starts from."""
 
 
 class BroadcastDecoder(nn.Module):
@@ -79,17 +80,23 @@ class BroadcastDecoder(nn.Module):
 
 
 class PixelShuffleDecoder(nn.Module):
-    """Decoder from an 8x8 broadcast by 3x3 convs and pixel shuffles.
+    """Decoder from a broadcast to a small map, by 3x3 convs and pixel shuffles.
 
     Args:
         image_size: side of the frames, 8 times a power of two.
         slot_dim: D.
         channels: channels at 8x8, 16x16, ... : one for each doubling.
         learned_position: add a free map to the linear position embedding; it starts at zero.
+        start: side of the map, 8 times a power of two; the doublings up to it are left out, their convs are not.
     """
 
     def __init__(
-        self, image_size: int, slot_dim: int, channels: tuple[int, ...], learned_position: bool = False
+        self,
+        image_size: int,
+        slot_dim: int,
+        channels: tuple[int, ...],
+        learned_position: bool = False,
+        start: int = BASE,
     ) -> None:
         super().__init__()
         doublings = int(math.log2(image_size // BASE))
@@ -99,10 +106,13 @@ class PixelShuffleDecoder(nn.Module):
                 f"{image_size} frames; give one for each doubling from {BASE}x{BASE}"
             )
         self.project = nn.Linear(slot_dim, channels[0])
-        self.position = SoftPositionEmbedding(BASE, channels[0])
-        self.position_map = nn.Parameter(torch.zeros(1, channels[0], BASE, BASE)) if learned_position else None
-        outs = (*channels[1:], 4)
-        self.convs = nn.ModuleList(nn.Conv2d(a, 4 * b, 3, padding=1) for a, b in zip(channels, outs, strict=True))
+        self.plain = int(math.log2(start // BASE))
+        self.position = SoftPositionEmbedding(start, channels[0])
+        self.position_map = nn.Parameter(torch.zeros(1, channels[0], start, start)) if learned_position else None
+        widths = zip(channels, (*channels[1:], 4), strict=True)
+        self.convs = nn.ModuleList(
+            nn.Conv2d(a, b if i < self.plain else 4 * b, 3, padding=1) for i, (a, b) in enumerate(widths)
+        )
 
     def forward(self, slots: Tensor) -> Tensor:
         """Slots (M, D) to RGB and mask logit (M, 4, H, W)."""
@@ -110,7 +120,7 @@ class PixelShuffleDecoder(nn.Module):
         x = F.relu(self.project(slots)[:, :, None, None] + position)
         x = x.contiguous(memory_format=torch.channels_last)
         for i, conv in enumerate(self.convs):
-            x = _doubled(conv, x, activate=i < len(self.convs) - 1)
+            x = F.relu(conv(x)) if i < self.plain else _doubled(conv, x, activate=i < len(self.convs) - 1)
         return x
 
 

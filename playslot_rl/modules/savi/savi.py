@@ -60,7 +60,9 @@ class SAVi(nn.Module):
         self.decoder: nn.Module = (
             BroadcastDecoder(image_size, c.slot_dim, c.decoder_channels, c.collapse)
             if c.decoder == "broadcast"
-            else PixelShuffleDecoder(image_size, c.slot_dim, c.decoder_channels, c.decoder_position == "learned")
+            else PixelShuffleDecoder(
+                image_size, c.slot_dim, c.decoder_channels, c.decoder_position == "learned", c.decoder_start
+            )
         )
         self.apply(_initialise)
         if c.transition_start == "identity":

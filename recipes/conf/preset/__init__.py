@@ -1,1 +1,1 @@
-"""The `preset` group: `smoke` (tests), `compact` (two CPU cores), `compact_gpu` (for a GPU), `paper` (one GPU)."""
+"""The `preset` group: `smoke` (tests), `compact` (two CPU cores), `compact_gpu`, `gpu`, `paper` (one GPU)."""

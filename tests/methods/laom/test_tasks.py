@@ -27,7 +27,7 @@ from playslot_rl.storage import checkpoints
 from playslot_rl.training import record as records
 
 TASKS = ("button_press", "block_push_easy", "block_push", "block_reach", "block_pick")
-PRESETS = ("smoke", "compact", "compact_gpu", "paper")
+PRESETS = ("smoke", "compact", "compact_gpu", "gpu", "paper")
 
 
 @pytest.fixture(autouse=True)
