@@ -18,7 +18,7 @@ code.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -140,9 +140,23 @@ class QuantisedInverse(nn.Module):
         sizes = config.code_dim, config.codes, config.decay, config.dead_threshold, config.commitment
         self.quantizers = nn.ModuleList(ActionQuantizer(*sizes) for _ in range(config.codebooks))
 
+    def read(self, frames: Tensor) -> Tensor:
+        """What the network makes of frames (B, F, ...): float32 (B, Z), before it is standardised."""
+        return self.network(frames).float()
+
+    @torch.no_grad()
+    def settle(self, batches: Iterable[Tensor]) -> None:
+        """Standardise by the mean and variance over batches of frames (b, F, ...) in evaluation mode. The moving
+        averages will not do: frames differ so little that a step moves the mean by several standard deviations.
+        """
+        z = torch.cat([self.read(frames) for frames in batches])
+        for buffer, value in ((self.standardise.running_mean, z.mean(0)), (self.standardise.running_var, z.var(0))):
+            assert buffer is not None
+            buffer.copy_(value)
+
     def forward(self, frames: Tensor) -> Inferred:
         """Frames (B, F, ...) to latent actions between the last two; the codebooks move in training mode."""
-        z = self.standardise(self.network(frames).float())
+        z = self.standardise(self.read(frames))
         grouped = z.view(len(z), -1, self.config.code_dim)
         parts = grouped.chunk(self.config.codebooks, dim=1)
         found = [quantizer(part) for quantizer, part in zip(self.quantizers, parts, strict=True)]
@@ -156,8 +170,8 @@ class InverseModel(QuantisedInverse):
     def __init__(self, config: LAPOConfig, image_size: int) -> None:
         super().__init__(config, EncoderMLP.of(config, config.frames, image_size))
 
-    def forward(self, frames: Tensor) -> Inferred:
-        return super().forward(normalise(frames).flatten(1, 2))
+    def read(self, frames: Tensor) -> Tensor:
+        return super().read(normalise(frames).flatten(1, 2))
 
 
 class ChangeUNet(nn.Module):

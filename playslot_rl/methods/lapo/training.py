@@ -73,7 +73,8 @@ class LAPOModelStage:
             resident = DeviceRows(lambda rows: torch.from_numpy(slots[rows]), len(slots), device, clips.resident)
             self.key, self.read = keys.SLOTS, resident
         self.ends = Ends.of(clips.source)
-        frames = normalise(self._frames(self.clips.spread(self.clips.train_episodes)))
+        self.seen = self.clips.spread(self.clips.train_episodes)
+        frames = normalise(self._frames(self.seen))
         self.still = max(1e-6, float((frames[:, -2] - frames[:, -1]).square().mean()))
 
     @property
@@ -100,7 +101,10 @@ class LAPOModelStage:
         }
 
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
-        """`unexplained`: error on held-out pairs over that of no change; `perplexity` of the codes (1 to K)."""
+        """`unexplained`: error on held-out pairs over that of no change; `perplexity` of the codes (1 to K). Before,
+        the inverse model's latents are standardised anew on training pairs.
+        """
+        self.inverse.settle(normalise(self._frames(rows)) for rows in in_batches(self.seen))
 
         def look(_: int, rows: IntArray) -> tuple[float, float, Tensor]:
             frames = normalise(self._frames(rows))

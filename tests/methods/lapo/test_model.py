@@ -65,6 +65,21 @@ def test_the_codebooks_move_in_training_only(models: Models) -> None:
     assert not any(torch.equal(q.prototypes, old) for q, old in zip(inverse.quantizers, before, strict=True))
 
 
+def test_latents_are_standardised_in_evaluation_however_far_the_mean_has_moved(models: Models) -> None:
+    inverse, frames = models[0], torch.rand(64, 3, 3, 32, 32)
+    inverse(frames)
+    with torch.no_grad():
+        inverse.network.mlp[2].bias.add_(3.0)  # type: ignore[union-attr, operator, index]
+    inverse.eval()
+    assert bool((inverse(frames).before.mean(0) > 1).all())
+    inverse.settle(frames.split(16))
+    z = inverse(frames).before
+    torch.testing.assert_close(z.mean(0), torch.zeros(8), atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        z.std(0), torch.ones(8), atol=0.2, rtol=0
+    )  # BatchNorm's eps counts where frames differ little
+
+
 def test_the_inverse_model_sees_three_frames_and_the_forward_model_the_first_two(models: Models) -> None:
     inverse, forward = models[0].eval(), models[1].eval()
     with torch.no_grad():
