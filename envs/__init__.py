@@ -214,7 +214,7 @@ def check_task(env: EnvConfig, expert: bool = False, success: bool = False) -> N
         from playslot_rl.envs import gym_task
 
         if expert:
-            gym_task.require_expert(env)
+            gym_task.check_expert(env)
         if success:
             gym_task.require_success(env)
 

@@ -33,6 +33,8 @@ seed and of the step, the action in the environment's own units, (A,)."""
 SUCCESS: Final = ("is_success", "success")
 """Entries of info that say whether a step solved the task."""
 EXPERT_STREAM: Final = 4
+ROUNDING: Final = 1e-5
+"""By how much an expert's action may lie outside of [-1, 1]."""
 NUMBERS: Final = "distance,azimuth,elevation,x,y,z"
 
 
@@ -122,15 +124,26 @@ def facts(name: str) -> Facts:
         observation, _ = env.reset(seed=0)
         box: Any = env.action_space
         info = env.step(((box.low + box.high) / 2).astype(box.dtype))[4]
+        parts = _is_mujoco(env)
+        if not parts:
+            _picture(env, name)
     finally:
         env.close()
-    success = next((key for key in SUCCESS if key in info), "")
-    hz, parts = float(env.metadata.get("render_fps") or 10), _is_mujoco(env)
+    success, hz = next((key for key in SUCCESS if key in info), ""), float(env.metadata.get("render_fps") or 10)
     return Facts(int(np.prod(box.shape)), len(flat(observation)), success, hz, parts)
 
 
 def _is_mujoco(env: gym.Env[Any, Any]) -> bool:
     return isinstance(getattr(env.unwrapped, "model", None), import_mujoco().MjModel)
+
+
+def _picture(env: gym.Env[Any, Any], name: str) -> Frame:
+    """What an environment draws; a ConfigError where that is no picture."""
+    picture: Any = env.render()
+    if not isinstance(picture, np.ndarray) or picture.ndim != 3 or picture.dtype != np.uint8:
+        got = f"{picture.dtype} {picture.shape}" if isinstance(picture, np.ndarray) else type(picture).__name__
+        raise ConfigError(f"env.id={name}: got {got} from render(), expected a picture, uint8 (H, W, 3)")
+    return picture
 
 
 def fitted(env: EnvConfig) -> EnvConfig:
@@ -162,6 +175,17 @@ def require_expert(env: EnvConfig) -> Expert:
     if not env.expert:
         raise ConfigError(NO_EXPERT.format(env.id))
     return load_expert(env.expert)
+
+
+def check_expert(env: EnvConfig) -> None:
+    """A ConfigError without an expert, or where its first action is none of the environment's."""
+    require_expert(env)
+    task = GymTask(env)
+    try:
+        task._begin(np.random.default_rng(0))
+        task.expert_action()
+    finally:
+        task.inner.close()
 
 
 def require_success(env: EnvConfig) -> None:
@@ -274,11 +298,7 @@ class GymTask(PixelTask):
     def draw(self) -> Frame:
         if self._mujoco:
             return super().draw()
-        picture: Any = self.inner.render()
-        if not isinstance(picture, np.ndarray) or picture.ndim != 3 or picture.dtype != np.uint8:
-            got = f"{picture.dtype} {picture.shape}" if isinstance(picture, np.ndarray) else type(picture).__name__
-            raise ConfigError(f"env.id={self.config.id}: got {got} from render(), expected a picture, uint8 (H, W, 3)")
-        return box_sized(picture, self.config.image_size)
+        return box_sized(_picture(self.inner, self.config.id), self.config.image_size)
 
     def _placed(self) -> None:
         """What an environment moves only to draw it, such as a goal's mark, moves in every step: it may touch the
@@ -317,7 +337,7 @@ class GymTask(PixelTask):
         return flat(self._observation)
 
     def expert_action(self) -> Action:
-        """What `env.expert` does now, scaled to [-1, 1]; a ConfigError without one."""
+        """What `env.expert` does now, scaled to [-1, 1]; a ConfigError without one, or for one outside its Box."""
         expert = self._expert or require_expert(self.config)
         stream = np.random.SeedSequence(self.episode, spawn_key=(EXPERT_STREAM, self._moment))
         box: Any = self.inner.action_space
@@ -327,6 +347,8 @@ class GymTask(PixelTask):
                 f"env.expert={self.config.expert}: got {given!r}, expected {self.config.action_dim} finite numbers"
             )
         scaled = 2 * (given.reshape(box.shape) - box.low) / (box.high.astype(np.float64) - box.low) - 1
+        if np.abs(scaled).max() > 1 + ROUNDING:
+            raise ConfigError(f"env.expert={self.config.expert}: got {given!r}, expected it in {box}: clip it there")
         clipped: Action = np.clip(scaled.ravel(), -1.0, 1.0).astype(np.float32)
         return clipped
 

@@ -57,6 +57,10 @@ def reach(observation: Any, info: dict[str, Any], generator: np.random.Generator
     return np.append(np.clip(10 * (observation["desired_goal"] - observation["achieved_goal"]), -1, 1), 0.0)
 
 
+def too_far(observation: Any, info: dict[str, Any], generator: np.random.Generator) -> Any:
+    return np.array([4.1])
+
+
 def too_many(observation: Any, info: dict[str, Any], generator: np.random.Generator) -> Any:
     return np.zeros(7)
 

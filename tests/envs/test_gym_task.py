@@ -149,6 +149,7 @@ UNBOUNDED = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
         (["env.id=LineUnbounded-v0"], "expected bounds below and above"),
         (["env.id=LineBlind-v0"], r"got render_modes \['human'\], expected rgb_array among them"),
         (["env.id=LineBroken-v0"], "expected an environment that can be made"),
+        (["env.id=LineGrey-v0"], r"got float64 \(4, 4\) from render\(\), expected a picture"),
         ([f"env.id={LINE}", "env.expert=gym_examples:nobody"], "env.expert: got 'gym_examples:nobody'"),
         ([f"env.id={LINE}", "env.expert=gym_examples:NOTHING"], "no function"),
     ],
@@ -158,6 +159,7 @@ def test_what_cannot_be_a_task_is_refused_in_one_line(given: list[str], message:
     gym_examples.register("LineUnbounded-v0", space=UNBOUNDED)
     gym_examples.register("LineBlind-v0", modes=["human"])
     gym_examples.register("LineBroken-v0", unknown=1)
+    gym_examples.register("LineGrey-v0", picture=np.zeros((4, 4)))
     with pytest.raises(ConfigError, match=message) as caught:
         compose(["env=gym", *given])
     assert "\n" not in str(caught.value)
@@ -170,7 +172,6 @@ def test_what_cannot_be_a_task_is_refused_in_one_line(given: list[str], message:
         (line(action_dim=3), "env.action_dim: got 3, expected 1"),
         (line(camera="front"), "env.camera: got 'front', expected none"),
         (line(id="FetchReach-v4", action_dim=4, camera="hed_camera_rgb"), "did you mean env.camera=head_camera_rgb"),
-        (line(id=gym_examples.register("LineGrey-v0", picture=np.zeros((4, 4)))), r"got float64 \(4, 4\) from render"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(config: EnvConfig, message: str) -> None:
@@ -186,10 +187,13 @@ def test_an_expert_or_success_that_there_is_not_is_refused_where_it_is_asked_for
         CollectionSpec.make(config, "expert", 1, 2, 0)
     with pytest.raises(ConfigError, match="whose info says no success"):
         check_task(config.env, success=True)
-    wrong = made(line(expert="gym_examples:too_many"))
-    wrong.reset(seed=0)
-    with pytest.raises(ConfigError, match="expected 1 finite numbers"):
-        wrong.expert_action()
+    for wrong, said in (
+        ("too_many", "expected 1 finite numbers"),
+        ("too_far", r"got .*4\.1.*, expected it in Box\(-2"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            check_task(line(expert=f"gym_examples:{wrong}"), expert=True)
+    check_task(line(expert="gym_examples:to_the_right"), expert=True)
 
 
 def test_its_keys_are_its_own() -> None:
