@@ -142,7 +142,8 @@ class QuantisedInverse(nn.Module):
 
     def read(self, frames: Tensor) -> Tensor:
         """What the network makes of frames (B, F, ...): float32 (B, Z), before it is standardised."""
-        return self.network(frames).float()
+        found: Tensor = self.network(frames)
+        return found.float()
 
     @torch.no_grad()
     def settle(self, batches: Iterable[Tensor]) -> None:
