@@ -12,7 +12,7 @@ from playslot_rl.collectors.export import META_NAME, export
 from playslot_rl.collectors.journal import SPEC_NAME, CollectionSpec, Journal, journal_path, read_spec, remove_leftover
 from playslot_rl.config import CollectorConfig, DataConfig, ExperimentConfig
 from playslot_rl.data.metadata import INFO_NAME, json_content
-from playslot_rl.envs import PROCEDURAL
+from playslot_rl.envs import PROCEDURAL, play_config
 from playslot_rl.errors import ConfigError, DataError, OutputError
 from playslot_rl.runtime.progress import StageProgress
 from playslot_rl.runtime.threads import available_cores
@@ -144,6 +144,12 @@ def collect_demos(config: ExperimentConfig, folder: Path) -> DataConfig:
     return replace(config.data, demos=str(demos), held_out=held_out)
 
 
+def playing(config: ExperimentConfig) -> ExperimentConfig:
+    """What the noisy expert records: `collect.exploration_noise` on its actions, random goals where a task has some."""
+    noise = replace(config.collect, noise=config.collect.exploration_noise)
+    return replace(config, collect=noise, env=play_config(config.env))
+
+
 def collect_videos(config: ExperimentConfig, folder: Path) -> DataConfig:
     """Record the world model's videos below `FOLDER/data`; `data.demos` are among them where the preset wants it."""
     random, want = folder / "data" / "random", config.collect
@@ -155,9 +161,9 @@ def collect_videos(config: ExperimentConfig, folder: Path) -> DataConfig:
         # Random actions never reach the object. Videos of a noisy expert (no action is read from them) show the world
         # model the places a policy goes to; the paper has 9,000 random episodes instead.
         noisy = folder / "data" / "noisy_expert"
-        noise = replace(config, collect=replace(want, noise=want.exploration_noise))
         # The next base seed: no episode of the demonstrations comes twice.
-        collect(noise, "expert", want.noisy_episodes, want.expert_steps, noisy, config.seed + 1, config.workers)
+        played = playing(config)
+        collect(played, "expert", want.noisy_episodes, want.expert_steps, noisy, config.seed + 1, config.workers)
         roots.append(str(noisy))
     if want.learn_from_demos and config.data.demos:
         roots.append(config.data.demos)

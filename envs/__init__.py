@@ -11,9 +11,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
-from playslot_rl.config.metaworld import DEFAULT as DEFAULT_TASK
+from playslot_rl.config.families import FAMILIES, OGBENCH
 from playslot_rl.config.metaworld import NAME as METAWORLD
-from playslot_rl.config.metaworld import TASKS as METAWORLD_TASKS
 from playslot_rl.config.plain import nearest
 from playslot_rl.config.tasks import TASKS
 from playslot_rl.errors import ConfigError
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
 _OURS: Final = {
     "button_press": ("PlaySlot/ButtonPress-v0", "playslot_rl.envs.metaworld:MetaWorldEnv"),
     METAWORLD: ("PlaySlot/MetaWorld-v0", "playslot_rl.envs.metaworld:MetaWorldEnv"),
+    OGBENCH: ("PlaySlot/OGBench-v0", "playslot_rl.envs.ogbench:CubeTask"),
     "block_push": ("PlaySlot/BlockPush-v0", "playslot_rl.envs.block_push:BlockPushEnv"),
     "block_push_easy": ("PlaySlot/BlockPushEasy-v0", "playslot_rl.envs.block_push:BlockPushEnv"),
     "block_reach": ("PlaySlot/BlockReach-v0", "playslot_rl.envs.block_push:BlockReachEnv"),
@@ -67,14 +67,20 @@ GYM: Final = EnvConfig("gym", frame_skip=1, max_steps=50, warmup_steps=0)
 """Any registered Gymnasium environment; `id` and `action_dim` are to be set."""
 
 
-def metaworld_config(task: str = DEFAULT_TASK) -> EnvConfig:
-    """As many agent steps of five environment steps as the task's expert takes, without warm-up; a ConfigError for an
-    unknown task."""
+def family_config(name: str, task: str = "") -> EnvConfig:
+    """Of a task of an environment that has several: as many agent steps as its expert takes, without warm-up; a
+    ConfigError for an unknown task."""
+    own: dict[str, Any] = {"action_dim": 5, "frame_skip": 4} if name == OGBENCH else {}
     try:
-        made = EnvConfig(METAWORLD, warmup_steps=0, task=task)
+        made = EnvConfig(name, warmup_steps=0, task=task or FAMILIES[name].default, **own)
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    return replace(made, max_steps=METAWORLD_TASKS[made.task].steps)
+    return replace(made, max_steps=FAMILIES[name].tasks[made.task].steps)
+
+
+def play_config(env: EnvConfig) -> EnvConfig:
+    """The task as unlabelled videos show it: OGBench's with random goals, others as they are."""
+    return replace(env, goals="random") if env.name == OGBENCH else env
 
 
 def block_config(name: str, blocks: BlocksConfig) -> EnvConfig:
@@ -119,7 +125,7 @@ def register() -> None:
     from gymnasium.envs.registration import registry
 
     wanted: dict[str, tuple[str, dict[str, Any]]] = {name: (entry, {}) for name, entry in _OURS.values()}
-    wanted[_OURS[METAWORLD][0]] = _OURS[METAWORLD][1], {"env": metaworld_config()}
+    wanted.update({_OURS[name][0]: (_OURS[name][1], {"env": family_config(name)}) for name in FAMILIES})
     wanted.update({name: (entry, {"env": config}) for name, (entry, config) in _settings().items()})
     for name, (entry, kwargs) in wanted.items():
         if name not in registry:
@@ -145,10 +151,10 @@ def gym_id(name: str) -> str:
 
 
 def task_config(env: EnvConfig | str | None = None) -> EnvConfig:
-    """A task's config, given itself or by its name, with the settings that `env=NAME` has (Meta-World's also as
-    `metaworld/TASK`); None means ButtonPress. A ConfigError for an unknown name, or something else."""
-    if isinstance(env, str) and env.partition("/")[0] == METAWORLD:
-        return metaworld_config(env.partition("/")[2] or DEFAULT_TASK)
+    """A task's config, given itself or by its name, with the settings that `env=NAME` has (also as
+    `metaworld/TASK`, `ogbench/TASK`); None means ButtonPress. A ConfigError for an unknown name, or something else."""
+    if isinstance(env, str) and env.partition("/")[0] in FAMILIES:
+        return family_config(env.partition("/")[0], env.partition("/")[2])
     if isinstance(env, str):
         default = "", GYM if env == GYM.name else EnvConfig(env)
         name = gym_id(env)

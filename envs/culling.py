@@ -7,6 +7,8 @@ the camera, cost a third of a frame. Without shadows and reflections nothing tha
   the pyramid's planes through the camera's position c, with inward unit normal n: n . (x - c) < -sum_k |n . h_k|;
 - facets of parts that never move: most of a robot's base faces away or stands behind the table. Only what the GL
   context is given shrinks: the model, and with it the simulation, stay as they are.
+
+`coarse` leaves out details that are finer than a pixel, which changes some by a few levels.
 """
 
 from __future__ import annotations
@@ -111,22 +113,47 @@ def in_sight(model: mujoco.MjModel, still: Still, name: str, camera: Vector) -> 
     return seen
 
 
+def _kept_first(model: mujoco.MjModel, mesh: int, kept: npt.NDArray[np.bool_]) -> None:
+    """Leave a mesh only those of its facets: bool (facets,)."""
+    rows = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + len(kept))
+    order = np.argsort(~kept, kind="stable")
+    for table in (model.mesh_face, model.mesh_facenormal, model.mesh_facetexcoord):
+        table[rows] = table[rows][order]
+    model.mesh_facenum[mesh] = kept.sum()
+
+
+@contextlib.contextmanager
+def _meshes_lent(model: mujoco.MjModel) -> Iterator[None]:
+    tables: list[Any] = [model.mesh_face, model.mesh_facenormal, model.mesh_facetexcoord, model.mesh_facenum]
+    before = [table.copy() for table in tables]
+    try:
+        yield
+    finally:
+        for table, kept in zip(tables, before, strict=True):
+            table[:] = kept
+
+
 @contextlib.contextmanager
 def only_in_sight(model: mujoco.MjModel, still: Still, camera: Vector) -> Iterator[None]:
     """While a GL context is made of the model, its still parts have only the facets that the camera sees."""
-    tables: list[Any] = [model.mesh_face, model.mesh_facenormal, model.mesh_facetexcoord]
-    kept = [table.copy() for table in tables], model.mesh_facenum.copy()
-    try:
+    with _meshes_lent(model):
         for name in still.geoms:
-            mesh = model.geom_dataid[model.geom(name).id]
-            seen = in_sight(model, still, name, camera)
-            rows = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
-            order = np.argsort(~seen, kind="stable")
-            for table in tables:
-                table[rows] = table[rows][order]
-            model.mesh_facenum[mesh] = seen.sum()
+            _kept_first(model, model.geom_dataid[model.geom(name).id], in_sight(model, still, name, camera))
         yield
-    finally:
-        for table, before in zip(tables, kept[0], strict=True):
-            table[:] = before
-        model.mesh_facenum[:] = kept[1]
+
+
+@contextlib.contextmanager
+def coarse(model: mujoco.MjModel, cell: float) -> Iterator[None]:
+    """While a GL context is made of the model, the vertices of a mesh in one cube of side `cell`, metres, are one, and
+    facets without an area are none."""
+    with _meshes_lent(model):
+        for mesh in range(model.nmesh):
+            start, first = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+            vertices = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
+            faces = model.mesh_face[first : first + model.mesh_facenum[mesh]]
+            cells = np.floor(vertices / cell).astype(np.int64)
+            _, chosen, of = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+            faces[:] = chosen[of.ravel()][faces]
+            a, b, c = faces.T
+            _kept_first(model, mesh, (a != b) & (b != c) & (c != a))
+        yield

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.config.metaworld import TASKS, VERSION, task_name
+from playslot_rl.config.families import task_name
+from playslot_rl.config.metaworld import TASKS, VERSION
 from playslot_rl.envs.pixel_task import ACTION_DIM, STATE_DIM, Action, Frame, PixelTask
 from playslot_rl.envs.rendering import Camera, FrameRenderer, import_mujoco
 

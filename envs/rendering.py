@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import RenderConfig
-from playslot_rl.envs.culling import FrustumCuller, Still, only_in_sight
+from playslot_rl.envs.culling import FrustumCuller, Still, coarse, only_in_sight
 from playslot_rl.envs.gl_contexts import kept_contexts
 from playslot_rl.errors import RenderError
 
@@ -123,8 +123,8 @@ def box_sized(picture: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.uint8
 
 class FrameRenderer:
     """Draws the scene of one MuJoCo model from a viewpoint, or a camera of the model, by its name; of one that is
-    `at_rest` in the world, and of `still` parts, which never move, `fast` draws only what it can see. A RenderError
-    without a GL backend.
+    `at_rest` in the world, and of `still` parts, which never move, `fast` draws only what it can see, and no details of
+    meshes under `cell` metres. A RenderError without a GL backend.
     """
 
     def __init__(
@@ -135,6 +135,7 @@ class FrameRenderer:
         config: RenderConfig,
         still: Still | None = None,
         at_rest: bool = True,
+        cell: float = 0.0,
     ) -> None:
         mj = import_mujoco()
         fast = config.quality == "fast"
@@ -148,6 +149,8 @@ class FrameRenderer:
         with contextlib.ExitStack() as stack:
             if fast and still is not None and isinstance(camera, str):
                 stack.enter_context(only_in_sight(model, still, model.camera(camera).pos))
+            if fast and cell:
+                stack.enter_context(coarse(model, cell))
             self._renderer = _make_renderer(mj, model, side)
         self._finalizer = weakref.finalize(self, self._renderer.close)
         # Handlers at exit run last in, first out: ours must precede EGL's own, registered with its first context, or

@@ -28,7 +28,7 @@ class Command:
 COMMANDS: Final[dict[str, Command]] = {
     "collect": Command(
         "record episodes into a LeRobot v3.0 data set",
-        "Records `episodes` episodes of the `random` or the `expert` policy with several worker processes. Episodes "
+        "Records `episodes` episodes of the policy `random`, `expert` or `noisy_expert` in several processes. Episodes "
         "go to a journal first: after a kill the same command carries on. The data depend on the seed, not on workers.",
         (
             "playslot collect policy=random episodes=400 out=data/random",
@@ -37,7 +37,8 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot collect env=grid_shapes episodes=1000 out=data/shapes",
         ),
         "preset policy episodes seed workers out collect.noise collect.storage collect.random_episodes "
-        f"collect.random_steps collect.expert_episodes collect.expert_steps logging.progress {TASK} collector",
+        "collect.random_steps collect.expert_episodes collect.expert_steps collect.noisy_episodes "
+        f"collect.exploration_noise logging.progress {TASK} collector",
     ),
     "convert": Command(
         "turn Sketchy, as published, into LeRobot v3.0 data sets",

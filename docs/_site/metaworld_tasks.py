@@ -1,7 +1,8 @@
-"""How often the experts of Meta-World's fifty tasks solve them, and what the tasks look like:
+"""How often the experts of Meta-World's fifty tasks solve them, and what these and OGBench's look like:
 
 .venv/bin/python docs/_site/metaworld_tasks.py experts    results/metaworld.json; then: make tables
 .venv/bin/python docs/_site/metaworld_tasks.py sheet      docs/images/metaworld.png
+.venv/bin/python docs/_site/metaworld_tasks.py cubes      docs/images/ogbench.png (needs the extra ogbench)
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
+from playslot_rl.config.families import FAMILIES, OGBENCH
 from playslot_rl.config.metaworld import TASKS
 from playslot_rl.envs import make_env, task_env
 from playslot_rl.seeds.episodes import episode_seed
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-SHEET: Final = ROOT / "docs" / "images" / "metaworld.png"
+IMAGES: Final = ROOT / "docs" / "images"
 FILE: Final = ROOT / "results" / "metaworld.json"
 COLUMNS: Final = 5
 LABEL: Final = 14
@@ -34,10 +36,10 @@ BLOCK: Final = 100
 Frame = npt.NDArray[np.uint8]
 
 
-def first_and_last(task: str) -> Frame:
-    """What an agent sees of the first episode at its beginning and when the expert has solved it: (H, 2 W, 3)."""
-    env = make_env(f"metaworld/{task}").unwrapped
-    begin = env.reset(seed=episode_seed("evaluation", BLOCK, 0))[0]["pixels"]
+def first_and_last(name: str, index: int = 0) -> Frame:
+    """What an agent sees of an episode at its beginning and when the expert has solved it: (H, 2 W, 3)."""
+    env = make_env(name).unwrapped
+    begin = env.reset(seed=episode_seed("evaluation", BLOCK, index))[0]["pixels"]
     env.draw_steps = False
     solved = truncated = False
     while not (solved or truncated):
@@ -48,9 +50,8 @@ def first_and_last(task: str) -> Frame:
     return frames
 
 
-def sheet() -> Image.Image:
-    """All tasks, `COLUMNS` side by side, each under its name."""
-    tiles = {task: first_and_last(task) for task in TASKS}
+def sheet(tiles: dict[str, Frame]) -> Image.Image:
+    """Tasks, `COLUMNS` side by side, each under its name."""
     height, width = next(iter(tiles.values())).shape[:2]
     rows = -(-len(tiles) // COLUMNS)
     picture = Image.new("RGB", (COLUMNS * (width + 4) - 4, rows * (height + LABEL)), "white")
@@ -105,16 +106,21 @@ def experts() -> dict[str, Any]:
 
 
 def main() -> None:
-    if sys.argv[1:] == ["sheet"]:
-        sheet().save(SHEET, optimize=True)
-        print(f"written: {SHEET.relative_to(ROOT)}, {SHEET.stat().st_size / 1000:.0f} kB")
+    if sys.argv[1:] in (["sheet"], ["cubes"]):
+        tiles = {task: (f"metaworld/{task}", 0) for task in TASKS}
+        if sys.argv[1] == "cubes":
+            cubes = FAMILIES[OGBENCH].tasks
+            tiles = {f"{task}, goal {i + 1}": (f"{OGBENCH}/{task}", i) for task in cubes for i in range(COLUMNS)}
+        file = IMAGES / f"{'metaworld' if sys.argv[1] == 'sheet' else OGBENCH}.png"
+        sheet({title: first_and_last(*episode) for title, episode in tiles.items()}).save(file, optimize=True)
+        print(f"written: {file.relative_to(ROOT)}, {file.stat().st_size / 1000:.0f} kB")
     elif sys.argv[1:] == ["experts"]:
         lines = json.dumps(experts(), indent=2, ensure_ascii=False)
         rows = re.sub(r"\[[^\[\]{}]*\]", lambda found: " ".join(found[0].split()), lines)
         FILE.write_text(rows + "\n")
         print(f"written: {FILE.relative_to(ROOT)}; now: make tables")
     else:
-        sys.exit(f"got {sys.argv[1:]}, expected sheet or experts")
+        sys.exit(f"got {sys.argv[1:]}, expected sheet, cubes or experts")
 
 
 if __name__ == "__main__":

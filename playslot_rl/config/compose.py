@@ -16,9 +16,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Final, cast
 
-from playslot_rl.config import ExperimentConfig, from_dict, metaworld, plugins, to_dict
+from playslot_rl.config import ExperimentConfig, from_dict, plugins, to_dict
 from playslot_rl.config.arguments import require_digits, require_folders, require_once, require_plain
 from playslot_rl.config.baselines import known_methods
+from playslot_rl.config.families import preset_values
 from playslot_rl.config.machine import require_machine
 from playslot_rl.config.methods import canonical_method
 from playslot_rl.config.plain import flatten, nearest, type_hints
@@ -275,9 +276,8 @@ def _presets(groups: tuple[str, ...]) -> dict[str, Any]:
 def _with_task(values: dict[str, Any], typed: Mapping[str, Any]) -> dict[str, Any]:
     """What a preset says, changed by the task of several that one environment has, and then by what was typed."""
     env = _merge(values["env"], typed.get("env", {}))
-    if env["name"] == metaworld.NAME:
-        values = _merge(values, metaworld.preset_values(str(env["task"]), values["preset"]))
-    return _merge(values, typed)
+    own = preset_values(env["name"], str(env.get("task", "")), values["preset"])
+    return _merge(_merge(values, own), typed)
 
 
 def _multiplied(values: Mapping[str, Any], factors: Mapping[str, Any]) -> dict[str, Any]:

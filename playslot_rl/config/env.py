@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
-from playslot_rl.config import metaworld
+from playslot_rl.config.families import FAMILIES, OGBENCH, task_name
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import SEED, UNSAID, Checked, at_least, between, within
 
@@ -144,7 +144,10 @@ class EnvConfig(Checked):
         camera: of `env=gym` with MuJoCo: a camera's name, or `distance,azimuth,elevation,x,y,z`; empty is its own.
         expert: of `env=gym`, typed `expert=`: `package.module:function`, from its own observation, info and a generator
             to its action.
-        task: which task of `metaworld`: `drawer-open`, or another of its fifty.
+        task: which task of `metaworld`: `drawer-open`, or another of its fifty; of `ogbench`: `cube-single` or
+            `cube-double`.
+        goals: of `ogbench`: its five of `evaluation`, in turn, or `random` ones one after the other, as in its data.
+        targets: of `ogbench`: whether they are drawn, translucent; its `visual-` environments hide them.
     """
 
     group = "env."
@@ -161,6 +164,8 @@ class EnvConfig(Checked):
     camera: str = field(default="", metadata=UNSAID)
     expert: str = field(default="", metadata=UNSAID)
     task: str = field(default="", metadata=UNSAID)
+    goals: Literal["evaluation", "random"] = field(default="evaluation", metadata=UNSAID)
+    targets: bool = field(default=True, metadata=UNSAID)
 
     @property
     def full_name(self) -> str:
@@ -180,9 +185,13 @@ class EnvConfig(Checked):
             check(self.name == "gym" or not value, f"env.{key}", value, f"none with env={self.name}: it is of env=gym")
         drawn = self.name not in ("grid_shapes", "sketchy", "video") or not self.variation.on
         check(drawn, "env.variation", self.variation, f"nothing with env={self.name}, which no simulator draws")
-        if self.name == metaworld.NAME:
-            object.__setattr__(self, "task", metaworld.task_name(self.name, self.task))
+        if self.name in FAMILIES:
+            object.__setattr__(self, "task", task_name(self.name, self.task))
         else:
-            check(not self.task, "env.task", self.task, f"none with env.name={self.name}: it is for env=metaworld")
+            known = ", ".join(f"env={name}" for name in FAMILIES)
+            check(not self.task, "env.task", self.task, f"none with env.name={self.name}: it is for {known}")
+        plain = self.goals == "evaluation" and self.targets
+        cube = f"nothing with env={self.name}: they are of env={OGBENCH}"
+        check(self.name == OGBENCH or plain, "env.goals, env.targets", (self.goals, self.targets), cube)
         used = self.name.startswith("block_") or self.blocks == BlocksConfig()
         check(used, "env.blocks", self.blocks, f"no changes with env.name={self.name}, which has no blocks")

@@ -231,7 +231,8 @@ class ExperimentConfig(Checked):
 
     Attributes:
         preset: name of the preset the values came from.
-        policy: collector policy of `collect`: `random` or `expert`.
+        policy: collector policy of `collect`: `random`, `expert`, or `noisy_expert`: with `collect.exploration_noise`,
+            and random goals of `env=ogbench`.
         episodes: episodes to collect or to evaluate; None means the command's default.
         seed: seed of data collection, training or evaluation, any 32-bit number.
         workers: collector processes; 0 means one per core.
@@ -248,7 +249,7 @@ class ExperimentConfig(Checked):
     """
 
     preset: str = field(default="paper", metadata=role("machine"))
-    policy: Literal["random", "expert"] = field(default="expert", metadata=role("call"))
+    policy: Literal["random", "expert", "noisy_expert"] = field(default="expert", metadata=role("call"))
     episodes: int | None = field(default=None, metadata=role("call") | at_least(1, largest=EPISODES))
     seed: int = field(default=0, metadata=SEED)
     workers: int = field(default=0, metadata=role("call", "machine") | WORKERS)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple
-
-from playslot_rl.config.plain import check, nearest
+from typing import Final, NamedTuple
 
 NAME: Final = "metaworld"
 VERSION: Final = "-v3"
@@ -77,30 +75,3 @@ TASKS: Final[dict[str, Member]] = {
     "window-close": Member(20, "Slide the window shut."),
     "window-open": Member(20, "Slide the window open."),
 }
-
-
-def task_name(env: str, task: str) -> str:
-    """The task of an environment's name and `env.task`, either of which may end in `-v3`; a ValueError where there is
-    none of that name, with the three nearest.
-    """
-    if env == BUTTON_PRESS:
-        return "button-press"
-    found = task.removesuffix(VERSION)
-    hint = nearest(found, TASKS, most=3)
-    check(found in TASKS, "env.task", task, f"one of Meta-World's {len(TASKS)} (docs/reference/environments.md){hint}")
-    return found
-
-
-def preset_values(task: str, preset: str) -> dict[str, Any]:
-    """What a task changes in a preset: the length of its episodes, and of all that is as long as they are."""
-    task = task.removesuffix(VERSION)
-    if preset == "smoke" or task not in TASKS:
-        return {}
-    steps = TASKS[task].steps
-    values = {
-        "env": {"max_steps": steps},
-        "collect": {"random_steps": steps, "expert_steps": steps},
-        "model": {"predictor": {"context": steps + 4}},  # past it imagination evicts frames and falls apart
-    }
-    rollout = {"dynamics": {"predicted_frames": steps - 2}}
-    return values if preset == "paper" else values | rollout

@@ -31,7 +31,7 @@ AS_COMPACT = ("resnet_oracle", "caddy_policy", "caddy_oracle")
 PRESETS = ["compact", "compact_gpu", "gpu", "paper", "smoke"]
 ENVS = [
     "block_pick", "block_push", "block_push_easy", "block_reach", "button_press", "dmc_ball_in_cup_catch",
-    "dmc_cartpole_balance", "grid_shapes", "gym", "metaworld", "sketchy", "video",
+    "dmc_cartpole_balance", "grid_shapes", "gym", "metaworld", "ogbench", "sketchy", "video",
 ]  # fmt: skip
 
 

@@ -16,14 +16,16 @@ import pytest
 
 from playslot_rl.config import EnvConfig
 from playslot_rl.config.compose import compose
+from playslot_rl.config.families import FAMILIES
 from playslot_rl.envs import ENVIRONMENTS, block_ids, dmc_ids, make_env, make_torchrl_env, task_config, task_env
 from playslot_rl.errors import ConfigError
 
 pytestmark = pytest.mark.integration
 
-SUITE = set(dmc_ids()) if find_spec("dm_control") else set()
-"""Ids of an optional package."""
-IDS = sorted({name for name, _ in ENVIRONMENTS.values()} - {"PlaySlot/Gym-v0", *dmc_ids()} | {*block_ids()} | SUITE)
+OPTIONAL = {**dict.fromkeys(dmc_ids(), "dm_control"), "PlaySlot/OGBench-v0": "ogbench"}
+SUITE = {name for name, package in OPTIONAL.items() if find_spec(package)}
+"""Ids of optional packages that are there."""
+IDS = sorted({name for name, _ in ENVIRONMENTS.values()} - {"PlaySlot/Gym-v0", *OPTIONAL} | {*block_ids()} | SUITE)
 """All but the one that is nothing without `env.id`."""
 NAMES = [f"playslot_rl.envs:{name}" for name in IDS]
 SOME = NAMES[:1]
@@ -95,7 +97,8 @@ def test_gymnasium_makes_every_id(names: list[str], tmp_path: Path) -> None:
 def task_config_of(name: str) -> EnvConfig:
     """The task that an id names."""
     found = {**block_ids(), **dmc_ids()}.get(name.partition(":")[2])
-    return task_config("metaworld") if "MetaWorld" in name else EnvConfig() if found is None else found[1]
+    family = next((env for env in FAMILIES if f"/{env}-" in name.lower()), None)
+    return task_config(family) if family else EnvConfig() if found is None else found[1]
 
 
 @pytest.mark.parametrize(
@@ -144,7 +147,7 @@ def test_registering_loads_gymnasium_and_nothing_heavy() -> None:
         "print(sum(name.startswith('PlaySlot/') for name in gymnasium.registry), list(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("21 ")
+    assert done.stdout.startswith("22 ")
     for heavy in ("torch", "torchrl", "mujoco", "metaworld", "gymnasium_robotics"):
         assert f"'{heavy}'" not in done.stdout
 

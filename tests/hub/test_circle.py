@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ EPISODES = 3
     [
         name if name in ("button_press", "grid_shapes") else pytest.param(name, marks=pytest.mark.slow)
         for name in (*ENVIRONMENTS, *PROCEDURAL)
-        if name != "gym" and not name.startswith("dmc_")
+        if name != "gym" and not name.startswith("dmc_") and (name != "ogbench" or find_spec(name))
     ],
 )
 def test_the_whole_circle(name: str, hub: FakeHub, client: Client, tmp_path: Path) -> None:
