@@ -77,7 +77,8 @@ COMMANDS: Final[dict[str, Command]] = {
     ),
     "train-baseline": Command(
         "one of the methods PlaySlot is compared with, as a run of its own",
-        "Trains method=slot_oracle, slot_bc, resnet_oracle, resnet_bc, lapo, lapo_slots, caddy_policy, caddy_oracle, "
+        "Trains method=slot_oracle, slot_bc, resnet_oracle, resnet_bc, history_bc, act, act_state, diffusion, "
+        "diffusion_state, autoencoder_bc, inverse_bc, lapo, lapo_slots, laom, clam, caddy_policy, caddy_oracle, "
         "dreamer or sold into out=; `playslot evaluate run=OUT` then measures it as PlaySlot. Or one that predicts "
         "videos, svg, caddy, slotformer or ocvp_seq; `playslot compare-video` scores it (docs/explanation/methods.md). "
         "run= is the world model whose slots slot_oracle, slot_bc, lapo_slots, sold, slotformer and ocvp_seq build "

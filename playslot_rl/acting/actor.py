@@ -82,6 +82,12 @@ def put_rows(tensordict: TensorDictBase, rows: int | Tensor, found: Mapping[str,
         tensordict.set(key, whole)
 
 
+def with_present(history: Tensor, present: Tensor, step: Tensor) -> Tensor:
+    """The last F of what is seen (n, F, ...), with the present (n, ...), which fills it where `step` (n, 1) is 0."""
+    now, begins = present.unsqueeze(1), (step == 0).view(-1, *[1] * (history.dim() - 1))
+    return torch.where(begins, now, torch.cat((history[:, 1:], now), dim=1))
+
+
 class SlotActor(Actor):
     """Frame to slots by SAVi, whose recurrent state is the memory; slots (n, N, D) to ACTION (n, A) by the heads.
 

@@ -117,11 +117,11 @@ class TaskPool:
         self.close()
 
 
-def start_episode(task: Task, seed: int, stride: int) -> tuple[Frames, int, int]:
+def start_episode(task: Task, seed: int, stride: int) -> tuple[dict[str, npt.NDArray[Any]], int, int]:
     """Reset to an episode that does not start solved; the seed tried next is `stride` further.
 
     Returns:
-        First frame (H, W, 3), the seed that was used, and how many were passed over.
+        First observation, the seed that was used, and how many were passed over.
 
     Raises:
         RuntimeError: MAX_REDRAWS episodes in a row start solved.
@@ -129,7 +129,7 @@ def start_episode(task: Task, seed: int, stride: int) -> tuple[Frames, int, int]
     for redrawn in range(MAX_REDRAWS):
         observation, info = task.reset(seed=seed + redrawn * stride)
         if not info.get("success", False):
-            return observation["pixels"], seed + redrawn * stride, redrawn
+            return observation, seed + redrawn * stride, redrawn
     raise RuntimeError(f"evaluation: {MAX_REDRAWS} episodes from seed {seed} on start solved; is the task trivial?")
 
 
@@ -196,7 +196,7 @@ class _LockStep:
         for task in self.tasks:
             task.draw_steps = actor.looks == "always" or (draw and look_on is not None)
         self.started = [start_episode(task, seed, stride) for task, seed in zip(self.tasks, seeds, strict=True)]
-        self.frames = [frame for frame, _, _ in self.started]
+        self.observed = [observation for observation, _, _ in self.started]
         self.rewards, self.totals = np.zeros(len(seeds), np.float32), np.zeros(len(seeds))
         self.solved: list[int | None] = [None] * len(seeds)
         self.loop = ClosedLoop(actor)
@@ -212,7 +212,7 @@ class _LockStep:
             seen = None if last and not see_last else self.loop.step(self._observe(running, step), running)
             if self.look_on is not None:
                 episodes = [self.first + i for i in running]
-                frames = np.stack([self.frames[i] for i in running])
+                frames = self._stack(keys.PIXELS, running)
                 self.look_on(Moment(step, episodes, frames, self.rewards[running].copy(), seen))
             if seen is not None and not last:
                 self._execute(running, seen, step + 1)
@@ -230,18 +230,22 @@ class _LockStep:
         """What the actor reads of the running episodes."""
         values, device = {}, self.actor.device
         if self.actor.looks == "always" or (self.actor.looks == "first" and step == 0):
-            frames = torch.from_numpy(np.stack([self.frames[i] for i in running]))
-            values[keys.PIXELS] = frames.to(device).movedim(-1, -3)
+            values[keys.PIXELS] = torch.from_numpy(self._stack(keys.PIXELS, running)).to(device).movedim(-1, -3)
+        if keys.STATE in self.actor.in_keys:
+            values[keys.STATE] = torch.from_numpy(self._stack(keys.STATE, running)).to(device)
         if keys.EXPERT_ACTION in self.actor.in_keys:
             actions = np.stack([self.tasks[i].expert_action() for i in running])
             values[keys.EXPERT_ACTION] = torch.from_numpy(actions).to(device)
         return TensorDict(values, [len(running)])
 
+    def _stack(self, key: str, running: Sequence[int]) -> npt.NDArray[Any]:
+        return np.stack([self.observed[i][key] for i in running])
+
     def _execute(self, running: Sequence[int], seen: TensorDictBase, step: int) -> None:
         actions = self.actor.executed(seen.get(keys.ACTION)).cpu().numpy()
         for i, action in zip(running, actions, strict=True):
-            observation, reward, _, _, info = self.tasks[i].step(action)
-            self.frames[i], self.rewards[i] = observation["pixels"], reward
+            self.observed[i], reward, _, _, info = self.tasks[i].step(action)
+            self.rewards[i] = reward
             self.totals[i] += float(reward)
             if info["success"] and self.solved[i] is None:
                 self.solved[i] = step

@@ -31,8 +31,8 @@ class CompareConfig(Checked):
         methods: names of `playslot_rl.config.methods`.
         demos: numbers of demonstrations, for the methods that learn from them.
         labels: numbers of labelled demonstrations. Those with latent actions learn from the videos of all `demos`
-            and the real actions of so many of them, `slot_bc`, `resnet_bc`, `autoencoder_bc`, `act` and `diffusion`
-            from these alone, the oracles from the actions of all. Empty: they see those of `behaviour.labelled_demos`.
+            and the real actions of so many of them, oracles from the actions of all, the other rows that clone (BC,
+            ACT, Diffusion Policy) from the labelled ones alone. Empty: they see those of `behaviour.labelled_demos`.
         videos: numbers of unlabelled videos that policies clone beside `labels`, instead of `demos`.
         worlds: world models, and models such as LAPO's, each with all seeds: `run`, `runs`, the rest trained.
         runs: run folders of further world models, separated by commas.

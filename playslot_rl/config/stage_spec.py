@@ -69,6 +69,12 @@ class StageSpec:
         """Groups that its checkpoint keeps, `env` first."""
         return tuple(dict.fromkeys(["env", *map(group_of, (*self.stores, *self.keys, *self.settings))]))
 
+    @cached_property
+    def own(self) -> str:
+        """The group of `baselines` that is kept by its name, its settings; empty where there is none."""
+        named = (g for g in self.groups if g.startswith(BASELINES) and self.stored_name(g) == self.name)
+        return next(named, "").removeprefix(BASELINES)
+
     def sees_labels(self, config: Any) -> bool:
         """Whether real actions count in it beside the videos, so that it is another one for each draw of labels."""
         return bool(self.labels) and bool(attrgetter(self.labels)(config) > 0)

@@ -31,6 +31,11 @@ class Ends(NamedTuple):
         before: IntArray = np.maximum(rows - 1, self.first[rows])
         return before
 
+    def past(self, rows: IntArray, frames: int) -> IntArray:
+        """Rows (..., `frames`) that end in each (...); before an episode's first frame it stands again."""
+        past: IntArray = np.maximum(rows[..., None] + np.arange(1 - frames, 1), self.first[rows][..., None])
+        return past
+
     def ahead(self, rows: IntArray, most: int, numbers: np.random.Generator) -> IntArray:
         """A row 1 to `most` steps after each of `rows` (...), which are no last ones, uniformly within its episode."""
         reach = np.minimum(most, self.last[rows] - rows)

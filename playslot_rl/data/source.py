@@ -67,6 +67,7 @@ class EpisodeFrames:
         name: the folder it was read from, for people.
         shares: of several sets that are drawn from with weights, which rows are whose; None draws all windows alike.
         limits: what actions in [-1, 1] stand for; None for those of our simulators, which are so, and without actions.
+        states: proprioception, float32 (F, S), or None.
     """
 
     frames: FrameRows
@@ -83,6 +84,7 @@ class EpisodeFrames:
     name: str = ""
     shares: Shares | None = None
     limits: ActionLimits | None = None
+    states: npt.NDArray[np.float32] | None = None
 
     @property
     def episodes(self) -> int:
@@ -117,6 +119,15 @@ class EpisodeFrames:
                 "use a data set of this robot, or set env.action_dim when the world model is trained"
             )
         return self.actions
+
+    def require_states(self) -> npt.NDArray[np.float32]:
+        """Proprioception (F, S); a DataError where there is none."""
+        if self.states is None:
+            raise DataError(
+                "got a data set without proprioception, expected the feature `observation.state`: record it, or name a "
+                "method that sees the camera alone"
+            )
+        return self.states
 
 
 def open_sources(
@@ -259,14 +270,17 @@ def files_fingerprint(files: Contents, camera: str, cache: Path) -> str:
 
 
 def labels_of(files: Contents) -> dict[str, Any]:
-    """`starts`, `lengths`, `actions`, `success` and `seeds`, as of `EpisodeFrames`."""
+    """`starts`, `lengths`, `actions`, `states`, `success` and `seeds`, as of `EpisodeFrames`."""
     lengths = np.array([episode.length for episode in files.episodes], np.int64)
     starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
-    actions, success, seeds = map(files.numbers, (keys.FEATURE_ACTION, keys.FEATURE_SUCCESS, keys.FEATURE_SEED))
+    actions, states, success, seeds = map(
+        files.numbers, (keys.FEATURE_ACTION, keys.FEATURE_STATE, keys.FEATURE_SUCCESS, keys.FEATURE_SEED)
+    )
     return {
         "starts": starts,
         "lengths": lengths,
         "actions": None if actions is None else actions.astype(np.float32).reshape(files.rows, -1),
+        "states": None if states is None else states.astype(np.float32).reshape(files.rows, -1),
         "success": None if success is None else success.astype(bool),
         "seeds": None if seeds is None else seeds[starts].astype(np.int64),
     }

@@ -166,6 +166,7 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
         starts=np.concatenate([s.starts + offset for s, offset in zip(sources, offsets, strict=True)]),
         lengths=joined("lengths"),
         actions=actions,
+        states=joined("states"),
         success=joined("success"),
         seeds=joined("seeds"),
         fingerprint=text_hash("+".join(source.fingerprint for source in sources)),
@@ -210,6 +211,7 @@ def every(source: EpisodeFrames, stride: int) -> EpisodeFrames:
         starts=(np.cumsum(lengths) - lengths).astype(np.int64),
         lengths=lengths.astype(np.int64),
         actions=None if source.actions is None else _mean_actions(source, stride),
+        states=None if source.states is None else source.states[rows],
         success=None if source.success is None else source.success[rows],
         fps=source.fps / stride,
     )
@@ -238,6 +240,7 @@ def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames
         starts=source.starts[first:last] - begin,
         lengths=source.lengths[first:last],
         actions=None if source.actions is None else source.actions[begin:end],
+        states=None if source.states is None else source.states[begin:end],
         success=None if source.success is None else source.success[begin:end],
         seeds=None if source.seeds is None else source.seeds[first:last],
     )

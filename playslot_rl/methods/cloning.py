@@ -30,6 +30,7 @@ from playslot_rl.data.demonstrations import (
     moving_frames,
     real_actions,
 )
+from playslot_rl.data.neighbours import Ends
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
@@ -170,14 +171,15 @@ def sizes(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
 
 
 def moving_examples(
-    config: ExperimentConfig, source: EpisodeFrames, device: torch.device, shift: int = 0
+    config: ExperimentConfig, source: EpisodeFrames, device: torch.device, shift: int = 0, frames: int = 1
 ) -> tuple[Transitions, FrameInputs, Tensor]:
-    """The transitions in which something moves, the frames before them, and their real actions (M, A) in [-1, 1]; a
-    DataError where there are no actions, or of another width.
+    """The transitions in which something moves, the frame before them or the last `frames`, and their real actions
+    (M, A) in [-1, 1]; a DataError where there are no actions, or of another width.
     """
     moves = moving_frames(source, config.behaviour.trim_pixels, config.behaviour.trim_margin)
     actions = real_actions(source, moves.rows, config.env.action_dim).to(device)
-    return moves, FrameInputs(source, moves.rows, device, shift, config.data.device == "auto"), actions
+    rows = moves.rows if frames == 1 else Ends.of(source).past(moves.rows, frames)
+    return moves, FrameInputs(source, rows, device, shift, config.data.device == "auto"), actions
 
 
 def action_stage(
@@ -191,12 +193,15 @@ def action_stage(
     shift: int,
     schedule: StageConfig,
     validated: int,
+    frames: int = 1,
 ) -> RegressionStage:
-    """A network clones the real actions of all demonstrations; it reads what `observe` makes of frames, as `key`."""
+    """A network clones the real actions of all demonstrations; it reads what `observe` makes of the last `frames`, as
+    `key`.
+    """
 
     def examples(source: EpisodeFrames, shift: int = 0) -> tuple[Inputs, Tensor]:
-        _, frames, actions = moving_examples(config, source, device, shift)
-        return observe(frames), actions
+        _, seen, actions = moving_examples(config, source, device, shift, frames)
+        return observe(seen), actions
 
     criterion = BehaviourLoss(network, config.behaviour.loss)
     criterion.set_keys(observation=key, action=keys.ACTION)

@@ -91,7 +91,8 @@ class Twin:
 
     def __init__(self, task: Task, seed: int, lead: Sequence[Action] = (), stride: int = 0) -> None:
         self._task, self._lead = task, [np.asarray(action, np.float32) for action in lead]
-        self._frame, self.seed, _ = start_episode(task, seed, stride) if stride else (self._reset(seed), seed, 0)
+        begun = start_episode(task, seed, stride) if stride else ({"pixels": self._reset(seed)}, seed, 0)
+        self._frame, self.seed = begun[0]["pixels"], begun[1]
         self._done: list[bytes] = []
         self.first = self.follow([])
 

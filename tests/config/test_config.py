@@ -329,7 +329,7 @@ def test_roles_say_what_each_key_counts_for() -> None:
     machine |= {key for key in keys_of(ExperimentConfig, "free") if key.endswith(".execution")}
     machine |= {"data.cache_limit", "data.device", "data.workers"}
     named = {"data.root", "data.demos", "data.cache", "behaviour.policy_from"}
-    others = ("lapo", "lapo_slots", "laom", "clam", "autoencoder_bc", "caddy_policy", "caddy_oracle")
+    others = ("lapo", "lapo_slots", "laom", "clam", "autoencoder_bc", "inverse_bc", "caddy_policy", "caddy_oracle")
     named |= {f"baselines.{method}.world" for method in others}
     measures = {"data.held_out", "collect.validation_episodes"}
     assert keys_of(ExperimentConfig, "machine") == machine | named | measures
@@ -385,9 +385,12 @@ def test_a_group_checks_its_ranges_under_its_own_name() -> None:
                 yield from groups(value, f"{prefix}{field.name}.")
 
     checked = {prefix: config for prefix, config in groups(compose()) if isinstance(config, Checked)}
-    shared = {f"baselines.{method}.model." for method in ("autoencoder_bc", "lapo", "lapo_slots", "laom", "clam")} | {
+    shared = {
+        f"baselines.{method}.model."
+        for method in ("autoencoder_bc", "inverse_bc", "lapo", "lapo_slots", "laom", "clam")
+    } | {
         f"baselines.{method}.policy."
-        for method in ("autoencoder_bc", "lapo", "laom", "clam", "caddy_policy", "caddy_oracle")
+        for method in ("autoencoder_bc", "inverse_bc", "lapo", "laom", "clam", "caddy_policy", "caddy_oracle")
     }
     assert {prefix: config.group for prefix, config in checked.items()} == {
         prefix: "" if prefix in shared else "optim." if prefix.endswith(".optim.") else prefix for prefix in checked

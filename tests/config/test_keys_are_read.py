@@ -29,6 +29,7 @@ LOOPS = (
     "playslot_rl/modules/predictors/",
     "playslot_rl/methods/cloning.py",
     "playslot_rl/methods/lapo/",
+    "playslot_rl/methods/frozen_encoder/",
     "playslot_rl/methods/lerobot_policy/",
     "playslot_rl/methods/online/",
     "playslot_rl/methods/video/",
@@ -37,7 +38,7 @@ LOOPS = (
 
 CHECKED: dict[str, str] = {
     f"baselines.{method}.world": "read by playslot_rl.methods.training of whatever method builds on a model"
-    for method in ("autoencoder_bc", "lapo", "lapo_slots", "laom", "clam", "caddy_policy", "caddy_oracle")
+    for method in ("autoencoder_bc", "inverse_bc", "lapo", "lapo_slots", "laom", "clam", "caddy_policy", "caddy_oracle")
 }
 """Keys that say something although no computation reads them."""
 

@@ -14,10 +14,13 @@ from playslot_rl.studies.video.jobs import video_config, video_jobs, video_recor
 OUT = Path("/comparison")
 PARENTS = {"slots": "a", "dynamics": "b", "demos": "c", "videos": "d"}
 ACTING = (
-    "playslot,slot_oracle,resnet_oracle,slot_bc,resnet_bc,act,diffusion,autoencoder_bc,lapo,lapo_slots,laom,clam,"
+    "playslot,slot_oracle,resnet_oracle,slot_bc,resnet_bc,history_bc,act,act_state,diffusion,diffusion_state,autoencoder_bc,inverse_bc,"
+    "lapo,lapo_slots,laom,clam,"
     "dreamer,sold,caddy_policy,caddy_oracle"
 )
-UNLABELLED = ACTING.replace("slot_bc,resnet_bc,act,diffusion,autoencoder_bc,", "")
+UNLABELLED = ACTING.replace(
+    "slot_bc,resnet_bc,history_bc,act,act_state,diffusion,diffusion_state,autoencoder_bc,inverse_bc,", ""
+)
 CHOICES: dict[str, tuple[str, ...]] = {
     "all methods": (f"methods={ACTING}", "demos=4,8", "labels=2,4", "seeds=0,1"),
     "no labels": (f"methods={UNLABELLED}", "demos=8", "seeds=2", "preset=smoke"),

@@ -31,6 +31,7 @@ from playslot_rl.training.record import StageRecord
 BASELINES = (
     "slot_oracle", "resnet_oracle", "lapo", "lapo_slots", "laom", "clam", "dreamer", "sold", "caddy_policy",
     "caddy_oracle", "svg", "caddy", "slotformer", "ocvp_seq", "act", "diffusion", "autoencoder_bc",
+    "inverse_bc", "history_bc", "act_state", "diffusion_state",
 )  # fmt: skip
 ON_A_MODEL = {
     "lapo": "lapo_model",
@@ -39,6 +40,7 @@ ON_A_MODEL = {
     "caddy_policy": "caddy",
     "caddy_oracle": "caddy",
     "autoencoder_bc": "autoencoder",
+    "inverse_bc": "inverse_resnet",
 }
 WHOLE = ("button_press", "compact")
 """Task and preset that are written out; the others only where they differ."""
@@ -74,7 +76,7 @@ class Seen:
 
 
 def few_videos(image_size: int, action_dim: int) -> EpisodeFrames:
-    """Eight episodes of eight frames in which a square jumps, with actions."""
+    """Eight episodes of eight frames in which a square jumps, with actions and proprioception."""
     numbers, rows = np.random.default_rng(0), 64
     frames = np.full((rows, image_size, image_size, 3), 40, np.uint8)
     for row in range(rows):
@@ -84,6 +86,7 @@ def few_videos(image_size: int, action_dim: int) -> EpisodeFrames:
         frames=frames, starts=np.arange(8) * 8, lengths=np.full(8, 8),
         actions=numbers.uniform(-1, 1, (rows, action_dim)).astype(np.float32),
         success=None, seeds=np.arange(8), fingerprint="data", fps=10.0, task="", camera="",
+        states=numbers.normal(size=(rows, 4)).astype(np.float32),
     )  # fmt: skip
 
 

@@ -66,10 +66,14 @@ def test_traits_follow_from_stages() -> None:
     assert named("online") == {"dreamer", "sold"}
     assert named("slots") == {"playslot", "lapo_slots", "slot_oracle", "slot_bc", "sold", "slotformer", "ocvp_seq"}
     assert named("decodes") == {"playslot", "lapo", "lapo_slots", "laom", "clam", "caddy_policy"}
-    assert named("labelled_only") == {"slot_bc", "resnet_bc", "act", "diffusion", "autoencoder_bc"}
+    assert named("labelled_only") == {
+        "slot_bc", "resnet_bc", "history_bc", "act", "act_state", "diffusion", "diffusion_state", "autoencoder_bc",
+        "inverse_bc",
+    }  # fmt: skip
     assert {name: m.model.name for name, m in METHODS.items() if m.model} == {
         "lapo": "lapo_model", "lapo_slots": "lapo_slots_model", "laom": "laom_model", "clam": "clam_model",
         "caddy_policy": "caddy", "caddy_oracle": "caddy", "autoencoder_bc": "autoencoder",
+        "inverse_bc": "inverse_resnet",
     }  # fmt: skip
     assert named("imagines") == {"playslot"}
 

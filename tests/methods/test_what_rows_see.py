@@ -38,12 +38,16 @@ class Sees:
         labels: real actions: of `behaviour.labelled_demos`, or of all demonstrations that it gets.
         acts_on: what its policy reads of the camera.
         state: its decoder may read that beside the latent action.
+        frames: of the camera, at once, at most.
+        proprioception: its policy reads it.
     """
 
     videos: bool
     labels: Labels
     acts_on: Literal["frames", "slots"]
     state: bool = False
+    frames: int = 1
+    proprioception: bool = False
 
 
 TABLE = {
@@ -52,9 +56,13 @@ TABLE = {
     "slot_bc": Sees(True, "all", "slots"),
     "resnet_oracle": Sees(False, "all", "frames"),
     "resnet_bc": Sees(False, "all", "frames"),
+    "history_bc": Sees(False, "all", "frames", frames=4),
     "act": Sees(False, "all", "frames"),
-    "diffusion": Sees(False, "all", "frames"),
+    "act_state": Sees(False, "all", "frames", proprioception=True),
+    "diffusion": Sees(False, "all", "frames", frames=2),
+    "diffusion_state": Sees(False, "all", "frames", frames=2, proprioception=True),
     "autoencoder_bc": Sees(True, "all", "frames"),
+    "inverse_bc": Sees(True, "all", "frames"),
     "lapo": Sees(True, "some", "frames", state=True),
     "laom": Sees(True, "some", "frames", state=True),
     "clam": Sees(True, "some", "frames"),
@@ -148,3 +156,15 @@ def test_it_acts_on_frames_or_on_their_slots(name: str, trainings: Trainings) ->
     assert (keys.SLOT_STATE in actor.memory_keys) == (TABLE[name].acts_on == "slots")
     decoders = [part for part in actor.modules() if isinstance(part, ActionDecoder)]
     assert any(decoder.reads_slots for decoder in decoders) == TABLE[name].state
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", TABLE)
+def test_it_acts_on_so_many_frames_and_reads_proprioception_where_the_table_says_so(
+    name: str, trainings: Trainings
+) -> None:
+    actor = plugins.call(METHODS[name].load.actor, trainings.train(name), "cpu")
+    assert (keys.STATE in actor.in_keys) == TABLE[name].proprioception
+    memory = actor.reset([0])
+    seen = memory[keys.FRAME_HISTORY].shape[1] if keys.FRAME_HISTORY in actor.memory_keys else 1
+    assert seen == TABLE[name].frames

@@ -21,6 +21,9 @@ METHODS = (
     "act",
     "diffusion",
     "autoencoder_bc",
+    "inverse_bc",
+    "history_bc",
+    "act_state",
     "lapo",
     "laom",
     "caddy_policy",
@@ -61,6 +64,9 @@ def _meta(run: Path, stage: str) -> dict[str, Any]:
         ("act", 4),
         ("diffusion", 4),
         ("autoencoder_bc", 4),
+        ("inverse_bc", 4),
+        ("history_bc", 4),
+        ("act_state", 4),
         ("lapo", 3),
         ("laom", 3),
         ("caddy_policy", 3),
@@ -73,7 +79,7 @@ def test_a_baseline_is_a_run_that_says_what_it_saw(trained: dict[str, Path], met
     assert (meta["demos"], meta["labelled_demos"]) == (4, labels)
     assert json.loads((run / "config.json").read_text())["method"] == method
     assert (run / method / "metrics.jsonl").is_file()
-    assert ("pretraining" in meta) == (method in ("resnet_oracle", "act", "diffusion"))
+    assert ("pretraining" in meta) == (method in ("resnet_oracle", "history_bc", "act", "act_state", "diffusion"))
 
 
 def test_a_finished_slot_oracle_does_not_ask_for_what_it_has_none_of(

@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.machine import WEIGHT, Need, chain, frame_numbers, windows
+from playslot_rl.config.machine import WEIGHT, Need, chain
 from playslot_rl.config.methods import Load, Method, Style
-from playslot_rl.config.plain import check
-from playslot_rl.config.roles import COUNT, Checked, above_zero, between, role
+from playslot_rl.config.pretraining import PretrainedConfig
+from playslot_rl.config.roles import COUNT, above_zero
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.config.stages import StageConfig, clipped_stage
 
 
 @dataclass(frozen=True)
-class CLAMConfig(Checked):
+class CLAMConfig(PretrainedConfig):
     """Sizes and schedule of CLAM.
 
     Attributes:
@@ -25,10 +25,6 @@ class CLAMConfig(Checked):
         latent_dim: of latent actions.
         label_weight: of the labelled actions in the model's loss.
         loss: of the policy, `l2` or `l1`.
-        shift: of frames in the policy's training, pixels.
-        model: training of the model and the decoder.
-        policy: training of the latent policy.
-        world: run of CLAM with the same labels whose model is taken; empty trains one.
     """
 
     group = "baselines.clam."
@@ -37,18 +33,14 @@ class CLAMConfig(Checked):
     latent_dim: int = field(default=8, metadata=COUNT)
     label_weight: float = field(default=1.0, metadata=above_zero())
     loss: Literal["l2", "l1"] = "l2"
-    shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
-    model: StageConfig = field(default_factory=lambda: clipped_stage(200_000, 3e-4, "cosine"))
     policy: StageConfig = field(default_factory=lambda: clipped_stage(100_000, 3e-4, "constant"))
-    world: str = field(default="", metadata=role("machine", "folder"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(1 <= len(self.channels) <= 5, "baselines.clam.channels", self.channels, "1 to 5 widths")
+        self.check_levels(self.channels)
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        for part, stage in (("model", self.model), ("policy", self.policy)):
-            yield windows(f"{name}.{part}", stage, frame_numbers(config))
+        yield from super().needs(name, config)
         weights = 9 * chain(9, *self.channels) + self.hidden * (self.channels[-1] + self.latent_dim)
         yield Need((name,), "CLAM's weights", weights * WEIGHT)
 

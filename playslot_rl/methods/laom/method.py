@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.machine import WEIGHT, Need, chain, frame_numbers, windows
+from playslot_rl.config.machine import WEIGHT, Need, chain
 from playslot_rl.config.methods import Load, Method, Style
-from playslot_rl.config.plain import check
-from playslot_rl.config.roles import COUNT, NOT_NEGATIVE, OPEN_FRACTION, RATE, Checked, at_least, between, role
+from playslot_rl.config.pretraining import PretrainedConfig
+from playslot_rl.config.roles import COUNT, NOT_NEGATIVE, OPEN_FRACTION, RATE, at_least, between
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.config.stages import DECODING, StageConfig, clipped_stage
 
 
 @dataclass(frozen=True)
-class LAOMConfig(Checked):
+class LAOMConfig(PretrainedConfig):
     """Sizes and schedule of LAOM, whose decoder is as LAPO's.
 
     Attributes:
@@ -28,12 +28,8 @@ class LAOMConfig(Checked):
         target_rate: part of the encoder that its slow copy takes in a step.
         label_weight: of the labelled actions in the model's loss; 0 does not read them.
         loss: of policy and decoder, `l2` or `l1`.
-        shift: of frames in the policy's training, pixels.
-        model: training of the model.
-        policy: training of the latent policy.
         decoder_steps: of the action decoder.
         decoder_lr: its learning rate.
-        world: run of LAOM with the same labels whose model is taken; empty trains one.
     """
 
     group = "baselines.laom."
@@ -45,20 +41,17 @@ class LAOMConfig(Checked):
     target_rate: float = field(default=0.001, metadata=OPEN_FRACTION)
     label_weight: float = field(default=0.1, metadata=NOT_NEGATIVE)
     loss: Literal["l2", "l1"] = "l2"
-    shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
     model: StageConfig = field(default_factory=lambda: clipped_stage(200_000, 1e-4, "cosine"))
     policy: StageConfig = field(default_factory=lambda: clipped_stage(20_000, 1e-4, "constant"))
     decoder_steps: int = field(default=20_000, metadata=at_least(1))
     decoder_lr: float = field(default=3e-4, metadata=RATE)
-    world: str = field(default="", metadata=role("machine", "folder"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(1 <= len(self.channels) <= 5, "baselines.laom.channels", self.channels, "1 to 5 widths")
+        self.check_levels(self.channels)
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
-        for part, stage in (("model", self.model), ("policy", self.policy)):
-            yield windows(f"{name}.{part}", stage, frame_numbers(config))
+        yield from super().needs(name, config)
         weights = 9 * chain(3, *self.channels) + self.hidden * (24 * self.hidden + 4 * self.latent_dim)
         yield Need((name,), "LAOM's weights", weights * WEIGHT)
 

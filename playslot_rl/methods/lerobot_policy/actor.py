@@ -2,7 +2,7 @@
 
 As their `select_action`, whose queues are the memory here.
 
-Shapes: n episodes side by side, F frames, E actions executed of a chunk, A action dim.
+Shapes: n episodes side by side, F frames, E actions executed of a chunk, A action dim, S proprioception.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import Actor
+from playslot_rl.acting.actor import Actor, with_present
 from playslot_rl.config import EnvConfig
 from playslot_rl.frames import normalise
 from playslot_rl.methods.lerobot_policy.method import ACTConfig, ChunkConfig, DiffusionConfig
@@ -23,15 +23,21 @@ from playslot_rl.seeds.draws import derived_seed
 
 
 class ChunkActor(Actor):
-    """Reads PIXELS (n, 3, W, W); its memory has the last F frames, the actions of the last chunk, steps and seeds."""
+    """Reads PIXELS (n, 3, W, W) and perhaps STATE (n, S); its memory has the last F of them, the actions of the last
+    chunk, steps and seeds.
+    """
 
     def __init__(self, policy: ChunkPolicy, image_size: int) -> None:
-        super().__init__((keys.FRAME_HISTORY, keys.PLANNED_ACTIONS, keys.STEP_COUNT, keys.NOISE_SEED))
+        memory = (keys.FRAME_HISTORY, keys.PLANNED_ACTIONS, keys.STEP_COUNT, keys.NOISE_SEED)
+        reads = (keys.PIXELS, keys.STATE) if policy.state_dim else (keys.PIXELS,)
+        super().__init__((*memory, *([keys.STATE_HISTORY] if policy.state_dim else [])), reads)
         self.policy, self.image_size = policy, image_size
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
         memory, n, side = super().reset(seeds), len(seeds), self.image_size
         memory[keys.FRAME_HISTORY] = torch.zeros(n, self.policy.frames, 3, side, side)
+        if self.policy.state_dim:
+            memory[keys.STATE_HISTORY] = torch.zeros(n, self.policy.frames, self.policy.state_dim)
         memory[keys.PLANNED_ACTIONS] = torch.zeros(n, self.policy.executed, self.policy.statistics.shape[1])
         memory[keys.STEP_COUNT] = torch.zeros(n, 1, dtype=torch.long)
         memory[keys.NOISE_SEED] = torch.tensor([[seed] for seed in seeds], dtype=torch.long)
@@ -39,15 +45,19 @@ class ChunkActor(Actor):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The chunk's next action; episodes whose chunk is used up predict another."""
-        step, pixels = tensordict.get(keys.STEP_COUNT), normalise(tensordict.get(keys.PIXELS)).unsqueeze(1)
-        frames = torch.cat((tensordict.get(keys.FRAME_HISTORY)[:, 1:], pixels), dim=1)
-        frames = torch.where((step == 0)[:, :, None, None, None], pixels, frames)
+        step, states = tensordict.get(keys.STEP_COUNT), None
+        frames = with_present(tensordict.get(keys.FRAME_HISTORY), normalise(tensordict.get(keys.PIXELS)), step)
+        if self.policy.state_dim:
+            states = with_present(tensordict.get(keys.STATE_HISTORY), tensordict.get(keys.STATE).float(), step)
+            tensordict.set(keys.STATE_HISTORY, states)
         plan, at = tensordict.get(keys.PLANNED_ACTIONS), (step % self.policy.executed).squeeze(-1)
         due = torch.nonzero(at == 0).squeeze(-1)
         if len(due):
             drawn = zip(tensordict.get(keys.NOISE_SEED)[due, 0].tolist(), step[due, 0].tolist(), strict=True)
             seeds = [derived_seed(seed, number, "noise") for seed, number in drawn]
-            plan = plan.index_copy(0, due, self.policy.plan(frames[due], seeds))
+            plan = plan.index_copy(
+                0, due, self.policy.plan(frames[due], seeds, None if states is None else states[due])
+            )
         action = plan[torch.arange(len(plan), device=plan.device), at]
         return tensordict.update(
             {
@@ -64,15 +74,24 @@ def load_act(run: Run, device: torch.device | str = "cpu") -> Actor:
     return _load(run, "act", ACTConfig, device)
 
 
+def load_act_state(run: Run, device: torch.device | str = "cpu") -> Actor:
+    """As `load_act`."""
+    return _load(run, "act_state", ACTConfig, device)
+
+
 def load_diffusion(run: Run, device: torch.device | str = "cpu") -> Actor:
     """As `load_act`; a ConfigError where diffusers is missing."""
     return _load(run, "diffusion", DiffusionConfig, device)
 
 
+def load_diffusion_state(run: Run, device: torch.device | str = "cpu") -> Actor:
+    """As `load_diffusion`."""
+    return _load(run, "diffusion_state", DiffusionConfig, device)
+
+
 def _load(run: Run, name: str, kind: type[ChunkConfig], device: torch.device | str) -> Actor:
     done = run.stage(name)
     own, env = done.group(kind, name), done.group(EnvConfig, "env")
-    policy = done.restore(
-        lambda: chunk_policy(own, env.image_size, env.action_dim, int(done.meta["chunk"])), "policy", device
-    )
+    chunk, state = int(done.meta["chunk"]), int(done.meta.get("state", 0))
+    policy = done.restore(lambda: chunk_policy(own, env.image_size, env.action_dim, chunk, state), "policy", device)
     return ChunkActor(policy, env.image_size)

@@ -3,6 +3,8 @@
 Networks, losses, processors and optimisers are LeRobot's (`lerobot.policies`), and so are the names' meanings and the
 defaults; frames, rows, seeds, checkpoints and the loop are ours.
 
+The camera is their input; of `act_state` and `diffusion_state` the robot's proprioception, too.
+
 Note: a chunk has 20 actions at most, LeRobot's defaults 100 and 64: episodes here have 20 to 25.
 """
 
@@ -169,13 +171,17 @@ def require_diffusers() -> None:
         )
 
 
-def _method(name: str, titles: tuple[str, ...], style: Style, config: type[ChunkConfig]) -> Method:
+def _method(
+    name: str, titles: tuple[str, ...], style: Style, config: type[ChunkConfig] | None, group: str = ""
+) -> Method:
+    """A method with settings of its own, or with proprioception and those of the method `group`."""
     stage = StageSpec(
         name,
         keys=("behaviour.trim_pixels", "behaviour.trim_margin"),
-        settings=(f"baselines.{name}",),
+        settings=(f"baselines.{group or name}",),
         data="labelled",
-        parts="playslot_rl.methods.lerobot_policy.training:training",
+        parts=f"playslot_rl.methods.lerobot_policy.training:{'with_state' if group else 'training'}",
+        names={f"baselines.{group}": name} if group else {},
     )
     return Method(
         name, titles, style, config, (stage,), Load(actor=f"playslot_rl.methods.lerobot_policy.actor:load_{name}")
@@ -184,3 +190,7 @@ def _method(name: str, titles: tuple[str, ...], style: Style, config: type[Chunk
 
 ACT: Final = _method("act", ("ACT",), Style(6, "d"), ACTConfig)
 DIFFUSION: Final = _method("diffusion", ("Diffusion Policy",), Style(7, "h"), DiffusionConfig)
+ACT_STATE: Final = _method("act_state", ("ACT with state",), Style(6, "$A$"), None, "act")
+DIFFUSION_STATE: Final = _method(
+    "diffusion_state", ("Diffusion Policy with state",), Style(7, "$D$"), None, "diffusion"
+)

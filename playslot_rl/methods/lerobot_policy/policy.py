@@ -3,11 +3,11 @@
     L = policy.forward(pre(o, a)),    a_{t:t+H} = post(policy(pre(o)))
 
 `pre` and `post` are LeRobot's processors: frames by ImageNet's statistics, as `lerobot-train` has it, actions by those
-of the labelled demonstrations, stored with the weights.
+and, where it is seen, proprioception by those of the labelled demonstrations, stored with the weights.
 
-Note: without the robot's state, which LeRobot's Diffusion Policy cannot do without, it is one number that is 0.
+Note: without proprioception, which LeRobot's Diffusion Policy cannot do without, it is one number that is 0.
 
-Shapes: B batch, F frames, H actions of a chunk, E of them executed, A action dim.
+Shapes: B batch, F frames, H actions of a chunk, E of them executed, A action dim, S proprioception, 0 without.
 """
 
 from __future__ import annotations
@@ -34,14 +34,17 @@ class ChunkPolicy(nn.Module):
     """ACT or Diffusion Policy for frames of `image_size` and chunks of H; `make` and `chunks` are theirs."""
 
     statistics: Tensor
+    state_statistics: Tensor
 
-    def __init__(self, own: ChunkConfig, image_size: int, action_dim: int, chunk: int) -> None:
+    def __init__(self, own: ChunkConfig, image_size: int, action_dim: int, chunk: int, state_dim: int = 0) -> None:
         super().__init__()
         from lerobot.configs import FeatureType, PolicyFeature
 
-        self.frames, self.chunk, self.executed = own.frames, chunk, own.kept(chunk)
+        self.frames, self.chunk, self.executed, self.state_dim = own.frames, chunk, own.kept(chunk), state_dim
+        image = PolicyFeature(FeatureType.VISUAL, (3, image_size, image_size))
+        state = {keys.FEATURE_STATE: PolicyFeature(FeatureType.STATE, (state_dim,))} if state_dim else {}
         shared = {
-            "input_features": {keys.FEATURE_IMAGE: PolicyFeature(FeatureType.VISUAL, (3, image_size, image_size))},
+            "input_features": {keys.FEATURE_IMAGE: image, **state},
             "output_features": {keys.FEATURE_ACTION: PolicyFeature(FeatureType.ACTION, (action_dim,))},
             "n_action_steps": self.executed,
             "pretrained_backbone_weights": None,  # they are loaded by us, from where `weights` says
@@ -50,6 +53,8 @@ class ChunkPolicy(nn.Module):
         }
         self.policy = self.make(own, chunk, shared)
         self.register_buffer("statistics", torch.zeros(len(STATISTICS), action_dim))
+        if state_dim:
+            self.register_buffer("state_statistics", torch.zeros(len(STATISTICS), state_dim))
         self.action_range = ActionRange(action_dim)
         self._processors: tuple[torch.device, Any, Any] | None = None
 
@@ -65,29 +70,36 @@ class ChunkPolicy(nn.Module):
     def stats(self) -> dict[str, dict[str, Tensor]]:
         """What LeRobot's processors normalise by."""
         image = {"mean": torch.tensor(IMAGENET_MEAN).view(3, 1, 1), "std": torch.tensor(IMAGENET_STD).view(3, 1, 1)}
-        actions = dict(zip(STATISTICS, self.statistics.detach().cpu().unbind(), strict=True))
-        return {keys.FEATURE_IMAGE: image, keys.FEATURE_ACTION: actions}
+        known = {keys.FEATURE_ACTION: self.statistics}
+        if self.state_dim:
+            known[keys.FEATURE_STATE] = self.state_statistics
+        found = {name: zip(STATISTICS, rows.detach().cpu().unbind(), strict=True) for name, rows in known.items()}
+        return {keys.FEATURE_IMAGE: image, **{name: dict(rows) for name, rows in found.items()}}
 
-    def give(self, actions: Tensor) -> None:
-        """Take the statistics of actions (M, A), as LeRobot's data sets have them."""
-        found = actions.double()
-        rows = (found.mean(0), found.std(0, correction=0), found.amin(0), found.amax(0))
-        self.statistics.copy_(torch.stack(rows))
+    def give(self, actions: Tensor, states: Tensor | None = None) -> None:
+        """Take the statistics of actions (M, A) and proprioception (M, S), as LeRobot's data sets have them."""
+        self.statistics.copy_(_statistics(actions))
+        if states is not None:
+            self.state_statistics.copy_(_statistics(states))
 
     def trunk(self) -> tuple[nn.Module, dict[str, str]]:
         """ResNet-18 in it, and torchvision's name of each of its tensors."""
         raise NotImplementedError
 
-    def loss(self, pixels: Tensor, actions: Tensor, pad: Tensor) -> Tensor:
-        """LeRobot's loss of frames (B, F, 3, W, W), chunks (B, H, A) in [-1, 1], and where these are padding (B, H)."""
-        batch = self._pre({**self.observed(pixels), keys.FEATURE_ACTION: actions, PAD: pad})
+    def loss(self, pixels: Tensor, actions: Tensor, pad: Tensor, states: Tensor | None = None) -> Tensor:
+        """LeRobot's loss of frames (B, F, 3, W, W), chunks (B, H, A) in [-1, 1], where these are padding (B, H), and
+        proprioception (B, F, S).
+        """
+        batch = self._pre({**self.observed(pixels, states), keys.FEATURE_ACTION: actions, PAD: pad})
         loss: Tensor = self.policy.forward(batch)[0]
         return loss
 
     @torch.no_grad()
-    def plan(self, pixels: Tensor, seeds: Sequence[int]) -> Tensor:
-        """The actions (B, E, A) to execute, from frames (B, F, 3, W, W); what is drawn hangs on a row's seed alone."""
-        actions = self.chunks(self._pre(self.observed(pixels)), seeds)
+    def plan(self, pixels: Tensor, seeds: Sequence[int], states: Tensor | None = None) -> Tensor:
+        """The actions (B, E, A) to execute, from frames (B, F, 3, W, W) and proprioception (B, F, S); what is drawn
+        hangs on a row's seed alone.
+        """
+        actions = self.chunks(self._pre(self.observed(pixels, states)), seeds)
         planned: Tensor = self._post(actions).to(pixels.device)
         return planned
 
@@ -95,10 +107,11 @@ class ChunkPolicy(nn.Module):
         """Chunks that begin with the present action, less what is not executed, normalised."""
         raise NotImplementedError
 
-    def observed(self, pixels: Tensor) -> dict[str, Tensor]:
+    def observed(self, pixels: Tensor, states: Tensor | None = None) -> dict[str, Tensor]:
         """What LeRobot's policy sees, by the names of its data sets."""
-        state = torch.zeros(*pixels.shape[:2], 1, device=pixels.device)
-        return {keys.FEATURE_IMAGE: normalise(pixels), keys.FEATURE_STATE: state}
+        if states is None:
+            states = torch.zeros(*pixels.shape[:2], 1, device=pixels.device)
+        return {keys.FEATURE_IMAGE: normalise(pixels), keys.FEATURE_STATE: states}
 
     def _pre(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         found: dict[str, Tensor] = self._made()[0](batch)
@@ -138,8 +151,8 @@ class ACTChunks(ChunkPolicy):
         backbone: nn.Module = self.policy.model.backbone
         return backbone, {name: name for name in backbone.state_dict()}
 
-    def observed(self, pixels: Tensor) -> dict[str, Tensor]:
-        return {name: value[:, 0] for name, value in super().observed(pixels).items()}
+    def observed(self, pixels: Tensor, states: Tensor | None = None) -> dict[str, Tensor]:
+        return {name: value[:, 0] for name, value in super().observed(pixels, states).items()}
 
     def chunks(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> Tensor:  # noqa: ARG002
         actions: Tensor = self.policy.predict_action_chunk(batch)
@@ -153,12 +166,12 @@ class DiffusionChunks(ChunkPolicy):
         from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig as Theirs
         from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
-        state = {keys.FEATURE_STATE: PolicyFeature(FeatureType.STATE, (1,))}
+        features = {keys.FEATURE_STATE: PolicyFeature(FeatureType.STATE, (1,)), **shared["input_features"]}
         config = Theirs(
             n_obs_steps=own.frames, horizon=chunk, down_dims=own.channels, num_train_timesteps=own.noise_steps,
             spatial_softmax_num_keypoints=own.keypoints, crop_shape=(own.crop, own.crop) if own.crop else None,
             num_inference_steps=own.denoising_steps or None, noise_scheduler_type=own.scheduler,
-            **{**shared, "input_features": {**shared["input_features"], **state}},
+            **{**shared, "input_features": features},
         )  # fmt: skip
         return DiffusionPolicy(config)
 
@@ -189,7 +202,13 @@ class DiffusionChunks(ChunkPolicy):
         return actions[:, self.frames - 1 : self.frames - 1 + self.executed]
 
 
-def chunk_policy(own: ChunkConfig, image_size: int, action_dim: int, chunk: int) -> ChunkPolicy:
+def chunk_policy(own: ChunkConfig, image_size: int, action_dim: int, chunk: int, state_dim: int = 0) -> ChunkPolicy:
     """The untrained policy that these settings are of; a ConfigError where its library is missing."""
     kind = DiffusionChunks if isinstance(own, DiffusionConfig) else ACTChunks
-    return kind(own, image_size, action_dim, chunk)
+    return kind(own, image_size, action_dim, chunk, state_dim)
+
+
+def _statistics(values: Tensor) -> Tensor:
+    """STATISTICS of (M, ...), stacked."""
+    found = values.double()
+    return torch.stack((found.mean(0), found.std(0, correction=0), found.amin(0), found.amax(0)))

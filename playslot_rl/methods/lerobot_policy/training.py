@@ -7,7 +7,7 @@ Note: LeRobot's reader takes an episode's last row for one with an action; here 
 chunk nor is in one. Rows are drawn with replacement; still stretches begin no chunk (`behaviour.trim_pixels`), which
 LeRobot's reader knows nothing of. Diffusion's warm-up begins one step further.
 
-Shapes: M rows, B batch, F frames, H actions of a chunk, E of them executed, A action dim.
+Shapes: M rows, B batch, F frames, H actions of a chunk, E of them executed, A action dim, S proprioception.
 """
 
 from __future__ import annotations
@@ -43,22 +43,31 @@ VALIDATED = 128
 
 
 class Chunks(NamedTuple):
-    """Rows: frames (M, F), the actions (M, H, A) in [-1, 1] that are predicted from them, and which of these are
-    padding, bool (M, H).
+    """Rows: frames (M, F), the actions (M, H, A) in [-1, 1] that are predicted from them, which of these are padding,
+    bool (M, H), and proprioception (M, F, S) where it is seen.
     """
 
     frames: FrameInputs
     actions: Tensor
     pad: Tensor
+    states: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.actions)
 
 
 def chunked(
-    config: ExperimentConfig, source: EpisodeFrames, own: ChunkConfig, chunk: int, device: torch.device, shift: int = 0
+    config: ExperimentConfig,
+    source: EpisodeFrames,
+    own: ChunkConfig,
+    chunk: int,
+    device: torch.device,
+    shift: int = 0,
+    state: bool = False,
 ) -> Chunks:
-    """The rows of demonstrations; a DataError where there are no actions, or nothing moves."""
+    """The rows of demonstrations; a DataError where there are no actions, or no proprioception that is to be seen, or
+    nothing moves.
+    """
     moves = moving_frames(source, config.behaviour.trim_pixels, config.behaviour.trim_margin)
     lengths = moves.lengths[moves.episode]
     # As LeRobot's sampler: the last rows of an episode, whose chunks would be padding for the most part, begin none.
@@ -71,7 +80,9 @@ def chunked(
     seen = np.maximum(rows[:, None] + np.arange(1 - own.frames, 1), first)
     actions = real_actions(source, np.clip(wanted, first, last), config.env.action_dim)
     frames = FrameInputs(source, seen, device, shift, config.data.device == "auto")
-    return Chunks(frames, actions.to(device), torch.from_numpy((wanted < first) | (wanted > last)).to(device))
+    pad = torch.from_numpy((wanted < first) | (wanted > last)).to(device)
+    states = torch.from_numpy(source.require_states()[seen]).to(device) if state else None
+    return Chunks(frames, actions.to(device), pad, states)
 
 
 class ChunkStage:
@@ -96,12 +107,14 @@ class ChunkStage:
         rows = own_rows(drawn)
         there = to_device(rows, self.trained.actions.device)
         pixels = self.trained.frames.draw(rows, generators)
-        return {keys.PIXELS: pixels, keys.ACTION: self.trained.actions[there], PAD: self.trained.pad[there]}
+        states = {} if self.trained.states is None else {keys.STATE: self.trained.states[there]}
+        return {keys.PIXELS: pixels, keys.ACTION: self.trained.actions[there], PAD: self.trained.pad[there], **states}
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         """Note: dropout, the VAE's and the diffusion's noise are drawn for each share of a batch alike."""
         with autocast(batch[keys.PIXELS].device.type, self.own.precision):
-            return {"loss": self.policy.loss(batch[keys.PIXELS], batch[keys.ACTION], batch[PAD]).float()}
+            seen = batch[keys.PIXELS], batch[keys.ACTION], batch[PAD], batch.get(keys.STATE)
+            return {"loss": self.policy.loss(*seen).float()}
 
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
         """Unexplained fraction of the variance of the actions that are executed."""
@@ -109,34 +122,42 @@ class ChunkStage:
 
     def _compared(self, chunks: Chunks) -> tuple[Tensor, Tensor]:
         rows = torch.linspace(0, len(chunks) - 1, min(VALIDATED, len(chunks))).long()
-        predicted = self.policy.plan(chunks.frames.plain(rows), rows.tolist())
-        there, begin = to_device(rows, predicted.device), self.own.frames - 1
+        there, begin = to_device(rows, chunks.actions.device), self.own.frames - 1
+        states = None if chunks.states is None else chunks.states[there]
+        predicted = self.policy.plan(chunks.frames.plain(rows), rows.tolist(), states)
         shown = slice(begin, begin + self.policy.executed)
         real = ~chunks.pad[there][:, shown]
         return predicted[real], chunks.actions[there][:, shown][real]
 
 
-def training(record: StageRecord) -> Training:
+def with_state(record: StageRecord) -> Training:
+    """With proprioception."""
+    return training(record, state=True)
+
+
+def training(record: StageRecord, state: bool = False) -> Training:
     config, device, split = record.config, record.device, record.demos
-    own: ChunkConfig = getattr(config.baselines, record.name)
+    group = f"baselines.{record.spec.own}"
+    own: ChunkConfig = getattr(config.baselines, record.spec.own)
     width = config.env.action_dim
     split.trained.require_actions(width)
     require_finite(split)
     moves = transitions(split.trained)
     chunk = own.sized(int(moves.lengths.max()))
+    states = torch.from_numpy(split.trained.require_states()[moves.rows]) if state else None
     with global_seed(config.seed, 0, record.name):
-        policy = chunk_policy(own, config.env.image_size, width, chunk)
+        policy = chunk_policy(own, config.env.image_size, width, chunk, 0 if states is None else states.shape[1])
     trunk, names = policy.trunk()
-    pretraining = load_trunk(trunk, own.weights, f"baselines.{record.name}.weights", names)
-    policy.give(real_actions(split.trained, moves.rows, width))
+    pretraining = load_trunk(trunk, own.weights, f"{group}.weights", names)
+    policy.give(real_actions(split.trained, moves.rows, width), states)
     policy.to(device)
-    trained = chunked(config, split.trained, own, chunk, device, own.shift)
-    held_out = None if split.held_out is None else chunked(config, split.held_out, own, chunk, device)
+    trained = chunked(config, split.trained, own, chunk, device, own.shift, state)
+    held_out = None if split.held_out is None else chunked(config, split.held_out, own, chunk, device, 0, state)
     stage = ChunkStage(policy, own, trained, held_out)
     said, extra = cloned(record.name, split, len(trained))
-    facts = {"pretraining": pretraining, "chunk": chunk}
+    facts = {"pretraining": pretraining, "chunk": chunk, **({"state": policy.state_dim} if state else {})}
     return Training(
-        [Part(f"baselines.{record.name}", stage, own, optimizer=partial(_optimizer, policy, own))],
+        [Part(f"baselines.{record.name}", stage, own, group=group, optimizer=partial(_optimizer, policy, own))],
         device,
         lambda _: f"{said}, chunks of {chunk}, ResNet-18 from {pretraining}, {record.folder}",
         extra={**extra, **facts},

@@ -1,4 +1,5 @@
-"""A ResNet-18 on the real actions of all demonstrations, or of the labelled ones alone (BC); its settings."""
+"""A ResNet-18 on the real actions of all demonstrations, or of the labelled ones alone (BC), where the arm hides things
+with the last frames; its settings."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from typing import Final
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.machine import Need, frame_numbers, windows
 from playslot_rl.config.methods import Load, Method, Style
-from playslot_rl.config.roles import at_least, between, was
+from playslot_rl.config.roles import UNSAID, at_least, between, was
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.config.stages import OptimConfig, StageConfig
 from playslot_rl.errors import ConfigError
@@ -27,6 +28,7 @@ class ResNetOracleConfig(StageConfig):
         shift: frames are shifted by up to so many pixels either way in training, edges repeated; 0 does not.
         patience: end before `steps` once the error on held-out demonstrations has not fallen for so many validations,
             with the weights that had the lowest; 0, or none held out: train all steps.
+        history: frames that `history_bc` sees, the present one the last.
     """
 
     group = "baselines.resnet_oracle."
@@ -38,6 +40,7 @@ class ResNetOracleConfig(StageConfig):
     weights: str = "auto"
     shift: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
     patience: int = field(default=0, metadata=was(0) | at_least(0))
+    history: int = field(default=4, metadata=UNSAID | between(2, 16, "2 to 16"))
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
         yield windows(name, self, frame_numbers(config))
@@ -61,5 +64,17 @@ STAGE: Final = StageSpec(
     parts="playslot_rl.methods.resnet_oracle.training:training",
 )
 _LOAD: Final = Load(actor="playslot_rl.methods.resnet_oracle.network:load_actor")
+HISTORY: Final = "history_bc"
+_WITH_HISTORY: Final = replace(
+    STAGE,
+    name=HISTORY,
+    data="labelled",
+    parts="playslot_rl.methods.resnet_oracle.training:with_history",
+    names={"baselines.resnet_oracle": HISTORY},
+)
 RESNET_ORACLE: Final = Method(NAME, ("ResNet Oracle", "ResNet"), Style(1, "v"), ResNetOracleConfig, (STAGE,), _LOAD)
 RESNET_BC: Final = Method("resnet_bc", ("ResNet BC",), Style(1, ">"), None, (replace(STAGE, data="labelled"),), _LOAD)
+HISTORY_BC: Final = Method(
+    HISTORY, ("ResNet BC with history",), Style(1, "$H$"), None, (_WITH_HISTORY,),
+    Load(actor="playslot_rl.methods.resnet_oracle.network:load_with_history"),
+)  # fmt: skip

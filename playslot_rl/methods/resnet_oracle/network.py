@@ -3,29 +3,31 @@
     a_t = clamp(f(R(o_t) + P), -1, 1)
 
 R is torchvision's ResNet-18 without pooling and classifier: its last feature map, read as h w tokens of 512, takes the
-place of the slots in the policy's network f; P is a learned position of each token. All of it is trained.
+place of the slots in the policy's network f; P is a learned position of each token. All of it is trained. With history
+f reads the tokens of the last F frames, each at a position of its own; before an episode's first frame it stands again.
 
 Note: the paper does not say where in ResNet-18 the features are taken, nor whether it stays frozen. Frames are 64x64,
 so the last feature map is 2x2: as many tokens as ButtonPress has slots.
 
-Shapes: B batch, H W image height and width, h w those of the feature map (H / 32, W / 32), A action dim.
+Shapes: B batch, F frames, H W image height and width, h w those of the feature map (H / 32, W / 32), A action dim.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import Actor, ReactiveActor
+from playslot_rl.acting.actor import Actor, ReactiveActor, with_present
 from playslot_rl.config import PolicyConfig
 from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import normalise
-from playslot_rl.methods.resnet_oracle.method import NAME
+from playslot_rl.methods.resnet_oracle.method import HISTORY, NAME, ResNetOracleConfig
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.runs import Run
 from playslot_rl.storage.tensors import pick_published, read_published
@@ -39,30 +41,30 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class ResNetPolicy(nn.Module):
-    """Real actions from frames H = W = `image_size`, a multiple of 32."""
+    """Real actions from frames H = W = `image_size`, a multiple of 32; from the last `frames` of them."""
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, config: PolicyConfig, image_size: int, out_dim: int) -> None:
+    def __init__(self, config: PolicyConfig, image_size: int, out_dim: int, frames: int = 1) -> None:
         from torchvision.models import resnet18
 
         super().__init__()
         trunk = resnet18(weights=None)
         trunk.avgpool, trunk.fc = nn.Identity(), nn.Identity()
-        self.trunk = trunk
-        self.position = nn.Parameter(torch.randn((image_size // 32) ** 2, WIDTH) * 0.02)
+        self.trunk, self.frames = trunk, frames
+        self.position = nn.Parameter(torch.randn(frames * (image_size // 32) ** 2, WIDTH) * 0.02)
         self.head = LatentPolicy(config, WIDTH, out_dim, acts=True)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
 
     def features(self, pixels: Tensor) -> Tensor:
-        """Frames (B, 3, H, W), uint8 or float [0, 1], to tokens (B, h w, 512)."""
-        flat: Tensor = self.trunk((normalise(pixels) - self.mean) / self.std)
-        return flat.view(len(flat), WIDTH, -1).transpose(1, 2)
+        """Frames (B, [F,] 3, H, W), uint8 or float [0, 1], to tokens (B, F h w, 512)."""
+        flat: Tensor = self.trunk((normalise(pixels).flatten(0, -4) - self.mean) / self.std)
+        return flat.view(len(flat), WIDTH, -1).transpose(1, 2).reshape(len(pixels), -1, WIDTH)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Frames (B, 3, H, W), uint8 or float [0, 1], to actions (B, A), not clamped."""
+        """Frames (B, [F,] 3, H, W), uint8 or float [0, 1], to actions (B, A), not clamped."""
         actions: Tensor = self.head(self.features(pixels) + self.position)
         return actions
 
@@ -115,9 +117,38 @@ def resnet_actor(policy: ResNetPolicy) -> Actor:
     return ReactiveActor(oracle_module(policy, keys.PIXELS))
 
 
+class HistoryActor(Actor):
+    """The last F frames (n, F, 3, W, W), its memory, to ACTION (n, A), clamped to [-1, 1]."""
+
+    def __init__(self, policy: ResNetPolicy, image_size: int) -> None:
+        super().__init__((keys.FRAME_HISTORY, keys.STEP_COUNT))
+        self.policy, self.image_size = policy, image_size
+
+    def reset(self, seeds: Sequence[int]) -> TensorDict:
+        memory, n, side = super().reset(seeds), len(seeds), self.image_size
+        memory[keys.FRAME_HISTORY] = torch.zeros(n, self.policy.frames, 3, side, side)
+        memory[keys.STEP_COUNT] = torch.zeros(n, 1, dtype=torch.long)
+        return memory
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        step = tensordict.get(keys.STEP_COUNT)
+        frames = with_present(tensordict.get(keys.FRAME_HISTORY), normalise(tensordict.get(keys.PIXELS)), step)
+        actions = self.policy(frames).clamp(-1, 1)
+        return tensordict.update({keys.ACTION: actions, keys.FRAME_HISTORY: frames, keys.STEP_COUNT: step + 1})
+
+
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a finished run; a CheckpointError where it is missing or damaged."""
-    done = run.stage(NAME)
+    return resnet_actor(_load(run, NAME, 1, device))
+
+
+def load_with_history(run: Run, device: torch.device | str = "cpu") -> Actor:
+    """As `load_actor`, of frames with history."""
+    own = run.stage(HISTORY).group(ResNetOracleConfig, HISTORY)
+    return HistoryActor(_load(run, HISTORY, own.history, device), run.stage(HISTORY).sizes[1].image_size)
+
+
+def _load(run: Run, stage: str, frames: int, device: torch.device | str) -> ResNetPolicy:
+    done = run.stage(stage)
     model, env = done.sizes
-    policy = done.restore(lambda: ResNetPolicy(model.policy, env.image_size, env.action_dim), "policy", device)
-    return resnet_actor(policy)
+    return done.restore(lambda: ResNetPolicy(model.policy, env.image_size, env.action_dim, frames), "policy", device)

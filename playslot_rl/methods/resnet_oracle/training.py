@@ -16,21 +16,25 @@ from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage_regression import HELD_OUT
 
 
-def training(record: StageRecord) -> Training:
+def with_history(record: StageRecord) -> Training:
+    """From the last frames."""
+    own: ResNetOracleConfig = record.config.baselines.resnet_oracle
+    return training(record, own.history)
+
+
+def training(record: StageRecord, frames: int = 1) -> Training:
     config, device, split = record.config, record.device, record.demos
     own: ResNetOracleConfig = config.baselines.resnet_oracle
     require_finite(split)
-    with global_seed(config.seed, 0, NAME):
-        policy = ResNetPolicy(config.model.policy, config.env.image_size, config.env.action_dim)
+    with global_seed(config.seed, 0, record.name):
+        policy = ResNetPolicy(config.model.policy, config.env.image_size, config.env.action_dim, frames)
     pretraining = load_pretrained(policy, own.weights)
     policy.to(device)
-    stage = action_stage(
-        "policy", policy, keys.PIXELS, lambda x: x, config, split, device, own.shift, own, validated=512
-    )
+    stage = action_stage("policy", policy, keys.PIXELS, lambda x: x, config, split, device, own.shift, own, 512, frames)
     patience = Patience(own.patience, f"unexplained{HELD_OUT}") if own.patience and split.held_out is not None else None
-    said, extra = cloned(NAME, split, len(stage.targets))
+    said, extra = cloned(record.name, split, len(stage.targets))
     return Training(
-        [Part(f"baselines.{NAME}", stage, own, patience=patience)],
+        [Part(f"baselines.{record.name}", stage, own, group=f"baselines.{NAME}", patience=patience)],
         device,
         lambda _: f"{said}, ResNet-18 from {pretraining}, {record.folder}",
         extra={**extra, "pretraining": pretraining},

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 from torch.utils.data import default_collate
 from torchvision.models import resnet18
@@ -20,7 +21,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import choices, compose
 from playslot_rl.data.demonstrations import real_actions, transitions
 from playslot_rl.data.source import open_sources
-from playslot_rl.errors import ConfigError
+from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.methods.lerobot_policy import method
 from playslot_rl.methods.lerobot_policy.actor import ChunkActor
 from playslot_rl.methods.lerobot_policy.method import ACTConfig, ChunkConfig, DiffusionConfig
@@ -64,13 +65,13 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def made(name: str, *more: str) -> tuple[ExperimentConfig, Any, ChunkPolicy]:
-    """Config, settings and an untrained policy of the smoke preset."""
+def made(name: str, *more: str, state: int = 0) -> tuple[ExperimentConfig, Any, ChunkPolicy]:
+    """Config, settings and an untrained policy of the smoke preset, that sees `state` numbers of proprioception."""
     config = compose(["preset=smoke", "env=button_press", *more])
     own = getattr(config.baselines, name)
     torch.manual_seed(0)
-    policy = chunk_policy(own, 64, 4, own.sized(8))
-    policy.give(torch.rand(20, 4) * 2 - 1)
+    policy = chunk_policy(own, 64, 4, own.sized(8), state)
+    policy.give(torch.rand(20, 4) * 2 - 1, torch.rand(20, state) if state else None)
     return config, own, policy
 
 
@@ -83,13 +84,15 @@ def theirs(name: str, policy: ChunkPolicy, recorded: Path) -> tuple[Any, Any]:
     from lerobot.policies.factory import make_pre_post_processors
 
     source = open_sources(recorded, cache=recorded.parent / "cache")
-    actions = real_actions(source, transitions(source).rows, 4)
-    policy.give(actions)
+    rows = transitions(source).rows
+    actions, states = real_actions(source, rows, 4), torch.from_numpy(source.require_states()[rows])
+    policy.give(actions, states if policy.state_dim else None)
     meta = LeRobotDatasetMetadata("me/demos", root=recorded)
     deltas = resolve_delta_timestamps(policy.policy.config, meta)
     stats = {
         keys.FEATURE_IMAGE: {key: torch.tensor(value) for key, value in IMAGENET_STATS.items()},
         keys.FEATURE_ACTION: get_feature_stats(actions.numpy(), axis=0, keepdims=False),
+        keys.FEATURE_STATE: get_feature_stats(states.numpy(), axis=0, keepdims=False),
     }
     processors = make_pre_post_processors(policy.policy.config, dataset_stats=stats)
     return LeRobotDataset("me/demos", root=recorded, delta_timestamps=deltas, video_backend="pyav"), processors
@@ -98,14 +101,15 @@ def theirs(name: str, policy: ChunkPolicy, recorded: Path) -> tuple[Any, Any]:
 def ours(config: ExperimentConfig, own: ChunkConfig, policy: ChunkPolicy, recorded: Path) -> tuple[Chunks, list[int]]:
     """Our rows, and their numbers in the data set."""
     source = open_sources(recorded, cache=recorded.parent / "cache")
-    found = chunked(config, source, own, policy.chunk, torch.device("cpu"))
+    found = chunked(config, source, own, policy.chunk, torch.device("cpu"), 0, bool(policy.state_dim))
     return found, [int(row) for row in found.frames.rows[:, -1]]
 
 
 @pytest.mark.integration
+@pytest.mark.parametrize("state", [0, 4])
 @pytest.mark.parametrize("name", NAMES)
-def test_rows_and_losses_are_those_of_lerobots_reader_and_processors(name: str, recorded: Path) -> None:
-    config, own, policy = made(name)
+def test_rows_and_losses_are_those_of_lerobots_reader_and_processors(name: str, state: int, recorded: Path) -> None:
+    config, own, policy = made(name, state=state)
     dataset, (before, _) = theirs(name, policy, recorded)
     found, numbers = ours(config, own, policy, recorded)
     last = np.cumsum(LENGTHS) - 1
@@ -119,19 +123,22 @@ def test_rows_and_losses_are_those_of_lerobots_reader_and_processors(name: str, 
         torch.testing.assert_close(found.actions[row][real], item[keys.FEATURE_ACTION][real])
         seen = item[keys.FEATURE_IMAGE].reshape(own.frames, 3, 64, 64)
         torch.testing.assert_close(found.frames.plain(torch.tensor([row]))[0] / 255, seen)
+        if found.states is not None:
+            torch.testing.assert_close(found.states[row], item[keys.FEATURE_STATE].reshape(own.frames, 4))
         # ACT's loss leaves padding out, whatever stands there; the other's learns it.
         same = name == "act" or not empty.any()
         items += [(row, {**item, PAD: found.pad[row]})] if same else []
     whole = [row for row, _ in items]
     assert found.pad[whole].any()
     batch: dict[str, Any] = before(default_collate([item for _, item in items]))
-    if keys.FEATURE_STATE in policy.policy.config.input_features:
+    if not state:
         batch[keys.FEATURE_STATE] = torch.zeros(len(whole), own.frames, 1)
     torch.manual_seed(3)
     expected = policy.policy.forward(batch)[0]
     torch.manual_seed(3)
     rows = torch.tensor(whole)
-    got = policy.loss(found.frames.plain(rows), found.actions[rows], found.pad[rows])
+    states = None if found.states is None else found.states[rows]
+    got = policy.loss(found.frames.plain(rows), found.actions[rows], found.pad[rows], states)
     torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-6)
 
 
@@ -143,22 +150,30 @@ def test_padding_repeats_a_real_action_and_never_the_empty_one(recorded: Path) -
     assert not found.pad[:, 0].any()
 
 
-def played(policy: ChunkPolicy, frames: Tensor, before: Any, after: Any, noise: Any) -> Tensor:
+def test_a_set_without_proprioception_is_refused_in_one_line(recorded: Path) -> None:
+    config, own, policy = made("act", state=4)
+    source = replace(open_sources(recorded, cache=recorded.parent / "cache"), states=None)
+    with pytest.raises(DataError, match=r"got a data set without proprioception, expected .* `observation.state`:"):
+        chunked(config, source, own, policy.chunk, torch.device("cpu"), state=True)
+
+
+def played(policy: ChunkPolicy, frames: Tensor, states: Tensor, before: Any, after: Any, noise: Any) -> Tensor:
     """Actions (T, n, A) by LeRobot's own queues."""
     chosen = []
     policy.policy.reset()
-    for step, pixels in enumerate(frames):
-        state = torch.zeros(len(pixels), 1)
+    for step, (pixels, state) in enumerate(zip(frames, states, strict=True)):
         batch = before({keys.FEATURE_IMAGE: pixels / 255, keys.FEATURE_STATE: state})
         chosen.append(after(policy.policy.select_action(batch, **noise(step))))
     return torch.stack(chosen)
 
 
+@pytest.mark.parametrize("state", [0, 3])
 @pytest.mark.parametrize("name", NAMES)
-def test_it_acts_as_lerobots_select_action(name: str) -> None:
-    _, own, policy = made(name, "baselines.diffusion.scheduler=DDIM")
+def test_it_acts_as_lerobots_select_action(name: str, state: int) -> None:
+    _, own, policy = made(name, "baselines.diffusion.scheduler=DDIM", state=state)
     policy.eval()
     frames = torch.randint(256, (5, 2, 3, 64, 64), dtype=torch.uint8)
+    states = torch.rand(5, 2, state) if state else torch.zeros(5, 2, 1)
     seeds = (3, 4)
 
     def noise(step: int) -> dict[str, Tensor]:
@@ -167,10 +182,11 @@ def test_it_acts_as_lerobots_select_action(name: str) -> None:
         drawn = [torch.Generator().manual_seed(derived_seed(seed, step, "noise")) for seed in seeds]
         return {"noise": torch.stack([torch.randn(policy.chunk, 4, generator=one) for one in drawn])}
 
-    expected = played(policy, frames, *policy.processors(), noise)
+    expected = played(policy, frames, states, *policy.processors(), noise)
     loop = ClosedLoop(ChunkActor(policy, 64))
     loop.reset(seeds)
-    got = torch.stack([loop.act(pixels) for pixels in frames])
+    seen = [TensorDict({keys.PIXELS: p, keys.STATE: s}, [2]) for p, s in zip(frames, states, strict=True)]
+    got = torch.stack([loop.step(observation)[keys.ACTION].clamp(-1, 1) for observation in seen])
     torch.testing.assert_close(got, expected.clamp(-1, 1), rtol=1e-4, atol=1e-5)
     assert own.executed == 2
     assert not torch.equal(expected[0], expected[1])

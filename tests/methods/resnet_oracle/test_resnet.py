@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torchvision.models import resnet18
 
 from playslot_rl import keys
+from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config import PolicyConfig
+from playslot_rl.data.neighbours import Ends
 from playslot_rl.errors import CheckpointError
-from playslot_rl.methods.resnet_oracle.network import ResNetPolicy, cached_weights, load_pretrained, resnet_actor
+from playslot_rl.methods.resnet_oracle.network import (
+    HistoryActor,
+    ResNetPolicy,
+    cached_weights,
+    load_pretrained,
+    resnet_actor,
+)
 from playslot_rl.storage.tensors import save_tensors
 
 HEAD = PolicyConfig(dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16)
@@ -80,3 +89,22 @@ def test_a_given_file_is_read_and_a_wrong_one_refused(policy: ResNetPolicy, tmp_
     (tmp_path / "bad.pth").write_bytes(b"no weights")
     with pytest.raises(CheckpointError, match="expected a file of ResNet-18's"):
         load_pretrained(policy, str(tmp_path / "bad.pth"))
+
+
+@torch.no_grad()
+def test_with_history_it_acts_on_the_last_frames_in_their_order() -> None:
+    torch.manual_seed(0)
+    network = ResNetPolicy(HEAD, 64, 4, frames=3).eval()
+    frames = torch.randint(256, (5, 2, 3, 64, 64), dtype=torch.uint8)
+    loop = ClosedLoop(HistoryActor(network, 64))
+    loop.reset([1, 2])
+    acted = torch.stack([loop.act(pixels) for pixels in frames])
+    for step, rows in enumerate(((0, 0, 0), (0, 0, 1), (0, 1, 2), (1, 2, 3), (2, 3, 4))):
+        expected = network(frames[list(rows)].transpose(0, 1)).clamp(-1, 1)
+        torch.testing.assert_close(acted[step], expected, rtol=1e-4, atol=1e-5)
+    assert not torch.allclose(network(frames[:3].transpose(0, 1)), network(frames[:3].flip(0).transpose(0, 1)))
+
+
+def test_rows_of_the_past_end_in_the_present_and_begin_with_the_episode() -> None:
+    ends = Ends(np.array([0, 0, 0, 3, 3]), np.array([2, 2, 2, 4, 4]))
+    assert ends.past(np.array([0, 2, 4]), 3).tolist() == [[0, 0, 0], [0, 1, 2], [3, 3, 4]]
