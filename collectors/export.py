@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -73,14 +73,17 @@ def columns(episode: RecordedEpisode) -> dict[str, npt.NDArray[Any]]:
 def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str, Any]]:
     """Write and finalise the data set at `root`; returns a record of each episode."""
     metadata = METADATA if spec.env.name in PROCEDURAL else task_metadata(spec.env)
+    tasks = list(spec.env.sentences)
     fps = max(1, round(metadata["control_hz"] / spec.env.frame_skip))
     stated = features(spec, journal.read(0).states.shape[1])
     # LeRobot's 10 makes a row group of some 150 columns every ten episodes, all in memory and in the footer.
     dataset = new_set(repo_id(spec), root, fps, spec.env.name, stated, metadata_buffer_size=METADATA_ROWS)
+    if tasks:
+        dataset.meta.save_episode_tasks(tasks)  # `task_index` is in their order, whichever come
     write = _write_video if spec.storage == "video" else _write_images
     records = []
     with finalising(dataset):
-        for episode in write(dataset, journal, metadata["task"]):
+        for episode in write(dataset, journal, tasks or [metadata["task"]]):
             solved = bool(episode.success.any())
             steps = int(episode.success.argmax()) + 1 if solved else None
             outcome = {"seed": episode.seed, "success": solved, "steps_to_success": steps, "redrawn": episode.redrawn}
@@ -88,22 +91,22 @@ def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str,
     return records
 
 
-def _write_images(dataset: Any, journal: Journal, task: str) -> Iterator[RecordedEpisode]:
+def _write_images(dataset: Any, journal: Journal, tasks: Sequence[str]) -> Iterator[RecordedEpisode]:
     """The journal's PNGs go into the data set as they are."""
-    with contextlib.closing(ImageSetWriter(dataset.meta, dataset.root, task)) as writer:
+    with contextlib.closing(ImageSetWriter(dataset.meta, dataset.root, tasks[0])) as writer:
         for index in range(journal.spec.episodes):
             episode, images = journal.read_with_images(index)
             values = columns(episode)
             frames = values.pop(keys.FEATURE_IMAGE)
-            writer.add(values, frames, images)
+            writer.add(values, frames, images, tasks[episode.seed % len(tasks)])
             yield episode
 
 
-def _write_video(dataset: Any, journal: Journal, task: str) -> Iterator[RecordedEpisode]:
+def _write_video(dataset: Any, journal: Journal, tasks: Sequence[str]) -> Iterator[RecordedEpisode]:
     """LeRobot encodes."""
     for index in range(journal.spec.episodes):
         episode = journal.read(index)
-        values = columns(episode)
+        values, task = columns(episode), tasks[episode.seed % len(tasks)]
         for t in range(len(episode.frames)):
             dataset.add_frame({name: column[t] for name, column in values.items()} | {"task": task})
         dataset.save_episode()

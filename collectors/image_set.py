@@ -61,7 +61,7 @@ def finalising(dataset: Any) -> Iterator[None]:
 
 class ImageSetWriter:
     """Appends episodes to a data set that LeRobot has just created, with one image feature; `meta` is its
-    `LeRobotDatasetMetadata`."""
+    `LeRobotDatasetMetadata`, `task` that of episodes that name none."""
 
     def __init__(self, meta: Any, root: Path, task: str) -> None:
         from lerobot.datasets.feature_utils import get_hf_features_from_features
@@ -74,10 +74,13 @@ class ImageSetWriter:
         self._chunk = self._number = self._bytes = 0
         meta.save_episode_tasks([task])
 
-    def add(self, values: dict[str, npt.NDArray[Any]], frames: npt.NDArray[np.uint8], images: list[bytes]) -> None:
+    def add(
+        self, values: dict[str, npt.NDArray[Any]], frames: npt.NDArray[np.uint8], images: list[bytes], task: str = ""
+    ) -> None:
         """Append an episode of T frames; `values` (T, ...) are neither the image nor LeRobot's own index."""
         from lerobot.datasets.utils import update_chunk_file_indices
 
+        task = task or self.task
         size = sum(map(len, images))
         if self._bytes and self._bytes + size > self.meta.data_files_size_in_mb * 2**20:
             self.close()
@@ -92,7 +95,7 @@ class ImageSetWriter:
             "frame_index": index,
             "episode_index": np.full(count, episode),
             "index": first + index,
-            "task_index": np.full(count, self.meta.get_task_index(self.task)),
+            "task_index": np.full(count, self.meta.get_task_index(task)),
         }
         self._columns.append({**full, self._image: images})
         place = {
@@ -101,7 +104,7 @@ class ImageSetWriter:
             "dataset_from_index": first,
             "dataset_to_index": first + count,
         }
-        self.meta.save_episode(episode, count, [self.task], self._stats(full, frames), place)
+        self.meta.save_episode(episode, count, [task], self._stats(full, frames), place)
         if len(self._columns) >= EPISODES_AT_ONCE:
             self._flush()
 

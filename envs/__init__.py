@@ -37,6 +37,10 @@ _OURS: Final = {
 }
 
 
+SET_ID: Final = "PlaySlot/MetaWorldMT10-v0"
+"""Gymnasium id of a set of Meta-World's tasks."""
+
+
 class _Environments(Mapping[str, tuple[str, str]]):
     def __getitem__(self, name: str) -> tuple[str, str]:
         return _OURS[name] if name in _OURS else (TASKS[name].gym_id, TASKS[name].entry_point)
@@ -126,6 +130,7 @@ def register() -> None:
 
     wanted: dict[str, tuple[str, dict[str, Any]]] = {name: (entry, {}) for name, entry in _OURS.values()}
     wanted.update({_OURS[name][0]: (_OURS[name][1], {"env": family_config(name)}) for name in FAMILIES})
+    wanted[SET_ID] = "playslot_rl.envs.task_set:TaskSet", {"env": family_config(METAWORLD, "MT10")}
     wanted.update({name: (entry, {"env": config}) for name, (entry, config) in _settings().items()})
     for name, (entry, kwargs) in wanted.items():
         if name not in registry:
@@ -171,7 +176,7 @@ def make_env(env: EnvConfig | str | None = None, render: RenderConfig | None = N
     `expert_action()` can be called on it; a RenderError where there is no working GL backend.
     """
     env = task_config(env)
-    name = gym_id(env.name)
+    name = SET_ID if env.tasks else gym_id(env.name)
     from playslot_rl.envs.rendering import import_mujoco
 
     import_mujoco()

@@ -104,11 +104,12 @@ class Agent(nn.Module):
             )
         config, env = world_model.config, world_model.env
         slot_dim, width = config.savi.slot_dim, world_model.inverse_dynamics.latent_dim
+        tasks = len(env.tasks)
         return cls(
             world_model,
-            LatentPolicy(config.policy, slot_dim, width, config.policy.whiten),
+            LatentPolicy(config.policy, slot_dim, width, config.policy.whiten, tasks=tasks),
             ActionDecoder(config.action_decoder, width, env.action_dim, slot_dim),
-            LatentPolicy(config.policy, slot_dim, env.action_dim, acts=True) if oracle else None,
+            LatentPolicy(config.policy, slot_dim, env.action_dim, acts=True, tasks=tasks) if oracle else None,
         )
 
 
@@ -202,9 +203,16 @@ def dynamics_module(world_model: WorldModel) -> TensorDictSequential:
     )
 
 
+def _observed(policy: nn.Module, observation: str = keys.SLOTS) -> list[str]:
+    """What a policy reads: its observation, and TASK where it is told."""
+    return [observation, *([keys.TASK] if getattr(policy, "tasks", 0) else [])]
+
+
 def latent_policy_module(policy: nn.Module) -> TensorDictModule:
-    """SLOTS (..., N, D) to LATENT_ACTION (..., [N,] Z). The same module acts in the simulator and in imagination."""
-    return TensorDictModule(policy, in_keys=[keys.SLOTS], out_keys=[keys.LATENT_ACTION])
+    """SLOTS (..., N, D), and TASK where it is told, to LATENT_ACTION (..., [N,] Z). The same module acts in the
+    simulator and in imagination.
+    """
+    return TensorDictModule(policy, in_keys=_observed(policy), out_keys=[keys.LATENT_ACTION])
 
 
 def action_decoder_module(action_decoder: ActionDecoder, state: str = keys.SLOTS) -> TensorDictModule:
@@ -213,6 +221,9 @@ def action_decoder_module(action_decoder: ActionDecoder, state: str = keys.SLOTS
     return TensorDictModule(action_decoder, in_keys=read, out_keys=[keys.ACTION])
 
 
-def oracle_module(oracle: nn.Module, observation: str = keys.SLOTS) -> TensorDictModule:
-    """SLOTS (..., N, D), or another observation, to ACTION (..., A), clamped to [-1, 1]."""
-    return TensorDictModule(nn.Sequential(oracle, nn.Hardtanh()), in_keys=[observation], out_keys=[keys.ACTION])
+def oracle_module(oracle: nn.Module, observation: str = keys.SLOTS) -> TensorDictSequential:
+    """SLOTS (..., N, D), or another observation, and TASK where it is told, to ACTION (..., A), clamped to [-1, 1]."""
+    return TensorDictSequential(
+        TensorDictModule(oracle, in_keys=_observed(oracle, observation), out_keys=[keys.ACTION]),
+        TensorDictModule(nn.Hardtanh(), in_keys=[keys.ACTION], out_keys=[keys.ACTION]),
+    )

@@ -134,6 +134,7 @@ def describe(result: dict[str, Any], run: Path) -> str:
     """The result in a few lines."""
     title = METHODS[result["method"]].title
     rows = [(f"{title}, {result['protocol']}", result)]
+    rows += list(result.get("per_task", {}).items())
     rows += [(name.replace("_", " "), reference) for name, reference in result["references"].items()]
     lines = []
     for name, row in rows:

@@ -17,7 +17,7 @@ from playslot_rl.config.planning import GoalName
 from playslot_rl.envs import check_task
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes.evaluate import run_with_policy
-from playslot_rl.runs.opening import require_task, run_of_pretrained
+from playslot_rl.runs.opening import require_one_task, require_task, run_of_pretrained
 from playslot_rl.runtime.devices import open_device
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.acting.planners import search_size
 
     run = run_with_policy(config, "plan")
+    require_one_task(config, "plan")
     check_task(config.env, expert=True, success=True)  # refuses what has no simulator
     frame_skip = config.env.frame_skip
     try:

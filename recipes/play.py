@@ -43,7 +43,8 @@ def open_studio(config: ExperimentConfig) -> Studio:
         raise ConfigError("run: got nothing, expected a run or a pretrained model, such as run=pretrained")
     run = Run.of(config)
     model = load(run, str(open_device(config.device, config.threads)), config.seed)
-    world, agent = model.world_model, model.agent
+    world = model.world_model
+    agent = None if world.env.tasks else model.agent  # nobody tells it which
     recorded, simulated = recorded_starts(config, run, world, agent), simulated_starts(config, world)
     if recorded is None and simulated is None:
         print("no data set and no simulator to start from: upload a picture, or give data.root=", flush=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.methods import METHODS
+from playslot_rl.config.methods import METHODS, require_told
 from playslot_rl.envs import gym_id
 from playslot_rl.errors import ConfigError
 
@@ -26,6 +26,7 @@ def main(config: ExperimentConfig) -> None:
         )
     if method.acts:
         gym_id(config.env.name)
+    require_told(config.env, method.name)
     from playslot_rl.methods.training import train
     from playslot_rl.visualization.charts import draw_curve
 

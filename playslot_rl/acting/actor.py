@@ -88,15 +88,22 @@ def with_present(history: Tensor, present: Tensor, step: Tensor) -> Tensor:
     return torch.where(begins, now, torch.cat((history[:, 1:], now), dim=1))
 
 
+def told(seeds: Sequence[int], tasks: int) -> dict[str, Tensor]:
+    """TASK (n, 1) of episodes, as `EnvConfig.of_episode`; nothing of one task."""
+    return {keys.TASK: torch.tensor([[seed % tasks] for seed in seeds])} if tasks else {}
+
+
 class SlotActor(Actor):
-    """Frame to slots by SAVi, whose recurrent state is the memory; slots (n, N, D) to ACTION (n, A) by the heads.
+    """Frame to slots by SAVi, whose recurrent state is the memory; slots (n, N, D) to ACTION (n, A) by the heads, which
+    are told which of several `tasks` an episode is of, TASK (n, 1), by its seed.
 
     Note: initial slots that are sampled (SAVi with `initial: gaussian`) come from one generator, which `reset` seeds
     with the first episode's seed; learned ones draw nothing.
     """
 
-    def __init__(self, savi: SAVi, *heads: TensorDictModuleBase) -> None:
-        super().__init__((keys.SLOT_STATE, keys.SLOT_AGE))
+    def __init__(self, savi: SAVi, *heads: TensorDictModuleBase, tasks: int = 0) -> None:
+        super().__init__((keys.SLOT_STATE, keys.SLOT_AGE, *([keys.TASK] if tasks else [])))
+        self.tasks = tasks
         self._slots = (savi.config.n_slots, savi.config.slot_dim)
         self.parser = frame_parser_module(savi)
         self.heads = TensorDictSequential(*heads)
@@ -107,7 +114,7 @@ class SlotActor(Actor):
         memory = super().reset(seeds)
         memory[keys.SLOT_STATE] = torch.zeros(len(seeds), *self._slots)
         memory[keys.SLOT_AGE] = torch.zeros(len(seeds), 1, dtype=torch.long)
-        return memory
+        return memory.update(told(seeds, self.tasks))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Parse, then act."""

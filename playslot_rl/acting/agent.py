@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import ExpertActor, PlannedActor, SlotActor, put_rows
+from playslot_rl.acting.actor import ExpertActor, PlannedActor, SlotActor, put_rows, told
 from playslot_rl.acting.episodes import Moment, TaskPool, record
 from playslot_rl.acting.imagination import ImaginationEnv
 from playslot_rl.frames import normalise
@@ -24,14 +25,14 @@ from playslot_rl.world_model import Agent, action_decoder_module, latent_policy_
 def playslot_actor(agent: Agent) -> SlotActor:
     """Parse with SAVi's recurrent state, choose a latent action, decode it (paper, section "Learning behaviours")."""
     heads = (latent_policy_module(agent.policy), action_decoder_module(agent.action_decoder))
-    return SlotActor(agent.world_model.savi, *heads)
+    return SlotActor(agent.world_model.savi, *heads, tasks=agent.policy.tasks)
 
 
 def oracle_actor(agent: Agent) -> SlotActor:
     """The slot oracle beside the agent, which gives real actions; a ValueError where there is none."""
     if agent.oracle is None:
         raise ValueError("oracle_actor: got an agent without a slot oracle, expected one trained with behaviour.oracle")
-    return SlotActor(agent.world_model.savi, oracle_module(agent.oracle))
+    return SlotActor(agent.world_model.savi, oracle_module(agent.oracle), tasks=agent.oracle.tasks)
 
 
 class Imagination(NamedTuple):
@@ -47,14 +48,16 @@ class Imagination(NamedTuple):
 @torch.no_grad()
 def imagine(agent: Agent, first: TensorDictBase, steps: int, generator: torch.Generator | None = None) -> Imagination:
     """Unfold the policy for T steps in latent space: nothing is observed after `first`, SLOTS (E, N, D) or PIXELS
-    (E, 3, H, W) on the agent's device.
+    (E, 3, H, W) on the agent's device, and TASK (E, 1) where the policy is told.
 
     The latents are decoded alone: a decoder that reads slots learned from those that it sees when it acts, and imagined
     ones mislead it (docs/notebook/labels.md).
     """
     env = ImaginationEnv(agent.world_model, first.batch_size, generator=generator)
     start = env.reset(first)
-    policy = latent_policy_module(agent.policy)
+    policy, task = latent_policy_module(agent.policy), first.get(keys.TASK, None)
+    if task is not None:
+        policy = TensorDictModule(lambda slots: agent.policy(slots, task), [keys.SLOTS], [keys.LATENT_ACTION])
     rollout = env.rollout(steps, policy, tensordict=start, auto_reset=False, break_when_any_done=False)
     slots = torch.cat([start[keys.SLOTS].unsqueeze(1), rollout["next", keys.SLOTS]], 1)
     latents = rollout[keys.LATENT_ACTION]
@@ -70,8 +73,10 @@ class ImaginationActor(PlannedActor):
     looks = "first"
 
     def __init__(self, agent: Agent, steps: int) -> None:
-        super().__init__(steps, agent.world_model.env.action_dim, (keys.PREDICTED_SLOTS,), (keys.PIXELS,))
-        self.agent = agent
+        told_key = (keys.TASK,) if agent.policy.tasks else ()
+        memory = (keys.PREDICTED_SLOTS, *told_key)
+        super().__init__(steps, agent.world_model.env.action_dim, memory, (keys.PIXELS,))
+        self.agent, self._shown = agent, (keys.PIXELS, *told_key)
         self._generator: torch.Generator | None = None
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
@@ -80,13 +85,13 @@ class ImaginationActor(PlannedActor):
         memory = super().reset(seeds)
         shape = (len(seeds), self.steps + 1, *self.agent.world_model.slot_shape)
         memory[keys.PREDICTED_SLOTS] = torch.zeros(shape)
-        return memory
+        return memory.update(told(seeds, self.agent.policy.tasks))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Imagine the whole episode at its first frame; then the step's action."""
         fresh = tensordict.get(keys.STEP_COUNT).squeeze(-1) == 0
         if bool(fresh.any()):
-            imagined = imagine(self.agent, tensordict.select(keys.PIXELS)[fresh], self.steps, self._generator)
+            imagined = imagine(self.agent, tensordict.select(*self._shown)[fresh], self.steps, self._generator)
             found = {keys.PLANNED_ACTIONS: imagined.actions, keys.PREDICTED_SLOTS: imagined.slots}
             put_rows(tensordict, fresh, found)
         return super().forward(tensordict)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
+from playslot_rl.errors import ConfigError
 from playslot_rl.frames import to_uint8
 
 
@@ -40,6 +41,8 @@ class ClosedLoop:
         """
         memory = self._memory
         if memory is None:
+            if keys.TASK in self.actor.memory_keys:
+                raise ConfigError("act: got episodes of a policy of several tasks, expected reset(seeds) to tell which")
             self.reset([self._seed] * len(observation))
             return self.step(observation, rows)
         some = rows is not None and len(rows) < len(memory)

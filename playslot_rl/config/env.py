@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
+from playslot_rl.config import metaworld
 from playslot_rl.config.families import FAMILIES, OGBENCH, task_name
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import SEED, UNSAID, Checked, at_least, between, within
@@ -144,8 +145,8 @@ class EnvConfig(Checked):
         camera: of `env=gym` with MuJoCo: a camera's name, or `distance,azimuth,elevation,x,y,z`; empty is its own.
         expert: of `env=gym`, typed `expert=`: `package.module:function`, from its own observation, info and a generator
             to its action.
-        task: which task of `metaworld`: `drawer-open`, or another of its fifty; of `ogbench`: `cube-single` or
-            `cube-double`.
+        task: which task of `metaworld`: `drawer-open`, another of its fifty, or `MT10`, ten of them by the episode; of
+            `ogbench`: `cube-single` or `cube-double`.
         goals: of `ogbench`: its five of `evaluation`, in turn, or `random` ones one after the other, as in its data.
         targets: of `ogbench`: whether they are drawn, translucent; its `visual-` environments hide them.
     """
@@ -166,6 +167,20 @@ class EnvConfig(Checked):
     task: str = field(default="", metadata=UNSAID)
     goals: Literal["evaluation", "random"] = field(default="evaluation", metadata=UNSAID)
     targets: bool = field(default=True, metadata=UNSAID)
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Of several tasks in one, their names; empty of one."""
+        return metaworld.SETS.get(self.task, ())
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What is to be done in each of `tasks`, as data sets say it."""
+        return tuple(metaworld.TASKS[name].sentence for name in self.tasks)
+
+    def of_episode(self, seed: int) -> EnvConfig:
+        """The task of several whose an episode is: each in turn by the seed; else itself."""
+        return replace(self, task=self.tasks[seed % len(self.tasks)]) if self.tasks else self
 
     @property
     def full_name(self) -> str:

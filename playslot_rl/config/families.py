@@ -28,7 +28,7 @@ class Family(NamedTuple):
 
 
 FAMILIES: Final = {
-    metaworld.NAME: Family("Meta-World", metaworld.VERSION, metaworld.DEFAULT, metaworld.TASKS),
+    metaworld.NAME: Family("Meta-World", metaworld.VERSION, metaworld.DEFAULT, metaworld.EVERY),
     OGBENCH: Family(
         "OGBench",
         "-v0",

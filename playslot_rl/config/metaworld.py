@@ -75,3 +75,17 @@ TASKS: Final[dict[str, Member]] = {
     "window-close": Member(20, "Slide the window shut."),
     "window-open": Member(20, "Slide the window open."),
 }
+
+SETS: Final[dict[str, tuple[str, ...]]] = {
+    "MT10": (
+        "reach", "push", "pick-place", "door-open", "drawer-open", "drawer-close", "button-press-topdown",
+        "peg-insert-side", "window-open", "window-close",
+    )
+}  # fmt: skip
+"""Several tasks under one name, in Meta-World's order: which of them an episode is follows from its seed."""
+
+EVERY: Final[dict[str, Member]] = TASKS | {
+    name: Member(max(TASKS[task].steps for task in tasks), f"One of {name}: {', '.join(tasks)}.")
+    for name, tasks in SETS.items()
+}
+"""Tasks, and sets of them, which last as long as their longest."""

@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Any, Final
 
 from playslot_rl.config import plugins
+from playslot_rl.config.env import EnvConfig
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.errors import ConfigError
 
@@ -46,6 +47,7 @@ class Method:
         config: dataclass of its group of keys, `baselines.NAME`; None if it has none.
         stages: that are trained one after the other; the last one's checkpoint is the method's.
         load: as what it is loaded.
+        told: whether its policy can be told which of several tasks an episode is of.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Method:
     config: type[Any] | None
     stages: tuple[StageSpec, ...]
     load: Load
+    told: bool = False
 
     @property
     def title(self) -> str:
@@ -148,6 +151,15 @@ def require_method(key: str, name: str) -> None:
     """Refuse a name of no method by a ValueError; a ConfigError where the package that brings it fails."""
     if name not in METHODS:
         raise ValueError(f"{key}: got {name!r}, expected one of {', '.join(METHODS)}")
+
+
+def require_told(env: EnvConfig, name: str) -> None:
+    """Refuse a method that acts and cannot be told the task, where there are several, by a ConfigError."""
+    if env.tasks and METHODS[name].acts and not METHODS[name].told:
+        able = ", ".join(method.name for method in METHODS.values() if method.told)
+        raise ConfigError(
+            f"env.task={env.task}: got method={name}, expected one that is told which of its tasks to do: {able}"
+        )
 
 
 def canonical_method(text: str, acting: bool = False) -> str:

@@ -21,6 +21,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from playslot_rl.config import EnvConfig
 from playslot_rl.data.cache import note_read
 from playslot_rl.data.neighbours import in_batches
 from playslot_rl.data.source import EpisodeFrames
@@ -32,7 +33,7 @@ from playslot_rl.world_model import WorldModel
 
 FRAMES_AT_ONCE = 1024
 EPISODES_AT_ONCE = 64  # that are labelled
-BY_ROW: Final = ("slots", "imagined", "latents", "actions", "episode", "step")
+BY_ROW: Final = ("slots", "imagined", "latents", "actions", "episode", "step", "task")
 """Parts of `Demonstrations` that have a row a transition."""
 MotionOf = Callable[[npt.NDArray[np.int64]], Tensor]  # the motion (M,) of the transitions from some rows (M,)
 
@@ -49,6 +50,7 @@ class Demonstrations:
         episode: number of the demonstration of each transition, int64 (M,); a shifted copy's is its original's.
         step: number of the transition in its demonstration, int64 (M,).
         lengths: transitions of each demonstration as it was recorded, int64 (E,).
+        task: which of several tasks it is of, int64 (M, 1); None where there is one.
     """
 
     slots: Tensor
@@ -58,6 +60,7 @@ class Demonstrations:
     episode: Tensor
     step: Tensor
     lengths: Tensor
+    task: Tensor | None = None
 
     def take(self, rows: Tensor) -> Demonstrations:
         """Some transitions, by an index int64 (M',) or a mask bool (M,); `lengths` stays."""
@@ -224,6 +227,22 @@ def transitions(source: EpisodeFrames) -> Transitions:
     return Transitions(rows, np.repeat(np.arange(len(kept)), steps), step, steps)
 
 
+def told_tasks(source: EpisodeFrames, moves: Transitions, env: EnvConfig) -> Tensor | None:
+    """Which of the environment's `tasks` each transition is of, int64 (M, 1), by what the data set says of its episode;
+    None where it has one. A DataError where an episode is of none of them."""
+    if not env.tasks:
+        return None
+    number = {sentence: i for i, sentence in enumerate(env.sentences)}
+    said = [] if source.tasks is None else source.tasks[source.lengths >= 2].tolist()
+    unknown = sorted({*said} - {*number}) or ([] if said else ["nothing"])
+    if unknown:
+        raise DataError(
+            f"{source.name}: got demonstrations of {unknown[0]!r}, expected the tasks of env.task={env.task} alone: "
+            "collect them with it"
+        )
+    return torch.tensor([number[sentence] for sentence in said])[moves.episode][:, None]
+
+
 def real_actions(source: EpisodeFrames, rows: npt.NDArray[np.int64], width: int) -> Tensor:
     """Real actions (M, A) of transitions, in [-1, 1] by the range of the data set; what lies outside is clipped. A
     DataError where there are none, or some of another width."""
@@ -293,7 +312,7 @@ def label_demonstrations(
     of_kept = np.full(len(moves.rows), -1)  # where each transition goes; -1: nowhere
     of_kept[first[moving.episode] + moving.step] = np.arange(len(moving.rows))
     actions = None if source.actions is None else real_actions(source, moving.rows, model.env.action_dim).to(device)
-    labels: tuple[Tensor, ...] = ()
+    task, labels = told_tasks(source, moving, model.env), tuple[Tensor, ...]()
     for steps in np.unique(moves.lengths):
         same = np.nonzero(moves.lengths == steps)[0]
         for chosen in in_batches(same, EPISODES_AT_ONCE):
@@ -313,6 +332,7 @@ def label_demonstrations(
         episode=torch.from_numpy(moving.episode).to(device),
         step=torch.from_numpy(moving.step).to(device),
         lengths=torch.from_numpy(moving.lengths),
+        task=None if task is None else task.to(device),
     )
 
 

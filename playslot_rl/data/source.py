@@ -66,6 +66,7 @@ class EpisodeFrames:
         robot: what was recorded, as the data set says; empty where it says nothing.
         name: the folder it was read from, for people.
         shares: of several sets that are drawn from with weights, which rows are whose; None draws all windows alike.
+        tasks: what is to be done in each episode, str (E,); None where it was not read.
         limits: what actions in [-1, 1] stand for; None for those of our simulators, which are so, and without actions.
         states: proprioception, float32 (F, S), or None.
     """
@@ -85,6 +86,7 @@ class EpisodeFrames:
     shares: Shares | None = None
     limits: ActionLimits | None = None
     states: npt.NDArray[np.float32] | None = None
+    tasks: npt.NDArray[np.str_] | None = None
 
     @property
     def episodes(self) -> int:
@@ -270,7 +272,7 @@ def files_fingerprint(files: Contents, camera: str, cache: Path) -> str:
 
 
 def labels_of(files: Contents) -> dict[str, Any]:
-    """`starts`, `lengths`, `actions`, `states`, `success` and `seeds`, as of `EpisodeFrames`."""
+    """`starts`, `lengths`, `actions`, `states`, `success`, `seeds` and `tasks`, as of `EpisodeFrames`."""
     lengths = np.array([episode.length for episode in files.episodes], np.int64)
     starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
     actions, states, success, seeds = map(
@@ -283,4 +285,5 @@ def labels_of(files: Contents) -> dict[str, Any]:
         "states": None if states is None else states.astype(np.float32).reshape(files.rows, -1),
         "success": None if success is None else success.astype(bool),
         "seeds": None if seeds is None else seeds[starts].astype(np.int64),
+        "tasks": np.array([next(iter(episode.tasks), "") for episode in files.episodes], np.str_),
     }

@@ -145,8 +145,8 @@ def _viewed(source: EpisodeFrames, how: str, **changes: Any) -> EpisodeFrames:
 
 def _chosen(source: EpisodeFrames, episodes: slice | IntArray, how: str) -> EpisodeFrames:
     """Some episodes, in an order. Row numbers stay, so that the slot cache of the whole serves any choice."""
-    seeds = None if source.seeds is None else source.seeds[episodes]
-    return _viewed(source, how, starts=source.starts[episodes], lengths=source.lengths[episodes], seeds=seeds)
+    known = {name: getattr(source, name) for name in ("starts", "lengths", "seeds", "tasks")}
+    return _viewed(source, how, **{k: None if values is None else values[episodes] for k, values in known.items()})
 
 
 def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
@@ -169,6 +169,7 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
         states=joined("states"),
         success=joined("success"),
         seeds=joined("seeds"),
+        tasks=joined("tasks"),
         fingerprint=text_hash("+".join(source.fingerprint for source in sources)),
         name=",".join(dict.fromkeys(source.name for source in sources)),
         shares=None,
@@ -243,6 +244,7 @@ def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames
         states=None if source.states is None else source.states[begin:end],
         success=None if source.success is None else source.success[begin:end],
         seeds=None if source.seeds is None else source.seeds[first:last],
+        tasks=None if source.tasks is None else source.tasks[first:last],
     )
 
 

@@ -26,7 +26,7 @@ import torch
 from playslot_rl.acting.actor import Actor, ExpertActor, RandomActor
 from playslot_rl.acting.agent import ImaginationActor, ReplayActor, oracle_actor, perform, playslot_actor
 from playslot_rl.acting.episodes import Outcome, TaskPool, run_episodes
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import EnvConfig, ExperimentConfig, to_dict
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.held_out import check_disjoint, first_seed, held_out_seeds, training_seeds
@@ -167,7 +167,7 @@ def measure(
         "protocol": protocol,
         "episodes": episodes,
         "seeds": played,
-        **summary(outcome),
+        **summary(outcome, config.env),
         "labelled_demos": facts.labelled_demos,
         "demos": facts.demos,
         **facts.extra,
@@ -241,10 +241,15 @@ def hardware() -> dict[str, Any]:
     }
 
 
-def summary(episodes: Sequence[Outcome]) -> dict[str, Any]:
+def summary(episodes: Sequence[Outcome], env: EnvConfig | None = None) -> dict[str, Any]:
     """`success_rate` (0 to 1), `ci95` (Wilson) and `mean_steps_to_success` (agent steps; None without a success); where
     no success is measured these are None, and there are `mean_return`, of agent steps' rewards, and its standard error.
+    Of several tasks in one `env`, `per_task` holds the same of each, and its number of `episodes`.
     """
+    if env is not None and env.tasks:
+        split = {name: [e for e in episodes if env.of_episode(e.seed).task == name] for name in env.tasks}
+        of_each = {name: {"episodes": len(some), **summary(some)} for name, some in split.items() if some}
+        return {**summary(episodes), "per_task": of_each}
     if any(e.success is None for e in episodes):
         totals = np.array([e.total for e in episodes], np.float64)
         error = float(totals.std(ddof=1) / math.sqrt(len(totals))) if len(totals) > 1 else None
@@ -287,7 +292,7 @@ def run_references(
         what = [weights, to_dict(config.env), to_dict(config.render), list(seeds)]
         key = f"{name}-{hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]}"
         if not weights or key not in stored:
-            stored[key] = summary(run_episodes(pool, actor, seeds))
+            stored[key] = summary(run_episodes(pool, actor, seeds), config.env)
         results[name] = stored[key]
     if oracle is None:
         results["slot_oracle"] = dict(NOTHING)

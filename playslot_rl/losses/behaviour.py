@@ -32,13 +32,15 @@ class _CloningLoss(LossModule):
     @dataclass
     class _AcceptedKeys:
         """Keys that `set_keys` can rename: what the network reads, the target, what a decoder with `reads_slots` reads
-        beside it, and an optional mask, bool (...), that leaves targets out where it is False.
+        beside it, the task that a policy is told, and an optional mask, bool (...), that leaves targets out where it is
+        False.
         """
 
         observation: NestedKey = keys.SLOTS
         action: NestedKey = keys.LATENT_ACTION
         mask: NestedKey = "mask"
         state: NestedKey = keys.SLOTS
+        task: NestedKey = keys.TASK
 
     tensor_keys: _AcceptedKeys
     default_keys: ClassVar[type[Any]] = _AcceptedKeys
@@ -53,8 +55,9 @@ class _CloningLoss(LossModule):
 
     @property
     def observed(self) -> list[NestedKey]:
-        """What the network reads, in its order."""
-        return [self.tensor_keys.observation]
+        """What the network reads, in its order: a policy of several tasks is told which."""
+        told = getattr(self.network, "tasks", 0)
+        return [self.tensor_keys.observation, *([self.tensor_keys.task] if told else [])]
 
     @property
     def in_keys(self) -> list[NestedKey]:

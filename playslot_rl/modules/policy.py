@@ -1,12 +1,15 @@
 """The latent policy: z_t = f_pi(S_t), InvDyn_S's architecture with one head (paper, appendix A.4).
 
-Shapes: slots (..., N, D) -> (..., Z). On real actions in place of latents it is the slot oracle.
+Shapes: slots (..., N, D) -> (..., Z). On real actions in place of latents it is the slot oracle. Of several tasks it is
+told which: f_pi(S_t, e_k), a learned row e_k (D,) beside the slots.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
+import torch
 from torch import Tensor, nn
 
 from playslot_rl.config import PolicyConfig
@@ -21,8 +24,9 @@ class Decides(Protocol):
     def features(self, observed: Tensor) -> Tensor:
         """What the decoder may read beside the latent action, (..., N, D), of what the policy observes."""
 
-    def decide(self, features: Tensor) -> Tensor:
-        """Latent actions (..., Z) from these."""
+    @property
+    def decide(self) -> Callable[..., Tensor]:
+        """Latent actions (..., Z) from these, and from TASK (..., 1) where it is told."""
 
 
 class LatentPolicy(nn.Module):
@@ -35,10 +39,17 @@ class LatentPolicy(nn.Module):
         out_dim: Z, or A for the oracle.
         whiten: have a `whitening`, to be fitted before training.
         acts: it gives real actions, and has their `action_range`.
+        tasks: how many tasks it is told apart; 0 for one, of which nothing is said.
     """
 
     def __init__(
-        self, config: PolicyConfig, slot_dim: int, out_dim: int, whiten: bool = False, acts: bool = False
+        self,
+        config: PolicyConfig,
+        slot_dim: int,
+        out_dim: int,
+        whiten: bool = False,
+        acts: bool = False,
+        tasks: int = 0,
     ) -> None:
         super().__init__()
         c = config
@@ -47,9 +58,14 @@ class LatentPolicy(nn.Module):
         self.whitening = Whitening(out_dim) if whiten else None
         if acts:
             self.action_range = ActionRange(out_dim)
+        self.tasks = tasks
+        self.told = nn.Embedding(tasks, slot_dim) if tasks else None
 
-    def forward(self, slots: Tensor) -> Tensor:
-        """Slots (..., N, D) to latent actions (..., Z)."""
+    def forward(self, slots: Tensor, task: Tensor | None = None) -> Tensor:
+        """Slots (..., N, D), and the task int64 (..., 1) where it is told, to latent actions (..., Z)."""
+        if self.told is not None:
+            assert task is not None
+            slots = torch.cat((slots, self.told(task)), dim=-2)
         out: Tensor = self.head(self.encoder(slots))
         return out if self.whitening is None else self.whitening.inverse(out)
 
@@ -57,7 +73,7 @@ class LatentPolicy(nn.Module):
         """The slots themselves."""
         return observed
 
-    def decide(self, features: Tensor) -> Tensor:
+    def decide(self, features: Tensor, *task: Tensor) -> Tensor:
         """Latent actions (..., Z)."""
-        z: Tensor = self(features)
+        z: Tensor = self(features, *task)
         return z

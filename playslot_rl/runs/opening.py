@@ -103,6 +103,15 @@ def require_task(config: ExperimentConfig, trained: EnvConfig, names: Sequence[s
             )
 
 
+def require_one_task(config: ExperimentConfig, command: str) -> None:
+    """Refuse several tasks in one, by a ConfigError: a command that cannot tell a policy which."""
+    if config.env.tasks:
+        raise ConfigError(
+            f"env.task={config.env.task}: got {len(config.env.tasks)} tasks, expected one: `playslot {command}` cannot "
+            "tell a policy which; use evaluate"
+        )
+
+
 def require_parent(config: ExperimentConfig, run: Run, parent: StageCheckpoint, *sizes: str) -> None:
     """Check that a parent is of the task's `image_size` or `action_dim`, and that a run can build on it and has no
     other; else a CheckpointError.

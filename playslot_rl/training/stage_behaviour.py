@@ -28,6 +28,7 @@ from playslot_rl.training.stage import Stage
 from playslot_rl.training.stage_regression import (
     HELD_OUT,
     Examples,
+    Inputs,
     PairedInputs,
     RegressionStage,
     TensorInputs,
@@ -62,11 +63,13 @@ def cloning_settings(config: BehaviourStageConfig) -> BehaviourStageConfig:
 class SeenSlots:
     """What policy and decoder see of demonstrations: parsed slots (`config.parsed`), imagined ones (`config.imagined`).
 
-    They are (I, N, D) in parts, the parsed ones first; `rows` is the transition of each, int64 (I,).
+    They are (I, N, D) in parts, the parsed ones first; `rows` is the transition of each, int64 (I,), `task`
+    its task (I, 1) where there are several.
     """
 
     slots: tuple[Tensor, ...]
     rows: Tensor
+    task: Tensor | None = None
 
     @classmethod
     def of(cls, demos: Demonstrations, config: BehaviourStageConfig, horizon: int | None) -> SeenSlots:
@@ -75,12 +78,15 @@ class SeenSlots:
         """
         rows = torch.arange(len(demos.slots), device=demos.slots.device)
         if not config.imagined:
-            return cls((demos.slots,), rows)
+            return cls((demos.slots,), rows, demos.task)
         far = rows if horizon is None else rows[demos.step <= horizon]
         imagined = demos.imagined if len(far) == len(rows) else demos.imagined[far]
-        if not config.parsed:
-            return cls((imagined,), far)
-        return cls((demos.slots, imagined), torch.cat((rows, far)))
+        slots, rows = ((imagined,), far) if not config.parsed else ((demos.slots, imagined), torch.cat((rows, far)))
+        return cls(slots, rows, None if demos.task is None else demos.task[rows])
+
+    def inputs(self, noise: float = 0.0, stream: str = "noise") -> Inputs:
+        """What a policy reads of them."""
+        return PairedInputs.told(TensorInputs(self.slots, noise, stream), self.task)
 
 
 class CloneStage:
@@ -117,7 +123,7 @@ class CloneStage:
             "policy": RegressionStage(
                 "policy",
                 BehaviourLoss(policy, config.loss),
-                TensorInputs(seen.slots, config.slot_noise, "policy_noise"),
+                seen.inputs(config.slot_noise, "policy_noise"),
                 demos.latents[seen.rows],
                 config.batch_size,
                 checks=_checks(demos) | ({} if held_out is None else _checks(held_out, HELD_OUT)),
@@ -132,8 +138,8 @@ class CloneStage:
                     "set behaviour.oracle=false"
                 )
             acted = _acted(held_out)
-            measured = None if acted is None else (acted.slots, acted.require_actions())
-            self.stages["oracle"] = oracle_stage(oracle, demos.slots, demos.actions, config, measured)
+            measured = None if acted is None else (acted.slots, acted.require_actions(), acted.task)
+            self.stages["oracle"] = oracle_stage(oracle, demos.slots, demos.actions, config, measured, demos.task)
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -161,8 +167,8 @@ class CloneStage:
 
 def _checks(demos: Demonstrations, ending: str = "") -> dict[str, Examples]:
     return {
-        f"unexplained_parsed{ending}": (TensorInputs(demos.slots), demos.latents),
-        f"unexplained_imagined{ending}": (TensorInputs(demos.imagined), demos.latents),
+        f"unexplained_{name}{ending}": (PairedInputs.told(TensorInputs(slots), demos.task), demos.latents)
+        for name, slots in (("parsed", demos.slots), ("imagined", demos.imagined))
     }
 
 
@@ -230,9 +236,7 @@ class DecoderStage(RegressionStage):
                 latents, slots, rows = [demos.latents], [demos.slots], [every]
             if config.decoder_inputs != "inverse_dynamics":
                 seen = SeenSlots.of(demos, config, horizon)
-                said = apply_rows(
-                    policy.decide, TensorInputs(seen.slots), torch.arange(len(seen.rows), device=seen.rows.device)
-                )
+                said = apply_rows(policy.decide, seen.inputs(), torch.arange(len(seen.rows), device=seen.rows.device))
                 latents, slots, rows = [*latents, said], [*slots, *seen.slots], [*rows, seen.rows]
             z = torch.cat(latents)
             state = [TensorInputs(torch.cat(slots), noise, "decoder_noise")] if decoder.reads_slots else []
@@ -327,7 +331,7 @@ class FinetuneStage(JointStage):
         def examples(demos: Demonstrations, noise: float) -> Examples:
             actions = demos.require_actions()
             seen = SeenSlots.of(demos, config, horizon)
-            return TensorInputs(seen.slots, noise, "finetune_noise"), actions[seen.rows]
+            return seen.inputs(noise, "finetune_noise"), actions[seen.rows]
 
         acted = _acted(held_out)
         labelled = examples(demos.take(demos.labelled(config.labelled_demos)), config.slot_noise)
@@ -338,10 +342,11 @@ class _Both(nn.Module):
     def __init__(self, policy: Any, decoder: ActionDecoder, blind: bool = False) -> None:
         super().__init__()
         self.policy, self.decoder, self.blind = policy, decoder, blind
+        self.tasks = getattr(policy, "tasks", 0)
 
-    def forward(self, observed: Tensor) -> Tensor:
+    def forward(self, observed: Tensor, *task: Tensor) -> Tensor:
         features = self.policy.features(observed)
-        out: Tensor = self.decoder(self.policy.decide(features), None if self.blind else features)
+        out: Tensor = self.decoder(self.policy.decide(features, *task), None if self.blind else features)
         return out
 
 
@@ -377,20 +382,21 @@ def oracle_stage(
     slots: Tensor,
     actions: Tensor,
     config: BehaviourStageConfig,
-    held_out: tuple[Tensor, Tensor] | None = None,
+    held_out: tuple[Tensor, Tensor, Tensor | None] | None = None,
+    task: Tensor | None = None,
 ) -> RegressionStage:
-    """The slot oracle's training: real actions (M, A) from parsed slots (M, N, D) of all demonstrations; the held-out
-    ones only measure.
+    """The slot oracle's training: real actions (M, A) from parsed slots (M, N, D) of all demonstrations, and which task
+    (M, 1) they are of where there are several; the held-out ones only measure.
     """
     criterion = BehaviourLoss(oracle, config.loss)
     criterion.set_keys(action=keys.ACTION)
     return RegressionStage(
         "oracle",
         criterion,
-        TensorInputs(slots, config.slot_noise, "oracle_noise"),
+        PairedInputs.told(TensorInputs(slots, config.slot_noise, "oracle_noise"), task),
         actions,
         config.batch_size,
-        held_out=held_out and (TensorInputs(held_out[0]), held_out[1]),
+        held_out=held_out and (PairedInputs.told(TensorInputs(held_out[0]), held_out[2]), held_out[1]),
         validated=VALIDATED,
         precision=config.precision,
     )

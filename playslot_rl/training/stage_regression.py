@@ -91,6 +91,11 @@ class PairedInputs:
     def __init__(self, *parts: TensorInputs) -> None:
         self.parts = parts
 
+    @classmethod
+    def told(cls, observed: TensorInputs, task: Tensor | None) -> Inputs:
+        """What a policy reads: an observation, and the task (M, 1) where it is told."""
+        return observed if task is None else cls(observed, TensorInputs(task))
+
     def __len__(self) -> int:
         return len(self.parts[0])
 

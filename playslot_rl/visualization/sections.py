@@ -132,6 +132,7 @@ def success_section(given: ReportInput) -> Section:
             cells.append([name, said, interval(result["ci95"]), taken, count])
         headers = ["", "success rate", "95 % interval", "mean steps to success", "episodes"]
         blocks.append(Table(headers, cells, "Wilson intervals. References run closed-loop on the same seeds."))
+        blocks += _task_table(rows)
         drawn = [
             (n, r["success_rate"], tuple(r["ci95"]), method)
             for n, r, method, _ in rows
@@ -154,6 +155,14 @@ def success_section(given: ReportInput) -> Section:
             command = given.command("evaluate", f"protocol={protocol}")
             blocks.append(Missing(f"Success in {protocol} has not been measured.", command))
     return Section("Success", blocks)
+
+
+def _task_table(rows: Sequence[tuple[str, dict[str, Any], str, str]]) -> list[Block]:
+    """Success in each of several tasks, a column for whoever acts; nothing where there is one."""
+    found = {name: result["per_task"] for name, result, _, _ in rows if "per_task" in result}
+    tasks = dict.fromkeys(task for each in found.values() for task in each)
+    cells = [[task, *(percent(each.get(task, {}).get("success_rate")) for each in found.values())] for task in tasks]
+    return [Table(["task", *found], cells, "Episodes take the tasks in turn, by their seeds.")] if cells else []
 
 
 def _success_rows(results: dict[str, dict[str, Any]]) -> list[tuple[str, dict[str, Any], str, str]]:

@@ -107,7 +107,7 @@ def test_the_names_are_metaworlds_own() -> None:
     ("arguments", "message"),
     [
         (("env=metaworld", "env.task=drawr-opn"), "did you mean drawer-open or drawer-close or door-open"),
-        (("env=metaworld", "env.task="), "env.task: got '', expected one of Meta-World's 50"),
+        (("env=metaworld", "env.task="), "env.task: got '', expected one of Meta-World's 51"),
         (("env.task=drawer-open",), "env.task: got 'drawer-open', expected none with env.name=button_press"),
     ],
 )

@@ -16,6 +16,7 @@ from playslot_rl.data.demonstrations import (
 )
 from playslot_rl.data.slot_cache import SlotRows
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.runs.opening import require_task
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.demonstrated import cloned, demonstration_views, policy_taken_over
 from playslot_rl.training.fit import Part
@@ -39,6 +40,8 @@ def training(record: StageRecord) -> Training:
     require_labelled(behaviour.labelled_demos, split.trained.episodes)  # before anything is computed
     require_finite(split, None if behaviour.oracle else behaviour.labelled_demos)
     world = record.world.load_world_model(device)
+    if config.env.tasks or world.env.tasks:
+        require_task(config, world.env, ("task",))  # the policy is told the tasks of its world model
     world.config = sizes(config, world.config)
     with global_seed(config.seed, 0, "policy"):
         agent = Agent.untrained(world, oracle=behaviour.oracle).to(device)

@@ -21,7 +21,8 @@ def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a run; a CheckpointError where it or its SAVi is missing, damaged, or of other slots."""
     done, savi = run.stage(NAME, "slots"), run.load_savi(device)
     model, env = done.sizes
+    sizes, tasks = savi.config.slot_dim, len(env.tasks)
     oracle = done.restore(
-        lambda: LatentPolicy(model.policy, savi.config.slot_dim, env.action_dim, acts=True), "oracle", device
+        lambda: LatentPolicy(model.policy, sizes, env.action_dim, acts=True, tasks=tasks), "oracle", device
     )
-    return SlotActor(savi, oracle_module(oracle))
+    return SlotActor(savi, oracle_module(oracle), tasks=tasks)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from playslot_rl.data.demonstrations import moving_slots, real_actions, require_finite, transitions
+from playslot_rl.data.demonstrations import moving_slots, real_actions, require_finite, told_tasks, transitions
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.demonstrated import ParsedVideos, cloned, demonstration_views
@@ -22,20 +22,24 @@ def training(record: StageRecord) -> Training:
     require_finite(split)
     savi = record.world.load_savi(device)
     with global_seed(config.seed, 0, record.name):
-        oracle = LatentPolicy(config.model.policy, savi.config.slot_dim, width, acts=True).to(device)
+        sizes, tasks = savi.config.slot_dim, len(config.env.tasks)
+        oracle = LatentPolicy(config.model.policy, sizes, width, acts=True, tasks=tasks).to(device)
 
     behaviour = config.behaviour
 
-    def examples(views: list[ParsedVideos]) -> tuple[Tensor, Tensor]:
+    def examples(views: list[ParsedVideos]) -> tuple[Tensor, Tensor, Tensor | None]:
         trim, margin = behaviour.trim, behaviour.trim_margin
-        rows = [moving_slots(transitions(frames), cached, trim, margin).rows for frames, cached in views]
+        moves = [moving_slots(transitions(frames), cached, trim, margin) for frames, cached in views]
+        rows = [moving.rows for moving in moves]
+        told = [told_tasks(frames, moving, config.env) for (frames, _), moving in zip(views, moves, strict=True)]
+        task = torch.cat([each.to(device) for each in told if each is not None]) if config.env.tasks else None
         slots = [torch.from_numpy(cached[at]) for (_, cached), at in zip(views, rows, strict=True)]
         actions = [real_actions(frames, at, width) for (frames, _), at in zip(views, rows, strict=True)]
-        return torch.cat(slots).to(device), torch.cat(actions).to(device)
+        return torch.cat(slots).to(device), torch.cat(actions).to(device), task
 
     views, others = demonstration_views(config, split, savi, record.prints["slots"])
-    slots, actions = examples(views)
-    stage = oracle_stage(oracle, slots, actions, behaviour, examples(others) if others else None)
+    slots, actions, task = examples(views)
+    stage = oracle_stage(oracle, slots, actions, behaviour, examples(others) if others else None, task)
     said, extra = cloned(record.name, split, len(slots), views=len(views))
     return Training(
         [Part(record.name, stage, config.behaviour, group="behaviour")],

@@ -9,7 +9,7 @@ from typing import Any
 
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import CompareConfig, EnvConfig, ExperimentConfig, from_dict
-from playslot_rl.config.methods import METHODS
+from playslot_rl.config.methods import METHODS, require_told
 from playslot_rl.envs import check_task
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.held_out import held_out_seeds
@@ -202,6 +202,7 @@ def check_success(config: ExperimentConfig) -> None:
     env = config.env
     check_task(env, expert=not config.data.demos and uses_demos(config))
     for method in config.compare.methods:
+        require_told(env, method)
         check_method(config, method)
     task_results(config)
     for run in world_runs(config) if uses_slots(config) else ():

@@ -1,0 +1,164 @@
+"""A policy of several tasks is told which: it acts by it, in the simulator and in imagination, and learns by it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from playslot_rl import keys
+from playslot_rl.acting.agent import ImaginationActor, imagine, oracle_actor, playslot_actor
+from playslot_rl.acting.closed_loop import ClosedLoop
+from playslot_rl.acting.episodes import Outcome
+from playslot_rl.config import BehaviourStageConfig, EnvConfig, OptimConfig, PolicyConfig
+from playslot_rl.config.metaworld import SETS
+from playslot_rl.data.demonstrations import Demonstrations, told_tasks, transitions
+from playslot_rl.data.views import concatenate, drawn_demonstrations, episode_range
+from playslot_rl.envs import task_config
+from playslot_rl.errors import ConfigError, DataError
+from playslot_rl.evaluation.success import summary
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.testing import tiny_agent, tiny_config
+from playslot_rl.training.fit import Part, fit
+from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage
+from playslot_rl.world_model import Agent
+from tests.recipes.commands import refused, smoke
+from tests.training.tiny_stages import videos
+
+MT10 = SETS["MT10"]
+SIZES = PolicyConfig(dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16)
+MADE = ("env=metaworld", "env.task=MT10", "env.max_steps=3", "collect.random_steps=3", "collect.expert_steps=3")
+
+
+@pytest.fixture(scope="module")
+def agent() -> Agent:
+    config = tiny_config()
+    env = replace(task_config("metaworld/MT10"), max_steps=6)
+    return tiny_agent(replace(config, env=env))
+
+
+@torch.no_grad()
+def test_it_acts_by_the_task_of_the_episodes_seed(agent: Agent) -> None:
+    frames = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0)).expand(4, -1, -1, -1)
+    for actor in (playslot_actor(agent), oracle_actor(agent), ImaginationActor(agent, 6)):
+        loop = ClosedLoop(actor.eval())
+        loop.reset([10, 3, 1_000_000_013, 5])
+        seen = loop.step(TensorDict({keys.PIXELS: frames}, [4]))
+        actions = seen[keys.ACTION]
+        assert seen[keys.TASK].flatten().tolist() == [0, 3, 3, 5]
+        torch.testing.assert_close(actions[1], actions[2])
+        assert (actions[1] - actions[0]).abs().max() > 1e-4
+        later = loop.step(TensorDict({keys.PIXELS: frames[:2]}, [2]), rows=[1, 3])  # two of them have ended
+        assert later[keys.TASK].flatten().tolist() == [3, 5]
+
+
+@torch.no_grad()
+def test_imagination_is_of_the_task(agent: Agent) -> None:
+    slots = torch.randn(1, 4, 32, generator=torch.Generator().manual_seed(0)).expand(2, -1, -1)
+    task = torch.tensor([[2], [7]])
+    both = imagine(agent, TensorDict({keys.SLOTS: slots, keys.TASK: task}, [2]), 3).latents
+    torch.testing.assert_close(both[:, 0], agent.policy(slots, task))
+    assert (both[0] - both[1]).abs().max() > 1e-4
+
+
+def test_act_without_seeds_is_refused(agent: Agent) -> None:
+    with pytest.raises(ConfigError, match=r"expected reset\(seeds\)"):
+        ClosedLoop(playslot_actor(agent)).act(torch.rand(1, 3, 64, 64))
+
+
+def test_policy_decoder_and_oracle_learn_what_the_slots_do_not_say(tmp_path: Path) -> None:
+    """The same slots in two tasks, the opposite to do in each: untold, half of it stays unexplained at best."""
+    draw = torch.Generator().manual_seed(0)
+    slots, task = torch.randn(20, 3, 16, generator=draw).repeat(2, 1, 1), torch.arange(2).repeat_interleave(20)[:, None]
+    actions = (1.0 - 2.0 * task) * torch.tensor([[0.5, -0.3]])
+    demos = Demonstrations(
+        slots, slots + 0.01, torch.cat((actions, actions), 1), actions, torch.arange(40) // 10, torch.arange(40) % 10,
+        torch.full((4,), 10),
+    )  # fmt: skip
+    own = BehaviourStageConfig(
+        steps=150, batch_size=20, labelled_demos=4, decoder_inputs="policy", validate_every=150, whiten=False,
+        optim=OptimConfig(lr=5e-3, warmup_steps=0),
+    )  # fmt: skip
+    left = {}
+    for tasks in (2, 0):
+        torch.manual_seed(0)
+        shown = replace(demos, task=task) if tasks else demos
+        policy = LatentPolicy(SIZES, 16, 4, tasks=tasks)
+        oracle = LatentPolicy(SIZES, 16, 2, acts=True, tasks=tasks)
+        clone = CloneStage(policy, oracle, shown, own, shown)
+        fit(Part("policy", clone, own), tmp_path / str(tasks), seed=0, device=torch.device("cpu"))
+        measured = clone.validate(0)
+        left[tasks] = [measured[name] for name in ("unexplained_parsed", "unexplained_imagined", "oracle_unexplained")]
+        assert measured["oracle_unexplained_held_out"] == measured["oracle_unexplained"]
+        decoder = ActionDecoder(tiny_config().model.action_decoder, 4, 2, 16)
+        decoding = DecoderStage(decoder, policy, shown, own)
+        heard = decoding.inputs.plain(torch.arange(40))[0]
+        torch.testing.assert_close(heard[:40], policy(slots, *([task] if tasks else [])))
+        both = FinetuneStage(clone.stages["policy"], decoder, shown, own)
+        assert both.validate(0)["unexplained"] >= 0
+    assert max(left[2]) < 0.05
+    assert min(left[0]) > 0.9
+
+
+def test_a_demonstration_is_of_the_task_that_the_set_says() -> None:
+    env = task_config("metaworld/MT10")
+    said = np.array([env.sentences[i] for i in (4, 0, 9, 4, 2, 1)])
+    source = replace(videos(32), tasks=said)
+
+    def told(of: object) -> list[int]:
+        found = told_tasks(of, transitions(of), env)  # type: ignore[arg-type]
+        assert found is not None
+        return found.flatten().tolist()[::6]
+
+    assert told(source) == [4, 0, 9, 4, 2, 1]
+    assert told(episode_range(source, 1, 3)) == [0, 9]
+    assert told(concatenate([source, episode_range(source, 2, 3)])) == [4, 0, 9, 4, 2, 1, 9]
+    drawn = drawn_demonstrations(source, 3)
+    assert [env.sentences[i] for i in told(drawn)] == drawn.tasks.tolist()  # type: ignore[union-attr]
+    assert told_tasks(source, transitions(source), EnvConfig()) is None
+    for tasks in (None, np.array([*said[:5], "Dance."])):
+        with pytest.raises(DataError, match=r"got demonstrations of '(nothing|Dance\.)', expected the tasks of"):
+            told(replace(source, tasks=tasks))
+
+
+def test_success_is_told_by_task() -> None:
+    env = task_config("metaworld/MT10")
+    episodes = [
+        Outcome(seed, solved, 5 if solved else None, 0) for seed, solved in ((20, True), (30, False), (4, True))
+    ]
+    found = summary(episodes, env)
+    assert found["success_rate"] == pytest.approx(2 / 3)
+    assert {name: (row["episodes"], row["success_rate"]) for name, row in found["per_task"].items()} == {
+        "reach": (2, 0.5), "drawer-open": (1, 1.0),
+    }  # fmt: skip
+    assert "per_task" not in summary(episodes, EnvConfig())
+
+
+@pytest.mark.integration
+@pytest.mark.slow
+def test_commands_from_videos_to_success_of_each_task(tmp_path: Path) -> None:
+    run, demos, bc = (tmp_path / name for name in ("run", "demos", "bc"))
+    smoke("collect", *MADE, "policy=expert", "episodes=11", f"out={demos}")
+    smoke("train-slots", *MADE, f"data.root={demos}", f"out={run}")
+    smoke("train-dynamics", f"run={run}")
+    smoke("train-policy", f"run={run}", f"data.demos={demos}")
+    done = smoke("evaluate", f"run={run}", "episodes=10", "protocol=imagination", "evaluation.references=false")
+    assert all(f"{task}:" in done.out for task in MT10)
+    assert "| peg-insert-side | 0 % |" in (run / "report.md").read_text()
+    refused("evaluate", f"run={run}", "env.task=drawer-open", message=r"env\.task: got drawer-open, expected MT10")
+    for command in ("plan", "export"):
+        refused(command, f"run={run}", f"out={tmp_path / 'new'}", message="got 10 tasks, expected one")
+    refused("train-policy", f"run={run}", f"out={tmp_path / 'one'}", "env.task=push", f"data.demos={demos}",
+            message=r"env\.task: got push, expected MT10")  # fmt: skip
+    smoke("train-baseline", "method=slot_bc", f"run={run}", f"data.demos={demos}", *MADE, f"out={bc}")
+    assert "push:" in smoke("evaluate", f"run={bc}", "episodes=2", "evaluation.references=false").out
+
+
+def test_methods_that_are_told_nothing_are_refused(tmp_path: Path) -> None:
+    refused("train-baseline", *MADE, "method=lapo", "data.root=x", "data.demos=y", f"out={tmp_path / 'lapo'}",
+            message="got method=lapo, expected one that is told .*: playslot, slot_oracle, slot_bc")  # fmt: skip
