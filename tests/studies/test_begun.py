@@ -150,6 +150,7 @@ COMPARE: dict[str, Any] = {
     "worlds": 2,
     "runs": "other",
     "reference": "lapo",
+    "envs": ("block_push_easy",),
     "tasks": "other",
     "processes": 2,
     "launcher": "basic",
