@@ -257,8 +257,8 @@ def test_frame_that_was_stored_wrongly_is_noticed(made: Path, tmp_path: Path, mo
 
     original = ImageSetWriter.add
 
-    def swapped(self: Any, values: Any, frames: Any, images: list[bytes]) -> None:
-        original(self, values, frames, [images[0], images[2], images[1], *images[3:]])
+    def swapped(self: Any, values: Any, frames: Any, images: list[bytes], *task: str) -> None:
+        original(self, values, frames, [images[0], images[2], images[1], *images[3:]], *task)
 
     out = tmp_path / "data"
     restore(made, out)

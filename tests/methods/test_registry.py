@@ -17,8 +17,8 @@ from playslot_rl.config.methods import METHODS, Method
 ROOT = Path(playslot_rl.__file__).parents[1]
 
 
-def test_a_method_has_six_members() -> None:
-    assert len(fields(Method)) == 6
+def test_a_method_has_seven_members() -> None:
+    assert len(fields(Method)) == 7
 
 
 def compared_names(source: str) -> Iterator[ast.Compare]:

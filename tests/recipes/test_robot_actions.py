@@ -27,8 +27,10 @@ from playslot_rl.storage.tensors import load_tensors
 pytestmark = pytest.mark.integration
 
 TASK = ("env=video", "env.action_dim=6")
-LABELS = [name for name, method in METHODS.items() if method.acts and not method.online]
-"""Methods that learn real actions from demonstrations."""
+STATE = ("act_state", "diffusion_state")
+LABELS = [name for name, method in METHODS.items() if method.acts and not method.online and name not in STATE]
+"""Methods that learn real actions from demonstrations; those of `STATE` refuse this robot, which has no proprioception.
+"""
 ACTIONS = np.concatenate(robot_actions())
 
 
@@ -212,6 +214,16 @@ def test_every_method_that_reads_labels_gives_the_robots_units(
     assert (said >= torch.from_numpy(low) - 1e-4).all()
     assert (said <= torch.from_numpy(high) + 1e-4).all()
     assert "finished before" in smoke(*command).out
+
+
+@pytest.mark.parametrize("method", STATE)
+def test_a_robot_without_proprioception_is_refused_where_it_is_read(arm: Path, tmp_path: Path, method: str) -> None:
+    run = tmp_path / "run"
+    refused(
+        *("train-baseline", f"method={method}", *TASK, f"data.demos={arm}", f"out={run}"),
+        message=r"got a data set without proprioception, expected the feature `observation\.state`",
+    )
+    assert not run.exists()
 
 
 def test_a_simulator_is_stepped_in_the_robots_units(
