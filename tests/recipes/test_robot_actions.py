@@ -217,10 +217,12 @@ def test_every_method_that_reads_labels_gives_the_robots_units(
 
 
 @pytest.mark.parametrize("method", STATE)
-def test_a_robot_without_proprioception_is_refused_where_it_is_read(arm: Path, tmp_path: Path, method: str) -> None:
-    run = tmp_path / "run"
+def test_a_robot_without_proprioception_is_refused_where_it_is_read(
+    simulated: tuple[Path, Path], tmp_path: Path, method: str
+) -> None:
+    arm, run = simulated[0], tmp_path / "run"
     refused(
-        *("train-baseline", f"method={method}", *TASK, f"data.demos={arm}", f"out={run}"),
+        *("train-baseline", f"method={method}", f"data.demos={arm}", f"out={run}"),
         message=r"got a data set without proprioception, expected the feature `observation\.state`",
     )
     assert not run.exists()
