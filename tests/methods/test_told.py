@@ -155,7 +155,7 @@ def test_commands_from_videos_to_success_of_each_task(tmp_path: Path) -> None:
     refused("export", f"run={run}", f"out={tmp_path / 'new'}", message="got 10 tasks, expected one")
     refused("train-policy", f"run={run}", f"out={tmp_path / 'one'}", "env.task=push", f"data.demos={demos}",
             message=r"env\.task: got push, expected MT10")  # fmt: skip
-    smoke("train-baseline", "method=slot_bc", f"run={run}", f"data.demos={demos}", *MADE, f"out={bc}")
+    smoke("train-baseline", "preset=smoke", "method=slot_bc", f"run={run}", f"data.demos={demos}", *MADE, f"out={bc}")
     assert "push:" in smoke("evaluate", f"run={bc}", "episodes=2", "evaluation.references=false").out
 
 
