@@ -18,6 +18,7 @@ import numpy.typing as npt
 from playslot_rl import keys
 from playslot_rl.collectors.image_set import ImageSetWriter, feature, finalising, new_set
 from playslot_rl.collectors.journal import CollectionSpec, Journal, RecordedEpisode
+from playslot_rl.config.env import in_turn
 from playslot_rl.envs import PROCEDURAL, task_metadata
 from playslot_rl.envs.grid_shapes import METADATA
 from playslot_rl.errors import OutputError
@@ -98,7 +99,7 @@ def _write_images(dataset: Any, journal: Journal, tasks: Sequence[str]) -> Itera
             episode, images = journal.read_with_images(index)
             values = columns(episode)
             frames = values.pop(keys.FEATURE_IMAGE)
-            writer.add(values, frames, images, tasks[episode.seed % len(tasks)])
+            writer.add(values, frames, images, tasks[in_turn(episode.seed, len(tasks))])
             yield episode
 
 
@@ -106,7 +107,7 @@ def _write_video(dataset: Any, journal: Journal, tasks: Sequence[str]) -> Iterat
     """LeRobot encodes."""
     for index in range(journal.spec.episodes):
         episode = journal.read(index)
-        values, task = columns(episode), tasks[episode.seed % len(tasks)]
+        values, task = columns(episode), tasks[in_turn(episode.seed, len(tasks))]
         for t in range(len(episode.frames)):
             dataset.add_frame({name: column[t] for name, column in values.items()} | {"task": task})
         dataset.save_episode()

@@ -18,6 +18,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import Tensor, nn
 
 from playslot_rl import keys
+from playslot_rl.config.env import in_turn
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.action_range import ActionRange, range_of
 from playslot_rl.modules.policy import Decides
@@ -90,7 +91,7 @@ def with_present(history: Tensor, present: Tensor, step: Tensor) -> Tensor:
 
 def told(seeds: Sequence[int], tasks: int) -> dict[str, Tensor]:
     """TASK (n, 1) of episodes, as `EnvConfig.of_episode`; nothing of one task."""
-    return {keys.TASK: torch.tensor([[seed % tasks] for seed in seeds])} if tasks else {}
+    return {keys.TASK: torch.tensor([[in_turn(seed, tasks)] for seed in seeds])} if tasks else {}
 
 
 class SlotActor(Actor):

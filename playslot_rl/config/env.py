@@ -127,6 +127,11 @@ class VariationConfig(Checked):
         return replace(self, seed=0) != VariationConfig()
 
 
+def in_turn(seed: int, tasks: int) -> int:
+    """Which of several tasks the episode of a seed is of."""
+    return seed % tasks
+
+
 @dataclass(frozen=True)
 class EnvConfig(Checked):
     """The task.
@@ -180,7 +185,7 @@ class EnvConfig(Checked):
 
     def of_episode(self, seed: int) -> EnvConfig:
         """The task of several whose an episode is: each in turn by the seed; else itself."""
-        return replace(self, task=self.tasks[seed % len(self.tasks)]) if self.tasks else self
+        return replace(self, task=self.tasks[in_turn(seed, len(self.tasks))]) if self.tasks else self
 
     @property
     def full_name(self) -> str:

@@ -26,11 +26,6 @@ class Ends(NamedTuple):
             first[start : start + length], last[start : start + length] = start, start + length - 1
         return cls(first, last)
 
-    def before(self, rows: IntArray) -> IntArray:
-        """The row before each (...), or itself at an episode's start."""
-        before: IntArray = np.maximum(rows - 1, self.first[rows])
-        return before
-
     def past(self, rows: IntArray, frames: int) -> IntArray:
         """Rows (..., `frames`) that end in each (...); before an episode's first frame it stands again."""
         past: IntArray = np.maximum(rows[..., None] + np.arange(1 - frames, 1), self.first[rows][..., None])
@@ -49,14 +44,14 @@ def pairs_at(rows: IntArray) -> IntArray:
 
 
 def with_past(pairs: IntArray, ends: Ends, frames: int = 3) -> IntArray:
-    """Rows (M, `frames`), 2 or 3, that end in those of pairs (M, 2); before an episode's first frame it stands again.
+    """Rows (M, `frames`), 2 or more, that end in pairs (M, 2); before an episode's first frame it stands again.
 
     Example:
         >>> with_past(np.array([[0, 1], [1, 2]]), Ends(np.array([0, 0, 0]), np.array([2, 2, 2])))
         array([[0, 0, 1],
                [0, 1, 2]])
     """
-    return np.concatenate((ends.before(pairs[:, :1]), pairs), axis=1) if frames == 3 else pairs
+    return ends.past(pairs[:, 1], frames)
 
 
 def in_batches(rows: IntArray, most: int = 64) -> list[IntArray]:

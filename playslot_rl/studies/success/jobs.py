@@ -176,9 +176,8 @@ def success_record(job: SuccessJob, config: ExperimentConfig, parents: Mapping[s
     """What the job's file says: with its own config, and fingerprints of what it builds on, which name it."""
     result = computed(config)  # of data and parents the content counts
     method = METHODS[job.method]
-    result["baselines"] = result["baselines"].get(
-        method.last.own, {}
-    )  # another method's settings are none of this job's
+    # another method's settings are none of this job's
+    result["baselines"] = result["baselines"].get(method.last.own, {})
     if method.model and method.last.sizes:  # with what its decoder reads, which jobs from before could not
         result["model"] = to_dict(plugins.call(method.last.sizes, config, config.model))
     if result["model"]["predictor"]["kind"] == "cocvp":

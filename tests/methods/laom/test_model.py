@@ -50,7 +50,7 @@ def test_a_look_ahead_ends_with_the_episode_and_reaches_every_step_before() -> N
     for row, later in found.items():
         last = row // 6 * 6 + 5
         assert later == set(range(row + 1, min(row + 4, last) + 1))
-        assert (ends.before(np.array([row]))[0], ends.first[row]) == (max(row - 1, last - 5), last - 5)
+        assert (ends.past(np.array([row]), 2)[0, 0], ends.first[row]) == (max(row - 1, last - 5), last - 5)
 
 
 def test_a_batch_is_a_frame_the_next_one_and_one_ahead() -> None:
