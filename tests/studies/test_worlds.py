@@ -148,6 +148,45 @@ def test_differences_are_of_pairs(two_worlds: list[dict[str, Any]]) -> None:
     assert not found["lapo"]["leaves_out_0"], "on one of two world models there is no difference"
 
 
+def by_worlds(out: Path, done: dict[str, dict[tuple[int, int], int]], planned: int = 3) -> list[dict[str, Any]]:
+    """Two seeds on each world model; finished are those (world, seed) that have successes, of 100."""
+    jobs = []
+    for method, won in done.items():
+        for place in [(world, seed) for world in range(planned) for seed in (0, 1)]:
+            job = SuccessJob(method, 100, place[1], out, 5, world=place[0])
+            jobs.append(finish(job, {"simulation": won[place]}, 100) if place in won else job)
+    return [row for row in rows_of(*jobs) if row["protocol"] == "simulation"]
+
+
+def test_a_difference_is_of_the_world_models_that_both_have_finished(tmp_path: Path) -> None:
+    whole = {(world, seed): 90 - 40 * (world > 0) for world in range(3) for seed in (0, 1)}
+    (row,) = differences(by_worlds(tmp_path, {"playslot": whole, "lapo": {(0, 0): 90}}), "playslot")
+    assert (row["difference"], row["seeds"], row["leaves_out_0"]) == (0.0, [0], False), "not against the other worlds"
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        ([(0, 0)], [(1, 0)]),
+        ([(0, 0), (1, 0)], [(2, 0)]),
+        ([(0, 0), (0, 1), (1, 0)], [(1, 1), (2, 0)]),
+        ([(0, 0), (1, 1)], [(0, 1), (1, 0)]),
+    ],
+)
+def test_jobs_without_a_pair_have_no_difference(
+    ours: list[tuple[int, int]], theirs: list[tuple[int, int]], tmp_path: Path
+) -> None:
+    rows = by_worlds(tmp_path, {"playslot": dict.fromkeys(ours, 90), "lapo": dict.fromkeys(theirs, 10)})
+    assert differences(rows, "playslot") == []
+
+
+def test_a_method_of_one_world_model_meets_all_that_are_finished(tmp_path: Path) -> None:
+    rows = by_worlds(tmp_path, {"playslot": {(1, 0): 90, (2, 1): 70}})
+    rows += by_worlds(tmp_path, {"resnet_bc": {(0, 0): 10, (0, 1): 10}}, planned=1)
+    (row,) = differences(rows, "playslot")
+    assert (row["difference"], row["seeds"]) == (pytest.approx(-0.7), [0, 1])
+
+
 def test_the_difference_of_a_row_to_its_double_is_0(tmp_path: Path) -> None:
     won = {"simulation": 6}
     jobs = [finish(SuccessJob(name, 100, 0, tmp_path, 5), won) for name in ("playslot", "lapo")]

@@ -22,12 +22,15 @@ CELL = ("method", "protocol", "demos", "labels")
 
 
 def cells(rows: Iterable[Row]) -> dict[tuple[Any, ...], list[Row]]:
-    """Rows of finished jobs by cell: one for each world model and seed."""
+    """Rows by cell: one for each world model and seed."""
     found: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
-        if row["success_rate"] is not None:
-            found.setdefault(tuple(row[name] for name in CELL), []).append(row)
+        found.setdefault(tuple(row[name] for name in CELL), []).append(row)
     return found
+
+
+def finished(rows: Iterable[Row]) -> list[Row]:
+    return [row for row in rows if row["success_rate"] is not None]
 
 
 def outcomes_of(runs: Sequence[Row], seeds: Sequence[int]) -> Outcomes:
@@ -45,7 +48,7 @@ def summarise(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
     `ci95` is over world models, policy seeds and episodes (`playslot_rl.evaluation.intervals`).
     """
-    return [_summary(cell, runs) for cell, runs in cells(rows).items()]
+    return [_summary(cell, runs) for cell, runs in cells(finished(rows)).items()]
 
 
 def _summary(cell: tuple[Any, ...], runs: Sequence[Row]) -> dict[str, Any]:
@@ -73,22 +76,27 @@ def _mean(values: Iterable[float | None]) -> int | None:
 
 def differences(rows: Sequence[Row], reference: str) -> list[dict[str, Any]]:
     """Success of each cell less that of the reference method in simulation, on pairs of the same world model, seed and
-    episode; `demos` and `labels` are those of the pair, and `leaves_out_0` says that the interval does.
+    episode; `demos` and `labels` are those of the pair, and `leaves_out_0` says that the interval does. A method of one
+    world model, finished or not, meets all of the other's.
 
     What learns from the labels alone meets the reference at every number of videos, an oracle at every number of
     labels, and a method that acts at all of them.
     """
-    found, known = [], cells(rows)
+    found, known, worlds = [], cells(finished(rows)), dict[str, set[int]]()
+    for row in rows:  # those that are to come, too
+        worlds.setdefault(row["method"], set()).add(row["world"])
     for other, there in known.items():
         if other[:2] != (reference, "simulation"):
             continue
         for cell, runs in known.items():
             if cell[:2] == other[:2] or not (at := _pair(cell, other)):
                 continue
-            seeds = sorted({run["seed"] for run in runs} & {run["seed"] for run in there})
-            if not seeds:
+            several = min(len(worlds[cell[0]]), len(worlds[reference])) > 1
+            sides = _in_both(runs, there, ("world", "seed") if several else ("seed",))
+            if not sides[0]:
                 continue
-            outcomes = paired(*(outcomes_of(side, seeds) for side in _same_worlds(runs, there)))
+            seeds = sorted({run["seed"] for run in sides[0]})
+            outcomes = paired(*(outcomes_of(side, seeds) for side in sides))
             low, high = hierarchical(outcomes, (-1.0, 1.0))
             found.append(
                 {
@@ -112,14 +120,12 @@ def _pair(cell: tuple[Any, ...], reference: tuple[Any, ...]) -> tuple[Any, Any] 
     return (cell if alone[1] else reference)[2], labels[0] if labels else None
 
 
-def _same_worlds(runs: Sequence[Row], reference: Sequence[Row]) -> tuple[Sequence[Row], Sequence[Row]]:
-    """The runs of two cells on the world models that both have; all, where one of them has but one."""
-    worlds = [{run["world"] for run in side} for side in (runs, reference)]
-    if min(len(side) for side in worlds) == 1:
-        return runs, reference
-    common = worlds[0] & worlds[1]
-    first, second = ([run for run in side if run["world"] in common] for side in (runs, reference))
-    return first, second
+def _in_both(runs: Sequence[Row], reference: Sequence[Row], keys: Sequence[str]) -> tuple[list[Row], list[Row]]:
+    """The runs of two cells that have one like them in the other."""
+    first, second = ({tuple(run[key] for key in keys) for run in side} for side in (runs, reference))
+    pairs = first & second
+    mine, theirs = ([run for run in side if tuple(run[key] for key in keys) in pairs] for side in (runs, reference))
+    return mine, theirs
 
 
 def across_tasks(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -143,7 +149,7 @@ def across_tasks(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def largest(rows: Sequence[Row]) -> dict[tuple[Any, ...], list[Row]]:
     """Rows by method, protocol and labels, of the largest number of demonstrations that it has."""
-    known, most = cells(rows), dict[tuple[Any, ...], tuple[Any, ...]]()
+    known, most = cells(finished(rows)), dict[tuple[Any, ...], tuple[Any, ...]]()
     for cell in known:
         key = (*cell[:2], cell[3])
         if key not in most or (cell[2] or 0) > (most[key][2] or 0):
