@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.frames import psnr
-from playslot_rl.storage.tensors import pick_published, read_published
+from playslot_rl.storage.tensors import cached, load_published
 
 BORDER: Final = 5
 """Pixels a side whose SSIM window, 11 wide, leaves the frame: not counted, as the authors' `piqa` does not."""
@@ -91,7 +91,9 @@ def open_lpips(weights: str = "") -> Perceptual:
     """LPIPS with the backbone of a file (torchvision's AlexNet, `.pth` as published, or `.safetensors` with the same
     names), or of torch's cache. A CheckpointError where the file is missing, damaged, or not AlexNet's.
     """
-    path = Path(weights) if weights else cached_alexnet()
+    from torchvision.models import AlexNet_Weights
+
+    path = Path(weights) if weights else cached(AlexNet_Weights.IMAGENET1K_V1.url)
     if not weights and not path.is_file():
         return Perceptual(
             None, f"AlexNet's weights are not at hand: metrics.lpips_weights=PATH, or {path.name} in cache"
@@ -100,15 +102,6 @@ def open_lpips(weights: str = "") -> Perceptual:
 
     network = _LPIPS(pretrained=True, net="alex", pnet_rand=True)
     # `slice2.3.weight` here is `features.3.weight` there.
-    own, cure = network.net.state_dict(), "give another file, or leave it out"
-    names = {name: "features." + name.split(".", 1)[1] for name in own}
-    stored = read_published(path, KEY, "AlexNet", "leave it out")
-    network.net.load_state_dict(pick_published(stored, names, own, f"{KEY}={path}", cure))
+    names = {name: "features." + name.split(".", 1)[1] for name in network.net.state_dict()}
+    load_published(network.net, path, KEY, "AlexNet", ("give another file", "leave it out"), names)
     return Perceptual(network.eval().requires_grad_(False), "")
-
-
-def cached_alexnet() -> Path:
-    """Where torchvision keeps AlexNet's ImageNet weights, there or not."""
-    from torchvision.models import AlexNet_Weights
-
-    return Path(torch.hub.get_dir()) / "checkpoints" / Path(AlexNet_Weights.IMAGENET1K_V1.url).name

@@ -126,35 +126,46 @@ def weights_fingerprint(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
-def read_published(path: Path, key: str, network: str, cure: str) -> dict[str, Tensor]:
-    """Tensors by name of a `network` that others published: a `.safetensors` file, or a `.pth` as torchvision stores
-    them, of which tensors are read only, nothing is run. A CheckpointError, with the config's `key` and the `cure`,
-    where it is missing or damaged.
+def cached(url: str) -> Path:
+    """Where torch's cache keeps the file of an address, there or not."""
+    return Path(torch.hub.get_dir()) / "checkpoints" / Path(url).name
+
+
+def load_published(
+    module: nn.Module,
+    path: Path,
+    key: str,
+    network: str,
+    cures: tuple[str, str],
+    names: Mapping[str, str] | None = None,
+    note: str = "",
+) -> None:
+    """Give a module the tensors of a `network` that others published: a `.safetensors` file, or a `.pth` as torchvision
+    stores them, of which tensors are read only, nothing is run. `names` are the published ones of each of its own. A
+    CheckpointError, with the config's `key`, where the file is missing or damaged (check the path, or the second cure),
+    or a tensor is missing or of another shape (the first cure, or the second; `note` says more of the file).
     """
     import pickle
 
     from safetensors import SafetensorError
     from safetensors.torch import load
 
+    other, cure = cures
     try:
         if path.suffix == ".safetensors":
-            return load(path.read_bytes())
-        state: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
+            state = load(path.read_bytes())
+        else:
+            state = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, ValueError, EOFError, SafetensorError, pickle.UnpicklingError) as error:
         said = (str(error).splitlines() or [type(error).__name__])[0]  # an empty file says nothing
         raise CheckpointError(
             f"{key}={path}: got {said}, expected a file of {network}'s weights: check the path, or {cure}"
         ) from error
-    return state
-
-
-def pick_published(
-    state: Mapping[str, Tensor], names: Mapping[str, str], shapes: Mapping[str, Tensor], where: str, cure: str
-) -> dict[str, Tensor]:
-    """The tensors a network of ours, with these shapes, takes; `names` are the published ones of each of ours. A
-    CheckpointError, with `where` (the key and the file) and the `cure`, where one is missing or of another shape.
-    """
-    wrong = sorted(old for own, old in names.items() if old not in state or state[old].shape != shapes[own].shape)
+    expected = module.state_dict()
+    names = names or {name: name for name in expected}
+    wrong = sorted(old for own, old in names.items() if old not in state or state[old].shape != expected[own].shape)
     if wrong:
-        raise CheckpointError(f"{where}: got no tensor {wrong[0]} of its shape, expected another file: {cure}")
-    return {own: state[old] for own, old in names.items()}
+        raise CheckpointError(
+            f"{key}={path}{note}: got no tensor {wrong[0]} of its shape, expected another file: {other}, or {cure}"
+        )
+    module.load_state_dict({own: state[old] for own, old in names.items()})

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor
-from torchvision.models import alexnet
+from torchvision.models import AlexNet_Weights, alexnet
 
 from playslot_rl.errors import CheckpointError
-from playslot_rl.evaluation.video import cached_alexnet, frame_scores, open_lpips
-from playslot_rl.storage.tensors import load_tensors, save_tensors
+from playslot_rl.evaluation.video import frame_scores, open_lpips
+from playslot_rl.storage.tensors import cached, load_tensors, save_tensors
 
 pytestmark = pytest.mark.integration
 
@@ -70,8 +70,9 @@ def test_without_weights_it_is_not_available_and_says_why(tmp_path: Path, monkey
 
 def test_the_cache_is_looked_into(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.hub, "_hub_dir", str(tmp_path))
-    cached_alexnet().parent.mkdir(parents=True)
-    torch.save(load_tensors(weights), cached_alexnet())
+    path = cached(AlexNet_Weights.IMAGENET1K_V1.url)
+    path.parent.mkdir(parents=True)
+    torch.save(load_tensors(weights), path)
     assert open_lpips().network is not None
 
 

@@ -42,20 +42,18 @@ from playslot_rl.losses.common import total_loss
 from playslot_rl.methods.caddy.action import ActionInformation, divergence, joint_distribution, mutual_information
 from playslot_rl.methods.caddy.method import CADDYConfig
 from playslot_rl.methods.caddy.model import CADDY, Rollout, at_times
+from playslot_rl.methods.resnet_oracle.network import IMAGENET_MEAN, IMAGENET_STD
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
 from playslot_rl.seeds.draws import StepGenerators
-from playslot_rl.storage.tensors import pick_published, read_published
+from playslot_rl.storage.tensors import cached, load_published
 from playslot_rl.world_model import module_device
 
 KEY = "baselines.caddy.perceptual"
 
 # Places of the ReLUs among the layers.
 _READ = (1, 6, 11, 20, 29)
-
-# Statistics of ImageNet, with which torchvision's weights were trained.
-_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class VGGFeatures(nn.Module):
@@ -69,8 +67,8 @@ class VGGFeatures(nn.Module):
 
         super().__init__()
         self.features = make_layers(cfgs["E"])[: _READ[-1] + 1]
-        self.register_buffer("mean", torch.tensor(_MEAN).view(3, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(_STD).view(3, 1, 1), persistent=False)
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
         self.requires_grad_(False)
         self.eval()
 
@@ -98,24 +96,17 @@ def load_perceptual(weights: str) -> VGGFeatures | None:
     """VGG19's features on the CPU, frozen, for `CADDYConfig.perceptual`; None where it is empty, or `auto` and torch's
     cache does not have the weights; a CheckpointError where the file is missing, damaged or not VGG19's.
     """
-    path = cached_weights() if weights == "auto" else Path(weights)
-    if not weights or (weights == "auto" and not path.is_file()):
+    if not weights:
+        return None
+    from torchvision.models import VGG19_Weights
+
+    path = cached(VGG19_Weights.IMAGENET1K_V1.url) if weights == "auto" else Path(weights)
+    if weights == "auto" and not path.is_file():
         return None
     with torch.random.fork_rng(devices=[]):
         network = VGGFeatures()
-    own, cure = network.state_dict(), "leave it empty"
-    state = read_published(path, KEY, "VGG19", cure)
-    names = {name: name for name in own}
-    where = f"{KEY}={path}"
-    network.load_state_dict(pick_published(state, names, own, where, f"give torchvision's VGG19, or {cure}"))
+    load_published(network, path, KEY, "VGG19", ("give torchvision's VGG19", "leave it empty"))
     return network
-
-
-def cached_weights() -> Path:
-    """Where torchvision keeps VGG19's ImageNet weights, there or not."""
-    from torchvision.models import VGG19_Weights
-
-    return Path(torch.hub.get_dir()) / "checkpoints" / Path(VGG19_Weights.IMAGENET1K_V1.url).name
 
 
 class CADDYLoss:

@@ -30,7 +30,7 @@ from playslot_rl.frames import normalise
 from playslot_rl.methods.resnet_oracle.method import HISTORY, NAME, ResNetOracleConfig
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.runs import Run
-from playslot_rl.storage.tensors import pick_published, read_published
+from playslot_rl.storage.tensors import cached, load_published
 from playslot_rl.world_model import oracle_module
 
 WIDTH = 512
@@ -69,43 +69,29 @@ class ResNetPolicy(nn.Module):
         return actions
 
 
-def load_pretrained(policy: ResNetPolicy, weights: str) -> Pretraining:
-    """See `load_trunk`."""
-    return load_trunk(policy.trunk, weights, f"baselines.{NAME}.weights")
-
-
 def load_trunk(trunk: nn.Module, weights: str, key: str, names: Mapping[str, str] | None = None) -> Pretraining:
     """Give a ResNet-18 its starting weights (`ResNetOracleConfig.weights`), and say which; a CheckpointError where the
     file is missing, damaged or not ResNet-18's, or cannot be fetched. `names` are torchvision's of its tensors.
     """
+    from torchvision.models import ResNet18_Weights
+
     if weights == "scratch":
         return "scratch"
-    path = cached_weights() if weights in ("auto", "download") else Path(weights)
+    url = ResNet18_Weights.IMAGENET1K_V1.url
+    path = cached(url) if weights in ("auto", "download") else Path(weights)
     if weights == "auto" and not path.is_file():
         return "scratch"
     if weights == "download" and not path.is_file():
-        _download(path, key)
-    cure, own = "set it to scratch", trunk.state_dict()
-    state = read_published(path, key, "ResNet-18", cure)
-    where = f"{key}={path} (torchvision's ResNet-18)"
-    known = names or {name: name for name in own}
-    trunk.load_state_dict(pick_published(state, known, own, where, f"give another, or {cure}"))
+        _download(url, path, key)
+    cures, note = ("give another", "set it to scratch"), " (torchvision's ResNet-18)"
+    load_published(trunk, path, key, "ResNet-18", cures, names, note)
     return "imagenet"
 
 
-def cached_weights() -> Path:
-    """Where torchvision keeps ResNet-18's ImageNet weights, there or not."""
-    from torchvision.models import ResNet18_Weights
-
-    return Path(torch.hub.get_dir()) / "checkpoints" / Path(ResNet18_Weights.IMAGENET1K_V1.url).name
-
-
-def _download(path: Path, key: str) -> None:
-    from torchvision.models import ResNet18_Weights
-
+def _download(url: str, path: Path, key: str) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        torch.hub.download_url_to_file(ResNet18_Weights.IMAGENET1K_V1.url, str(path), progress=False)
+        torch.hub.download_url_to_file(url, str(path), progress=False)
     except OSError as error:
         raise CheckpointError(
             f"{key}=download: got {error}, expected a network: put the file at {path}, or set it to scratch"

@@ -6,7 +6,7 @@ from playslot_rl import keys
 from playslot_rl.data.demonstrations import require_finite
 from playslot_rl.methods.cloning import action_stage
 from playslot_rl.methods.resnet_oracle.method import NAME, ResNetOracleConfig
-from playslot_rl.methods.resnet_oracle.network import ResNetPolicy, load_pretrained
+from playslot_rl.methods.resnet_oracle.network import ResNetPolicy, load_trunk
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.demonstrated import cloned
 from playslot_rl.training.fit import Part
@@ -28,7 +28,7 @@ def training(record: StageRecord, frames: int = 1) -> Training:
     require_finite(split)
     with global_seed(config.seed, 0, record.name):
         policy = ResNetPolicy(config.model.policy, config.env.image_size, config.env.action_dim, frames)
-    pretraining = load_pretrained(policy, own.weights)
+    pretraining = load_trunk(policy.trunk, own.weights, f"baselines.{NAME}.weights")
     policy.to(device)
     stage = action_stage("policy", policy, keys.PIXELS, lambda x: x, config, split, device, own.shift, own, 512, frames)
     patience = Patience(own.patience, f"unexplained{HELD_OUT}") if own.patience and split.held_out is not None else None

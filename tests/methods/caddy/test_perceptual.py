@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 from torch import nn
-from torchvision.models import vgg19
+from torchvision.models import VGG19_Weights, vgg19
 
 from playslot_rl.errors import CheckpointError
-from playslot_rl.methods.caddy.stage import VGGFeatures, cached_weights, load_perceptual
-from playslot_rl.storage.tensors import save_tensors
+from playslot_rl.methods.caddy.stage import VGGFeatures, load_perceptual
+from playslot_rl.storage.tensors import cached, save_tensors
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +63,9 @@ def test_auto_takes_the_cache_and_leaves_the_global_generator_alone(
     network: VGGFeatures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.hub, "_hub_dir", str(tmp_path))
-    cached_weights().parent.mkdir()
-    torch.save({**network.state_dict(), "classifier.0.weight": torch.zeros(1)}, cached_weights())
+    path = cached(VGG19_Weights.IMAGENET1K_V1.url)
+    path.parent.mkdir()
+    torch.save({**network.state_dict(), "classifier.0.weight": torch.zeros(1)}, path)
     before = torch.get_rng_state()
     loaded = load_perceptual("auto")
     assert torch.equal(torch.get_rng_state(), before)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torchvision.models import resnet18
+from torchvision.models import ResNet18_Weights, resnet18
 
 from playslot_rl import keys
 from playslot_rl.acting.closed_loop import ClosedLoop
@@ -17,11 +17,10 @@ from playslot_rl.errors import CheckpointError
 from playslot_rl.methods.resnet_oracle.network import (
     HistoryActor,
     ResNetPolicy,
-    cached_weights,
-    load_pretrained,
+    load_trunk,
     resnet_actor,
 )
-from playslot_rl.storage.tensors import save_tensors
+from playslot_rl.storage.tensors import cached, save_tensors
 
 HEAD = PolicyConfig(dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16)
 
@@ -66,29 +65,30 @@ def test_auto_takes_the_cached_weights_and_says_scratch_without(
 ) -> None:
     monkeypatch.setattr(torch.hub, "_hub_dir", str(tmp_path))
     before = policy.trunk.conv1.weight.clone()
-    assert load_pretrained(policy, "auto") == "scratch"
+    assert load_trunk(policy.trunk, "auto", "weights") == "scratch"
     assert torch.equal(policy.trunk.conv1.weight, before)
     other = resnet18(weights=None)
-    cached_weights().parent.mkdir()
-    torch.save(other.state_dict(), cached_weights())
-    assert load_pretrained(policy, "auto") == "imagenet"
+    path = cached(ResNet18_Weights.IMAGENET1K_V1.url)
+    path.parent.mkdir()
+    torch.save(other.state_dict(), path)
+    assert load_trunk(policy.trunk, "auto", "weights") == "imagenet"
     assert torch.equal(policy.trunk.conv1.weight, other.conv1.weight)
-    assert load_pretrained(policy, "scratch") == "scratch"
+    assert load_trunk(policy.trunk, "scratch", "weights") == "scratch"
 
 
 def test_a_given_file_is_read_and_a_wrong_one_refused(policy: ResNetPolicy, tmp_path: Path) -> None:
     tensors = dict(policy.trunk.state_dict())
     save_tensors(tmp_path / "good.safetensors", tensors)
-    assert load_pretrained(policy, str(tmp_path / "good.safetensors")) == "imagenet"
+    assert load_trunk(policy.trunk, str(tmp_path / "good.safetensors"), "weights") == "imagenet"
     tensors.pop("layer1.0.conv1.weight")
     save_tensors(tmp_path / "short.safetensors", tensors)
     with pytest.raises(CheckpointError, match=r"got no tensor layer1\.0\.conv1\.weight"):
-        load_pretrained(policy, str(tmp_path / "short.safetensors"))
+        load_trunk(policy.trunk, str(tmp_path / "short.safetensors"), "weights")
     with pytest.raises(CheckpointError, match="expected a file of ResNet-18's"):
-        load_pretrained(policy, str(tmp_path / "none.pth"))
+        load_trunk(policy.trunk, str(tmp_path / "none.pth"), "weights")
     (tmp_path / "bad.pth").write_bytes(b"no weights")
     with pytest.raises(CheckpointError, match="expected a file of ResNet-18's"):
-        load_pretrained(policy, str(tmp_path / "bad.pth"))
+        load_trunk(policy.trunk, str(tmp_path / "bad.pth"), "weights")
 
 
 @torch.no_grad()
