@@ -16,6 +16,7 @@ with L levels, C code width, A action dim.
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 from typing import ClassVar, Self
 
@@ -142,17 +143,8 @@ class CodePolicy(nn.Module):
         return actions
 
 
-def load_autoencoder(run: Run, device: torch.device | str = "cpu") -> Actor:
+def _load(name: str, parent: str, kind: type[EncoderBCConfig], run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a finished run; a CheckpointError where it is missing, damaged, or of another model."""
-    return _load(run, AUTOENCODER_BC.name, "autoencoder", AutoencoderBCConfig, device)
-
-
-def load_inverse_resnet(run: Run, device: torch.device | str = "cpu") -> Actor:
-    """As `load_autoencoder`."""
-    return _load(run, INVERSE_BC.name, "inverse_resnet", InverseBCConfig, device)
-
-
-def _load(run: Run, name: str, parent: str, kind: type[EncoderBCConfig], device: torch.device | str) -> Actor:
     done = run.stage(name, parent)
     own, (model, env) = done.group(kind, name), done.sizes
 
@@ -161,3 +153,7 @@ def _load(run: Run, name: str, parent: str, kind: type[EncoderBCConfig], device:
         return CodePolicy(encoder, model.policy, own.code, env.image_size, env.action_dim)
 
     return ReactiveActor(oracle_module(done.restore(build, "policy", device), keys.PIXELS))
+
+
+load_autoencoder = partial(_load, AUTOENCODER_BC.name, "autoencoder", AutoencoderBCConfig)
+load_inverse_resnet = partial(_load, INVERSE_BC.name, "inverse_resnet", InverseBCConfig)

@@ -8,6 +8,7 @@ Shapes: n episodes side by side, F frames, E actions executed of a chunk, A acti
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -69,29 +70,17 @@ class ChunkActor(Actor):
         )
 
 
-def load_act(run: Run, device: torch.device | str = "cpu") -> Actor:
-    """The actor of a finished run; a CheckpointError where it is missing or damaged."""
-    return _load(run, "act", ACTConfig, device)
-
-
-def load_act_state(run: Run, device: torch.device | str = "cpu") -> Actor:
-    """As `load_act`."""
-    return _load(run, "act_state", ACTConfig, device)
-
-
-def load_diffusion(run: Run, device: torch.device | str = "cpu") -> Actor:
-    """As `load_act`; a ConfigError where diffusers is missing."""
-    return _load(run, "diffusion", DiffusionConfig, device)
-
-
-def load_diffusion_state(run: Run, device: torch.device | str = "cpu") -> Actor:
-    """As `load_diffusion`."""
-    return _load(run, "diffusion_state", DiffusionConfig, device)
-
-
-def _load(run: Run, name: str, kind: type[ChunkConfig], device: torch.device | str) -> Actor:
+def _load(name: str, kind: type[ChunkConfig], run: Run, device: torch.device | str = "cpu") -> Actor:
+    """The actor of a finished run; a CheckpointError where it is missing or damaged, a ConfigError where Diffusion
+    Policy's diffusers is.
+    """
     done = run.stage(name)
     own, env = done.group(kind, name), done.group(EnvConfig, "env")
     chunk, state = int(done.meta["chunk"]), int(done.meta.get("state", 0))
     policy = done.restore(lambda: chunk_policy(own, env.image_size, env.action_dim, chunk, state), "policy", device)
     return ChunkActor(policy, env.image_size)
+
+
+load_act, load_act_state = partial(_load, "act", ACTConfig), partial(_load, "act_state", ACTConfig)
+load_diffusion = partial(_load, "diffusion", DiffusionConfig)
+load_diffusion_state = partial(_load, "diffusion_state", DiffusionConfig)
