@@ -27,7 +27,13 @@ class Ends(NamedTuple):
         return cls(first, last)
 
     def past(self, rows: IntArray, frames: int) -> IntArray:
-        """Rows (..., `frames`) that end in each (...); before an episode's first frame it stands again."""
+        """Rows (..., `frames`) that end in each (...); before an episode's first frame it stands again.
+
+        Example:
+            >>> Ends(np.array([0, 0, 0]), np.array([2, 2, 2])).past(np.array([1, 2]), 3)
+            array([[0, 0, 1],
+                   [0, 1, 2]])
+        """
         past: IntArray = np.maximum(rows[..., None] + np.arange(1 - frames, 1), self.first[rows][..., None])
         return past
 
@@ -41,17 +47,6 @@ class Ends(NamedTuple):
 def pairs_at(rows: IntArray) -> IntArray:
     """Rows (M, 2): each of `rows` (M,), which are no last ones of their episodes, and the next."""
     return np.stack((rows, rows + 1), axis=1)
-
-
-def with_past(pairs: IntArray, ends: Ends, frames: int = 3) -> IntArray:
-    """Rows (M, `frames`), 2 or more, that end in pairs (M, 2); before an episode's first frame it stands again.
-
-    Example:
-        >>> with_past(np.array([[0, 1], [1, 2]]), Ends(np.array([0, 0, 0]), np.array([2, 2, 2])))
-        array([[0, 0, 1],
-               [0, 1, 2]])
-    """
-    return ends.past(pairs[:, 1], frames)
 
 
 def in_batches(rows: IntArray, most: int = 64) -> list[IntArray]:

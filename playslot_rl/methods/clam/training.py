@@ -24,7 +24,7 @@ from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
-from playslot_rl.data.neighbours import Ends, in_batches, pairs_at, with_past
+from playslot_rl.data.neighbours import Ends, in_batches
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray
 from playslot_rl.frames import normalise
@@ -65,10 +65,10 @@ class CLAMStage:
 
     def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         count = self.config.model.batch_size
-        rows = with_past(self.clips.sample(count, generators.numpy("moves")), self.ends)
+        pairs = self.clips.sample(count, generators.numpy("moves"))
         known, actions = self.labelled.draw(count, generators)
-        frames = self.labelled.pixels(own_rows(with_past(pairs_at(known), self.labelled.ends)))
-        videos = self.clips.pixels(own_rows(rows), module_device(self.inverse))
+        frames = self.labelled.pixels(own_rows(self.labelled.ends.past(known + 1, 3)))
+        videos = self.clips.pixels(own_rows(self.ends.past(pairs[:, 1], 3)), module_device(self.inverse))
         return together({"videos": {keys.PIXELS: videos}, "labelled": {keys.PIXELS: frames, keys.ACTION: actions}})
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
@@ -93,7 +93,7 @@ class CLAMStage:
         return {"unexplained": sum(errors) / max(1e-6, sum(stills))}
 
     def _frames(self, pairs: IntArray) -> Tensor:
-        return normalise(self.clips.pixels(with_past(pairs, self.ends), module_device(self.inverse)))
+        return normalise(self.clips.pixels(self.ends.past(pairs[:, 1], 3), module_device(self.inverse)))
 
 
 @torch.no_grad()
@@ -101,8 +101,8 @@ def infer_latents(
     inverse: Inverse, source: EpisodeFrames, moves: Transitions, device: torch.device | str = "cpu"
 ) -> Tensor:
     """Latent actions (M, Z) of transitions; the model in evaluation mode."""
-    ends, parts = Ends.of(source), in_batches(pairs_at(moves.rows))
-    return torch.cat([inverse(source.pixels(with_past(pairs, ends)).to(device)) for pairs in parts])
+    ends, parts = Ends.of(source), in_batches(moves.rows + 1)
+    return torch.cat([inverse(source.pixels(ends.past(rows, 3)).to(device)) for rows in parts])
 
 
 class PolicyStage(RegressionStage):

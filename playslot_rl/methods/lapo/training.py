@@ -28,7 +28,7 @@ from playslot_rl.config import ExperimentConfig, StageConfig
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
 from playslot_rl.data.device_rows import DeviceRows
-from playslot_rl.data.neighbours import Ends, in_batches, pairs_at, with_past
+from playslot_rl.data.neighbours import Ends, in_batches
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray
 from playslot_rl.errors import CheckpointError
@@ -123,7 +123,7 @@ class LAPOModelStage:
         return torch.stack(used).mean(), torch.stack(perplexity).mean()
 
     def _frames(self, pairs: IntArray) -> Tensor:
-        return self.read(with_past(pairs, self.ends, self.inverse.config.frames))
+        return self.read(self.ends.past(pairs[:, 1], self.inverse.config.frames))
 
 
 @torch.no_grad()
@@ -137,8 +137,8 @@ def infer_latents(
 ) -> Tensor:
     """Latent actions (M, Z) of transitions, from frames or what `read` gives of rows; the model in evaluation mode."""
     ends, parts = Ends.of(source), []
-    for pairs in in_batches(pairs_at(moves.rows)):
-        inferred = inverse((read or source.pixels)(with_past(pairs, ends, inverse.config.frames)).to(device))
+    for rows in in_batches(moves.rows + 1):
+        inferred = inverse((read or source.pixels)(ends.past(rows, inverse.config.frames)).to(device))
         parts.append(inferred.z if quantised else inferred.before)
     return torch.cat(parts)
 

@@ -12,7 +12,7 @@ from playslot_rl.config import ActionDecoderConfig, StageConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import transitions
-from playslot_rl.data.neighbours import Ends, pairs_at, with_past
+from playslot_rl.data.neighbours import Ends
 from playslot_rl.data.views import first_demonstrations
 from playslot_rl.methods.clam.method import CLAMConfig
 from playslot_rl.methods.clam.model import Forward, Inverse
@@ -37,7 +37,7 @@ def stage() -> CLAMStage:
 
 def test_it_sees_the_frame_before_the_frame_and_the_next_and_an_episodes_first_frame_twice() -> None:
     source = moving_square(episodes=2, length=4)
-    rows = with_past(pairs_at(transitions(source).rows), Ends.of(source))
+    rows = Ends.of(source).past(transitions(source).rows + 1, 3)
     assert rows.tolist() == [[0, 0, 1], [0, 1, 2], [1, 2, 3], [4, 4, 5], [4, 5, 6], [5, 6, 7]]
     inverse = stage().inverse.eval()
     latents = infer_latents(inverse, source, transitions(source))

@@ -16,7 +16,7 @@ from playslot_rl.config import ActionDecoderConfig, BehaviourStageConfig, OptimC
 from playslot_rl.config.compose import compose
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import transitions
-from playslot_rl.data.neighbours import Ends, with_past
+from playslot_rl.data.neighbours import Ends
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.lapo.method import Encoder, LAPOConfig
@@ -96,9 +96,9 @@ def test_the_inverse_model_sees_three_frames_and_the_forward_model_the_first_two
 def test_before_an_episodes_first_frame_it_stands_again() -> None:
     source = moving_square(length=3)
     moves = transitions(source)
-    rows = with_past(np.stack((moves.rows, moves.rows + 1), axis=1), Ends.of(source), 3)
+    rows = Ends.of(source).past(moves.rows + 1, 3)
     assert rows[:4].tolist() == [[0, 0, 1], [0, 1, 2], [3, 3, 4], [3, 4, 5]]
-    assert with_past(np.array([[3, 4]]), Ends.of(source), 2).tolist() == [[3, 4]]
+    assert Ends.of(source).past(np.array([4]), 2).tolist() == [[3, 4]]
 
 
 def test_the_forward_model_starts_from_no_change(models: Models) -> None:
@@ -184,7 +184,7 @@ def test_training_predicts_the_change_and_the_codes_tell_directions_apart(
         assert stage.validate(config.steps)["unexplained"] < 0.6
     moves = transitions(source)
     assert source.actions is not None
-    frames = source.pixels(with_past(np.stack((moves.rows, moves.rows + 1), axis=1), Ends.of(source), 3))
+    frames = source.pixels(Ends.of(source).past(moves.rows + 1, 3))
     directions: dict[tuple[int, ...], list[bool]] = {}
     for code, action in zip(inverse(frames).code.tolist(), source.actions[moves.rows, 0], strict=True):
         directions.setdefault(tuple(code), []).append(bool(action > 0))
