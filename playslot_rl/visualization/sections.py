@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ from playslot_rl.evaluation.success import POLICY_PROTOCOLS, PROTOCOLS, hardware
 from playslot_rl.evaluation.video import video_metrics
 from playslot_rl.frames import to_float
 from playslot_rl.storage.atomic import json_or_nothing
+from playslot_rl.training.logging import History
 from playslot_rl.visualization.charts import DARK, LIGHT, Theme, loss_chart, loss_names, success_chart
 from playslot_rl.visualization.document import Block, Missing, Picture, Section, Table, Text
 from playslot_rl.visualization.drawings import draw_prototypes, draw_slots, run_rollouts
@@ -252,17 +252,6 @@ def prototype_section(given: ReportInput, clip: Callable[[], Any]) -> Section:
     return Section(title, [Picture("prototypes", png(draw_prototypes(model, clip()[0])), alt, caption)])
 
 
-def read_history(path: Path) -> list[dict[str, Any]]:
-    """Rows of a `metrics.jsonl`; a line that a kill cut off is left out."""
-    rows = []
-    for line in path.read_text().splitlines() if path.is_file() else []:
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            break
-    return rows
-
-
 def metric_text(metrics: Mapping[str, Any]) -> str:
     """The numbers among a stage's metrics that no column of the report has; a dash where there are none."""
     found = []
@@ -302,7 +291,7 @@ def training_section(given: ReportInput, stages: Sequence[str] = STAGES) -> Sect
         blocks.insert(0, Table(["stage", "steps", "time", "machine", "commit", "measured at the end"], rows))
         blocks[1:1] = _unexplained(given.metas.get("policy", {}).get("metrics", {}))
     paths = {name: given.run / folder / "metrics.jsonl" for name, folder in HISTORIES.items()}
-    histories = {name: history for name, path in paths.items() if loss_names(history := read_history(path))}
+    histories = {name: history for name, path in paths.items() if loss_names(history := History(path).read())}
     if histories:
         names = ", ".join(histories)
         caption = f"Logarithmic where all values are positive. Trained in this run: {names}."
