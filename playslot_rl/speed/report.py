@@ -6,10 +6,10 @@ import platform
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl.config import BlocksConfig, EnvConfig, ExperimentConfig
+from playslot_rl.runtime.devices import device_name
 from playslot_rl.runtime.threads import available_cores, set_threads, tune_allocator
 from playslot_rl.visualization import document
 
@@ -73,22 +73,15 @@ def machine(*packages: str) -> dict[str, Any]:
     """Processor, system, and versions."""
     from importlib.metadata import version
 
+    import torch
+
     return {
-        "cpu": _cpu(),
+        "cpu": device_name(torch.device("cpu")),
         "cores": available_cores(),
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         **{name: version(name) for name in packages},
     }
-
-
-def _cpu() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def table(figures: Figures) -> str:
