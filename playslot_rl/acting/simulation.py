@@ -141,13 +141,12 @@ def make_simulation_env(
     world_model: WorldModel,
     action_decoder: ActionDecoder,
     generator: torch.Generator | None = None,
-    device: torch.device | str = "cpu",
 ) -> TransformedEnv:
     """The simulated task with SLOTS as observation and LATENT_ACTION as action, rendered as the training data were.
 
     The task's own keys stay (PIXELS, SUCCESS, reward, done). `action_decoder_module` on the rollout gives the real
     actions again, in [-1, 1]. Seed by `env.set_seed(seed)` before a reset; `generator` is that of sampled initial
-    slots. The networks stay on their device, whatever that of the environment's tensors. A ConfigError for an unknown
+    slots. The environment's tensors are on the CPU, the networks stay on their device. A ConfigError for an unknown
     environment, a RenderError without a GL backend, a ValueError for another frame size or action width than the world
     model's.
 
@@ -165,6 +164,4 @@ def make_simulation_env(
     from playslot_rl.envs import make_torchrl_env
 
     base = make_torchrl_env(env_config, render_config)
-    if torch.device(device).type != "cpu":
-        base = base.to(device)
     return latent_env(base, world_model, action_decoder, env_config.max_steps, generator)

@@ -57,7 +57,7 @@ def wilson(successes: float, trials: int) -> Interval:
     return low, high
 
 
-def hierarchical(outcomes: Outcomes, bounds: Interval = (-math.inf, math.inf), seed: int = 0) -> Interval:
+def hierarchical(outcomes: Outcomes, bounds: Interval = (-math.inf, math.inf)) -> Interval:
     """95 % interval of the mean outcome, cut to `bounds`; a ValueError where nothing was measured.
 
     Example:
@@ -68,7 +68,7 @@ def hierarchical(outcomes: Outcomes, bounds: Interval = (-math.inf, math.inf), s
     if outcomes.ndim != 3 or not there.any():
         raise ValueError(f"outcomes: got shape {outcomes.shape} with {there.sum()} measured, expected (W, S, E)")
     values, mean = np.where(there, outcomes, 0.0), float(np.nanmean(outcomes))
-    counts = [_counts(units, seed + level) for level, units in enumerate(outcomes.shape)]
+    counts = [_counts(units, level) for level, units in enumerate(outcomes.shape)]
     drawn, weight = _sums(counts, values), _sums(counts, there.astype(np.float64))
     low, high = np.quantile(drawn[weight > 0] / weight[weight > 0], _TAILS)
     wider = _widening(outcomes)

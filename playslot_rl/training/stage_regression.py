@@ -59,10 +59,6 @@ class TensorInputs:
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts)
 
-    def whole(self) -> Tensor:
-        """All rows, as one tensor."""
-        return torch.cat(self.parts)
-
     def draw(self, rows: Tensor, generators: StepGenerators) -> Tensor:
         """Rows, with noise."""
         values = self.plain(rows)

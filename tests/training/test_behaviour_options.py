@@ -68,10 +68,10 @@ def test_imagined_rows_end_at_the_horizon() -> None:
     demos = demonstrations()
     seen = SeenSlots.of(demos, CONFIG, horizon=2)
     far = demos.step <= 2
-    inputs = TensorInputs(seen.slots)
-    assert torch.equal(inputs.whole(), torch.cat((demos.slots, demos.imagined[far])))
+    inputs, whole = TensorInputs(seen.slots), torch.cat(seen.slots)
+    assert torch.equal(whole, torch.cat((demos.slots, demos.imagined[far])))
     some = torch.randperm(len(inputs), generator=torch.Generator().manual_seed(0))[:50]
-    assert torch.equal(inputs.plain(some), inputs.whole()[some])
+    assert torch.equal(inputs.plain(some), whole[some])
     assert SeenSlots.of(demos, CONFIG, horizon=None).slots[1] is demos.imagined, "nothing is copied where all are seen"
     assert torch.equal(seen.rows, torch.cat((torch.arange(len(far)), torch.nonzero(far)[:, 0])))
     assert len(SeenSlots.of(demos, CONFIG, horizon=None).rows) == 2 * len(far)
