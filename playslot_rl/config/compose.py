@@ -22,7 +22,7 @@ from playslot_rl.config.baselines import known_methods
 from playslot_rl.config.families import preset_values
 from playslot_rl.config.machine import require_machine
 from playslot_rl.config.methods import canonical_method
-from playslot_rl.config.plain import flatten, nearest, type_hints
+from playslot_rl.config.plain import flatten, nearest, put, type_hints
 from playslot_rl.config.planning import GOALS, PLANNERS, PROPOSALS
 from playslot_rl.config.roles import keys_of
 from playslot_rl.config.tasks import GROUP as TASKS_GROUP
@@ -133,7 +133,7 @@ def _parse(overrides: Sequence[str]) -> dict[str, str]:
         key = key.strip().lstrip("+")
         if not equals or not key or key.startswith("~"):
             raise ConfigError(f"got the argument {argument!r}, expected key=value, such as preset=compact")
-        hint = _hint(key)
+        hint = hint_of(key)
         if hint is None:
             raise ConfigError(_unknown_key(key))
         if key in METHOD_KEYS:
@@ -195,7 +195,7 @@ def quoted(text: str) -> str:
     return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
-def _hint(key: str) -> Any:
+def hint_of(key: str) -> Any:
     """Type of a dotted key of the config, or None where there is no such key."""
     hint: Any = ExperimentConfig
     for part in key.split("."):
@@ -208,9 +208,9 @@ def _hint(key: str) -> Any:
 def _unknown_key(key: str) -> str:
     """The message for an unknown key: the keys of its deepest known group, and the nearest key of all."""
     group = key.rpartition(".")[0]
-    while group and not dataclasses.is_dataclass(_hint(group)):
+    while group and not dataclasses.is_dataclass(hint_of(group)):
         group = group.rpartition(".")[0]
-    level = _hint(group) if group else ExperimentConfig
+    level = hint_of(group) if group else ExperimentConfig
     names = [f"{group}.{f.name}" if group else f.name for f in dataclasses.fields(level)]
     hint = nearest(key, [*names, *flatten(to_dict(ExperimentConfig()))])
     return f"unknown key {key}: expected one of {', '.join(sorted(names))}{hint}"
@@ -242,7 +242,7 @@ def _assignments(pairs: Mapping[str, str]) -> list[str]:
     for key, value in pairs.items():
         if key in GROUPS:
             continue
-        if _hint(key) is str and value != "null":
+        if hint_of(key) is str and value != "null":
             text = _expand_home(_unquote(value)) if key in folders else _unquote(value)
             value = quoted(text)
         assignments.append(f"++{key}={value}")
@@ -307,10 +307,8 @@ def _typed(pairs: Mapping[str, str]) -> dict[str, Any]:
                     f"cannot read the arguments: got several values for {override.key_or_group}, expected one "
                     "(a list goes in brackets)"
                 )
-            *path, last = override.key_or_group.split(".")
-            change: dict[str, Any] = {last: override.value()}
-            for name in reversed(path):
-                change = {name: change}
+            change: dict[str, Any] = {}
+            put(change, override.key_or_group, override.value())
             typed = _merge(typed, change)
     return typed
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any, Final, Literal, cast, get_args, get_origin
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.compose import COMPARISONS, GROUPS, NAMES, choices
+from playslot_rl.config.compose import COMPARISONS, GROUPS, NAMES, choices, hint_of
 from playslot_rl.config.plain import type_hints
 from playslot_rl.config.roles import keys_of
 
@@ -43,10 +43,10 @@ def explained(command: str, keys: Sequence[str]) -> str:
 def _rows(command: str, group: str) -> list[tuple[str, str]]:
     """Names of a group's keys; a group of groups has a row for each of them."""
     names, inner = [], []
-    for name, hint in fields_of(_hint(group)).items():
+    for name, hint in fields_of(hint_of(group)).items():
         if not dataclasses.is_dataclass(hint):
             names.append(name)
-        elif all(map(dataclasses.is_dataclass, fields_of(_hint(group)).values())) or len(fields_of(hint)) > _INLINE:
+        elif all(map(dataclasses.is_dataclass, fields_of(hint_of(group)).values())) or len(fields_of(hint)) > _INLINE:
             inner += _rows(command, f"{group}.{name}")
         else:
             names.append(f"{name}.{{{','.join(fields_of(hint))}}}")
@@ -67,19 +67,12 @@ def fields_of(cls: Any) -> dict[str, Any]:
 
 
 def _is_group(key: str) -> bool:
-    return dataclasses.is_dataclass(_hint(key))
-
-
-def _hint(key: str) -> Any:
-    hint: Any = ExperimentConfig
-    for part in key.split("."):
-        hint = fields_of(hint)[part]
-    return hint
+    return dataclasses.is_dataclass(hint_of(key))
 
 
 def _owner(key: str) -> tuple[type, str]:
     group, _, name = key.rpartition(".")
-    return cast(type, _hint(group) if group else ExperimentConfig), name
+    return cast(type, hint_of(group) if group else ExperimentConfig), name
 
 
 def _shown(key: str) -> str:
@@ -87,8 +80,8 @@ def _shown(key: str) -> str:
     if key in GROUPS:
         return "NAME"
     owner, name = _owner(key)
-    if get_origin(_hint(key)) is Literal and len(get_args(_hint(key))) < 5:
-        return "|".join(map(str, get_args(_hint(key))))
+    if get_origin(hint_of(key)) is Literal and len(get_args(hint_of(key))) < 5:
+        return "|".join(map(str, get_args(hint_of(key))))
     if key in keys_of(ExperimentConfig, "folder"):
         return "DIR"
     default = next(field.default for field in dataclasses.fields(owner) if field.name == name)

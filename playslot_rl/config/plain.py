@@ -71,6 +71,20 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def place_of(values: dict[str, Any], key: str) -> tuple[dict[str, Any], str]:
+    """The group of nested dicts that a dotted key is in, made where it is missing, and the key's name there."""
+    *groups, name = key.split(".")
+    for group in groups:
+        values = values.setdefault(group, {})
+    return values, name
+
+
+def put(values: dict[str, Any], key: str, value: Any) -> None:
+    """Set a dotted key of nested dicts."""
+    group, name = place_of(values, key)
+    group[name] = value
+
+
 def fingerprint(config: Any) -> str:
     """Short content hash of a config: equal configs, equal names."""
     text = json.dumps(to_dict(config), sort_keys=True)

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable
 from typing import Any, ClassVar, Final, Literal
 
-from playslot_rl.config.plain import check, to_dict, type_hints
+from playslot_rl.config.plain import check, flatten, place_of, put, to_dict, type_hints
 from playslot_rl.seeds.episodes import EPISODES, LARGEST_SEED
 
 Role = Literal["call", "machine", "free", "folder"]
@@ -139,11 +139,8 @@ def without(config: Any, unwanted: Role) -> dict[str, Any]:
     """Nested plain dict of a config, less the keys and groups that have a role."""
     values = to_dict(config)
     for key in keys_of(type(config), unwanted):  # type: ignore[arg-type]
-        *groups, name = key.split(".")
-        level = values
-        for group in groups:
-            level = level[group]
-        del level[name]
+        group, name = place_of(values, key)
+        del group[name]
     return values
 
 
@@ -168,14 +165,10 @@ def naming(config: Any) -> dict[str, Any]:
     """What names a job of a comparison, nested: all but the keys of the machine. One that is left open, None, counts as
     what it `was`, so that jobs from before it could be are the same jobs.
     """
-    values = without(config, "machine")
+    flat = flatten(values := without(config, "machine"))
     for key, value in earlier(type(config)).items():  # type: ignore[arg-type]
-        *groups, name = key.split(".")
-        level = values
-        for group in groups:
-            level = level.get(group, {})
-        if level.get(name, value) is None:
-            level[name] = value
+        if flat.get(key, value) is None:
+            put(values, key, value)
     return values
 
 

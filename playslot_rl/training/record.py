@@ -14,6 +14,7 @@ import torch
 from torch import nn
 
 from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config.plain import put
 from playslot_rl.config.roles import by_default, without
 from playslot_rl.config.stage_spec import StageSpec, group_of
 from playslot_rl.config.weights import data_roots
@@ -359,11 +360,3 @@ class StageRecord:
         several = "," in self.config.data.camera
         drawn = {"drawn": self.drawn} if self.drawn else {}
         return {"fps": self.data.fps, **drawn} | ({} if several else {"camera": self.data.camera})
-
-
-def put(values: dict[str, Any], key: str, value: Any) -> None:
-    """Set a dotted key of nested dicts."""
-    *groups, last = key.split(".")
-    for group in groups:
-        values = values.setdefault(group, {})
-    values[last] = value

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 
 from playslot_rl.config import ExperimentConfig, from_dict, to_dict
 from playslot_rl.config.compare_video import CompareVideoConfig, method_of, title_of
-from playslot_rl.config.plain import flatten
+from playslot_rl.config.plain import flatten, put
 from playslot_rl.errors import ConfigError
 from playslot_rl.studies.study import Job, absolute, computed, fingerprint_of, job_config
 
@@ -133,11 +133,7 @@ def _with_setting(config: ExperimentConfig, key: str, text: str) -> ExperimentCo
     if not key.startswith(VARIED) or key not in flatten(values):
         known = ", ".join(part.removesuffix(".") for part in VARIED)
         raise ConfigError(f"vary: got {key!r}, expected a setting under {known}")
-    *groups, name = key.split(".")
-    at = values
-    for group in groups:
-        at = at[group]
-    at[name] = _parsed(text)
+    put(values, key, _parsed(text))
     try:
         return from_dict(ExperimentConfig, values)
     except ValueError as error:
