@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from playslot_rl.config.methods import METHODS, require_method
 from playslot_rl.config.plain import check
@@ -18,6 +19,16 @@ LAUNCHERS: dict[str, str] = {
     "ray": "hydra_plugins.hydra_ray_launcher",
 }
 """Hydra's launchers by name, and the module each of them needs."""
+
+
+def check_lists(config: Any, prefix: str, filled: Sequence[str], *more: str) -> None:
+    """Refuse a list of a comparison that names something twice, one of `filled` that is empty, and no launcher."""
+    for name in (*filled, *more):
+        values = getattr(config, name)
+        check(len(values) > 0 or name in more, f"{prefix}{name}", values, "at least one")
+        check(len(set(values)) == len(values), f"{prefix}{name}", values, "each one once")
+    check(config.launcher in ("", *LAUNCHERS), "hydra.launcher", config.launcher, f"one of {', '.join(LAUNCHERS)}")
+    check(not config.hydra or bool(config.launcher), "hydra", config.hydra, "hydra.launcher=NAME with it")
 
 
 @dataclass(frozen=True)
@@ -67,17 +78,11 @@ class CompareConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("methods", "demos", "seeds"):
-            values = getattr(self, name)
-            check(len(values) > 0, name, values, "at least one")
-            check(len(set(values)) == len(values), name, values, "each one once")
+        check_lists(self, "", ("methods", "demos", "seeds"), "envs", "labels", "videos")
         for name in self.methods:
             require_method("methods", name)
         still = [name for name in self.methods if not METHODS[name].acts]
         check(not still, "methods", ",".join(still), "methods that act; `playslot compare-video` compares predictions")
-        for name in ("envs", "labels", "videos"):
-            values = getattr(self, name)
-            check(len(set(values)) == len(values), name, values, "each one once")
         most = max(self.labels, default=0)
         if self.videos:
             check(bool(self.labels), "videos", self.videos, "numbers of labelled demonstrations, labels=, with them")
@@ -106,9 +111,6 @@ class CompareConfig(Checked):
         online = self.online_seeds
         check(set(online) <= set(self.seeds), "compare.online_seeds", online, f"some of seeds={self.seeds}")
         check(len(set(online)) == len(online), "compare.online_seeds", online, "each one once")
-        known = ", ".join(LAUNCHERS)
-        check(self.launcher in ("", *LAUNCHERS), "hydra.launcher", self.launcher, f"one of {known}")
-        check(not self.hydra or bool(self.launcher), "hydra", self.hydra, "hydra.launcher=NAME with it")
 
     @property
     def numbers(self) -> tuple[int, ...]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from playslot_rl.config.compare import LAUNCHERS
+from playslot_rl.config.compare import check_lists
 from playslot_rl.config.methods import METHODS, Method
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import OPEN_FRACTION, SEED, YEAR_MINUTES, Checked, above_zero, at_least, between, role
@@ -89,11 +89,7 @@ class CompareVideoConfig(Checked):
         known_methods = video_methods()
         for name in self.methods:
             check(name in known_methods, f"{self.group}methods", name, f"one of {', '.join(known_methods)}")
-        for name in ("methods", "seeds", "shown", "rates", "tested_on"):
-            check(len(getattr(self, name)) > 0, f"{self.group}{name}", getattr(self, name), "at least one")
-        for name in ("methods", "seeds", "shown", "rates", "tested_on", "values", "objects"):
-            values = getattr(self, name)
-            check(len(set(values)) == len(values), f"{self.group}{name}", values, "each one once")
+        check_lists(self, self.group, ("methods", "seeds", "shown", "rates", "tested_on"), "values", "objects")
         check(bool(self.vary) == bool(self.values), f"{self.group}values", self.values, "vary=SETTING and values=A,B")
         trained = self.trained_seed + self.trained_frames
         check(
@@ -102,6 +98,3 @@ class CompareVideoConfig(Checked):
             self.shown,
             f"fewer than a training clip's {trained} frames",
         )
-        known = ", ".join(LAUNCHERS)
-        check(self.launcher in ("", *LAUNCHERS), "hydra.launcher", self.launcher, f"one of {known}")
-        check(not self.hydra or bool(self.launcher), "hydra", self.hydra, "hydra.launcher=NAME with it")
