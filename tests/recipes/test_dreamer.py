@@ -69,18 +69,6 @@ def test_its_actor_plays_and_repeats_itself(run: Path) -> None:
     assert shown[0] == shown[1]
 
 
-def test_the_same_command_again_does_nothing(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = weights(run)
-    train(run)
-    assert "dreamer: finished before (4 steps), skipped" in capsys.readouterr().out
-    assert weights(run) == before
-
-
-def test_other_values_in_the_same_folder_are_refused(run: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"dreamer\.gamma: got 0\.5, expected 0\.99"):
-        train(run, "baselines.dreamer.gamma=0.5")
-
-
 def test_a_run_without_an_actor_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="no dreamer checkpoint"):
         load_actor(Run(tmp_path))
@@ -103,15 +91,6 @@ def test_what_cannot_be_learned_from_is_refused_before_anything_is_written(
     with pytest.raises(ConfigError, match=message):
         training.train(config)
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.slow
-def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(run: Path, tmp_path: Path) -> None:
-    out = tmp_path / "killed"
-    killed_at_first_checkpoint(out / "dreamer", "train-baseline", *SMOKE, f"out={out}")
-    train(out)
-    assert weights(out) == weights(run)
-    assert not list(out.rglob("*.tmp-*"))
 
 
 @pytest.mark.slow

@@ -1,11 +1,11 @@
-"""Ctrl-C and kill -9: the same command carries on and ends with the same weights, bit for bit."""
+"""Ctrl-C: the same command carries on and ends with the same weights, bit for bit; two commands share no run. Kills are
+in tests/methods/test_contract.py and tests/faults.
+"""
 
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -21,51 +21,12 @@ from playslot_rl import cli
 from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.errors import OutputError
-from playslot_rl.runs.opening import STAGE_LOCK, run_to_write
+from playslot_rl.runs.opening import run_to_write
 from playslot_rl.seeds.draws import StepGenerators
-from playslot_rl.storage.locks import locked
 from playslot_rl.training import record
 from playslot_rl.training.stage_slots import SlotsStage
 
 pytestmark = pytest.mark.integration
-
-LONG = {
-    "slots": ("slots.steps=32", "slots.checkpoint_every=4", "slots.validate_every=16"),
-    "dynamics": ("dynamics.steps=32", "dynamics.checkpoint_every=4", "dynamics.validate_every=16"),
-    "policy": ("behaviour.steps=100", "behaviour.decoder_steps=20", "behaviour.checkpoint_every=10"),
-    "decoder": ("behaviour.steps=20", "behaviour.decoder_steps=200", "behaviour.checkpoint_every=10"),
-}
-FOLDERS = {"slots": "slots", "dynamics": "dynamics", "policy": "policy", "decoder": "policy/decoder"}
-
-
-@pytest.fixture(scope="module")
-def start() -> Callable[..., multiprocessing.process.BaseProcess]:
-    """Start a command in a process of its own that has the imports already: it can be killed while it works."""
-    context = multiprocessing.get_context("forkserver")
-    parts = ("training.stage_slots", "training.stage_dynamics", "training.checkpoints", "data.slot_cache")
-    context.set_forkserver_preload(["torchrl.data", *(f"playslot_rl.{part}" for part in parts)])
-
-    def begin(command: str, *arguments: object) -> multiprocessing.process.BaseProcess:
-        process = context.Process(target=cli.main, args=([command, *map(str, arguments), *ONE_CORE],))
-        process.start()
-        return process
-
-    return begin
-
-
-def _command(part: str, run: Path, videos: Path, demos: Path) -> tuple[str, ...]:
-    stage = "policy" if part == "decoder" else part
-    data = demos if stage == "policy" else videos
-    return (f"train-{stage}", "preset=smoke", f"out={run}", f"data.root={data}", *LONG[part])
-
-
-def _prepared(shared_run: Path, run: Path, part: str) -> Path:
-    """A run that has what comes before a stage."""
-    parents = {"slots": (), "dynamics": ("slots",)}.get(part, ("slots", "dynamics"))
-    run.mkdir()
-    for stage in parents:
-        shutil.copytree(shared_run / stage, run / stage)
-    return run
 
 
 def _wait_for_checkpoint(folder: Path, alive: Callable[[], bool]) -> None:
@@ -75,34 +36,6 @@ def _wait_for_checkpoint(folder: Path, alive: Callable[[], bool]) -> None:
             return
         time.sleep(0.002)
     raise AssertionError(f"no checkpoint came up in {folder}")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("part", LONG)
-def test_a_killed_stage_ends_with_the_weights_of_one_that_was_not(
-    shared_run: Path, videos: Path, demos: Path, tmp_path: Path, part: str, start: Callable[..., object]
-) -> None:
-    whole, killed = (_prepared(shared_run, tmp_path / name, part) for name in ("whole", "killed"))
-    smoke(*_command(part, whole, videos, demos))
-    process = start(*_command(part, killed, videos, demos))
-    assert isinstance(process, multiprocessing.process.BaseProcess)
-    checkpoints = killed / FOLDERS[part] / "checkpoints"
-    _wait_for_checkpoint(checkpoints, process.is_alive)
-    process.kill()
-    process.join()
-    assert process.exitcode == -signal.SIGKILL
-    stage = "policy" if part == "decoder" else part
-    assert not (killed / stage / "checkpoint").exists()
-    smoke(*_command(part, killed, videos, demos))
-    assert weights(killed, stage) == weights(whole, stage)
-    assert not [name for name in contents(killed) if ".tmp-" in name]
-    meta = [json.loads((run / stage / "checkpoint" / "meta.json").read_text()) for run in (whole, killed)]
-    assert meta[0]["metrics"] == meta[1]["metrics"]
-    counted = [[(one["training"], one["steps"]) for one in found["sittings"]] for found in meta]
-    assert len(counted[1]) == len(counted[0]) + 1  # the killed process, and the one that went on
-    for found, own in zip(meta, counted, strict=True):
-        assert sum(steps for training, steps in own if training == own[0][0]) == found["steps"]
-        assert sum(one["seconds"] for one in found["sittings"]) == pytest.approx(found["seconds"], abs=0.1)
 
 
 def test_an_interrupt_is_one_line_and_the_same_command_carries_on(
@@ -121,35 +54,6 @@ def test_an_interrupt_is_one_line_and_the_same_command_carries_on(
         refused(*command, message="slots interrupted; the same command carries on from step 3 ", code=130)
     smoke(*command)
     assert weights(run, "slots") == weights(shared_run, "slots")
-
-
-TRAININGS = {
-    "slots": ("train-slots",),
-    "dynamics": ("train-dynamics",),
-    "policy": ("train-policy",),
-    **{
-        method: ("train-baseline", f"method={method}")
-        for method in ("slot_oracle", "resnet_oracle", "lapo", "caddy_policy", "dreamer", "sold")
-    },
-}
-
-
-@pytest.mark.parametrize("stage", TRAININGS)
-def test_a_stage_that_another_command_trains_is_refused(
-    shared_run: Path, videos: Path, demos: Path, tmp_path: Path, stage: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(record, "PATIENCE", 0.0)
-    run = tmp_path / "run"
-    folder = run / {"lapo": "lapo_model", "caddy_policy": "caddy"}.get(stage, stage)  # what each trains first
-    folder.mkdir(parents=True)
-    data = demos if stage not in ("slots", "dynamics") else videos
-    own = () if stage in ("slots", "resnet_oracle", "lapo", "dreamer") else (f"run={shared_run}",)
-    (run / "config.json").write_bytes((shared_run / "config.json").read_bytes())
-    before = contents(run).keys()
-    with locked(folder / STAGE_LOCK):
-        busy = f"got a run whose {folder.name} another command is training, expected none: wait for it"
-        refused(*TRAININGS[stage], "preset=smoke", *own, f"out={run}", f"data.root={data}", message=busy)
-    assert contents(run).keys() == before | {f"{folder.name}/{STAGE_LOCK}"}
 
 
 def test_a_new_run_is_one_commands_too(
@@ -192,7 +96,8 @@ def test_a_kill_before_the_first_file_of_a_run_leaves_no_foreign_folder(tmp_path
 @pytest.mark.slow
 def test_ctrl_c_in_a_terminal_is_one_line_and_carries_on(shared_run: Path, videos: Path, tmp_path: Path) -> None:
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    command = _command("slots", stopped, videos, videos)
+    longer = ("slots.steps=32", "slots.checkpoint_every=4", "slots.validate_every=16", f"data.root={videos}")
+    command = ("train-slots", "preset=smoke", f"out={stopped}", *longer)
     process = subprocess.Popen(
         [sys.executable, "-m", "playslot_rl", *command, *ONE_CORE],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"},
@@ -205,7 +110,7 @@ def test_ctrl_c_in_a_terminal_is_one_line_and_carries_on(shared_run: Path, video
     assert "slots interrupted; the same command carries on from step " in err
     assert not (stopped / "slots" / "checkpoint").exists()
     smoke(*command)
-    smoke(*_command("slots", whole, videos, videos))
+    smoke("train-slots", f"out={whole}", *longer)
     assert weights(stopped, "slots") == weights(whole, "slots")
 
 

@@ -9,16 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from commands import killed_at_first_checkpoint, smoke
+from commands import smoke
 from safetensors.torch import load_file
 
 from playslot_rl import keys
 from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import compose
-from playslot_rl.errors import CheckpointError, ConfigError, TrainingError
+from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.methods.sold.acting import load_actor
-from playslot_rl.methods.sold.learner import SOLDLearner
 from playslot_rl.methods.sold.networks import prior_steps
 from playslot_rl.methods.training import train
 from playslot_rl.modules.savi import SAVi
@@ -32,10 +31,6 @@ FIXED = ("preset=smoke", "method=sold", "device=cpu", "threads=1", "logging.back
 
 def _config(world: Path, out: Path, *overrides: str) -> ExperimentConfig:
     return compose([*FIXED, f"run={world}", f"out={out}", *overrides])
-
-
-def _weights(run: Path) -> bytes:
-    return (run / "sold" / "checkpoint" / "weights.safetensors").read_bytes()
 
 
 def _write_world(run: Path, seed: int = 0) -> Path:
@@ -112,46 +107,6 @@ def test_it_is_evaluated_by_the_evaluator_of_all_methods(trained: Path) -> None:
     assert len(info["per_episode"]) == 2
 
 
-def test_a_finished_run_is_skipped(trained: Path, world: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = _weights(trained)
-    train(_config(world, trained))
-    assert "sold: finished before" in capsys.readouterr().out
-    assert _weights(trained) == before
-
-
-def test_an_interrupted_run_ends_with_the_same_weights(
-    trained: Path, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config, original = _config(world, tmp_path / "run"), SOLDLearner.update
-
-    def stopped(self: SOLDLearner, batch: object, generators: object) -> object:
-        if generators.step == 5:
-            raise KeyboardInterrupt
-        return original(self, batch, generators)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(SOLDLearner, "update", stopped)
-        with pytest.raises(KeyboardInterrupt, match="sold interrupted; the same command carries on from step 24"):
-            train(config)
-    assert not (tmp_path / "run" / "sold" / "checkpoint").exists()
-    train(config)
-    assert _weights(tmp_path / "run") == _weights(trained)
-
-
-def test_a_loss_that_is_not_finite_stops_with_the_last_checkpoint(
-    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    original = SOLDLearner.update
-
-    def broken(self: SOLDLearner, batch: object, generators: object) -> object:
-        values = dict(original(self, batch, generators))
-        return values | {"slot_mse": torch.tensor(float("nan"))} if generators.step == 5 else values
-
-    monkeypatch.setattr(SOLDLearner, "update", broken)
-    with pytest.raises(TrainingError, match=r"sold: slot_mse is nan .* the last good checkpoint is .*step_00000024"):
-        train(_config(world, tmp_path / "run"))
-
-
 def test_another_savi_than_it_was_trained_on_is_refused(trained: Path, tmp_path: Path) -> None:
     other = _write_world(tmp_path / "other", seed=1)
     run = Path(shutil.copytree(trained, tmp_path / "run"))
@@ -217,11 +172,3 @@ def test_savis_data_are_counted_from_the_config_the_checkpoint_or_its_episodes(w
 def test_settings_that_cannot_be_are_refused(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         compose(["preset=smoke", f"baselines.sold.{override}"])
-
-
-@pytest.mark.slow
-def test_a_killed_run_ends_with_the_same_weights(trained: Path, world: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    killed_at_first_checkpoint(run / "sold", "train-baseline", *FIXED, f"run={world}", f"out={run}")
-    train(_config(world, run))
-    assert _weights(run) == _weights(trained)
