@@ -1,9 +1,8 @@
-"""SVG's training: what a step draws, resuming, learning."""
+"""SVG's training: what a step draws, learning."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,8 +14,6 @@ from playslot_rl.methods.svg.method import SVGConfig
 from playslot_rl.methods.svg.model import SVG
 from playslot_rl.methods.svg.training import SVGStage
 from playslot_rl.seeds.draws import StepGenerators
-from playslot_rl.storage.tensors import load_tensors
-from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.stage import step_loss
 
 
@@ -27,39 +24,6 @@ def make_stage(config: SVGConfig, episodes: int = 6) -> SVGStage:
     frames = config.seed_frames + config.predicted_frames
     clips = Clips(moving_square(episodes, length=8, size=32), frames, validation=0.3, seed=0)
     return SVGStage(SVG(config, 32), clips, config)
-
-
-def train(folder: Path, config: SVGConfig) -> SVGStage:
-    stage = make_stage(config)
-    fit(Part("svg", stage, config), folder, seed=3)
-    return stage
-
-
-@pytest.mark.integration
-def test_a_resumed_training_ends_with_the_same_weights_statistics_and_optimiser(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: SVGConfig
-) -> None:
-    config = replace(config, steps=4, decoded_frames=2, checkpoint_every=2, validate_every=2)
-    train(tmp_path / "whole", config)
-    original = SVGStage.batch
-
-    def stop(self: SVGStage, step: int, generators: StepGenerators) -> object:
-        if step == 3:
-            raise KeyboardInterrupt
-        return original(self, step, generators)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(SVGStage, "batch", stop)
-        with pytest.raises(KeyboardInterrupt, match="from step 2 "):
-            train(tmp_path / "parts", config)
-    train(tmp_path / "parts", config)
-    for name in ("modules", "optimizer"):
-        one, two = (
-            load_tensors(tmp_path / run / "checkpoints" / "step_00000004" / f"{name}.safetensors")
-            for run in ("whole", "parts")
-        )
-        assert one.keys() == two.keys()
-        assert [key for key in one if not torch.equal(one[key], two[key])] == []
 
 
 def test_a_steps_randomness_is_all_from_its_generators(config: SVGConfig) -> None:
