@@ -29,8 +29,8 @@ def spec_of(episodes: int) -> CollectionSpec:
     return CollectionSpec.make(config(), "random", episodes, STEPS, 0)
 
 
-def small(out: Path, episodes: int) -> Path:
-    return collect(config(), "random", episodes, STEPS, out, seed=0, workers=1)
+def small(out: Path, episodes: int = 2, **changes: Any) -> Path:
+    return collect(config(**changes), "random", episodes, STEPS, out, seed=0, workers=1)
 
 
 def assert_whole(out: Path, episodes: int, reference: list[Any] | None = None) -> None:

@@ -1,19 +1,15 @@
-"""Collections: what they hold, that they survive kills, and what they refuse."""
+"""Collections: what they hold, and what they refuse."""
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from small_sets import STEPS, config, small, spec_of
 
 from playslot_rl import keys
 from playslot_rl.collectors import collect
@@ -23,21 +19,6 @@ from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.errors import ConfigError, DataError, OutputError
 
 pytestmark = pytest.mark.integration
-
-STEPS = 3
-SMALL = {
-    "env": {"image_size": 32, "warmup_steps": 1},
-    "render": {"supersample": 1},
-    "logging": {"progress": False},
-}
-
-
-def config(**changes: Any) -> ExperimentConfig:
-    return from_dict(ExperimentConfig, {**SMALL, **changes})
-
-
-def small(out: Path, episodes: int = 2, policy: Any = "random", workers: int = 1, **changes: Any) -> Path:
-    return collect(config(**changes), policy, episodes, STEPS, out, seed=0, workers=workers)
 
 
 def load(root: Path) -> Any:
@@ -58,7 +39,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = folder / "data"
     from playslot_rl.collectors.episodes import record
 
-    spec = CollectionSpec.make(config(), "random", 2, STEPS, 0)
+    spec = spec_of(2)
     journal = Journal(journal_path(out), spec)
     for episode in record(spec, [0, 1]):
         journal.add(episode)
@@ -73,7 +54,7 @@ def restore(made: Path, out: Path) -> None:
 
 def test_data_set_opens_in_lerobot_with_the_recorded_frames(made: Path) -> None:
     dataset = load(made)
-    journal = Journal(made.parent / "journal_copy", CollectionSpec.make(config(), "random", 2, STEPS, 0))
+    journal = Journal(made.parent / "journal_copy", spec_of(2))
     assert (dataset.num_episodes, len(dataset), dataset.fps) == (2, 2 * (STEPS + 1), 16)
     for e in range(2):
         episode = journal.read(e)
@@ -98,7 +79,7 @@ def test_record_names_seeds_success_and_versions(made: Path) -> None:
 def test_recorded_episode_is_the_environments_own(made: Path) -> None:
     from playslot_rl.envs import make_env
 
-    journal = Journal(made.parent / "journal_copy", CollectionSpec.make(config(), "random", 2, STEPS, 0))
+    journal = Journal(made.parent / "journal_copy", spec_of(2))
     episode = journal.read(1)
     env = make_env(journal.spec.env, journal.spec.render)
     frames = [env.reset(seed=1)[0]["pixels"]] + [env.step(a)[0]["pixels"] for a in episode.actions]
@@ -148,7 +129,7 @@ def test_episodes_that_start_solved_are_redrawn(monkeypatch: pytest.MonkeyPatch)
     from playslot_rl.collectors.episodes import SeededView
     from playslot_rl.envs import make_env
 
-    spec = CollectionSpec.make(config(), "random", 1, STEPS, 0)
+    spec = spec_of(1)
     env = make_env(spec.env, spec.render)
     original = type(env.unwrapped).reset
 
@@ -225,33 +206,6 @@ def test_damaged_data_set_is_refused(made: Path, tmp_path: Path) -> None:
         small(out)
 
 
-def test_second_process_on_the_same_folder_is_refused(made: Path, tmp_path: Path) -> None:
-    out = tmp_path / "data"
-    restore(made, out)
-    spec = CollectionSpec.make(config(), "random", 2, STEPS, 0)
-    with Journal(journal_path(out), spec).lock(), pytest.raises(OutputError, match="another process"):
-        small(out)
-
-
-def test_full_disk_is_one_line_and_loses_nothing(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from playslot_rl.collectors import export
-
-    out = tmp_path / "data"
-    restore(made, out)
-
-    def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(export, "_check", full)
-        with pytest.raises(OutputError, match="disk is full"):
-            small(out)
-    assert not out.exists()
-    assert not list(tmp_path.glob(".*export"))
-    small(out)
-    assert len(load(out)) == 2 * (STEPS + 1)
-
-
 def test_frame_that_was_stored_wrongly_is_noticed(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from playslot_rl.collectors.image_set import ImageSetWriter
 
@@ -318,124 +272,3 @@ def test_a_request_refused_by_the_environment_leaves_nothing(tmp_path: Path, mon
     with pytest.raises(ConfigError, match="only the simulator knows"):
         small(tmp_path / "data")
     assert list(tmp_path.iterdir()) == []
-
-
-# --- kills ----------------------------------------------------------------------------------------------------------
-
-PROGRAM = """
-import json, sys
-from pathlib import Path
-from playslot_rl.collectors import collect
-from playslot_rl.config import ExperimentConfig, from_dict
-if __name__ == "__main__":
-    settings, episodes, workers, out = json.loads(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), Path(sys.argv[4])
-    collect(from_dict(ExperimentConfig, settings), "random", episodes, 3, out, seed=0, workers=workers)
-"""
-
-
-def start(tmp_path: Path, out: Path, episodes: int, workers: int) -> subprocess.Popen[bytes]:
-    program = tmp_path / "program.py"
-    program.write_text(PROGRAM)
-    command = [sys.executable, str(program), json.dumps(SMALL), str(episodes), str(workers), str(out)]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True)
-
-
-def wait_for(process: subprocess.Popen[bytes], happened: Any, timeout: float = 120.0) -> None:
-    deadline = time.monotonic() + timeout
-    while not happened():
-        assert process.poll() is None, process.communicate()[1].decode()
-        assert time.monotonic() < deadline, "timed out"
-        time.sleep(0.005)
-
-
-def children(pid: int) -> list[int]:
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = path.read_text().rsplit(")", 1)[1].split()
-        except OSError:
-            continue
-        if int(fields[1]) == pid and fields[0] != "Z":
-            found.append(int(path.parent.name))
-    return found
-
-
-def alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except OSError:
-        return False
-
-
-@pytest.mark.slow
-def test_kill_during_collection_loses_only_the_episode_in_hand(made: Path, tmp_path: Path) -> None:
-    out = tmp_path / "data"
-    process = start(tmp_path, out, episodes=200, workers=1)
-    folder = journal_path(out)
-    wait_for(process, lambda: len(list(folder.glob("episode_*.npz"))) >= 3)
-    process.kill()
-    process.wait()
-    stored = sorted(p.name for p in folder.glob("episode_*.npz"))
-    assert stored == [f"episode_{i:06d}.npz" for i in range(len(stored))]
-    assert 3 <= len(stored) < 200
-    journal = Journal(folder, CollectionSpec.make(config(), "random", 200, STEPS, 0))
-    whole = Journal(made.parent / "journal_copy", CollectionSpec.make(config(), "random", 2, STEPS, 0))
-    for index in range(len(stored)):
-        assert journal.read(index).frames.shape == (STEPS + 1, 32, 32, 3)
-    np.testing.assert_array_equal(journal.read(1).frames, whole.read(1).frames)
-    assert journal.missing() == list(range(len(stored), 200))
-    assert not out.exists()
-
-
-@pytest.mark.slow
-def test_kill_during_export_leaves_nothing_half_made(made: Path, tmp_path: Path) -> None:
-    out = tmp_path / "data"
-    restore(made, out)
-    process = start(tmp_path, out, episodes=2, workers=1)
-    wait_for(process, lambda: any(tmp_path.glob(".data.tmp-*/meta")))
-    process.kill()
-    process.wait()
-    assert not out.exists()
-    assert len(list(journal_path(out).glob("episode_*.npz"))) == 2
-    small(out)
-    np.testing.assert_array_equal(frames_of(out), frames_of(made))
-    assert not list(tmp_path.glob(".data.tmp-*"))
-    assert not journal_path(out).exists()
-
-
-@pytest.mark.slow
-def test_two_workers_record_the_same_data_and_die_with_their_parent(made: Path, tmp_path: Path) -> None:
-    one, two = tmp_path / "one", tmp_path / "two"
-    process = start(tmp_path, two, episodes=150, workers=2)
-    wait_for(process, lambda: len(list(journal_path(two).glob("episode_*.npz"))) >= 4, timeout=240)
-    workers = children(process.pid)
-    process.kill()
-    process.wait()
-    deadline = time.monotonic() + 10
-    while any(alive(w) for w in workers) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert len(workers) >= 2
-    assert not any(alive(w) for w in workers)
-    shutil.rmtree(journal_path(two))
-
-    process = start(tmp_path, two, episodes=5, workers=2)
-    errors = process.communicate(timeout=300)[1].decode()
-    assert process.returncode == 0, errors
-    assert "Traceback" not in errors
-    small(one, episodes=5)
-    np.testing.assert_array_equal(frames_of(one), frames_of(two))
-
-
-@pytest.mark.slow
-def test_interrupt_leaves_a_journal_to_go_on_from(tmp_path: Path) -> None:
-    out = tmp_path / "data"
-    process = start(tmp_path, out, episodes=400, workers=2)
-    wait_for(process, lambda: len(list(journal_path(out).glob("episode_*.npz"))) >= 2, timeout=240)
-    os.killpg(process.pid, signal.SIGINT)
-    errors = process.communicate(timeout=60)[1].decode()
-    assert process.returncode != 0
-    assert errors.strip().endswith("KeyboardInterrupt")
-    assert errors.count("Traceback") == 1, errors  # ours, which the command line catches; none from the workers
-    stored = len(list(journal_path(out).glob("episode_*.npz")))
-    journal = Journal(journal_path(out), CollectionSpec.make(config(), "random", 400, STEPS, 0))
-    assert len(journal.missing()) == 400 - stored

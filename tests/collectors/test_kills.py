@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_sets import SMALL, assert_whole, small
+from small_sets import SMALL, assert_whole, small, spec_of
 
-from playslot_rl.collectors.journal import journal_path
+from playslot_rl.collectors.journal import Journal, journal_path
 
 PROGRAM = """
 import json, sys
@@ -157,3 +157,16 @@ def test_death_beyond_the_limit_ends_in_one_line_and_the_same_command_carries_on
     assert_no_orphans(process.pid)
     small(out, 150)
     assert_whole(out, 150, reference)
+
+
+@pytest.mark.slow
+def test_interrupt_leaves_a_journal_to_go_on_from(tmp_path: Path, started: list[subprocess.Popen[bytes]]) -> None:
+    out = tmp_path / "data"
+    process = start(started, tmp_path, out, episodes=400)
+    wait_for(lambda: stored(out) >= 2, process)
+    os.killpg(process.pid, signal.SIGINT)
+    errors = process.communicate(timeout=60)[1].decode()
+    assert process.returncode != 0
+    assert errors.strip().endswith("KeyboardInterrupt")
+    assert errors.count("Traceback") == 1, errors  # ours, which the command line catches; none from the workers
+    assert len(Journal(journal_path(out), spec_of(400)).missing()) == 400 - stored(out)
