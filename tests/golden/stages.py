@@ -108,7 +108,7 @@ def planned(env: str, preset: str, folder: Path) -> Seen:
             _ = record.data  # opened while it can be
         return record.save({"name": _Named(record.name)}, {}, 1, 0.0, {"agent_steps": 1})
 
-    with patch.object(StageRecord, "finished", finished), _videos():
+    with patch.object(StageRecord, "finished", finished), on_few_videos():
         _run_all(seen, folder, [f"env={env}", f"preset={preset}", "demos=4", "behaviour.labelled_demos=2"])
     return seen
 
@@ -135,14 +135,16 @@ def begun(options: tuple[str, ...], folder: Path) -> Seen:
         patch.object(TrainingCheckpoints, "__init__", init),
         patch.object(TrainingCheckpoints, "resume", resume),
         patch.object(StageRecord, "finished", finished),
-        _videos(),
+        on_few_videos(),
     ):
         _run_all(seen, folder, ["env=button_press", "preset=smoke", f"data.cache={folder / 'cache'}", *options])
     return seen
 
 
 @contextlib.contextmanager
-def _videos() -> Iterator[None]:
+def on_few_videos() -> Iterator[None]:
+    """Inside the block stages are trained on `few_videos`."""
+
     def open_videos(config: Any, *_: str) -> EpisodeFrames:
         return few_videos(config.env.image_size, config.env.action_dim)
 

@@ -5,7 +5,6 @@ not train it at once.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +13,7 @@ from unittest.mock import patch
 
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
-
-from stages import few_videos
+from stages import on_few_videos
 
 from playslot_rl.config import plugins
 from playslot_rl.config.compose import compose
@@ -28,7 +24,6 @@ from playslot_rl.methods.online.replay import OnlineCheckpoints
 from playslot_rl.recipes import train_baseline, train_dynamics, train_policy, train_slots
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import STAGE_LOCK
-from playslot_rl.storage import checkpoints
 from playslot_rl.storage.locks import locked
 from playslot_rl.training import record as records
 from playslot_rl.training.batches import GlobalBatches
@@ -87,14 +82,7 @@ class _Killed(BaseException):
 
 @pytest.fixture(autouse=True)
 def _few_videos() -> Iterator[None]:
-    def open_videos(config: Any, *_: str) -> Any:
-        return few_videos(config.env.image_size, config.env.action_dim)
-
-    with (
-        patch.object(records, "open_videos", open_videos),
-        patch.object(records, "PATIENCE", 0.0),
-        patch.object(checkpoints, "provenance", dict),
-    ):
+    with on_few_videos(), patch.object(records, "PATIENCE", 0.0):
         yield
 
 

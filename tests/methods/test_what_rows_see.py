@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,9 +9,6 @@ from typing import Any, Literal
 from unittest.mock import patch
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "golden"))
-
 from stages import few_videos
 
 from playslot_rl import keys

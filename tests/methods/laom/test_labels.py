@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "golden"))
-
-from stages import few_videos
+from stages import on_few_videos
 
 from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import CheckpointError
 from playslot_rl.recipes import train_baseline
 from playslot_rl.runs import Run
-from playslot_rl.storage import checkpoints
 from playslot_rl.studies.success.jobs import latent_models, success_config, success_jobs, success_record
-from playslot_rl.training import record as records
 from playslot_rl.training.record import StageRecord
 
 SHARED = ("preset=smoke", "env=button_press", "data.root=videos", "data.demos=demos", "device=cpu")
@@ -31,11 +24,7 @@ OUT = Path("out")
 
 @pytest.fixture(autouse=True)
 def _few_videos() -> Iterator[None]:
-    def open_videos(config: Any, *_: str) -> Any:
-        return few_videos(config.env.image_size, config.env.action_dim)
-
-    quick = patch.object(checkpoints, "provenance", dict)
-    with patch.object(records, "open_videos", open_videos), quick:
+    with on_few_videos():
         yield
 
 

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
-from unittest.mock import patch
 
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "golden"))
-
-from stages import few_videos
+from stages import on_few_videos
 
 from playslot_rl import keys
 from playslot_rl.config import plugins
@@ -23,8 +17,6 @@ from playslot_rl.methods.clam.model import CLAMPolicy, Forward, Inverse
 from playslot_rl.methods.laom.model import LAOMPolicy, LatentActions
 from playslot_rl.recipes import train_baseline
 from playslot_rl.runs import Run
-from playslot_rl.storage import checkpoints
-from playslot_rl.training import record as records
 
 TASKS = ("button_press", "block_push_easy", "block_push", "block_reach", "block_pick")
 PRESETS = ("smoke", "compact", "compact_gpu", "gpu", "paper")
@@ -32,10 +24,7 @@ PRESETS = ("smoke", "compact", "compact_gpu", "gpu", "paper")
 
 @pytest.fixture(autouse=True)
 def _few_videos() -> Iterator[None]:
-    def open_videos(config: Any, *_: str) -> Any:
-        return few_videos(config.env.image_size, config.env.action_dim)
-
-    with patch.object(records, "open_videos", open_videos), patch.object(checkpoints, "provenance", dict):
+    with on_few_videos():
         yield
 
 
