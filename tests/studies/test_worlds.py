@@ -93,24 +93,6 @@ def test_videos_are_counted_on_top_of_the_labelled_ones() -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("typed", "message"),
-    [
-        (["videos=0,50"], "videos: got .*, expected numbers of labelled demonstrations, labels=, with them"),
-        (["videos=0", "labels=5", "demos=10"], "demos: got .*, expected none with videos="),
-        (["videos=-1", "labels=5"], "videos: got -1, expected numbers of 0 or more"),
-        (["worlds=0"], "worlds: got 0, expected 1 to 100"),
-        (["methods=lapo", "compare.reference=slot_oracle"], "reference: got 'slot_oracle', expected one of lapo"),
-        (["compare.block=test", "compare.evaluation_seed=7"], "evaluation_seed: got 7, expected none, or 2147483648"),
-        ([f"compare.evaluation_seed={TEST_BLOCKS}"], "evaluation_seed: got 2147483648, expected compare.block=test"),
-    ],
-)
-def test_what_cannot_be_asked_is_one_line(typed: list[str], message: str) -> None:
-    with pytest.raises(ConfigError, match=message) as error:
-        compared(*typed)
-    assert "\n" not in str(error.value)
-
-
 @pytest.fixture
 def two_worlds(tmp_path: Path) -> list[dict[str, Any]]:
     """PlaySlot on two world models, LAPO that is as good on one and lost on the other, and a ResNet."""
