@@ -40,6 +40,16 @@ def bowl(z: Tensor) -> Tensor:
     return (z - GOAL).square().sum((1, 2))
 
 
+def watched(seen: list[Tensor]) -> Callable[[Tensor], Tensor]:
+    """The bowl, which keeps what it is asked."""
+
+    def cost(z: Tensor) -> Tensor:
+        seen.append(z)
+        return bowl(z)
+
+    return cost
+
+
 def search(cost: Callable[[Tensor], Tensor] = bowl, starts: Tensor | None = None, scale: float = 1.0) -> Search:
     whitening = Whitening(Z)
     whitening.scale.fill_(scale)
@@ -87,12 +97,7 @@ def test_a_plan_to_begin_with_is_never_made_worse(name: str) -> None:
 
 def test_elites_stay_candidates() -> None:
     seen: list[Tensor] = []
-
-    def watched(z: Tensor) -> Tensor:
-        seen.append(z)
-        return bowl(z)
-
-    CEMPlanner(candidates=20, elites=5, iterations=4)(search(watched), generator())
+    CEMPlanner(candidates=20, elites=5, iterations=4)(search(watched(seen)), generator())
     for before, after in itertools.pairwise(seen[1:]):  # the first are the plans to begin with
         elites = before[bowl(before).topk(5, largest=False).indices]
         assert all((after - elite).abs().amax((1, 2)).min() < 1e-6 for elite in elites)
@@ -102,12 +107,7 @@ def test_elites_stay_candidates() -> None:
 def test_the_deviation_never_falls_under_its_floor(floor: float) -> None:
     planner = CEMPlanner(candidates=400, iterations=25, floor=floor, correlation=0.0)
     seen: list[Tensor] = []
-
-    def watched(z: Tensor) -> Tensor:
-        seen.append(z)
-        return bowl(z)
-
-    planner(search(watched), generator())
+    planner(search(watched(seen)), generator())
     spread = seen[-1][:400].std(0)  # those that were drawn in the last iteration
     assert 0.85 * floor < float(spread.mean()) < 1.5 * floor
 
@@ -119,12 +119,7 @@ def test_one_elite_is_enough() -> None:
 
 def test_candidates_are_drawn_at_the_scale_of_the_latents() -> None:
     seen: list[Tensor] = []
-
-    def watched(z: Tensor) -> Tensor:
-        seen.append(z)
-        return bowl(z)
-
-    CEMPlanner(candidates=500, iterations=1)(search(watched, scale=0.01), generator())
+    CEMPlanner(candidates=500, iterations=1)(search(watched(seen), scale=0.01), generator())
     assert float(seen[1].std()) == pytest.approx(0.01, rel=0.1)
     assert float(seen[1].abs().max()) <= 0.03 + 1e-6, "the bound is three deviations"
 
