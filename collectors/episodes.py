@@ -147,7 +147,17 @@ class EpisodeCollector(Collector):
     @classmethod
     def make(cls, spec: CollectionSpec) -> EpisodeCollector:
         """A collector in this process."""
-        return cls(TaskMaker(spec), make_policy(spec), total_frames=-1, **collector_settings(spec))
+        return cls(
+            TaskMaker(spec),
+            make_policy(spec),
+            total_frames=-1,
+            frames_per_batch=spec.steps,  # batches of shape (T,) that are one episode each
+            reset_at_each_iter=True,
+            split_trajs=False,
+            trust_policy=True,
+            traj_format=None,
+            auto_register_policy_transforms=False,
+        )
 
     def record(self, index: int) -> RecordedEpisode:
         """Record episode `index` of the collection.
@@ -158,18 +168,6 @@ class EpisodeCollector(Collector):
         """
         self._maker.add(index)
         return _episode(self.next())
-
-
-def collector_settings(spec: CollectionSpec) -> dict[str, Any]:
-    """TorchRL's settings for batches of shape (T,) that are one episode each."""
-    return {
-        "frames_per_batch": spec.steps,
-        "reset_at_each_iter": True,
-        "split_trajs": False,
-        "trust_policy": True,
-        "traj_format": None,
-        "auto_register_policy_transforms": False,
-    }
 
 
 def _episode(batch: TensorDictBase) -> RecordedEpisode:

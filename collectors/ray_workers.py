@@ -1,4 +1,4 @@
-"""Workers on a Ray cluster: TorchRL's `RayCollector`, whose remote collectors are asked for one episode at a time.
+"""Workers on a Ray cluster, each an actor with a collector of its own that is asked for one episode at a time.
 
 The cluster's machines need this package (the same version, since episodes are functions of seed and code) and a GL
 backend; no shared disk: episodes come back encoded, and this process stores them.
@@ -7,26 +7,28 @@ backend; no shared disk: episodes come back encoded, and this process stores the
 from __future__ import annotations
 
 import contextlib
-from functools import partial
 from typing import Any
 
-from playslot_rl.collectors.episodes import EpisodeCollector, TaskMaker, collector_settings, make_policy
-from playslot_rl.collectors.journal import Journal, encode
+from playslot_rl.collectors.episodes import EpisodeCollector
+from playslot_rl.collectors.journal import CollectionSpec, Journal, encode
 from playslot_rl.collectors.recording import Report
 from playslot_rl.errors import PlaySlotError
 from playslot_rl.runtime.ray_cluster import RayCluster, worker_cannot_start
 from playslot_rl.storage.atomic import write_bytes
 
 
-class RemoteEpisodeCollector(EpisodeCollector):
-    """The collector in a Ray actor."""
+class RemoteEpisodeCollector:
+    """A Ray actor's body."""
 
-    def record_encoded(self, index: int) -> tuple[int, bytes]:
-        """Index and encoded content of one episode (see `EpisodeCollector.record`)."""
+    def __init__(self, spec: CollectionSpec) -> None:
         import torch
 
         torch.set_num_threads(1)
-        return index, encode(self.record(index))
+        self._collector = EpisodeCollector.make(spec)
+
+    def record(self, index: int) -> tuple[int, bytes]:
+        """Index and encoded content of one episode (see `EpisodeCollector.record`)."""
+        return index, encode(self._collector.record(index))
 
 
 class RayWorkers:
@@ -41,16 +43,16 @@ class RayWorkers:
         self.journal = journal
         self._tasks: dict[Any, int] = {}
         self._actors: list[Any] = [None] * count
-        self._pool = RayCluster.find(address, count).connect(partial(_collector, journal))
+        self._ours = RayCluster.find(address, count).connect()
 
     def start(self, slot: int) -> None:
-        spec = self.journal.spec
-        resources = {"num_cpus": 1, "max_restarts": 0}  # we start another one ourselves, and know its episodes
-        self._pool.add_collectors([TaskMaker(spec)], 1, make_policy(spec), [collector_settings(spec)], [resources])
-        self._actors[slot] = self._pool.remote_collectors[-1]
+        import ray
+
+        made = ray.remote(num_cpus=1, max_restarts=0)(RemoteEpisodeCollector)  # we start another one ourselves
+        self._actors[slot] = made.remote(self.journal.spec)
 
     def submit(self, slot: int, index: int) -> None:
-        self._tasks[self._actors[slot].record_encoded.remote(index)] = slot
+        self._tasks[self._actors[slot].record.remote(index)] = slot
 
     def reports(self, timeout: float) -> list[Report]:
         import ray
@@ -89,27 +91,14 @@ class RayWorkers:
         actor, self._actors[slot] = self._actors[slot], None
         self._tasks = {task: owner for task, owner in self._tasks.items() if owner != slot}
         if actor is not None:
-            self._pool.remote_collectors.remove(actor)
             with contextlib.suppress(ray.exceptions.RayError):
                 ray.kill(actor)
 
     def close(self) -> None:
         """End the actors, and Ray too if it was started here."""
-        self._tasks = {}
-        self._pool.shutdown()
+        import ray
 
-
-def _collector(journal: Journal, init: dict[str, Any]) -> Any:
-    """TorchRL's Ray collector, without actors yet."""
-    from torchrl.collectors.distributed import RayCollector
-
-    return RayCollector(
-        [],
-        make_policy(journal.spec),
-        collector_class=RemoteEpisodeCollector,
-        frames_per_batch=journal.spec.steps,
-        collector_kwargs=[],
-        remote_configs=[],
-        ray_init_config=init,
-        weight_sync_schemes={},
-    )
+        for slot in range(len(self._actors)):
+            self.kill(slot)
+        if self._ours:
+            ray.shutdown()

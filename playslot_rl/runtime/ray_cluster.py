@@ -7,17 +7,14 @@ import importlib.util
 import os
 import socket
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from playslot_rl.errors import ConfigError, PlaySlotError
 
 CONNECT_S = 10.0
 STARTS = 3
 """Attempts to start Ray on this machine: it gives its own processes 30 seconds, too few where all cores are busy."""
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -54,18 +51,21 @@ class RayCluster:
         quiet: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "logging_level": "error"}
         return cls(where, quiet | ({"address": where} if where else {"address": "local", "num_cpus": count}))
 
-    def connect(self, start: Callable[[dict[str, Any]], T]) -> T:
-        """What `start` makes of `init`, which it hands to `ray.init` sooner or later; a PlaySlotError where the cluster
-        cannot be reached, or this machine's does not start.
+    def connect(self) -> bool:
+        """Connect, and say whether this process was not before, so that who asked ends it; a PlaySlotError where the
+        cluster cannot be reached, or this machine's does not start.
         """
+        import ray
+
+        if ray.is_initialized():
+            return False
         for attempt in range(1 if self.where else STARTS):
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")
-                    return start(self.init)
+                    ray.init(**self.init)
+                return True
             except Exception as error:  # a node that does not start in time is a plain Exception
-                import ray
-
                 with contextlib.suppress(Exception):
                     ray.shutdown()
                 if self.where or attempt == STARTS - 1:

@@ -140,8 +140,7 @@ class Players:
         torch.save((learner, make_pool), packed)
         self._setup = packed.getvalue()
         self._ray = RayCluster.find(settings.ray_address, count) if settings.backend == "ray" else None
-        if self._ray is not None:
-            self._ray.connect(_init_ray)
+        self._ours = self._ray is not None and self._ray.connect()
         self._workers: list[_LocalWorker | _RayWorker] = [self._made() for _ in range(count)]
         self._ready = [False] * count
         self._weights, self._parts = b"", list[Round]()
@@ -173,7 +172,7 @@ class Players:
         for worker in self._workers:
             worker.close()
         self._workers, self._futures = [], []
-        if self._ray is not None:
+        if self._ours:
             import ray
 
             ray.shutdown()
@@ -215,12 +214,6 @@ class Players:
         self.replaced += 1
         self._workers[i], self._ready[i] = self._made(), False
         self._futures[i] = self._workers[i].submit(self._weights, self._parts[i], i)
-
-
-def _init_ray(settings: dict[str, Any]) -> None:
-    import ray
-
-    ray.init(**settings)
 
 
 def _lost(error: Exception) -> bool:
