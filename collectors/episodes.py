@@ -19,7 +19,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase
 
 from playslot_rl import keys
 from playslot_rl.collectors.journal import CollectionSpec, RecordedEpisode
@@ -120,38 +119,16 @@ class SeededView(TensorView):
         return result
 
 
-class TaskMaker:
-    """Makes a worker's environment and hands it its jobs; goes to other processes and machines as it is."""
+class EpisodeCollector(Collector):
+    """TorchRL's collector, whose batches (T,) are the one whole episode that it is asked for."""
 
     def __init__(self, spec: CollectionSpec) -> None:
-        self.spec = spec
-        self._view: SeededView | None = None
-
-    def __call__(self) -> EnvBase:
-        self._view = SeededView(make_env(self.spec.env, self.spec.render))
-        return wrap(self._view)
-
-    def add(self, index: int) -> None:
-        """Queue episode `index` of the collection."""
-        assert self._view is not None
-        self._view.jobs.append((index, self.spec.episode_seed(index)))
-
-
-class EpisodeCollector(Collector):
-    """TorchRL's collector, whose batch is the one whole episode it is asked for."""
-
-    def __init__(self, create_env_fn: TaskMaker, policy: Any = None, **kwargs: Any) -> None:
-        self._maker = create_env_fn
-        super().__init__(create_env_fn, policy, **kwargs)
-
-    @classmethod
-    def make(cls, spec: CollectionSpec) -> EpisodeCollector:
-        """A collector in this process."""
-        return cls(
-            TaskMaker(spec),
+        self._spec, self._view = spec, SeededView(make_env(spec.env, spec.render))
+        super().__init__(
+            wrap(self._view),
             make_policy(spec),
             total_frames=-1,
-            frames_per_batch=spec.steps,  # batches of shape (T,) that are one episode each
+            frames_per_batch=spec.steps,
             reset_at_each_iter=True,
             split_trajs=False,
             trust_policy=True,
@@ -166,7 +143,7 @@ class EpisodeCollector(Collector):
             RenderError: there is no working GL backend.
             ConfigError: every draw of the episode starts solved.
         """
-        self._maker.add(index)
+        self._view.jobs.append((index, self._spec.episode_seed(index)))
         return _episode(self.next())
 
 
@@ -191,7 +168,7 @@ def _episode(batch: TensorDictBase) -> RecordedEpisode:
 
 def record(spec: CollectionSpec, indices: Sequence[int]) -> Iterator[RecordedEpisode]:
     """Record the episodes `indices` of a collection in this process; errors of `EpisodeCollector.record`."""
-    collector = EpisodeCollector.make(spec)
+    collector = EpisodeCollector(spec)
     try:
         for index in indices:
             yield collector.record(index)

@@ -24,7 +24,7 @@ class RemoteEpisodeCollector:
         import torch
 
         torch.set_num_threads(1)
-        self._collector = EpisodeCollector.make(spec)
+        self._collector = EpisodeCollector(spec)
 
     def record(self, index: int) -> tuple[int, bytes]:
         """Index and encoded content of one episode (see `EpisodeCollector.record`)."""

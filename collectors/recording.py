@@ -52,7 +52,7 @@ def serve(pipe: Connection[Any, Any], journal: Journal) -> None:
     begin_worker()
     torch.set_num_threads(1)
     try:
-        collector = EpisodeCollector.make(journal.spec)
+        collector = EpisodeCollector(journal.spec)
         pipe.send(None)  # ready
         while True:
             index: int = pipe.recv()
