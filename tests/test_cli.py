@@ -157,13 +157,6 @@ def test_a_slip_in_a_name_gets_the_nearest(arguments: list[str], near: str, caps
     assert f"; did you mean {near}?" in err
 
 
-@pytest.fixture
-def in_a_folder_with_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "runs" / "mine").mkdir(parents=True)
-    (tmp_path / "runs" / "mine" / "config.json").write_text("{}")
-
-
 @pytest.mark.parametrize(
     ("run", "near"),
     [("pretraind", "pretrained"), ("pretraind/block_push", "pretrained/block_push"), ("runs/mien", "runs/mine")],

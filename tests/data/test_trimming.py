@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from playslot_rl.data.demonstrations import (
     Demonstrations,
@@ -44,11 +43,6 @@ def slots_of(source: EpisodeFrames) -> np.ndarray[Any, np.dtype[np.float32]]:
     level = np.asarray(source.frames)[:, :1, :1, 0].astype(np.float32) / 20
     rise = np.arange(1, 33, dtype=np.float32) / 32
     return np.repeat(level * rise, 4, axis=1).reshape(len(level), 4, 32)
-
-
-def steps_of(source: EpisodeFrames) -> Tensor:
-    """Number of each transition in its episode."""
-    return torch.cat([torch.arange(int(n) - 1) for n in source.lengths])
 
 
 def test_motion_is_the_rms_change_of_the_slots() -> None:
