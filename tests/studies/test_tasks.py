@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from playslot_rl.studies.success import tasks
 from playslot_rl.studies.success.jobs import SuccessJob, success_jobs
 from playslot_rl.studies.success.measure import SuccessMeasure, job_rows
 from playslot_rl.studies.success.page import success_page
+from playslot_rl.studies.success.summary import summarise
 from playslot_rl.studies.success.task_table import joint_table
 from playslot_rl.visualization.document import to_markdown
 
@@ -112,6 +114,43 @@ def test_the_page_of_tasks_shows_them(results: list[dict[str, Any]], tmp_path: P
     assert "| interquartile mean | 60 (" in table
     assert "PlaySlot is ahead of all methods on the labels alone in 1 of 2 tasks; not in hard." in table
     assert "| hard | – |" in page.partition("## Over tasks\n")[2], "the oracle was not measured there"
+
+
+def lacking(result: dict[str, Any], *names: str) -> dict[str, Any]:
+    """The comparison with jobs of these names failed."""
+    rows = [
+        {**row, "status": "failed", "success_rate": None, "outcomes": None} if row["name"] in names else row
+        for row in result["rows"]
+    ]
+    return {**result, "rows": rows, "summary": summarise(rows)}
+
+
+def test_a_cell_that_lacks_a_run_is_shown_and_in_no_mean(results: list[dict[str, Any]]) -> None:
+    broken = [results[0], lacking(results[1], "slot_bc-d5-l5-s1")]
+    joint = joint_table(broken, "playslot")
+    assert [row["method"] for row in joint["rows"]] == ["playslot"]
+    assert joint["ahead"] == [{"labels": 5, "ahead": ["easy"], "behind": []}]
+    assert [row["env"] for row in joint["summary"] if row["method"] == "slot_bc"] == ["easy", "hard"]
+    page = to_markdown(success_page({**results[0], "across_tasks": joint}))
+    table = page.partition("## Over tasks, with 5 labelled demonstrations")[2].partition("## ")[0]
+    line = next(line for line in table.splitlines() if line.startswith("| hard |"))
+    assert line.split("|")[3].strip().startswith("30 (")
+    assert line.split("|")[3].strip().endswith("; 1 of 2 seeds)")
+    assert re.search(r"\| interquartile mean \| 60 \(\d+ to \d+\) \| – \|", table)
+    assert "in 1 of 1 tasks that have all runs." in table
+    nothing = joint_table([results[0], lacking(results[1], "slot_bc-d5-l5-s0", "slot_bc-d5-l5-s1")], "playslot")
+    page = to_markdown(success_page({**results[0], "across_tasks": nothing}))
+    assert re.search(r"\| hard \| 30 \(.*\) \| – \(0 of 2 seeds\) \|", page)
+
+
+def test_the_largest_number_of_demonstrations_counts_finished_or_not(tmp_path: Path) -> None:
+    jobs = [finish(SuccessJob("playslot", 10, n, tmp_path, 5), {"simulation": 9}) for n in (0, 1)]
+    jobs += [SuccessJob("playslot", 50, n, tmp_path, 5) for n in (0, 1)]
+    rows = [row for job in jobs for row in job_rows(job, 5, read_status(job.file)) if row["protocol"] == "simulation"]
+    joint = joint_table([{"env": "easy", "rows": rows, "summary": summarise(rows)}], "playslot")
+    assert joint["rows"] == []
+    (cell,) = joint["cells"]
+    assert (cell["demos"], cell["runs"], cell["of"], cell["success_rate"]) == (50, 0, 2, None)
 
 
 def test_jobs_of_each_task_lie_in_its_folder(tmp_path: Path) -> None:

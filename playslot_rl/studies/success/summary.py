@@ -129,15 +129,15 @@ def _in_both(runs: Sequence[Row], reference: Sequence[Row], keys: Sequence[str])
 
 
 def across_tasks(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Interquartile means over the runs of all tasks, of methods and labels that are finished in each of them: `score`,
-    `ci95`, `runs`. Where a task has several numbers of demonstrations, the largest counts.
+    """Interquartile means over the runs of all tasks, `score` and `ci95`, of methods and labels of which each task has
+    every run. Where a task has several numbers of demonstrations, the largest counts.
     """
     tasks = [largest(result["rows"]) for result in results]
     rows = []
     for key in tasks[0] if tasks else ():
-        if not all(key in task for task in tasks):
+        runs = [task.get(key, []) for task in tasks]
+        if not all(side and len(finished(side)) == len(side) for side in runs):
             continue
-        runs = [task[key] for task in tasks]
         outcomes = [outcomes_of(side, sorted({run["seed"] for run in side})) for side in runs]
         if any(np.isnan(one).any() for one in outcomes):
             continue
@@ -148,8 +148,8 @@ def across_tasks(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def largest(rows: Sequence[Row]) -> dict[tuple[Any, ...], list[Row]]:
-    """Rows by method, protocol and labels, of the largest number of demonstrations that it has."""
-    known, most = cells(finished(rows)), dict[tuple[Any, ...], tuple[Any, ...]]()
+    """Rows by method, protocol and labels, of the largest number of demonstrations, finished or not."""
+    known, most = cells(rows), dict[tuple[Any, ...], tuple[Any, ...]]()
     for cell in known:
         key = (*cell[:2], cell[3])
         if key not in most or (cell[2] or 0) > (most[key][2] or 0):

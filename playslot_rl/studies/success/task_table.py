@@ -7,47 +7,66 @@ from typing import Any
 
 from playslot_rl.config.methods import METHODS
 from playslot_rl.studies.study import FOOTNOTES, Result, machine_note
-from playslot_rl.studies.success.summary import across_tasks, largest
+from playslot_rl.studies.success.summary import CELL, across_tasks, largest
 from playslot_rl.visualization.document import Block, Document, Linked, Notes, Section, Table, Text
 
 IQM = "interquartile mean"
 
 
 def joint_table(results: Sequence[Result], reference: str | None) -> dict[str, Any]:
-    """`tasks`; `summary`, every task's with its `env`; `rows`, the interquartile means over them; and `ahead`, of each
-    number of labels the tasks in which the reference in simulation beats every method on these labels alone, and the
-    others.
+    """`tasks`; `summary`, every task's with its `env`; `cells`, of these the ones of the largest number of
+    demonstrations, with `runs` that are done, `of` all; `rows`, the interquartile means over tasks; and `ahead`, of
+    each number of labels the tasks in which the reference in simulation beats every method on these labels alone, and
+    the others, of those that have all runs.
     """
+    cells = [cell for result in results for cell in _cells(result)]
     return {
         "tasks": [result["env"] for result in results],
         "rows": across_tasks(results),
         "summary": [{"env": result["env"], **row} for result in results for row in result["summary"]],
+        "cells": cells,
         "reference": reference,
-        "ahead": _ahead(results, reference),
+        "ahead": _ahead(cells, reference),
     }
 
 
-def _ahead(results: Sequence[Result], reference: str | None) -> list[dict[str, Any]]:
+def _cells(result: Result) -> list[dict[str, Any]]:
+    known, found = {tuple(row[name] for name in CELL): row for row in result["summary"]}, []
+    for runs in largest(result["rows"]).values():
+        own = {name: runs[0][name] for name in CELL}
+        measured = known.get(tuple(own.values()), {})
+        counts = {
+            "worlds": len({run["world"] for run in runs}),
+            "runs": sum(run["status"] == "done" for run in runs),
+            "of": len(runs),
+        }
+        rates = {name: measured.get(name) for name in ("success_rate", "ci95")}
+        found.append({"env": result["env"], **own, **counts, **rates})
+    return found
+
+
+def _ahead(cells: Sequence[Result], reference: str | None) -> list[dict[str, Any]]:
     found = []
-    tasks = {result["env"]: _rates(result["summary"]) for result in results}
-    for labels in sorted({key[2] for rates in tasks.values() for key in rates} - {None}):
+    for labels in sorted({cell["labels"] for cell in cells} - {None}):
         sides: dict[str, Any] = {"labels": labels, "ahead": [], "behind": []}
-        for task, rates in tasks.items():
-            own = rates.get((reference, "simulation", labels))
-            alone = [rate for (name, _, n), rate in rates.items() if n == labels and METHODS[name].labelled_only]
-            if own is not None and alone:
-                sides["ahead" if own > max(alone) else "behind"].append(task)
+        for task in dict.fromkeys(cell["env"] for cell in cells):
+            own = [cell for cell in cells if (cell["env"], cell["labels"]) == (task, labels)]
+            first = [cell for cell in own if (cell["method"], cell["protocol"]) == (reference, "simulation")]
+            alone = [cell for cell in own if METHODS[cell["method"]].labelled_only]
+            if first and alone and all(map(_whole, [*first, *alone])):
+                rate, *others = (round(cell["success_rate"], 9) for cell in [*first, *alone])  # means round differently
+                sides["ahead" if rate > max(others) else "behind"].append(task)
         found += [sides] if sides["ahead"] or sides["behind"] else []
     return found
 
 
-def _rates(summary: Sequence[Result]) -> dict[tuple[Any, ...], float]:
-    return {key: round(row["success_rate"], 9) for key, (row,) in largest(summary).items()}  # means round differently
+def _whole(cell: Result) -> bool:
+    return cell["runs"] == cell["of"] and cell["success_rate"] is not None
 
 
 def task_sections(joint: Result) -> list[Section]:
     """A table of tasks and methods for each number of labels, then one of the methods that have no such number."""
-    numbers = {row["labels"] for row in joint["summary"]}
+    numbers = {cell["labels"] for cell in joint["cells"]}
     return [
         Section(
             f"Over tasks, with {labels} labelled demonstrations" if labels else "Over tasks",
@@ -58,31 +77,40 @@ def task_sections(joint: Result) -> list[Section]:
 
 
 def _blocks(joint: Result, labels: int | None) -> list[Block]:
-    own = [row for row in joint["summary"] if row["labels"] == labels]
-    methods = dict.fromkeys((row["method"], row["protocol"]) for row in own)
+    own = [cell for cell in joint["cells"] if cell["labels"] == labels]
+    methods = dict.fromkeys((cell["method"], cell["protocol"]) for cell in own)
+    there = {(cell["env"], cell["method"], cell["protocol"]): cell for cell in own}
     rows = {(row["method"], row["protocol"]): row for row in joint["rows"] if row["labels"] == labels}
-    body = []
-    for task in joint["tasks"]:
-        there = {key[:2]: row for key, (row,) in largest([row for row in own if row["env"] == task]).items()}
-        body.append([task, *(_cell(there.get(method), "success_rate") for method in methods)])
-    body.append([IQM, *(_cell(rows.get(method), "score") for method in methods)])
+    body = [[task, *(_cell(there.get((task, *method))) for method in methods)] for task in joint["tasks"]]
+    body.append([IQM, *(_rate(rows[method], "score") if method in rows else "–" for method in methods)])
     titles = [METHODS[name].title + ("" if at == "simulation" else f", {at}") for name, at in methods]
-    blocks: list[Block] = [Table(["success, %", *titles], body, "In brackets 95 % intervals.")]
+    missing = any(cell["runs"] < cell["of"] for cell in own)
+    caption = "In brackets 95 % intervals."
+    caption += " A mean is of methods that have all runs of all tasks." if missing else ""
+    blocks: list[Block] = [Table(["success, %", *titles], body, caption)]
     for sides in (sides for sides in joint["ahead"] if sides["labels"] == labels):
         where = f"; not in {', '.join(sides['behind'])}" if sides["behind"] else ""
-        of = len(sides["ahead"]) + len(sides["behind"])
+        of = f"{len(sides['ahead']) + len(sides['behind'])} tasks{' that have all runs' if missing else ''}"
         said = (
             f"{METHODS[joint['reference']].title} is ahead of all methods on the labels alone in {len(sides['ahead'])}"
         )
-        blocks.append(Text(f"{said} of {of} tasks{where}."))
+        blocks.append(Text(f"{said} of {of}{where}."))
     return blocks
 
 
-def _cell(row: Result | None, key: str) -> str:
-    if row is None:
+def _cell(cell: Result | None) -> str:
+    if cell is None:
         return "–"
+    what = "policies" if cell["worlds"] > 1 else "seeds"
+    note = f"{cell['runs']} of {cell['of']} {what}" if cell["runs"] < cell["of"] else ""
+    if cell["success_rate"] is None:
+        return f"– ({note})" if note else "–"
+    return _rate(cell, "success_rate", f"; {note}" if note else "")
+
+
+def _rate(row: Result, key: str, note: str = "") -> str:
     low, high = row["ci95"]
-    return f"{100 * row[key]:.0f} ({100 * low:.0f} to {100 * high:.0f})"
+    return f"{100 * row[key]:.0f} ({100 * low:.0f} to {100 * high:.0f}{note})"
 
 
 def tasks_page(result: Result) -> Document:
