@@ -55,11 +55,13 @@ def log_file(job_file: Path) -> Path:
     return job_file.with_suffix(".log")
 
 
-def read_status(job_file: Path) -> Status:
+def read_status(job_file: Path, fingerprint: str | None = None) -> Status:
+    """How a job stands; with other settings, data or parents than those of a fingerprint it waits."""
     try:
-        return from_dict(Status, json_or_nothing(job_file.with_suffix(".status.json")))
+        status = from_dict(Status, json_or_nothing(job_file.with_suffix(".status.json")))
     except ValueError:
         return Status()
+    return status if fingerprint in (None, status.fingerprint) else Status()
 
 
 def write_status(job_file: Path, status: Status) -> None:
@@ -106,12 +108,14 @@ def run_process(job_file: Path) -> Status:
 
 
 def settle(job_file: Path, code: int) -> Status:
-    status = read_status(job_file)
+    """How a job stands whose process ended; `failed` if it died, before it wrote a status, too."""
+    fingerprint = json_or_nothing(job_file).get("fingerprint")
+    status = read_status(job_file, fingerprint)
     if code != 0 and status.status != "failed":
         reason = f"signal {-code}" if code < 0 else f"exit code {code}"
         hint = " (killed, perhaps out of memory)" if code == -9 else ""
         died = f"the job's process ended with {reason}{hint}; see {log_file(job_file).name}"
-        status = Status("failed", status.fingerprint, died, status.seconds)
+        status = Status("failed", fingerprint or status.fingerprint, died, status.seconds)
         write_status(job_file, status)
     return status
 

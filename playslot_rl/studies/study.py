@@ -238,9 +238,7 @@ class Study[J: Job]:
         return due
 
     def _status(self, job: J) -> launch.Status:
-        """How a job stands; done with other settings, data or parents than those asked for, it is still to be done."""
-        status = launch.read_status(job.file)
-        return status if status.fingerprint == self._jobs[job]["fingerprint"] else launch.Status()
+        return launch.read_status(job.file, self._jobs[job]["fingerprint"])
 
     def _ended(self, job: J) -> None:
         status = self._status(job)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from playslot_rl.errors import PlaySlotError
+from playslot_rl.storage.atomic import write_json
 from playslot_rl.studies import launch
 from playslot_rl.studies.launch import Status, job_lock, log_file, read_status, write_status
 
@@ -34,6 +35,17 @@ def test_a_process_that_died_is_a_failure_that_says_of_what(job: Path) -> None:
     write_status(job, Status("running", "f"))
     assert "signal 9 (killed, perhaps out of memory)" in launch.settle(job, -9).error
     assert read_status(job).status == "failed"
+
+
+@pytest.mark.parametrize("before", [None, Status("done", "old"), Status("failed", "old", "loss is nan")])
+def test_a_process_that_died_before_it_wrote_a_status_is_this_jobs_failure(job: Path, before: Status | None) -> None:
+    write_json(job, {"fingerprint": "new"})
+    if before is not None:
+        write_status(job, before)
+    launch.settle(job, -9)
+    found = read_status(job)
+    assert (found.status, found.fingerprint) == ("failed", "new")
+    assert "signal 9" in found.error
 
 
 def test_an_error_the_job_reported_itself_is_kept(job: Path) -> None:
