@@ -18,7 +18,7 @@ from playslot_rl.storage.atomic import write_json
 from playslot_rl.studies.launch import comparison_lock, read_status
 from playslot_rl.studies.success import tasks
 from playslot_rl.studies.success.jobs import SuccessJob, success_jobs
-from playslot_rl.studies.success.measure import SuccessMeasure, job_rows
+from playslot_rl.studies.success.measure import SuccessMeasure, check_success, job_rows
 from playslot_rl.studies.success.page import success_page
 from playslot_rl.studies.success.summary import summarise
 from playslot_rl.studies.success.task_table import joint_table
@@ -162,6 +162,32 @@ def test_jobs_of_each_task_lie_in_its_folder(tmp_path: Path) -> None:
     assert files == [
         tmp_path / task / "jobs" / name for task in ("metaworld_door-open", "block_push_easy") for name in names
     ]
+
+
+def test_each_task_is_compared_once(results: list[dict[str, Any]], tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_json(tmp_path / name / "comparison.json", {**results[0], "env": "block_push_easy"})
+    twice = rf"^compare\.tasks: got {tmp_path / 'b'} of block_push_easy, which is compared already, expected each task"
+    config = compose(["preset=compact", "methods=lapo", f"compare.tasks={tmp_path / 'a'},{tmp_path / 'b'}"], "compare")
+    with pytest.raises(ConfigError, match=twice):
+        check_success(config)
+    own = ["preset=compact", "env=block_push_easy", "methods=lapo", f"compare.tasks={tmp_path / 'b'}"]
+    with pytest.raises(ConfigError, match=twice):
+        check_success(compose(own, "compare"))
+
+
+@pytest.mark.parametrize(
+    ("env", "message"), [("block_push_easy", "which is compared already"), ("", "without outcomes in comparison.json")]
+)
+def test_other_tasks_are_read_before_anything_is_computed(
+    env: str, message: str, results: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tasks, "compute_study", lambda measure: pytest.fail(f"computed {measure.config.env.full_name}"))
+    other, out = tmp_path / "other", tmp_path / "out"
+    write_json(other / "comparison.json", {**results[0], "env": env} if env else {})
+    with pytest.raises(ConfigError, match=message):
+        compare.main(*each(TWO, f"out={out}", f"compare.tasks={other}"))
+    assert not out.exists()
 
 
 def test_a_task_that_fails_stops_no_other_and_the_table_says_so(

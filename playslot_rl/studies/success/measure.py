@@ -204,7 +204,7 @@ def check_success(config: ExperimentConfig) -> None:
     for method in config.compare.methods:
         require_told(env, method)
         check_method(config, method)
-    task_results(config)
+    task_results(config, [env.full_name])
     for run in world_runs(config) if uses_slots(config) else ():
         for checkpoint in Run.open(run).world_stages.values() if run else ():
             require_config(checkpoint, {"env": {"image_size": env.image_size, "action_dim": env.action_dim}})
@@ -216,16 +216,24 @@ def check_success(config: ExperimentConfig) -> None:
                 )
 
 
-def task_results(config: ExperimentConfig) -> list[dict[str, Any]]:
-    """Comparisons of other tasks; a ConfigError where a folder holds no finished one of this version."""
+def task_results(config: ExperimentConfig, own: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """Comparisons of other tasks; a ConfigError where a folder holds no finished one of this version, or one of a task
+    that is there already, among them or in `own`.
+    """
     folders = [Path(part.strip()) for part in config.compare.tasks.split(",") if part.strip()]
-    results = [json_or_nothing(folder / "comparison.json") for folder in folders]
+    results, tasks = [json_or_nothing(folder / "comparison.json") for folder in folders], list(own)
     for folder, result in zip(folders, results, strict=True):
         if not all("outcomes" in row for row in result.get("rows") or [{}]):
             raise ConfigError(
                 f"compare.tasks: got {folder} without outcomes in comparison.json, expected a comparison's folder: run "
                 "its command again, which computes nothing that is done"
             )
+        if result["env"] in tasks:
+            raise ConfigError(
+                f"compare.tasks: got {folder} of {result['env']}, which is compared already, expected each task once: "
+                "leave one of them out"
+            )
+        tasks.append(result["env"])
     return results
 
 

@@ -27,6 +27,7 @@ def compare_tasks(configs: Sequence[ExperimentConfig], out: Path) -> None:
         PlaySlotError: a task failed, or a job of it; the others have finished, and the page says so.
     """
     measures = _measures(configs, out)
+    others = task_results(configs[0], list(measures))
     for measure in measures.values():
         check_study(measure)
     launch.open_comparison(out)
@@ -42,7 +43,7 @@ def compare_tasks(configs: Sequence[ExperimentConfig], out: Path) -> None:
             except PlaySlotError as error:
                 failed = explain(error)
             errors |= {task: failed} if failed else {}
-            result = _joint(configs[0], results, errors)
+            result = _joint(configs[0], results, others, errors)
             page = tasks_page(result)
             write_result(out / "comparison", result, page, lambda _, theme: tasks_figure(results, theme))
     print(f"{tables(page)}\ncompare: {out / 'comparison.md'}", flush=True)
@@ -65,9 +66,11 @@ def _measures(configs: Sequence[ExperimentConfig], out: Path) -> dict[str, Succe
     return found
 
 
-def _joint(config: ExperimentConfig, results: Mapping[str, Result], errors: Mapping[str, str]) -> dict[str, Any]:
+def _joint(
+    config: ExperimentConfig, results: Mapping[str, Result], others: Sequence[Result], errors: Mapping[str, str]
+) -> dict[str, Any]:
     """What `OUT/comparison.json` holds, of the tasks that have had their turn and those of `compare.tasks`."""
-    own, every = config.compare, [*results.values(), *task_results(config)]
+    own, every = config.compare, [*results.values(), *others]
     reference = own.reference if own.reference in own.methods else None
     return {
         "preset": config.preset,
