@@ -95,35 +95,53 @@ def paired(outcomes: Outcomes, reference: Outcomes) -> Outcomes:
     return outcomes - reference
 
 
-def interquartile_mean(scores: npt.ArrayLike) -> float:
-    """Mean of the middle half of all scores, tasks and runs together (R. Agarwal and others, 2021; rliable).
+def interquartile_mean(scores: npt.ArrayLike, weights: npt.ArrayLike = 1.0) -> float:
+    """Mean of the middle half of all scores, tasks and runs together (R. Agarwal and others, 2021): of the quantile
+    function Q of the scores with their weights, 2 int Q(u) du from 1/4 to 3/4.
+
+    Note:
+        rliable trims `n // 4` scores at each end, which is more than half of them where n is no multiple of 4; here
+        the scores at the ends count in part. And there a task with more runs weighs more.
 
     Example:
         >>> interquartile_mean([0, 1, 2, 3, 4, 5, 6, 100])
         3.5
+        >>> round(interquartile_mean([0, 1, 5]), 6)
+        1.5
     """
-    numbers = np.sort(np.asarray(scores, np.float64), axis=None)
-    cut = len(numbers) // 4
-    return float(numbers[cut : len(numbers) - cut].mean())
+    values = np.asarray(scores, np.float64)
+    return float(_middle(values.reshape(1, -1), np.broadcast_to(weights, values.shape).reshape(1, -1))[0])
+
+
+def _middle(scores: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Interquartile mean (B,) of each row of scores (B, n) with weights (B, n)."""
+    order = np.argsort(scores, axis=1)
+    scores, weights = np.take_along_axis(scores, order, 1), np.take_along_axis(weights, order, 1)
+    ends = weights.cumsum(axis=1) / weights.sum(axis=1, keepdims=True)
+    inside = np.diff(ends.clip(0.25, 0.75), axis=1, prepend=0.25)
+    mean: npt.NDArray[np.float64] = (inside * scores).sum(axis=1) / inside.sum(axis=1)
+    return mean
 
 
 def over_tasks(tasks: Sequence[Outcomes], seed: int = 0) -> tuple[float, Interval]:
     """Interquartile mean of the runs' rates over tasks, each (W, S, E) with all measured, and its 95 % interval: the
-    percentiles of draws within each task, as wide as its levels are.
+    percentiles of draws within each task, at least Wilson's over the middle half of all episodes. Every task weighs the
+    same, and its runs share it.
     """
-    drawn: list[npt.NDArray[np.float64]] = []
+    drawn, weights = list[npt.NDArray[np.float64]](), list[npt.NDArray[np.float64]]()
     for number, outcomes in enumerate(tasks):
-        draws = np.random.default_rng(seed + number)
-        worlds, seeds = (draws.integers(0, n, (DRAWS, max(1, n - 1))) for n in outcomes.shape[:2])
-        episodes = _counts(outcomes.shape[2], seed + number)
+        worlds, seeds, episodes = (_counts(n, seed + 3 * number + level) for level, n in enumerate(outcomes.shape))
         rates = np.einsum("be,wse->bws", episodes, outcomes) / episodes.sum(axis=1)[:, None, None]
-        rates = rates[np.arange(DRAWS)[:, None, None], worlds[:, :, None], seeds[:, None, :]]
+        share = worlds[:, :, None] * seeds[:, None, :]
         drawn.append(rates.reshape(DRAWS, -1))
-    scores = np.sort(np.concatenate(drawn, axis=1), axis=1)
-    cut = scores.shape[1] // 4
-    low, high = np.quantile(scores[:, cut : scores.shape[1] - cut].mean(axis=1), _TAILS)
-    runs = np.concatenate([outcomes.mean(axis=2).ravel() for outcomes in tasks])
-    return interquartile_mean(runs), (float(low), float(high))
+        weights.append((share / share.sum(axis=(1, 2), keepdims=True)).reshape(DRAWS, -1))
+    low, high = np.quantile(_middle(np.concatenate(drawn, axis=1), np.concatenate(weights, axis=1)), _TAILS)
+    runs = [outcomes.mean(axis=2).ravel() for outcomes in tasks]
+    shares = [np.full(len(task), 1 / len(task)) for task in runs]
+    score = interquartile_mean(np.concatenate(runs), np.concatenate(shares))
+    trials = max(1, sum(outcomes.shape[2] for outcomes in tasks) // 2)
+    alone = wilson(min(score, 1.0) * trials, trials)
+    return score, (min(float(low), alone[0]), max(float(high), alone[1]))
 
 
 @functools.lru_cache(maxsize=32)

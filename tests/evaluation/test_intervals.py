@@ -120,19 +120,56 @@ def test_no_failure_leaves_what_wilson_leaves() -> None:
     assert of_successes(np.zeros((3, 1, 50))) == wilson(0, 50)
 
 
-def test_the_interquartile_mean_is_scipys() -> None:
+def test_the_interquartile_mean_is_scipys_where_quarters_are_whole() -> None:
     from scipy.stats import trim_mean
 
-    scores = np.random.default_rng(0).random((5, 7))
+    scores = np.random.default_rng(0).random((4, 7))
     assert interquartile_mean(scores) == pytest.approx(trim_mean(scores, 0.25, axis=None))
 
 
-def test_over_tasks_every_task_counts_and_equal_runs_leave_no_width() -> None:
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 6, 7])
+def test_the_interquartile_mean_is_of_exactly_half_of_the_scores(count: int) -> None:
+    scores = np.random.default_rng(count).random(count)
+    fourfold = np.repeat(scores, 4)
+    assert interquartile_mean(scores) == pytest.approx(interquartile_mean(fourfold))
+    assert interquartile_mean(scores, scores + 1) == pytest.approx(
+        interquartile_mean(fourfold, np.repeat(scores + 1, 4))
+    )
+
+
+def test_every_task_weighs_the_same_however_many_runs_it_has() -> None:
+    """Runs that are alike within a task leave nothing to draw: the draws are of the score, and Wilson's is left."""
+    rates = (0.0, 0.5, 1.0)
+    shapes = ((1, 1), (3, 5), (1, 2))
+    tasks = [
+        np.broadcast_to(np.arange(20) < rate * 20, (*shape, 20)).astype(np.float64)
+        for rate, shape in zip(rates, shapes, strict=True)
+    ]
+    for alike in (tasks, [tasks[0], *tasks[2:]], [tasks[2], tasks[2], tasks[0]]):
+        score, interval = over_tasks(alike)
+        assert score == pytest.approx(interquartile_mean([task.mean() for task in alike]))
+        if all(task.mean() in (0, 1) for task in alike):
+            trials = len(alike) * 20 // 2
+            assert interval == pytest.approx(wilson(score * trials, trials))
+
+
+def test_over_tasks_all_won_leaves_what_wilson_leaves_over_half_of_the_episodes() -> None:
     easy, hard = np.ones((3, 5, 20)), np.zeros((3, 5, 20))
-    assert over_tasks([easy, easy]) == (1.0, (1.0, 1.0))
+    assert over_tasks([easy, easy]) == (1.0, wilson(20, 20))
     mean, (low, high) = over_tasks([easy, hard])
-    assert mean == pytest.approx(0.5, abs=0.05)
-    assert low <= mean <= high
+    assert mean == pytest.approx(0.5)
+    assert low < mean < high
     mixed = simulated(np.random.default_rng(0), (3, 5, 20), 0.1, 0.1, 0.1)
     mean, (low, high) = over_tasks([mixed, mixed])
     assert low < mean < high
+
+
+@pytest.mark.slow
+def test_the_interval_over_tasks_holds_the_true_score_as_often_as_it_says() -> None:
+    draws, held = np.random.default_rng(3), 0
+    chances = np.linspace(0.2, 0.9, 6)
+    for _ in range(200):
+        tasks = [(draws.random((1, 3, 50)) < chance).astype(np.float64) for chance in chances]
+        low, high = over_tasks(tasks)[1]
+        held += low <= interquartile_mean(chances) <= high
+    assert held / 200 >= 0.93
