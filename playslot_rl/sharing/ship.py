@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from playslot_rl.errors import ConfigError
+from playslot_rl.errors import ConfigError, PlaySlotError
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.checkpoints import STAGES, StageCheckpoint, checkpoint_folder, read_stage, require_whole
@@ -53,13 +53,19 @@ def halved(value: Tensor) -> Tensor:
 
 
 def main(arguments: list[str]) -> None:
-    """RUN and FOLDER; a ConfigError for other arguments, or a folder inside the run."""
-    if len(arguments) != 2 or Path(arguments[1]).resolve() == Run.open(arguments[0]).folder.resolve():
-        raise ConfigError(f"got {' '.join(arguments) or 'nothing'}, expected a run and another folder to write")
-    for stage in ship(Run.open(arguments[0]), Path(arguments[1])):
+    """RUN and FOLDER; a ConfigError for other arguments, or a folder that is the run's or lies in it."""
+    run = Run.open(arguments[0]) if len(arguments) == 2 else None
+    if run is None or Path(arguments[1]).resolve().is_relative_to(run.folder.resolve()):
+        raise ConfigError(
+            f"got {' '.join(arguments) or 'nothing'}, expected a run and another folder to write, outside of it"
+        )
+    for stage in ship(run, Path(arguments[1])):
         size = (stage.path / "weights.safetensors").stat().st_size
         print(f"{stage.path}: {size / 1e6:.1f} MB, {stage.fingerprint}")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    try:
+        main(sys.argv[1:])
+    except PlaySlotError as error:
+        sys.exit(f"ship: error: {error}")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +66,16 @@ def test_its_stages_belong_together_and_to_no_other_model(halves: Path) -> None:
 
 
 def test_a_run_is_not_written_over_itself(halves: Path) -> None:
-    for arguments in ([], [str(halves)], [str(halves), str(halves)]):
+    for arguments in ([], [str(halves)], [str(halves), str(halves)], [str(halves), str(halves / "model")]):
         with pytest.raises(ConfigError, match="expected a run and another folder to write"):
             module.main(arguments)
+    assert not (halves / "model").exists()
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("arguments", [(), ("pretrained/button_press",), ("no/such/run", "model")])
+def test_bad_arguments_are_one_line(arguments: tuple[str, ...], tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "playslot_rl.sharing.ship", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert re.fullmatch(r"ship: error: .*, expected .*\n", done.stderr)
