@@ -91,6 +91,23 @@ def test_the_page_has_a_table_for_each_number_of_videos_with_bc_in_each(by_label
     assert "PlaySlot saw the real actions of 5, 25 of 100, 5, 25 of 300 demonstrations" in page
 
 
+@pytest.mark.parametrize("videos", [[], [90, 290]])
+def test_methods_on_the_labels_alone_are_compared_in_every_table(videos: list[int], tmp_path: Path) -> None:
+    ended = [
+        finish(SuccessJob("slot_bc", 10, 0, tmp_path, 10), {"simulation": 4}),
+        finish(SuccessJob("resnet_bc", 10, 0, tmp_path, 10), {"simulation": 6}),
+        *(finish(SuccessJob("lapo", n, 0, tmp_path, 10), {"simulation": 7}) for n in (100, 300)),
+    ]
+    rows = [row for job in ended for row in job_rows(job, 5, read_status(job.file))]
+    page = to_markdown(success_page({**comparison(tmp_path, rows, "slot_bc"), "videos": videos, "seeds": [0]}))
+    tables = page.replace("**", "").split("| less Slot BC |")[1:]
+    assert len(tables) == (1 if videos else 2)
+    for table in tables:
+        lines = {line.split("|")[1].strip(): line for line in table.split("\n\n")[0].splitlines() if line[:2] == "| "}
+        assert lines["ResNet BC, simulation"].count("+20 (") == (2 if videos else 1)
+        assert lines["LAPO, simulation"].count("+30 (") == (2 if videos else 1)
+
+
 @pytest.mark.integration
 def test_the_plot_has_a_panel_for_each_number_of_videos(by_labels: dict[str, Any]) -> None:
     panels = success_figure(by_labels, LIGHT).axes

@@ -87,8 +87,15 @@ def _of_labels(result: Result, rows: Sequence[Result], videos: int | None) -> Pa
 
     heading = f"By labelled demonstrations{f', of {videos} videos' if videos else ''}"
     all_of = f"With the actions of all {videos}"
-    apart = [{**row, "at": row["labels"]} for row in result["differences"] if row["demos"] == videos]
+    apart = [row for row in result["differences"] if row["demos"] == videos or _without_videos(row, result)]
+    apart = [{**row, "at": row["labels"]} for row in apart]
     return Panel(f"{videos} videos" if videos else "", heading, "labels", all_of, own(rows), apart, own(result["rows"]))
+
+
+def _without_videos(difference: Result, result: Result) -> bool:
+    """Whether neither side of a difference learns from unlabelled videos."""
+    reference = METHODS[result["reference"]].labelled_only
+    return reference and (difference["demos"] is None or METHODS[difference["method"]].labelled_only)
 
 
 def _of_videos(result: Result, rows: Sequence[Result], labels: int) -> Panel:
@@ -96,10 +103,13 @@ def _of_videos(result: Result, rows: Sequence[Result], labels: int) -> Panel:
 
     def own(side: Sequence[Result]) -> list[Result]:
         there: list[Result] = []
-        for row in side:
+        for row in (row for row in side if row["labels"] in (None, labels) and row["demos"]):
+            if "difference" in row and _without_videos(row, result):  # in every column
+                there += [{**row, "at": number} for number in result["videos"]]
+                continue
             alone = METHODS[row["method"]].labelled_only and "difference" not in row
-            at = None if alone or row["demos"] is None else row["demos"] - labels
-            if row["labels"] in (None, labels) and row["demos"] and (at is None or at in result["videos"]):
+            at = None if alone else row["demos"] - labels
+            if at is None or at in result["videos"]:
                 there.append({**row, "at": at})
         return there
 
