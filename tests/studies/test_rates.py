@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import compose
+from playslot_rl.studies.launch import Status, write_status
 from playslot_rl.studies.video.jobs import VideoJob, video_record
+from playslot_rl.studies.video.measure import _predictions
 from playslot_rl.studies.video.training import VideoTraining, beyond
 
 
@@ -72,6 +75,21 @@ def test_models_on_frames_get_savis_time_on_top_of_the_budget(tmp_path: Path) ->
         training, config = of(method, tmp_path, budget, slots_seconds=30.0)
         steps[method] = training.chosen(config)["steps"]
     assert steps == {"svg": 180, "playslot": 120}
+
+
+def test_pictures_are_of_jobs_that_are_done_as_asked(tmp_path: Path) -> None:
+    pictures = np.zeros((1, 2, 4, 4, 3), np.uint8)
+    jobs = {VideoJob("svg", seed, tmp_path): {"fingerprint": "new"} for seed in range(4)}
+    status = [Status("running", "new"), Status("failed", "new"), Status("done", "old"), Status("done", "new")]
+    for number, (job, how) in enumerate(zip(jobs, status, strict=True)):
+        write_status(job.file, how)
+        job.pictures.parent.mkdir(parents=True)
+        if how == status[-1]:
+            np.savez_compressed(job.pictures, shown=pictures + number)
+        else:  # of a process that was killed while it wrote
+            job.pictures.write_bytes(b"PK\x03\x04")
+    (found,) = _predictions(jobs, "shown").values()
+    assert (found == 3).all()
 
 
 def test_savis_time_names_no_job(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from playslot_rl.evaluation.intervals import hierarchical
 from playslot_rl.evaluation.video import open_lpips
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing, write_json, write_text
-from playslot_rl.studies.launch import Status
+from playslot_rl.studies.launch import Status, read_status
 from playslot_rl.studies.study import Evaluate, Record, count_parameters, made_by, run_study
 from playslot_rl.studies.video.jobs import VideoJob, check_variants, video_config, video_jobs, video_record
 from playslot_rl.studies.video.page import objects_page, video_figure, video_page, video_sheet
@@ -132,7 +132,7 @@ class VideoMeasure:
         data = replace(config.data, tested=own.tested if config.data.root and not own.test else 0.0)
         self.config = replace(config, data=data, demos=None)
         self.launcher: tuple[str, Sequence[str]] = (own.launcher, own.hydra)
-        self._jobs, self._lpips_reason = list[VideoJob](), ""
+        self._jobs, self._lpips_reason = dict[VideoJob, Record](), ""
         self._references, self._truth = list[dict[str, Any]](), dict[tuple[str, int], npt.NDArray[np.uint8]]()
 
     def check(self) -> None:
@@ -159,7 +159,7 @@ class VideoMeasure:
             found[job] = video_record(job, own, parents, not self._lpips_reason, slots_seconds(config))
         require_begun_alike(found, config.compare_video)
         self._references, self._truth = score_references(config, parents), true_frames(config)
-        self._jobs = list(found)
+        self._jobs = found
         return found
 
     @staticmethod
@@ -205,11 +205,12 @@ class VideoMeasure:
         return {name: png(video_sheet(self._truth[key], _predictions(self._jobs, name))) for key, name in names.items()}
 
 
-def _predictions(jobs: Sequence[VideoJob], name: str) -> dict[str, npt.NDArray[np.uint8]]:
-    """Predictions of the first clips by title, of the first training seed that is done."""
+def _predictions(jobs: Mapping[VideoJob, Record], name: str) -> dict[str, npt.NDArray[np.uint8]]:
+    """Predictions of the first clips by title, of the first training seed that is done as its file asks."""
     found: dict[str, npt.NDArray[np.uint8]] = {}
-    for job in jobs:
-        if job.title not in found and job.pictures.is_file():
+    for job, record in jobs.items():
+        done = read_status(job.file, record["fingerprint"]).status == "done"
+        if done and job.title not in found and job.pictures.is_file():
             with np.load(job.pictures) as stored:
                 if name in stored:
                     found[job.title] = stored[name]

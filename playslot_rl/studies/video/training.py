@@ -6,6 +6,7 @@ their steps, learning rates and clips, and would name those.
 
 from __future__ import annotations
 
+import io
 import json
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,7 +24,7 @@ from playslot_rl.evaluation.video import open_lpips
 from playslot_rl.methods.video.scores import method_rows, score_clips
 from playslot_rl.runs import Run
 from playslot_rl.runtime.devices import open_device
-from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing, write_json
+from playslot_rl.storage.atomic import json_or_nothing, write_bytes, write_json
 from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.storage.locks import locked
 from playslot_rl.studies.launch import train
@@ -220,8 +221,9 @@ class VideoTraining:
                 scores.append({"row": row.name, "clips_of": label, "seed_frames": shown, "sees": row.sees, **values})
                 if not row.name:
                     pictures[sheet_name(label, shown)] = frames
-        with explain_write_errors(job.pictures):
-            np.savez_compressed(job.pictures, **pictures)
+        packed = io.BytesIO()
+        np.savez_compressed(packed, **pictures)
+        write_bytes(job.pictures, packed.getvalue())
         facts = {"fingerprint": self._record["fingerprint"], "clips": clips, "scores": scores}
         write_json(job.scores, facts | _of_training(job, done, time.monotonic() - began))
 
