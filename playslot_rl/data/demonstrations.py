@@ -137,12 +137,17 @@ def split_demonstrations(
         )
     trained = first_demonstrations(source, free if demos is None else demos)
     parsed = first_demonstrations(source, max(free, trained.episodes))
-    last = max(kept, measured if draw is None else min(measured, source.episodes // 2))
+    last = max(kept, measured) if draw is None else source.episodes - drawn_among(source.episodes, kept, measured)
     rest = source.episodes - min(last, source.episodes - trained.episodes)
     if draw is not None:
         trained = first_demonstrations(drawn_demonstrations(source, draw, source.episodes - last), trained.episodes)
     usable = bool((source.lengths[rest:] >= 2).any())
     return DemonstrationSplit(trained, parsed, episode_range(source, rest, source.episodes) if usable else None)
+
+
+def drawn_among(episodes: int, kept: int, measured: int) -> int:
+    """Of how many episodes of a set a draw takes its demonstrations: all but the last ones, which may measure."""
+    return episodes - max(kept, min(measured, episodes // 2))
 
 
 @dataclass(frozen=True)

@@ -5,15 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS
+from playslot_rl.data.demonstrations import split_demonstrations
+from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.studies.launch import require_launcher
 from playslot_rl.studies.study import absolute_roots
+from playslot_rl.studies.success import jobs
 from playslot_rl.studies.success.jobs import (
     SuccessJob,
     check_demos,
@@ -167,3 +171,64 @@ def test_too_few_demonstrations_are_refused() -> None:
 def test_roots_are_absolute_but_for_addresses_and_weights_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert absolute_roots("a:2,hf://datasets/u/n@main") == f"{tmp_path / 'a'}:2,hf://datasets/u/n@main:1"
+
+
+SETS = {
+    "as it is": (160, ()),
+    "held out by hand": (160, ("data.held_out=10",)),
+    "all of both": (160, ("data.held_out=10", "collect.validation_episodes=10")),
+    "fewer held out than measured": (160, ("data.held_out=4",)),
+    "a preset's own": (5_000, ("env=block_push", "data.held_out=200")),
+    "twenty episodes": (20, ("data.held_out=10",)),
+    "recorded": (160, ("data.demos=out/data/expert", "data.held_out=10", "out=out")),
+    "few recorded": (15, ("data.demos=out/data/expert", "data.held_out=10", "out=out")),
+}
+
+
+def demonstrations(episodes: int) -> EpisodeFrames:
+    frames, one = np.zeros((2 * episodes, 4, 4, 3), np.uint8), np.arange(episodes)
+    return EpisodeFrames(frames, 2 * one, np.full(episodes, 2), None, None, one, "f", 10.0, "", "c")
+
+
+def built_on(episodes: int, typed: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    monkeypatch.setattr(jobs, "open_videos", lambda *_: demonstrations(episodes))
+    where = () if any(pair.startswith("data.demos=") for pair in typed) else ("data.demos=expert",)
+    config = compared("methods=resnet_oracle", "demos=5", *where, *typed)
+    return jobs.Shared(config).parents(SuccessJob("resnet_oracle", 5, 0, OUT))
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_jobs_of_the_presets_draw_are_the_jobs_they_were(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    episodes, typed = SETS[name]
+    assert built_on(episodes, typed, monkeypatch).keys() == {"demos"}
+
+
+@pytest.mark.parametrize(
+    ("episodes", "typed"),
+    [
+        (160, ("data.held_out=30",)),
+        (160, ("collect.validation_episodes=30",)),
+        (160, ("collect.validation_episodes=4",)),
+        (15, ("data.held_out=10",)),
+    ],
+)
+def test_jobs_of_another_draw_are_other_jobs(
+    episodes: int, typed: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They learn from other demonstrations of the same seed, so that none is taken for the other's."""
+    usual, other = (compared("data.demos=expert", *more) for more in ((), typed))
+    draws = [
+        split_demonstrations(demonstrations(episodes), 3, c.data.held_out, c.collect.validation_episodes, 0).trained
+        for c in (usual, other)
+    ]
+    assert draws[0].fingerprint != draws[1].fingerprint
+    prints = [built_on(episodes, more, monkeypatch) for more in ((), typed)]
+    assert prints[0] != prints[1]
+    job = SuccessJob("resnet_oracle", 5, 0, OUT)
+    first, second = (success_record(job, success_config(usual, job, ""), one)["fingerprint"] for one in prints)
+    assert first != second
+
+
+def test_equal_draws_by_other_keys_are_one_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    two = [built_on(160, (f"{key}=30",), monkeypatch) for key in ("data.held_out", "collect.validation_episodes")]
+    assert two[0] == two[1]

@@ -11,11 +11,12 @@ from typing import Any
 
 from playslot_rl.collectors.collection import collect_demos, collect_videos
 from playslot_rl.config import DataConfig, ExperimentConfig, from_dict, plugins, to_dict
-from playslot_rl.config.compose import is_pretrained
+from playslot_rl.config.compose import compose, is_pretrained
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.agreement import open_files
+from playslot_rl.data.demonstrations import drawn_among
 from playslot_rl.data.views import first_demonstrations
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.held_out import held_out_seeds
@@ -291,6 +292,16 @@ def _demos(config: ExperimentConfig, out: Path) -> DataConfig:
     return collect_demos(replace(config, collect=replace(config.collect, expert_episodes=most)), out)
 
 
+def unusual_draw(config: ExperimentConfig, episodes: int) -> dict[str, str]:
+    """Among how many demonstrations the seeds draw, as a part of what jobs build on; nothing where it is as many as
+    the preset gives of this data set, so that only jobs of another draw are other jobs.
+    """
+    usual = compose([f"preset={config.preset}", f"env={config.env.name}"]).collect.validation_episodes
+    here = bool(config.data.held_out) and Path(config.data.demos) == Path(config.out) / RECORDED
+    among = drawn_among(episodes, config.data.held_out, config.collect.validation_episodes)
+    return {} if among == drawn_among(episodes, usual if here else 0, usual) else {"drawn_among": str(among)}
+
+
 class Shared:
     """What was made or found: what jobs build on, and what the result says of it."""
 
@@ -305,6 +316,7 @@ class Shared:
         if len(set(prints)) < len(prints):
             raise ConfigError(f"compare.runs: got one world model twice among {', '.join(runs)}, expected others")
         self._demos = open_videos(config, config.data.demos, "compare") if uses_demos(config) else None
+        self._draw = unusual_draw(config, self._demos.episodes) if self._demos else {}
         self._supervised = {name for name in config.compare.methods if _supervised(config, name)}
         self._videos = open_videos(config, config.data.root, "compare").fingerprint if self._supervised else ""
 
@@ -318,7 +330,8 @@ class Shared:
         elif method.model:
             prints[method.model.name] = self._models[method.model.name][job.world].fingerprint
         if job.demos is not None and self._demos is not None:
-            prints["demos"] = first_demonstrations(self._demos, job.demos).fingerprint  # the draw is in its config
+            prints["demos"] = first_demonstrations(self._demos, job.demos).fingerprint  # the seed is in its config
+            prints |= self._draw
         return prints
 
     def plain(self) -> dict[str, Any]:
