@@ -274,9 +274,9 @@ def _presets(groups: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _with_task(values: dict[str, Any], typed: Mapping[str, Any]) -> dict[str, Any]:
-    """What a preset says, changed by the task of several that one environment has, and then by what was typed."""
+    """What a preset says, changed by how long its task lasts, and then by what was typed."""
     env = _merge(values["env"], typed.get("env", {}))
-    own = preset_values(env["name"], str(env.get("task", "")), values["preset"])
+    own = preset_values(env, values["preset"], values["dynamics"]["predicted_frames"], plugins.brought(TASKS_GROUP))
     return _merge(_merge(values, own), typed)
 
 

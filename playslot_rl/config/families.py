@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from typing import Any, Final, NamedTuple
 
 from playslot_rl.config import metaworld
@@ -9,6 +10,7 @@ from playslot_rl.config.metaworld import Member
 from playslot_rl.config.plain import check, nearest
 
 OGBENCH: Final = "ogbench"
+GYM: Final = "gym"
 
 
 class Family(NamedTuple):
@@ -54,17 +56,25 @@ def task_name(env: str, task: str) -> str:
     return found
 
 
-def preset_values(env: str, task: str, preset: str) -> dict[str, Any]:
-    """What a task changes in a preset: the length of its episodes, and of all that is as long as they are."""
-    family = FAMILIES.get(env)
-    task = task.removesuffix(family.version) if family else ""
-    if family is None or preset == "smoke" or task not in family.tasks:
+def preset_values(env: Mapping[str, Any], preset: str, rollout: int, brought: Collection[str]) -> dict[str, Any]:
+    """What a task changes in a preset whose dynamics predict `rollout` frames: the length of its episodes, and of all
+    that is as long as they are. No preset knows `env=gym` and tasks that are `brought`: `env` says how long theirs are.
+    """
+    family = FAMILIES.get(env["name"])
+    task = str(env.get("task", "")).removesuffix(family.version) if family else ""
+    if family and task in family.tasks:
+        steps = family.tasks[task].steps
+        rollout = rollout if preset == "paper" else steps - 2
+    elif env["name"] in (GYM, *brought) and isinstance(env["max_steps"], int):
+        steps = env["max_steps"]
+        rollout = max(1, min(rollout, steps - 2))
+    else:
         return {}
-    steps = family.tasks[task].steps
-    values = {
+    if preset == "smoke":
+        return {}
+    return {
         "env": {"max_steps": steps},
         "collect": {"random_steps": steps, "expert_steps": steps},
         "model": {"predictor": {"context": steps + 4}},  # past it imagination evicts frames and falls apart
+        "dynamics": {"predicted_frames": rollout},
     }
-    rollout = {"dynamics": {"predicted_frames": steps - 2}}
-    return values if preset == "paper" else values | rollout

@@ -196,6 +196,16 @@ def test_an_expert_or_success_that_there_is_not_is_refused_where_it_is_asked_for
     check_task(line(expert="gym_examples:to_the_right"), expert=True)
 
 
+def test_episodes_are_recorded_as_long_as_they_are_evaluated() -> None:
+    for typed, steps in ((), 50), (("env.max_steps=30",), 30):
+        config = compose(["env=gym", f"env.id={LINE}", *typed])
+        assert (config.env.max_steps, config.collect.random_steps, config.collect.expert_steps) == (steps,) * 3
+        assert (config.model.predictor.context, config.dynamics.predicted_frames) == (steps + 4, 18)
+    typed = ("env.max_steps=30", "collect.random_steps=7", "model.predictor.context=9")
+    config = compose(["env=gym", f"env.id={LINE}", *typed])
+    assert (config.collect.random_steps, config.collect.expert_steps, config.model.predictor.context) == (7, 30, 9)
+
+
 def test_its_keys_are_its_own() -> None:
     with pytest.raises(ConfigError, match=r"env\.id: got 'FetchReach-v4', expected none with env=button_press"):
         compose(["env.id=FetchReach-v4"])
