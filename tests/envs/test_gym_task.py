@@ -115,6 +115,19 @@ def test_without_a_measure_of_success_episodes_have_a_return() -> None:
         }  # fmt: skip
 
 
+def test_an_episode_that_starts_solved_is_known_by_its_goal() -> None:
+    """FetchReach's own info says it after a step, and not after a reset."""
+    task = made(compose(["env=gym", "env.id=FetchReach-v4", "env.image_size=32"]).env)
+    task.draw_resets, starts = False, []
+    for seed in range(200):
+        observation, info = task.reset(seed=seed)
+        goal = task.inner.unwrapped.goal  # type: ignore[attr-defined]
+        starts.append((info["success"], bool(np.linalg.norm(task._observation["achieved_goal"] - goal) < 0.05)))
+    assert sum(solved for solved, _ in starts) > 0
+    assert all(solved == near for solved, near in starts)
+    task.close()
+
+
 def test_the_users_expert_solves_the_users_task() -> None:
     typed = ["env=gym", "env.id=FetchReach-v4", "env.image_size=32", "preset=smoke"]
     config = compose([*typed, "expert=gym_examples:reach"], "collect")
