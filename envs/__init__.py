@@ -180,6 +180,7 @@ def make_env(env: EnvConfig | str | None = None, render: RenderConfig | None = N
     from playslot_rl.envs.rendering import import_mujoco
 
     import_mujoco()
+    _check_variation(env)
     import gymnasium
 
     made: gym.Env[Any, Any] = gymnasium.make(name, env=env, render=render or RenderConfig(), render_mode="rgb_array")
@@ -211,14 +212,20 @@ def without_expert(env: EnvConfig) -> ConfigError:
 
 
 def check_task(env: EnvConfig, expert: bool = False, success: bool = False) -> None:
-    """Refuse, by a ConfigError, a task that there is not, another width than its actions', and one without an expert,
-    or a measure of success, where one is asked for.
+    """Refuse, by a ConfigError, a task that there is not, another width than its actions', a camera or a variation that
+    it has not, one that does not say what data sets say of it, and one without an expert, or a measure of success,
+    where one is asked for.
     """
     creator = _creator(env.name)
     from playslot_rl.envs.pixel_task import ACTION_DIM, check_actions
 
     width = getattr(creator, "actions_of", None)
     check_actions(env, ACTION_DIM if width is None else width(env))
+    missing = [name for name in ("control_hz", "task") if name not in task_metadata(env)]
+    if missing:
+        expected = "control_hz (environment steps a second) and task (a sentence) in that of its class"
+        raise ConfigError(f"env={env.name}: got metadata without {' and '.join(missing)}, expected {expected}")
+    _check_variation(env)
     if expert and not getattr(creator, "has_expert", True):
         raise without_expert(env)
     if env.name == GYM.name:
@@ -226,24 +233,36 @@ def check_task(env: EnvConfig, expert: bool = False, success: bool = False) -> N
 
         if expert:
             gym_task.check_expert(env)
+        elif env.camera:
+            gym_task.GymTask(env).close()
         if success:
             gym_task.require_success(env)
 
 
-def has_parts(env: EnvConfig) -> bool:
-    """Whether a simulated task knows which object each pixel shows."""
-    if env.name != GYM.name:
-        return True
-    from playslot_rl.envs.gym_task import facts
+def _in_mujoco(env: EnvConfig) -> bool:
+    known = getattr(_creator(env.name), "in_mujoco", None)
+    return known is None or known(env)
 
-    return facts(env.id).parts
+
+def _check_variation(env: EnvConfig) -> None:
+    if env.variation.on and not _in_mujoco(env):
+        raise ConfigError(f"env.variation: got {env.variation}, expected none: env={env.full_name} draws itself")
+
+
+def has_parts(env: EnvConfig) -> bool:
+    """Whether a task knows which object each pixel shows: MuJoCo does, or `segment` of a class that draws itself."""
+    if env.name in PROCEDURAL or _in_mujoco(env):
+        return True
+    from playslot_rl.envs.pixel_task import PixelTask
+
+    return env.name != GYM.name and _creator(env.name).segment is not PixelTask.segment
 
 
 def task_metadata(env: EnvConfig) -> dict[str, Any]:
     """Gymnasium's metadata of a task, without making it: `control_hz`, `task` (a sentence), `action` (its numbers)."""
     creator = _creator(env.name)
     describe = getattr(creator, "metadata_of", None)  # a family of tasks says what is to be done in each
-    metadata: dict[str, Any] = creator.metadata if describe is None else describe(env)
+    metadata: dict[str, Any] = getattr(creator, "metadata", {}) if describe is None else describe(env)
     return metadata
 
 

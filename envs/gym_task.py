@@ -260,6 +260,11 @@ class GymTask(PixelTask):
         """Width of its actions."""
         return facts(config.id).actions
 
+    @classmethod
+    def in_mujoco(cls, config: EnvConfig) -> bool:
+        """Whether `env.id` has a MuJoCo model."""
+        return facts(config.id).parts
+
     def __init__(
         self, env: EnvConfig | None = None, render: RenderConfig | None = None, render_mode: str | None = "rgb_array"
     ) -> None:
@@ -283,9 +288,8 @@ class GymTask(PixelTask):
                 FrameRenderer, self._simulation.model, view, config.image_size, render or RenderConfig(),
                 at_rest=at_rest,
             )  # fmt: skip
-        elif config.camera or config.variation.on:
-            what = f"env.camera: got {config.camera!r}" if config.camera else f"env.variation: got {config.variation}"
-            raise ConfigError(f"{what}, expected none: {config.id} draws itself")
+        elif config.camera:
+            raise ConfigError(f"env.camera: got {config.camera!r}, expected none: {config.id} draws itself")
         self._observation: Any = None
         self._info: dict[str, Any] = {}
         self._over = False
@@ -361,11 +365,6 @@ class GymTask(PixelTask):
         model = self._simulation.model
         moving = {int(model.body_rootid[body]) for body in model.jnt_bodyid} if self._mujoco else set()
         return [(model.body(body).name,) for body in sorted(moving) if model.body(body).name]
-
-    def segment(self) -> npt.NDArray[np.int64]:
-        if not self._mujoco:
-            raise ConfigError(f"env.id={self.config.id}: got an environment that is no MuJoCo one, expected parts")
-        return super().segment()
 
     def places(self) -> dict[str, npt.NDArray[np.float64]]:
         """The achieved goal of a goal environment, padded with zeros; of others the bodies that have joints."""

@@ -95,6 +95,14 @@ class PixelTask(gym.Env[Observation, Action]):
         del config
         return ACTION_DIM
 
+    @classmethod
+    def in_mujoco(cls, config: EnvConfig) -> bool:
+        """Whether `FrameRenderer` draws MuJoCo's scene, whose parts are known and which `env.variation` changes; a class
+        that draws itself opens none.
+        """
+        del config
+        return cls.open_renderer is PixelTask.open_renderer
+
     @cached_property
     def _renderer(self) -> FrameRenderer:
         """Made with the first episode: a process that is forked from one with a GL context cannot draw."""
@@ -156,7 +164,11 @@ class PixelTask(gym.Env[Observation, Action]):
         """Where the arm's hand and the movable things are: name -> (3,) metres; as many in each step of an episode."""
 
     def segment(self) -> npt.NDArray[np.int64]:
-        """Which object each pixel shows: int64 (H, W), o + 1 for `objects()[o]`, 0 for the ground."""
+        """Which object each pixel shows: int64 (H, W), o + 1 for `objects()[o]`, 0 for the ground; a ConfigError where
+        MuJoCo does not know.
+        """
+        if not self.in_mujoco(self.config):
+            raise ConfigError(f"env={self.config.full_name}: got a task that draws itself, expected one in MuJoCo")
         model, found = self._simulation.model, self._renderer.parts(self._simulation.data)
         number = {name: label for label, names in enumerate(self.objects(), 1) for name in names}
         kinds = import_mujoco().mjtObj

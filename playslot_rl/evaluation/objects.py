@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.envs import PROCEDURAL, RECORDED, make_env
+from playslot_rl.envs import PROCEDURAL, RECORDED, has_parts, make_env
 from playslot_rl.envs.grid_shapes import MOVES, Clips, generate
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.held_out import held_out_seeds
@@ -285,6 +285,8 @@ def validation_scores(config: ExperimentConfig) -> Callable[[SAVi], dict[str, fl
         return None
     seeds = [episode_seed("development", config.seed, i) for i in range(config.slots.segmented_episodes)]
     try:
+        if not has_parts(config.env):
+            return None
         episodes = list(segmented_episodes(config, seeds))
     except Exception as error:  # noqa: BLE001  a simulator fails in as many ways as it has drivers
         said = str(error).partition("\n")[0]
@@ -309,8 +311,13 @@ def slots_per_object(truth: npt.NDArray[np.int64], found: npt.NDArray[np.int64],
 
 def evaluate_slots(run: Run, out: Path, config: ExperimentConfig, device: torch.device | str) -> dict[str, Any]:
     """Score a run's slots on `config.episodes` episodes (20) and write `OUT/evaluation/slots/eval_info.json`. A
-    ConfigError where a training data set holds one of the seeds.
+    ConfigError where a training data set holds one of the seeds, or nobody knows the task's objects.
     """
+    if not has_parts(config.env):
+        raise ConfigError(
+            f"protocol=slots: got env={config.env.full_name}, which draws itself and does not say which object each pixel "
+            "shows, expected a task in MuJoCo, or one whose class has `segment`"
+        )
     began = time.perf_counter()
     seeds = held_out_seeds(config, config.seed, config.episodes or DEFAULT_SCENES, run.folder)
     result = {

@@ -16,6 +16,7 @@ from playslot_rl.collectors.episodes import record
 from playslot_rl.collectors.journal import CollectionSpec
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.config.compose import compose
+from playslot_rl.config.env import VariationConfig
 from playslot_rl.envs import check_task, make_env, task_metadata
 from playslot_rl.envs.gym_task import GymTask
 from playslot_rl.errors import ConfigError
@@ -207,6 +208,19 @@ def test_an_expert_or_success_that_there_is_not_is_refused_where_it_is_asked_for
         with pytest.raises(ConfigError, match=said):
             check_task(line(expert=f"gym_examples:{wrong}"), expert=True)
     check_task(line(expert="gym_examples:to_the_right"), expert=True)
+
+
+def test_a_camera_or_a_variation_that_there_is_not_is_refused_before_anything_is_trained() -> None:
+    """Also where nobody asks for an expert, since demonstrations are given."""
+    varied = VariationConfig(background=True)
+    for config, said in (
+        (line(camera="front"), "env.camera: got 'front', expected none"),
+        (line(variation=varied), r"env\.variation: .* draws itself"),
+        (line(id="FetchReach-v4", action_dim=4, camera="hed_camera_rgb"), "did you mean env.camera=head_camera_rgb"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            check_task(config)
+    check_task(line(id="FetchReach-v4", action_dim=4, camera="head_camera_rgb", variation=varied))
 
 
 def test_episodes_are_recorded_as_long_as_they_are_evaluated() -> None:

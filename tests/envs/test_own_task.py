@@ -8,8 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from playslot_rl.config import plugins
+from playslot_rl.collectors.journal import CollectionSpec
+from playslot_rl.config import EnvConfig, plugins
 from playslot_rl.config.compose import compose
+from playslot_rl.envs import check_task, has_parts, make_env
+from playslot_rl.errors import ConfigError
+from playslot_rl.evaluation.objects import evaluate_slots, validation_scores
+from playslot_rl.runs import Run
 
 PAGE = Path(__file__).parents[2] / "docs" / "tutorials" / "add-a-task.md"
 Bring = Callable[..., list[str]]
@@ -46,3 +51,33 @@ def test_its_episodes_are_recorded_and_imagined_as_long_as_they_are_evaluated(br
         assert config.dynamics.predicted_frames <= steps - 2
     smoke = compose([*bring("dot_smoke"), "preset=smoke", "env.max_steps=20"])
     assert (smoke.collect.random_steps, smoke.env.max_steps) == (6, 20)
+
+
+def test_nobody_knows_its_parts_and_no_score_asks_for_them(bring: Bring, capsys: pytest.CaptureFixture[str]) -> None:
+    config = compose([*bring("dot_parts"), "preset=smoke", "slots.segmented_episodes=1"])
+    assert not has_parts(config.env)
+    assert validation_scores(config) is None
+    assert capsys.readouterr().out == ""
+    with pytest.raises(ConfigError, match="protocol=slots: got env=dot_parts, which draws itself"):
+        evaluate_slots(Run(Path("none")), Path("none"), config, "cpu")
+    with pytest.raises(ConfigError, match="draws itself"):
+        make_env(config.env).unwrapped.segment()  # type: ignore[attr-defined]
+    assert has_parts(EnvConfig())
+    assert has_parts(EnvConfig("grid_shapes"))
+    own = "    def segment(self):\n        return np.zeros((32, 32), np.int64)\n\n    def _begin(self, rng):"
+    labelled = compose([*bring("dot_labelled", ("    def _begin(self, rng):", own))])
+    assert has_parts(labelled.env)
+
+
+def test_a_variation_that_it_cannot_show_is_refused(bring: Bring) -> None:
+    varied = compose([*bring("dot_varied"), "env.variation.background=true"]).env
+    for use in (check_task, make_env):
+        with pytest.raises(ConfigError, match=r"env\.variation: .*, expected none: env=dot_varied\S* draws itself"):
+            use(varied)
+
+
+def test_what_data_sets_say_of_it_is_asked_for_before_anything_is_recorded(bring: Bring) -> None:
+    silent = bring("dot_silent", ('"control_hz": 10,', ""), ('"task": "Move the white square onto the red dot.", ', ""))
+    with pytest.raises(ConfigError, match="env=dot_silent: got metadata without control_hz and task, expected"):
+        CollectionSpec.make(compose(silent), "random", 1, 2, 0)
+    CollectionSpec.make(compose(bring("dot_told")), "expert", 1, 2, 0)
