@@ -196,7 +196,7 @@ class EnvConfig(Checked):
     @property
     def typed(self) -> list[str]:
         """The arguments that choose it."""
-        return [f"env={self.name}", *([f"env.task={self.task}"] if self.task else [])]
+        return [f"env={self.name}", *(f"env.{key}={own}" for key in ("task", "id") if (own := getattr(self, key)))]
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -140,7 +140,8 @@ def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
     environment is not one of this version.
     """
     free, machine, folders = (keys_of(ExperimentConfig, role) for role in ("free", "machine", "folder"))
-    preset = flatten(to_dict(compose([*config.env.typed, f"preset={config.preset}"])))
+    width = [f"env.action_dim={config.env.action_dim}"] if config.env.id else []  # it is not asked for: it may be gone
+    preset = flatten(to_dict(compose([*_base(config), *width])))
     found = []
     for key, value in flatten(to_dict(config)).items():
         group, _, name = key.rpartition(".")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict
+from playslot_rl.config import CompareConfig, EnvConfig, ExperimentConfig, from_dict
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS
@@ -17,7 +18,7 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.studies.launch import require_launcher
 from playslot_rl.studies.study import absolute_roots
-from playslot_rl.studies.success import jobs
+from playslot_rl.studies.success import jobs, measure
 from playslot_rl.studies.success.jobs import (
     SuccessJob,
     check_demos,
@@ -160,6 +161,16 @@ def test_the_shipped_world_model_of_another_task_is_refused() -> None:
     check_success(compared("run=pretrained"))
     with pytest.raises(CheckpointError, match="got a world model of env=button_press, expected env=block_reach"):
         check_success(compared("run=pretrained", "env=block_reach"))
+
+
+def test_the_world_model_of_another_gymnasium_environment_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint = SimpleNamespace(group=lambda *_: EnvConfig("gym", id="FetchReach-v4"))
+    monkeypatch.setattr(measure.Run, "open", lambda _: SimpleNamespace(world_stages={"slots": checkpoint}))
+    monkeypatch.setattr(measure, "require_config", lambda *_: None)
+    given = ["env=gym", "run=reach", "methods=playslot", "data.demos=demos"]
+    check_success(compared(*given, "env.id=FetchReach-v4"))
+    with pytest.raises(CheckpointError, match=r"model of env=gym env\.id=FetchReach-v4, expected .*=FetchPush-v4"):
+        check_success(compared(*given, "env.id=FetchPush-v4"))
 
 
 def test_too_few_demonstrations_are_refused() -> None:
