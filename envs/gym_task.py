@@ -247,6 +247,7 @@ class GymTask(PixelTask):
     False) it is false, and evaluations measure the return. Its `reset(seed=)` gets the episode's seed.
     """
 
+    scenery = False
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 (as Gymnasium has it)
 
     @classmethod
@@ -349,7 +350,13 @@ class GymTask(PixelTask):
         expert = self._expert or require_expert(self.config)
         stream = np.random.SeedSequence(self.episode, spawn_key=(EXPERT_STREAM, self._moment))
         box: Any = self.inner.action_space
-        given = np.asarray(expert(self._observation, self._info, np.random.default_rng(stream)), np.float64)
+        try:
+            given = np.asarray(expert(self._observation, self._info, np.random.default_rng(stream)), np.float64)
+        except Exception as error:  # whatever a foreign function does
+            raise ConfigError(
+                f"env.expert={self.config.expert}: got {type(error).__name__} ({first_line(error)}), expected a "
+                f"function (observation, info, generator) that gives {self.config.action_dim} numbers"
+            ) from error
         if given.size != self.config.action_dim or not np.isfinite(given).all():
             raise ConfigError(
                 f"env.expert={self.config.expert}: got {given!r}, expected {self.config.action_dim} finite numbers"

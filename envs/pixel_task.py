@@ -69,6 +69,8 @@ class PixelTask(gym.Env[Observation, Action]):
     """Metres from the camera to the middle of what happens."""
     still: ClassVar[tuple[str, ...]] = ()
     """Bodies of an object that stay where they are and look like ground."""
+    scenery: ClassVar[bool] = True
+    """Whether what belongs to none of `objects` is scenery, which `env.variation` may paint over; else planes alone."""
 
     def __init__(
         self, config: EnvConfig, render_mode: str | None, *, actions: int = ACTION_DIM, state: int = STATE_DIM
@@ -97,8 +99,8 @@ class PixelTask(gym.Env[Observation, Action]):
 
     @classmethod
     def in_mujoco(cls, config: EnvConfig) -> bool:
-        """Whether `FrameRenderer` draws MuJoCo's scene, whose parts are known and which `env.variation` changes; a class
-        that draws itself opens none.
+        """Whether `FrameRenderer` draws a scene of MuJoCo, whose parts are known and which `env.variation` changes; a
+        class that draws itself opens none.
         """
         del config
         return cls.open_renderer is PixelTask.open_renderer
@@ -112,7 +114,8 @@ class PixelTask(gym.Env[Observation, Action]):
         make: Any = self._make_renderer
         renderer: FrameRenderer = make(still=None, at_rest=False) if variation.shake else make()
         (arm, *others), model = list(self.objects()) or [()], self._simulation.model
-        self._variation = Variation(variation, model, {*arm, *chain(*others)}, {*arm}, self.distance_seen)
+        things, coloured = ({*arm, *chain(*others)}, {*arm}) if self.scenery else (None, set[str]())
+        self._variation = Variation(variation, model, things, coloured, self.distance_seen)
         renderer.vary(self._variation)
         return renderer
 
@@ -222,8 +225,20 @@ class PixelTask(gym.Env[Observation, Action]):
 
     def _observe(self, draw: bool) -> Observation:
         if draw or self._frame is None:
-            self._frame = self.draw()
-        return Observation({keys.PIXELS: self._frame, keys.STATE: self._state()})
+            self._frame = self._fitting(keys.PIXELS, self.draw())
+        state = np.asarray(self._state(), np.float32)
+        return Observation({keys.PIXELS: self._frame, keys.STATE: self._fitting(keys.STATE, state)})
+
+    def _fitting(self, key: str, part: Any) -> Any:
+        """A part of an observation; a ConfigError where it is of another kind or shape than its space."""
+        space: Any = cast(gym.spaces.Dict, self.observation_space)[key]
+        if not isinstance(part, np.ndarray) or (part.dtype, part.shape) != (space.dtype, space.shape):
+            got = f"{part.dtype} {part.shape}" if isinstance(part, np.ndarray) else type(part).__name__
+            raise ConfigError(
+                f"env={self.config.full_name}: got {key} {got}, expected {space.dtype} {space.shape}: change what the "
+                "task draws, or the width it states (state=)"
+            )
+        return part
 
     def render(self) -> Frame | None:
         """The present frame, uint8 (H, W, 3); None without a render mode or before the first reset."""

@@ -32,6 +32,8 @@ SIZE: Final = 0.09  # half side of the moving object, in units of its distance f
 NEARER: Final = 0.6  # its distance, of that of the point looked at
 DISTRACTOR: Final = 1 << 20
 """Number of the moving object where parts are numbered: no geom has it."""
+PLANE: Final = 0
+"""MuJoCo's `mjGEOM_PLANE`."""
 COLOURED: Final = ("geom_rgba", "mat_rgba")
 LIT: Final = ("light_diffuse", "light_ambient")
 
@@ -64,7 +66,8 @@ class Variation:
     """One environment's variation of a MuJoCo model.
 
     Args:
-        things: names of root bodies that the task is about, with the robot: never painted over.
+        things: names of root bodies that the task is about, with the robot: never painted over. None where nobody
+            knows: then planes and sky alone are painted, and nothing takes other colours.
         coloured: names of those among them that may take other colours: the robot.
         distance: metres to the point looked at.
     """
@@ -73,7 +76,7 @@ class Variation:
         self,
         config: VariationConfig,
         model: mujoco.MjModel,
-        things: Collection[str],
+        things: Collection[str] | None,
         coloured: Collection[str],
         distance: float,
     ) -> None:
@@ -82,11 +85,11 @@ class Variation:
         roots = [model.body(int(root)).name for root in model.body_rootid[model.geom_bodyid]]
         bodies = [model.body(int(body)).name for body in model.geom_bodyid]
         table = np.array(["table" in name.lower() for name in bodies])
-        thing = np.array([name in things for name in roots])
+        thing = model.geom_type != PLANE if things is None else np.array([name in things for name in roots])
         rest = model.body_weldid[model.geom_bodyid] == 0
         self._kinds = np.where(thing | ~(rest | table), 0, np.where(table, 2, 1)).astype(np.uint8)
         """Of each geom: 0 is left alone, 1 is background, 2 is a table."""
-        self._plain = np.array([name in coloured for name in roots]) | (self._kinds > 0)
+        self._plain = np.array([name in coloured for name in roots]) | ((self._kinds > 0) & (things is not None))
         self._base = {name: getattr(model, name).copy() for name in (*COLOURED, *LIT)}
         self._headlight = (model.vis.headlight.diffuse.copy(), model.vis.headlight.ambient.copy())
 

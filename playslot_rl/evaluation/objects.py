@@ -315,7 +315,7 @@ def evaluate_slots(run: Run, out: Path, config: ExperimentConfig, device: torch.
     """
     if not has_parts(config.env):
         raise ConfigError(
-            f"protocol=slots: got env={config.env.full_name}, which draws itself and does not say which object each pixel "
+            f"protocol=slots: got env={config.env.full_name}, which draws itself and does not say what each pixel "
             "shows, expected a task in MuJoCo, or one whose class has `segment`"
         )
     began = time.perf_counter()

@@ -137,14 +137,31 @@ def test_what_is_collected_has_it_and_the_same_actions() -> None:
     assert not np.array_equal(episodes[1].frames, episodes[0].frames)
 
 
-def test_a_gymnasium_robot_has_it() -> None:
-    task = make_env(compose(["env=gym", "env.id=PointMaze_UMaze-v3", "env.image_size=32"]).env).unwrapped
-    varied = make_env(replace(task.config, variation=VariationConfig(**ALL))).unwrapped
-    first, other = task.reset(seed=0)[0], varied.reset(seed=0)[0]
-    np.testing.assert_array_equal(first[keys.STATE], other[keys.STATE])
-    assert (first["pixels"] != other["pixels"]).any(axis=-1).mean() > 0.3
+@pytest.mark.parametrize("name", ["PointMaze_UMaze-v3", "AdroitHandPen-v1"])
+def test_of_a_gymnasium_robot_planes_and_sky_alone_are_painted_over(name: str) -> None:
+    """Nobody says which of its geoms is a wall, a goal or a part of the robot."""
+    import mujoco
+
+    task = make_env(compose(["env=gym", f"env.id={name}", "env.image_size=32"]).env).unwrapped
+    assert isinstance(task, PixelTask)
+    first = task.reset(seed=0)[0]
+    number, kind = np.moveaxis(task._renderer.parts(task._simulation.data), -1, 0)
+    model, is_geom = task._simulation.model, kind == int(mujoco.mjtObj.mjOBJ_GEOM)
+    free = (kind == -1) | (is_geom & (model.geom_type[number.clip(0)] == mujoco.mjtGeom.mjGEOM_PLANE))
+    kept = ~free
+    for shift in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        kept &= ~np.roll(free, shift, (0, 1))
+    assert kept.sum() > 20
+    for painted in ({"background": True, "textures": True, "colours": 1.0}, ALL):
+        varied = make_env(replace(task.config, variation=VariationConfig(**painted))).unwrapped
+        other = varied.reset(seed=0)[0]
+        np.testing.assert_array_equal(first[keys.STATE], other[keys.STATE])
+        changed = np.abs(first["pixels"].astype(int) - other["pixels"]).max(axis=-1) > 0
+        assert changed[free].mean() > 0.3
+        if painted is not ALL:
+            assert changed[kept].mean() < 0.05
+        varied.close()
     task.close()
-    varied.close()
 
 
 def test_off_is_unsaid() -> None:
