@@ -36,7 +36,7 @@ MAX_REDRAWS: Final = 20
 
 
 class CollectionPolicy(nn.Module):
-    """Uniform actions in [-1, 1], or the expert's with Gaussian noise of that deviation, clipped to [-1, 1]."""
+    """Uniform actions in [-1, 1], or the expert's, with Gaussian noise of that deviation, clipped to [-1, 1]."""
 
     def __init__(self, name: str, noise: float = 0.0) -> None:
         super().__init__()
@@ -49,7 +49,7 @@ class CollectionPolicy(nn.Module):
         if self.name == "random":
             return torch.from_numpy(rng.uniform(-1.0, 1.0, width).astype(np.float32))
         if self.noise == 0.0:
-            return expert.clone()
+            return expert.clamp(-1.0, 1.0)  # as a step executes it
         noise = rng.normal(0.0, self.noise, width).astype(np.float32)
         return (expert + torch.from_numpy(noise)).clamp(-1.0, 1.0)
 

@@ -65,4 +65,16 @@ def too_many(observation: Any, info: dict[str, Any], generator: np.random.Genera
     return np.zeros(7)
 
 
+def of_one(observation: Any) -> Any:
+    return np.zeros(1)
+
+
+def forgetful(observation: Any, info: dict[str, Any], generator: np.random.Generator) -> Any:
+    return info["goal"]
+
+
+def in_words(observation: Any, info: dict[str, Any], generator: np.random.Generator) -> Any:
+    return "right"
+
+
 NOTHING = 3

@@ -121,7 +121,7 @@ def test_an_episode_that_starts_solved_is_known_by_its_goal() -> None:
     task = made(compose(["env=gym", "env.id=FetchReach-v4", "env.image_size=32"]).env)
     task.draw_resets, starts = False, []
     for seed in range(200):
-        observation, info = task.reset(seed=seed)
+        info = task.reset(seed=seed)[1]
         goal = task.inner.unwrapped.goal  # type: ignore[attr-defined]
         starts.append((info["success"], bool(np.linalg.norm(task._observation["achieved_goal"] - goal) < 0.05)))
     assert sum(solved for solved, _ in starts) > 0
@@ -204,6 +204,9 @@ def test_an_expert_or_success_that_there_is_not_is_refused_where_it_is_asked_for
     for wrong, said in (
         ("too_many", "expected 1 finite numbers"),
         ("too_far", r"got .*4\.1.*, expected it in Box\(-2"),
+        ("of_one", r"env\.expert=gym_examples:of_one: got TypeError \(.*\), expected a function \(observation, info"),
+        ("forgetful", r"got KeyError \('goal'\), expected .* gives 1 numbers"),
+        ("in_words", r"got ValueError \(.*'right'\), expected"),
     ):
         with pytest.raises(ConfigError, match=said):
             check_task(line(expert=f"gym_examples:{wrong}"), expert=True)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from playslot_rl.collectors.episodes import record
 from playslot_rl.collectors.journal import CollectionSpec
 from playslot_rl.config import EnvConfig, plugins
 from playslot_rl.config.compose import compose
@@ -81,3 +84,43 @@ def test_what_data_sets_say_of_it_is_asked_for_before_anything_is_recorded(bring
     with pytest.raises(ConfigError, match="env=dot_silent: got metadata without control_hz and task, expected"):
         CollectionSpec.make(compose(silent), "random", 1, 2, 0)
     CollectionSpec.make(compose(bring("dot_told")), "expert", 1, 2, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        (
+            "float",
+            "        return frame\n",
+            "        return frame / 255.0\n",
+            r"pixels float64 \(32, 32, 3\), expected uint8",
+        ),
+        ("small", "return frame\n", "return frame[:16]\n", r"pixels uint8 \(16, 32, 3\), expected uint8 \(32, 32, 3\)"),
+        ("nothing", "return frame\n", "return None\n", r"pixels NoneType, expected uint8"),
+        (
+            "wide",
+            "(self.square, self.dot)).as",
+            "(self.square, self.dot, [1])).as",
+            r"float32 \(5,\), expected float32 \(4,\)",
+        ),
+    ],
+)
+def test_what_is_no_frame_or_state_is_refused_at_the_first_look(
+    bring: Bring, name: str, old: str, new: str, message: str
+) -> None:
+    config = compose([*bring(f"dot_{name}", (old, new)), "preset=smoke"])
+    with pytest.raises(ConfigError, match=message) as caught:
+        next(record(CollectionSpec.make(config, "random", 1, 2, 0), [0]))
+    assert "\n" not in str(caught.value)
+
+
+def test_the_recorded_action_is_the_one_that_was_executed(bring: Bring) -> None:
+    """The expert of this task asks for more than an action can be."""
+    config = compose(
+        [*bring("dot_far", ("np.clip((self.dot - self.square) / 0.1, -1, 1)", "(self.dot - self.square) / 0.1"))]
+    )
+    spec = CollectionSpec.make(replace(config, collect=replace(config.collect, noise=0.0)), "expert", 1, 3, 0)
+    (episode,) = record(spec, [0])
+    assert np.abs(episode.actions).max() == 1.0
+    moved = np.diff(episode.states[:, :2], axis=0)
+    np.testing.assert_allclose(moved, 0.1 * episode.actions[:, :2], atol=1e-6)
