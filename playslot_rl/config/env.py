@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Final, Literal
 
 from playslot_rl.config import metaworld
@@ -126,6 +126,12 @@ class VariationConfig(Checked):
         """Whether anything changes."""
         return replace(self, seed=0) != VariationConfig()
 
+    @property
+    def words(self) -> list[str]:
+        """What is on, as names say it: `background`, `shake0.5`, `seed1`; nothing where all is off."""
+        found = {field.name: getattr(self, field.name) for field in fields(self)} if self.on else {}
+        return [name if value is True else f"{name}{value:g}" for name, value in found.items() if value]
+
 
 def in_turn(seed: int, tasks: int) -> int:
     """Which of several tasks the episode of a seed is of."""
@@ -189,9 +195,9 @@ class EnvConfig(Checked):
 
     @property
     def full_name(self) -> str:
-        """The name, and the task where that has several, as folders and reports call it."""
+        """The name, the task where that has several, and what varies, as folders and reports call it."""
         own = self.task or self.id.replace("/", "_").replace(":", "_")
-        return f"{self.name}_{own}" if own else self.name
+        return "_".join((self.name, *([own] if own else []), *self.variation.words))
 
     @property
     def typed(self) -> list[str]:

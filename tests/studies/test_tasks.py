@@ -33,7 +33,8 @@ def each(*typed: str) -> list[ExperimentConfig]:
 
 def test_each_task_has_its_own_settings_and_all_that_was_typed() -> None:
     door, push = each(TWO, "env.variation.shake=0.5", "episodes=7")
-    assert [config.env.full_name for config in (door, push)] == ["metaworld_door-open", "block_push_easy"]
+    names = ["metaworld_door-open_shake0.5", "block_push_easy_shake0.5"]
+    assert [config.env.full_name for config in (door, push)] == names
     assert (door.env.max_steps, push.env.max_steps) == (25, 25)
     assert (door.env.frame_skip, push.env.frame_skip) == (5, 2)
     assert {(config.env.variation.shake, config.episodes) for config in (door, push)} == {(0.5, 7)}
@@ -45,6 +46,18 @@ def test_each_task_has_its_own_settings_and_all_that_was_typed() -> None:
 def test_a_gymnasium_id_is_a_task_of_its_own() -> None:
     (config,) = each("envs=gym/FetchReach-v4")
     assert (config.env.id, config.env.full_name) == ("FetchReach-v4", "gym_FetchReach-v4")
+
+
+def test_a_varied_task_has_a_name_and_a_folder_of_its_own() -> None:
+    for typed, name in (
+        ([], "block_push_easy"),
+        (["background=true", "object=true"], "block_push_easy_background_object"),
+        (["shake=0.5", "seed=1"], "block_push_easy_shake0.5_seed1"),
+        (["colours=1"], "block_push_easy_colours1"),
+        (["seed=1"], "block_push_easy"),
+    ):
+        varied = [f"env.variation.{key}" for key in typed]
+        assert compose(["env=block_push_easy", *varied]).env.full_name == name
 
 
 @pytest.mark.parametrize(
