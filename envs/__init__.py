@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, cast
 
+from playslot_rl import keys
 from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
 from playslot_rl.config.families import FAMILIES, OGBENCH
 from playslot_rl.config.metaworld import NAME as METAWORLD
@@ -175,7 +176,12 @@ def make_env(env: EnvConfig | str | None = None, render: RenderConfig | None = N
     """Make a task (`playslot_rl.envs.pixel_task.PixelTask`) as a Gymnasium environment without wrappers, so that
     `expert_action()` can be called on it; a RenderError where there is no working GL backend.
     """
-    env = task_config(env)
+    made = _without_renderer(task_config(env), render)
+    task_env(made).open_renderer()
+    return made
+
+
+def _without_renderer(env: EnvConfig, render: RenderConfig | None = None) -> gym.Env[Any, Any]:
     name = SET_ID if env.tasks else gym_id(env.name)
     from playslot_rl.envs.rendering import import_mujoco
 
@@ -183,9 +189,16 @@ def make_env(env: EnvConfig | str | None = None, render: RenderConfig | None = N
     _check_variation(env)
     import gymnasium
 
-    made: gym.Env[Any, Any] = gymnasium.make(name, env=env, render=render or RenderConfig(), render_mode="rgb_array")
-    task_env(made).open_renderer()
-    return made
+    return gymnasium.make(name, env=env, render=render or RenderConfig(), render_mode="rgb_array")
+
+
+def state_width(env: EnvConfig) -> int:
+    """Width S of a task's proprioception, which only the task itself knows: it is made, and drawn nothing of."""
+    made = _without_renderer(env)
+    try:
+        return int(task_env(made).observation_space[keys.STATE].shape[0])  # type: ignore[index]
+    finally:
+        made.close()
 
 
 def task_env(env: gym.Env[Any, Any]) -> PixelTask:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from playslot_rl import keys
@@ -17,7 +17,7 @@ from playslot_rl.config.compose import compose, is_pretrained
 from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import keys_of
 from playslot_rl.config.weights import data_roots
-from playslot_rl.envs import ENVIRONMENTS, RECORDED
+from playslot_rl.envs import ENVIRONMENTS, RECORDED, task_config
 from playslot_rl.sharing.folder import SharedPolicyConfig
 
 RUN: Final = "runs/again"
@@ -185,17 +185,20 @@ def rate_words(policy: SharedPolicyConfig) -> str:
 
 def use(policy: SharedPolicyConfig, experiment: ExperimentConfig | None = None) -> str:
     """The paragraph on LeRobot's programs, as Markdown."""
-    if policy.env.name not in ENVIRONMENTS or policy.env.id:  # LeRobot makes only tasks with a name
-        return REAL.format(camera=policy.camera, rate=rate_words(policy))
-    known = experiment or ExperimentConfig()
-    own, task = policy.env, compose(policy.env.typed).env
+    own, known = policy.env, experiment or ExperimentConfig()
+    task_name = "/".join(filter(None, (own.name, own.task)))
+    if own.name not in ENVIRONMENTS or own.id:  # LeRobot makes only tasks with a name
+        return REAL.format(why=NOWHERE, camera=policy.camera, rate=rate_words(policy))
+    task = task_config(task_name)
+    alike = replace(own, image_size=task.image_size, frame_skip=task.frame_skip, max_steps=task.max_steps)
+    if alike != task:
+        return REAL.format(why=CHANGED, camera=policy.camera, rate=rate_words(policy))
     options = {
         "image_size": (own.image_size, 64),
         "quality": (known.render.quality, "fast"),
         "frame_skip": (own.frame_skip * policy.stride, task.frame_skip),
         "episode_length": (-(-own.max_steps // policy.stride), task.max_steps),
     }
-    task_name = "/".join(filter(None, (own.name, own.task)))
     command = ["lerobot-eval", "--policy.path=THIS_FOLDER", "--env.type=playslot", f"--env.task={task_name}"]
     command += [f"--env.{name}={value}" for name, (value, default) in options.items() if value != default]
     if policy.camera != keys.FEATURE_IMAGE:
@@ -211,9 +214,12 @@ training has seen:
 ```bash
 {command}
 ```"""
+NOWHERE: Final = "No simulator of this task ships with `playslot_rl`: `lerobot-eval` has nothing to run it in."
+CHANGED: Final = "`lerobot-eval` has no options for what was changed of this task; `playslot evaluate` runs it."
 REAL: Final = """\
-No simulator of this task ships with `playslot_rl`: `lerobot-eval` has nothing to run it in. It is shown the frames
-of the robot, {rate}. In LeRobot's own terms, with `playslot_rl` and `lerobot_policy_playslot` installed:
+{why}
+It is shown the frames of the robot, {rate}. In LeRobot's own terms, with `playslot_rl` and `lerobot_policy_playslot`
+installed:
 
 ```python
 from lerobot.policies import make_pre_post_processors

@@ -228,7 +228,16 @@ def test_other_tasks_have_their_own_settings(task: str) -> None:
 
     config = PlaySlotEnv(task=task)
     assert config.task_config() == compose([f"env={task}"]).env
+    assert config.features["agent_pos"].shape == (4,)
     assert PlaySlotEnv(task=task, episode_length=7).task_config() == replace(config.task_config(), max_steps=7)
+
+
+def test_the_state_is_as_wide_as_the_tasks() -> None:
+    pytest.importorskip("ogbench")
+    from lerobot_policy_playslot import PlaySlotEnv
+
+    config = PlaySlotEnv(task="ogbench/cube-single")
+    assert (config.features["action"].shape, config.features["agent_pos"].shape) == ((5,), (5,))
 
 
 @pytest.mark.parametrize("task", ["grid_shapes", "button_pres"])

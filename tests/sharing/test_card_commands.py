@@ -260,6 +260,10 @@ def test_the_use_of_a_simulators_policy_names_what_differs_from_the_task(tmp_pat
     )
     assert made.task_config() == replace(env, frame_skip=3 * env.frame_skip, max_steps=9)
     assert json.loads(options["rename_map"]) == {"observation.images.front": "observation.images.top"}
+    for changed in ("env.variation.shake=0.5", "env.blocks.distractors=1", "env.warmup_steps=1"):
+        said = use(SharedPolicyConfig(env=compose(["env=block_push", changed]).env))
+        assert "lerobot-eval --" not in said, "it would run another task"
+        assert said.startswith("`lerobot-eval` has no options for what was changed of this task")
     plain = SharedPolicyConfig(env=compose(["env=block_push"]).env)
     assert not [part for part in lines(use(plain))[0] if part.startswith(("--env.i", "--env.f", "--env.e", "--env.q"))]
 

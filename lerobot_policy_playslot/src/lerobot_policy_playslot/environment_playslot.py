@@ -14,7 +14,7 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 import playslot_rl.config as ours
-from playslot_rl.envs import task_config
+from playslot_rl.envs import state_width, task_config
 from playslot_rl.envs.lerobot import CAMERA, LeRobotTask, frames_a_second
 
 IMAGE = f"{OBS_IMAGES}.{CAMERA}"
@@ -27,8 +27,8 @@ class PlaySlotEnv(EnvConfig):
     """A task of playslot_rl.
 
     Attributes:
-        task: `button_press`, `block_push`, `block_push_easy`, `block_reach`, `block_pick`, or one of Meta-World's,
-            `metaworld/drawer-open`.
+        task: `button_press`, `block_push`, `block_push_easy`, `block_reach`, `block_pick`, or one of Meta-World's or
+            OGBench's, `metaworld/drawer-open`.
         episode_length: longest episode in agent steps; None takes the task's own.
         frame_skip: environment steps of an agent step; None takes the task's own. A policy that was trained on one
             frame in three acts at a third of the rate: three times as many.
@@ -50,7 +50,7 @@ class PlaySlotEnv(EnvConfig):
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (env.action_dim,)),
             IMAGE: PolicyFeature(FeatureType.VISUAL, (side, side, 3)),
-            STATE: PolicyFeature(FeatureType.STATE, (4,)),
+            STATE: PolicyFeature(FeatureType.STATE, (state_width(env),)),
         }
 
     def task_config(self) -> ours.EnvConfig:
