@@ -119,6 +119,17 @@ def test_a_task_of_a_package_is_recorded_and_learned(tmp_path: Path) -> None:
     assert (stored["env"]["name"], stored["env"]["frame_skip"]) == ("reach_dot", 1)
 
 
+@pytest.mark.slow
+def test_the_pipeline_of_a_task_of_a_package_ends(tmp_path: Path) -> None:
+    """It draws itself: nobody knows its parts, and its slots are not scored."""
+    site = tmp_path / "site"
+    install(site, "reach_dot", "playslot_rl.envs", "reach_dot = reach_dot:TASK", module_of("add-a-task.md"))
+    said = play(site, "pipeline preset=smoke env=reach_dot logging.progress=false out=run")
+    assert "out=run: 0" in said, said
+    assert (site / "run" / "report.html").is_file()
+    assert not (site / "run" / "evaluation" / "slots").exists()
+
+
 def test_a_package_that_fails_is_one_line_where_it_is_named(tmp_path: Path) -> None:
     site, broken = tmp_path / "site", "raise RuntimeError('no such chip')\n"
     install(site, "broken", "playslot_rl.methods", "broken = broken:METHOD", broken)
