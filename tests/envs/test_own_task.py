@@ -14,7 +14,7 @@ from playslot_rl.collectors.episodes import record
 from playslot_rl.collectors.journal import CollectionSpec
 from playslot_rl.config import EnvConfig, plugins
 from playslot_rl.config.compose import compose
-from playslot_rl.envs import check_task, has_parts, make_env
+from playslot_rl.envs import check_task, has_parts, make_env, state_width
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.objects import evaluate_slots, validation_scores
 from playslot_rl.runs import Run
@@ -70,6 +70,11 @@ def test_nobody_knows_its_parts_and_no_score_asks_for_them(bring: Bring, capsys:
     own = "    def segment(self):\n        return np.zeros((32, 32), np.int64)\n\n    def _begin(self, rng):"
     labelled = compose([*bring("dot_labelled", ("    def _begin(self, rng):", own))])
     assert has_parts(labelled.env)
+
+
+def test_its_state_is_as_wide_as_it_says(bring: Bring) -> None:
+    wider = bring("dot_wider", ("(env or TASK.env, render_mode)", "(env or TASK.env, render_mode, state=5)"))
+    assert state_width(compose(wider).env) == 5
 
 
 def test_a_variation_that_it_cannot_show_is_refused(bring: Bring) -> None:
