@@ -39,10 +39,10 @@ class LabelledMoves:
 
 
 def jittered(pixels: Tensor, shift: int, generators: StepGenerators, stream: str) -> Tensor:
-    """Frames (b, T, 3, H, W), each moved by its own random offset of at most `shift` pixels; edges repeat."""
+    """Frames (b, T, 3, H, W), those of a row moved alike by a random offset of at most `shift` pixels; edges repeat."""
     if shift == 0:
         return pixels
-    generator = generators.torch(stream, "cpu")
-    offsets = own_noise((*pixels.shape[:2], 2), lambda shape: torch.randint(2 * shift + 1, shape, generator=generator))
-    moved = shifted(pixels.flatten(0, 1), to_device(offsets.flatten(0, 1) - shift, pixels.device))
+    generator, (rows, times) = generators.torch(stream, "cpu"), pixels.shape[:2]
+    offsets = own_noise((rows, 2), lambda shape: torch.randint(2 * shift + 1, shape, generator=generator)) - shift
+    moved = shifted(pixels.flatten(0, 1), to_device(offsets.repeat_interleave(times, dim=0), pixels.device))
     return moved.view_as(pixels)

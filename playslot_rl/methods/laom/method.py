@@ -24,7 +24,7 @@ class LAOMConfig(PretrainedConfig):
         hidden: width of layers.
         latent_dim: of latent actions.
         offset: most steps that the inverse model looks ahead.
-        jitter: shift of each frame, pixels.
+        jitter: shift of a transition's frames, pixels.
         target_rate: part of the encoder that its slow copy takes in a step.
         label_weight: of the labelled actions in the model's loss; 0 does not read them.
         loss: of policy and decoder, `l2` or `l1`.

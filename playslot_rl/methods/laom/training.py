@@ -3,12 +3,13 @@ that clones its latents, and an action decoder.
 
     L = mean (FDM(sg[h_t], z_t) - (e_{t+1} - e_t))^2 / s + lambda mean (W z_u + b - a_u)^2,   s ~ mean (e_{t+1} - e_t)^2
 
-t runs over the videos and u over the moving transitions of the labelled demonstrations, equally many a step; each frame
-is shifted by itself. s is an average over the last steps, so that lambda (`label_weight`) counts alike in all tasks.
-Targets of the policy are z of one step (k = 1), from frames as they are.
+t runs over the videos and u over the moving transitions of the labelled demonstrations, equally many a step; the frames
+of a transition are shifted alike. s is an average over the last steps, so that lambda (`label_weight`) counts alike in
+all tasks. Targets of the policy are z of one step (k = 1), from frames as they are.
 
-Note: the original's error is not divided, its lambda is 0.001, and its augmentations also turn and tilt frames. Our
-episodes have 20 to 50 steps: k ends with the episode, where the original leaves out its last K steps.
+Note: the original's error is not divided, its lambda is 0.001, and it shifts, turns and tilts each frame by itself,
+which hides motion of a pixel or two. Our episodes have 20 to 50 steps: k ends with the episode, where the original
+leaves out its last K steps.
 
 Shapes: B batch, H W image height and width, M transitions, Z latent-action width.
 """
@@ -98,17 +99,21 @@ class LAOMStage:
 
     @torch.no_grad()
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
-        """`unexplained`: error on held-out pairs over that of no change, in the target's features."""
+        """On held-out pairs: `unexplained`, error over that of no change, in the target's features; and `directions`,
+        (tr C)^2 / tr C^2 of the latents' covariance C: features that fall into few are easily explained.
+        """
 
-        def look(_: int, rows: IntArray) -> tuple[float, float]:
+        def look(_: int, rows: IntArray) -> tuple[float, float, Tensor]:
             first, second = self._frames(rows)
             h, later = self.model.features(torch.cat((first, second))).chunk(2)
-            wanted = self.target(first, second)
-            error = self.model.change(h, self.model.infer(h, later)) - wanted
-            return float(error.square().sum()), float(wanted.square().sum())
+            wanted, z = self.target(first, second), self.model.infer(h, later)
+            error = self.model.change(h, z) - wanted
+            return float(error.square().sum()), float(wanted.square().sum()), z.float().cpu()
 
-        errors, stills = zip(*spread(in_batches(self.clips.held_out), look), strict=True)
-        return {"unexplained": sum(errors) / max(1e-12, sum(stills))}
+        errors, stills, latents = zip(*spread(in_batches(self.clips.held_out), look), strict=True)
+        c = torch.cat(latents).T.cov()
+        directions = float(c.trace().square() / c.square().sum().clamp_min(1e-24))
+        return {"unexplained": sum(errors) / max(1e-12, sum(stills)), "directions": directions}
 
     def _later(self, ends: Ends, rows: IntArray, generators: StepGenerators, stream: str) -> IntArray:
         return ends.ahead(rows, self.config.offset, generators.numpy(stream))

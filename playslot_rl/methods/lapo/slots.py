@@ -3,7 +3,8 @@ Latent Action Learning"), and what acts in their latent actions.
 
     z_t = VQ(IDM(S_{t-1}, S_t, S_{t+1})),   S^_{t+1} = S_t + FDM(S_{t-1}, S_t, z_t)
 
-Is it the slots, or PlaySlot's latents? Everything else is as there: slots, policy, decoder, fine-tuning.
+Is it the slots, or PlaySlot's latents? The rest is as there: slots, policy, decoder, fine-tuning; but these latents are
+not whitened, with which they do worse, and the policy sees no imagined slots (`behaviour.imagined`).
 
 Note: a slot keeps its number over time, so that it is one token, its vectors in all frames beside each other. No
 position code: z_t does not depend on the order of the slots, and the prediction follows it.

@@ -110,12 +110,13 @@ def test_before_training_the_error_is_that_of_no_change() -> None:
         assert 0.3 < float(step_loss(made, 0, StepGenerators(0, 0))["loss"]) < 3
 
 
-def test_every_frame_is_shifted_by_itself() -> None:
+def test_frames_of_a_transition_are_shifted_alike_and_rows_by_themselves() -> None:
     plain = torch.arange(32 * 32, dtype=torch.float32).view(1, 1, 1, 32, 32).expand(16, 3, 3, 32, 32)
     moved = jittered(plain, 2, StepGenerators(0, 0), "jitter")
     offsets = moved[:, :, 0, 16, 16] - plain[:, :, 0, 16, 16]
     assert {float(offset) for offset in offsets.flatten()} <= {32.0 * y + x for y in range(-2, 3) for x in range(-2, 3)}
-    assert (offsets[:, 0] != offsets[:, 1]).any()
+    assert (offsets == offsets[:, :1]).all()
+    assert len(set(offsets[:, 0].tolist())) > 3
     assert jittered(plain, 0, StepGenerators(0, 0), "jitter") is plain
 
 
@@ -166,3 +167,12 @@ def test_labels_make_the_action_readable_off_the_latents_where_something_else_mo
         actions = torch.from_numpy(source.actions[moves.rows, :1])
         found[weight] = probed(latents[labelled:], actions[labelled:])
     assert 1 - found[1.0] < 0.4 * (1 - found[0.0])
+
+
+def test_validation_counts_the_directions_that_the_latents_have() -> None:
+    made = stage(labelled=0, source=moving_square(episodes=20))
+    assert 1.2 < made.validate(0)["directions"] <= made.config.latent_dim
+    with torch.no_grad():  # all numbers of z say the same
+        out = made.model.inverse.out
+        out.weight.copy_(out.weight[:1].expand_as(out.weight))
+    assert made.validate(0)["directions"] == pytest.approx(1, abs=1e-3)
