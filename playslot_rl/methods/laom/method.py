@@ -24,7 +24,7 @@ class LAOMConfig(PretrainedConfig):
         hidden: width of layers.
         latent_dim: of latent actions.
         offset: most steps that the inverse model looks ahead.
-        jitter: shift of a transition's frames, pixels.
+        jitter: shift of a transition's frames, pixels; without it latents fall into few directions.
         target_rate: part of the encoder that its slow copy takes in a step.
         label_weight: of the labelled actions in the model's loss; 0 does not read them.
         loss: of policy and decoder, `l2` or `l1`.
@@ -37,7 +37,7 @@ class LAOMConfig(PretrainedConfig):
     hidden: int = field(default=1024, metadata=COUNT)
     latent_dim: int = field(default=8192, metadata=COUNT)
     offset: int = field(default=10, metadata=COUNT)
-    jitter: int = field(default=0, metadata=between(0, 16, "0 to 16 pixels"))
+    jitter: int = field(default=4, metadata=between(0, 16, "0 to 16 pixels"))
     target_rate: float = field(default=0.001, metadata=OPEN_FRACTION)
     label_weight: float = field(default=0.1, metadata=NOT_NEGATIVE)
     loss: Literal["l2", "l1"] = "l2"
