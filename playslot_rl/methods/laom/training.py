@@ -111,7 +111,7 @@ class LAOMStage:
             return float(error.square().sum()), float(wanted.square().sum()), z.float().cpu()
 
         errors, stills, latents = zip(*spread(in_batches(self.clips.held_out), look), strict=True)
-        c = torch.cat(latents).T.cov()
+        c = torch.cat(latents).T.cov(correction=0)  # one pair has no directions, not NaN
         directions = float(c.trace().square() / c.square().sum().clamp_min(1e-24))
         return {"unexplained": sum(errors) / max(1e-12, sum(stills)), "directions": directions}
 
