@@ -14,6 +14,8 @@ STAMP := $(VENV)/.setup-done
 LOCK := requirements.lock
 PLUGIN := lerobot_policy_playslot
 ARGS ?=
+# Of everything at once; empty: as it is imported.
+BYTECODE := --compile-bytecode
 # The quick tests compute; whole commands wait for processes, locks and pipes, too: one worker more than cores.
 CORES := $(shell getconf _NPROCESSORS_ONLN)
 PARALLEL := --maxprocesses 5 --dist loadfile --no-loadscope-reorder
@@ -76,7 +78,7 @@ $(UV): $(if $(VENV_OK),,FORCE)
 
 $(STAMP): $(UV) $(LOCK) pyproject.toml $(PLUGIN)/pyproject.toml
 	@# With bytecode: where PYTHONDONTWRITEBYTECODE is set, every command would compile torch and its like anew (20 s).
-	@$(UV) pip install --compile-bytecode --require-hashes -r $(LOCK)
+	@$(UV) pip install $(BYTECODE) --require-hashes -r $(LOCK)
 	@$(UV) pip install --no-deps --editable . --editable ./$(PLUGIN)
 	@touch $@
 
@@ -104,7 +106,7 @@ test-browser: $(STAMP)
 		echo "error: found no Chromium. Install it (Debian, Ubuntu: apt-get install --no-install-recommends chromium)" >&2; \
 		exit 1; \
 	fi
-	@$(UV) pip install --quiet --compile-bytecode -r pyproject.toml --extra browser
+	@$(UV) pip install --quiet -r pyproject.toml --extra browser
 	@$(BIN)/python -m pytest -m browser $(ARGS)
 
 # On a machine with a GPU.

@@ -42,7 +42,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if not collection_path.name.startswith("test_") or collection_path.suffix != ".py":
         return None
     text, wanted = collection_path.read_text(), config.option.markexpr
-    for tier in ("integration", "slow"):
+    for tier in ("integration", "slow", "browser", "gpu"):
         whole, part = re.search(rf"^pytestmark = (\[\s*)?pytest\.mark\.{tier}\b", text, re.M), f"mark.{tier}" in text
         if (f"not {tier}" in wanted and whole) or (wanted.startswith(tier) and not part):
             return True
@@ -95,6 +95,17 @@ def _models_compiled_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mujoco.MjModel, "from_xml_path", once)
+        yield
+
+
+@pytest.fixture(scope="module")
+def thin_resnets() -> Iterator[None]:
+    """ResNet-18 is thin: for trainings that promise nothing of its size."""
+    import torchvision
+    from thin import thin_resnet18
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torchvision.models, "resnet18", thin_resnet18)
         yield
 
 

@@ -29,7 +29,7 @@ from playslot_rl.training import record as records
 from playslot_rl.training.batches import GlobalBatches
 from playslot_rl.training.fit import _Run
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("thin_resnets")]
 
 WORLD = {"slots": train_slots, "dynamics": train_dynamics, "policy": train_policy}
 RATES = {
@@ -101,21 +101,21 @@ def train(case: Case, out: Path, world: Path, *more: str) -> None:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Runs by stage, made when they are asked for; `world` is PlaySlot's."""
+    """Runs by method, made when they are asked for; `world` is PlaySlot's."""
     return {"folder": tmp_path_factory.mktemp("runs")}
 
 
 def trained(name: str, runs: dict[str, Path]) -> Path:
-    """A finished run of a stage; look, do not touch."""
-    world = runs["folder"] / "world"
-    for stage in WORLD:
-        if stage not in runs:
+    """A finished run of a stage and of all others of its method; look, do not touch."""
+    world, method = runs["folder"] / "world", CASES[name].method
+    if "playslot" not in runs:
+        for stage in WORLD:
             train(CASES[stage], world, world)
-            runs[stage] = world
-    if name not in runs:
-        runs[name] = runs["folder"] / name
-        train(CASES[name], runs[name], world)
-    return runs[name]
+        runs["playslot"] = world
+    if method not in runs:
+        train(CASES[name], runs["folder"] / method, world)
+        runs[method] = runs["folder"] / method
+    return runs[method]
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -128,7 +128,7 @@ class Trainings:
 
 
 @pytest.fixture(scope="module")
-def trainings(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Trainings]:
+def trainings(tmp_path_factory: pytest.TempPathFactory, thin_resnets: None) -> Iterator[Trainings]:
     made = Trainings(tmp_path_factory.mktemp("sees"))
     with patch.object(records, "open_videos", made.open_videos), patch.object(checkpoints, "provenance", dict):
         yield made

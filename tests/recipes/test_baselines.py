@@ -13,7 +13,7 @@ from commands import instead, refused, smoke, weights
 from playslot_rl.config import to_dict
 from playslot_rl.config.compose import compose
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("thin_resnets")]
 
 FEW = ("lapo", "laom", "caddy_policy")
 """They see the labels of three demonstrations only."""

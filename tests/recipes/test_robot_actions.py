@@ -24,7 +24,7 @@ from playslot_rl.runs import Run
 from playslot_rl.sharing.folder import RANGE
 from playslot_rl.storage.tensors import load_tensors
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("thin_resnets")]
 
 TASK = ("env=video", "env.action_dim=6")
 STATE = ("act_state", "diffusion_state")
