@@ -25,12 +25,17 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 LONGEST = (
-    "recipes/test_robot_actions.py",
+    "recipes/test_baselines.py",
     "recipes/test_compare_video.py",
+    "methods/test_contract.py",
+    "methods/test_what_rows_see.py",
+    "recipes/test_robot_actions.py",
     "faults/test_every_command.py",
+    "training/test_several_processes.py",
     "recipes/test_several_processes.py",
     "test_docs_site.py",
-    "recipes/test_baselines.py",
+    "test_docs_python.py",
+    "golden/test_identities.py",
     "recipes/test_compare.py",
     "hub/test_circle.py",
 )
