@@ -86,18 +86,18 @@ demo: $(STAMP)
 	@$(BIN)/playslot demo $(ARGS)
 
 test: $(STAMP)
-	@$(BIN)/python -m pytest -m "not integration and not slow and not browser" -n $(CORES) $(PARALLEL) $(ARGS)
+	@$(BIN)/python -m pytest -m "not integration and not slow and not browser and not gpu" -n $(CORES) $(PARALLEL) $(ARGS)
 
 test-integration: $(STAMP)
-	@$(BIN)/python -m pytest -m "integration and not slow and not browser" -n $$(($(CORES) + 1)) $(PARALLEL) $(ARGS)
+	@$(BIN)/python -m pytest -m "integration and not slow and not browser and not gpu" -n $$(($(CORES) + 1)) $(PARALLEL) $(ARGS)
 
 # Both at once, as .ci/run takes them: workers that wait for processes leave the cores to the quick ones.
 test-most: $(STAMP)
-	@$(BIN)/python -m pytest -m "not slow and not browser" -n $$(($(CORES) + 1)) $(PARALLEL) $(ARGS)
+	@$(BIN)/python -m pytest -m "not slow and not browser and not gpu" -n $$(($(CORES) + 1)) $(PARALLEL) $(ARGS)
 
 # The slow ones kill processes and count on time: one after the other.
 test-all: test test-integration
-	@$(BIN)/python -m pytest -m "slow and not browser" $(ARGS)
+	@$(BIN)/python -m pytest -m "slow and not browser and not gpu" $(ARGS)
 
 # Playwright (161 MB) is installed here only. The browser is the system's: Playwright's own need not be downloaded.
 test-browser: $(STAMP)
@@ -111,7 +111,7 @@ test-browser: $(STAMP)
 
 # On a machine with a GPU.
 test-gpu: $(STAMP)
-	@$(BIN)/python -m pytest -m gpu $(ARGS)
+	@$(BIN)/python -m pytest tests/gpu -m gpu $(ARGS)
 
 lint: $(STAMP) typing
 	@$(BIN)/ruff check .

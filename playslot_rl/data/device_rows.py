@@ -1,8 +1,8 @@
 """Rows of a data set on the device that computes.
 
 On a GPU all rows are put into its memory once, where they fill at most half of what is free; a batch is then a gather
-there, and the host only draws the numbers of the rows. Otherwise the rows of a batch are copied there from pinned
-memory, while the GPU still computes what came before.
+there, and the host only draws the numbers of the rows. Otherwise the rows of a batch are gathered in pinned memory
+while the GPU still computes what came before, and then copied.
 
 Shapes: F rows, each (...).
 """
@@ -54,6 +54,7 @@ class DeviceRows:
     def _table(self) -> Tensor | None:
         one = self.host(np.arange(1))
         free, _ = torch.cuda.mem_get_info(self.device)
+        free += torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)  # torch's own cache
         if one.nbytes * self.count > SHARE * free:
             return None
         table = torch.empty(self.count, *one.shape[1:], dtype=one.dtype, device=self.device)

@@ -97,7 +97,8 @@ class ActionDecoder(nn.Module):
             return self.action_range.pinned(torch.tanh(self.layers(inputs)))
         state = self.encoder(slots)
         if self.training and self.dropout:
-            drawn = own_noise((*state.shape[:-1], 1), lambda shape: torch.rand(shape, device=state.device))
+            device = state.device  # the draw may be kept, and is not to keep the state
+            drawn = own_noise((*state.shape[:-1], 1), lambda shape: torch.rand(shape, device=device))
             state = state * (drawn >= self.dropout)
         return self.action_range.pinned(torch.tanh(self.seeing(torch.cat((inputs, state), dim=-1))))
 

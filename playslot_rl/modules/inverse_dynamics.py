@@ -135,9 +135,8 @@ class InverseDynamics(nn.Module):
         mean, variance = mu[:, 1:] - mu[:, :-1], var[:, 1:] + var[:, :-1]
         z = mean
         if self.training or self.config.sample:
-            noise = own_noise(
-                mean.shape, lambda s: torch.randn(s, generator=generator, device=mean.device, dtype=mean.dtype)
-            )
+            device, dtype = mean.device, mean.dtype  # the draw may be kept, and is not to keep the mean
+            noise = own_noise(mean.shape, lambda s: torch.randn(s, generator=generator, device=device, dtype=dtype))
             z = mean + variance.sqrt() * noise
         return self._compose(z, mean)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import inspect
 import itertools
 import traceback
@@ -23,6 +24,7 @@ from playslot_rl.errors import first_line
 SHAPES: Final = 8
 """Graphs that are kept, of the shapes used last."""
 PACKAGE: Final = str(Path(__file__).parents[1])
+_failed: Final[list[torch.cuda.CUDAGraph]] = []
 _capturing: ContextVar[bool] = ContextVar("capturing", default=True)
 Key = tuple[object, ...]
 
@@ -42,14 +44,31 @@ def recorded[Result](compute: Callable[[], Result], stream: torch.cuda.Stream) -
     computed, always in the same place. Raises the error of torch where it cannot be recorded (`stopped_at`).
     """
     graph = torch.cuda.CUDAGraph()
+    try:
+        return graph.replay, _captured(graph, compute, stream)
+    except BaseException:
+        # The random generator is left as in a capture, so that draws and replays of other graphs fail: the end of a
+        # capture that succeeds sets it right. The allocator keeps pointing at the graph.
+        _failed.append(graph)
+        with contextlib.suppress(RuntimeError):
+            _captured(torch.cuda.CUDAGraph(), lambda: torch.zeros(1, device=stream.device), stream)
+        raise
+
+
+def _captured[Result](graph: torch.cuda.CUDAGraph, compute: Callable[[], Result], stream: torch.cuda.Stream) -> Result:
+    collects = gc.isenabled()
     # The outer stream is there to be put back: a capture that fails does not.
     with (
         torch.cuda.device(stream.device),
         torch.cuda.stream(stream),
         torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
     ):
-        result = compute()
-    return graph.replay, result
+        gc.disable()  # it could destroy an older graph, which a capture may not see
+        try:
+            return compute()
+        finally:
+            if collects:
+                gc.enable()
 
 
 def stopped_at(error: BaseException) -> str:

@@ -125,6 +125,7 @@ class Steps:
         self._replay: Callable[[], None] | None = None
         self._phase: Hashable = None
         self._taken = 0
+        self._said = False
         self._inputs: dict[str, Tensor] = {}
         self._values: dict[str, Tensor] = {}
         self._trouble = torch.full((3,), -1.0, device=self.device)
@@ -184,6 +185,7 @@ class Steps:
     def _captured(self, step: int) -> dict[str, Tensor]:
         phase = self.stage.phase(step) if isinstance(self.stage, PhasedStage) else "all"
         if phase is None:
+            self._refused("these steps compute something else each time, or wait for values")
             return self._written(step)
         if phase != self._phase:
             self._replay, self._phase, self._taken = None, phase, 0
@@ -226,13 +228,18 @@ class Steps:
         except RuntimeError as error:
             if out_of_memory(error):
                 raise
-            reason = f"{self.name}: a step could not be captured at {stopped_at(error)}"
-            if self.config.execution == "graph":
-                raise TrainingError(f"{reason}: use {self.key}.execution=eager") from error
-            warnings.warn(f"{reason}; its kernels are launched one by one", RuntimeWarning, stacklevel=2)
+            self._refused(f"a step could not be captured at {stopped_at(error)}", error)
             self.captures = False
             return None
         return replay
+
+    def _refused(self, why: str, error: RuntimeError | None = None) -> None:
+        """Say once why steps are not captured; an error where `execution` is `graph`."""
+        if self.config.execution == "graph":
+            raise TrainingError(f"{self.name}: {why}: use {self.key}.execution=auto") from error
+        if not self._said:
+            self._said = True
+            warnings.warn(f"{self.name}: {why}; their kernels are launched one by one", RuntimeWarning, stacklevel=3)
 
     def _captures(self) -> bool:
         """Whether steps are to be captured, by the setting and by what there is."""

@@ -16,6 +16,7 @@ from tiny_stages import CADDY_STEPS, STAGES, in_double
 from torch import Tensor
 
 from playslot_rl.acting.imagination import ImaginationSession
+from playslot_rl.config import StageConfig
 from playslot_rl.errors import TrainingError
 from playslot_rl.runtime.captured import Captured
 from playslot_rl.seeds.draws import step_generator
@@ -51,7 +52,8 @@ def part_of(name: str, **settings: Any) -> Part:
     part = STAGES[name]()
     steps = CADDY_STEPS if name == "caddy" else STEPS
     config = replace(part.config, steps=steps, checkpoint_every=steps // 2, validate_every=steps // 2, **settings)
-    part.stage.config = config  # type: ignore[attr-defined]
+    if isinstance(getattr(part.stage, "config", None), StageConfig):
+        part.stage.config = config  # type: ignore[attr-defined]
     return replace(part, config=config)
 
 
@@ -74,7 +76,7 @@ def difference(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:
 @pytest.mark.parametrize("name", STAGES)
 def test_captured_steps_end_with_the_weights_of_the_written_ones(name: str, tmp_path: Path) -> None:
     with warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)  # a step that could not be captured warns
+        warnings.filterwarnings("error", message=".* could not be captured", category=RuntimeWarning)
         captured = trained(name, tmp_path / "graph", "auto")
     assert difference(trained(name, tmp_path / "eager", "eager"), captured) <= SAME
 
@@ -126,6 +128,34 @@ def test_a_step_that_is_not_finite_is_skipped_and_named(tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match=r"loss is nan at step 14, expected a finite number"):
         fit(part, tmp_path, seed=3, device="cuda")
     assert all(bool(value.isfinite().all()) for value in module_tensors(stage.modules).values())
+
+
+def test_a_step_that_cannot_be_captured_is_taken_as_it_is_written(tmp_path: Path) -> None:
+    """Also one that draws from the default generator, and while graphs of others live on."""
+    layer = torch.nn.Linear(4, 4, device="cuda").requires_grad_(False)
+    captured, x = Captured(layer.forward, layer), torch.ones(2, 4, device="cuda")
+
+    def ended(execution: str) -> dict[str, Tensor]:
+        part = part_of("decoder", execution=execution)
+        original = part.stage.loss
+
+        def loss(batch: Any, step: int, generators: Any) -> Any:
+            found = original(batch, step, generators)
+            drawn = torch.rand((), device="cuda")
+            float(drawn)  # waits, which a capture cannot
+            return {key: value * (1 + drawn) for key, value in found.items()}
+
+        part.stage.loss = loss  # type: ignore[method-assign]
+        fit(part, tmp_path / execution, seed=3, device="cuda")
+        return {key: value.cpu().clone() for key, value in module_tensors(part.stage.modules).items()}
+
+    with torch.no_grad():
+        expected = [captured(x).clone() for _ in range(3)][-1]
+        with pytest.warns(RuntimeWarning, match=r"could not be captured at `.*`: .*; their kernels are launched"):
+            refused = ended("auto")
+        assert torch.equal(captured(x), expected)
+    assert difference(ended("eager"), refused) <= SAME
+    assert torch.rand(2, device="cuda").isfinite().all()
 
 
 def test_a_captured_function_is_the_function() -> None:

@@ -36,6 +36,12 @@ from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.caddy.method import CADDYConfig
 from playslot_rl.methods.caddy.model import CADDY
 from playslot_rl.methods.caddy.stage import CADDYStage
+from playslot_rl.methods.clam.method import CLAMConfig
+from playslot_rl.methods.clam.model import Forward, Inverse
+from playslot_rl.methods.clam.training import CLAMStage
+from playslot_rl.methods.frozen_encoder.method import AutoencoderBCConfig
+from playslot_rl.methods.frozen_encoder.network import Autoencoder
+from playslot_rl.methods.frozen_encoder.training import EncoderStage
 from playslot_rl.methods.laom.method import LAOMConfig
 from playslot_rl.methods.laom.training import LAOMStage
 from playslot_rl.methods.laom.training import built as laom_built
@@ -237,6 +243,23 @@ def laom() -> Part:
     return Part("laom", LAOMStage(model.to(DEVICE), target.to(DEVICE), videos, labelled, own), own.model)
 
 
+def clam() -> Part:
+    own = CLAMConfig(channels=(4, 8), hidden=16, latent_dim=4, model=_plain())
+    with global_seed(0, 0, "test"):
+        inverse, forward = Inverse(own, 16).to(DEVICE), Forward(own).to(DEVICE)
+        decoder = ActionDecoder(ActionDecoderConfig(hidden_dim=8), 4, 2).to(DEVICE)
+    videos = clips(16, 2)
+    labelled = LabelledMoves(videos.source, ExperimentConfig(env=EnvConfig(action_dim=2)), DEVICE)
+    return Part("clam", CLAMStage(inverse, forward, decoder, videos, labelled, own), own.model)
+
+
+def autoencoder() -> Part:
+    own = AutoencoderBCConfig(channels=(4, 8, 8, 8), model=_plain())
+    with global_seed(0, 0, "test"):
+        network = Autoencoder(own).to(DEVICE)
+    return Part("autoencoder", EncoderStage("autoencoder", network, clips(32, 1), own.model), own.model)
+
+
 @contextlib.contextmanager
 def in_double(wanted: bool) -> Iterator[None]:
     """Compute everything in double precision, also what the library says is float32."""
@@ -275,4 +298,6 @@ STAGES: dict[str, Callable[[], Part]] = {
     "caddy": caddy,
     "lapo": lapo,
     "laom": laom,
+    "clam": clam,
+    "autoencoder": autoencoder,
 }
