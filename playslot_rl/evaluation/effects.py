@@ -235,7 +235,7 @@ def effect_lines(
     if not model.inverse_dynamics.latent_dim:
         return [line(key, None, NO_LATENTS) for key, m in MEASURES.items() if m.group == EFFECTS], {}, shown
     moved = displacements(start.labels, true.labels, n)
-    lines, details = _transfer(shown, moved, n)
+    lines, details = transfer_lines(shown, moved, n)
     constancy, held, table = _constancy(model, windows, used)
     sensitivity, region = _sensitivity(shown, details["moving_slots"])
     details |= {"prototypes": table, "steps": windows.latents.shape[1], "windows": len(first)}
@@ -243,7 +243,7 @@ def effect_lines(
     return [*lines, constancy, *sensitivity], details, shown
 
 
-def _transfer(shown: Replayed, moved: npt.NDArray[np.float64], n: int) -> tuple[list[Line], dict[str, Any]]:
+def transfer_lines(shown: Replayed, moved: npt.NDArray[np.float64], n: int) -> tuple[list[Line], dict[str, Any]]:
     count, steps = moved.shape[0], shown.windows.latents.shape[1]
     what = f"{count} windows of {steps} steps"
     own = agreement(moved, displacements(shown.start.labels, shown.own.labels, n))
@@ -256,11 +256,16 @@ def _transfer(shown: Replayed, moved: npt.NDArray[np.float64], n: int) -> tuple[
     alike = agreement(moved, elsewhere)
     wrong, mover = moved[shown.windows.thirds], same_mover(moved, elsewhere)
     chance = same_mover(wrong, elsewhere)
+    said = (
+        "no other window to compare with moves"
+        if chance is None
+        else f"with the motion of another window: {chance:.2f}"
+    )
     return [
         *lines,
         line("transfer", alike, what if alike is not None else STILL),
         line("transfer_shuffled", agreement(wrong, elsewhere), what if alike is not None else STILL),
-        line("same_slot", mover, STILL if mover is None else f"with the motion of another window: {chance:.2f}"),
+        line("same_slot", mover, STILL if mover is None else said),
     ], details
 
 

@@ -71,17 +71,24 @@ def hold_out(source: EpisodeFrames, metas: Mapping[str, Mapping[str, Any]], conf
 def _candidates(
     source: EpisodeFrames, metas: Mapping[str, Mapping[str, Any]], config: DataConfig, usable: Ints
 ) -> tuple[Ints, str, bool]:
-    trained = [str(metas.get(stage, {}).get("data", {}).get("train", "")) for stage in ("slots", "dynamics")]
-    if source.fingerprint in trained:
-        # Both stages split alike: by the seed they were trained with.
-        seed = int(metas["dynamics"].get("seed", 0))
-        held = split_episodes(source.episodes, config.validation, seed)[1]
-        if config.validation > 0 and len(chosen := np.intersect1d(held, usable)):
+    world = [metas[stage] for stage in ("slots", "dynamics") if stage in metas]
+    trained = [meta for meta in world if str(meta.get("data", {}).get("train", "")) == source.fingerprint]
+    if trained:
+        chosen = usable
+        for meta in trained:  # each stage holds out by its own seed; checkpoints of before say no share
+            share = float(meta.get("validation", config.validation))
+            held = split_episodes(source.episodes, share, int(meta.get("seed", 0)))[1] if share > 0 else usable[:0]
+            chosen = np.intersect1d(chosen, held)
+        if len(chosen):
             return chosen, "the world model's own videos, the episodes that its validation held out", True
         return usable[-max(1, len(usable) // 4) :], "the world model's own videos, none of which were held out", False
     last = _policy_held_out(source, metas.get("policy", {}), config)
     if len(chosen := usable[usable >= source.episodes - last]):
-        return chosen, f"the last {last} episodes, which are held out from training", True
+        unseen = bool(world) and all(int(meta.get("held_out", 0)) >= last for meta in world)
+        why = (
+            "training" if unseen else "the policy's training; the checkpoints do not say whether the world model's, too"
+        )
+        return chosen, f"the last {last} episodes, which are held out from {why}", unseen
     if len(chosen := usable[usable >= source.episodes - config.held_out]):
         return chosen, f"the last {config.held_out} episodes, as data.held_out says", False
     what = "the last quarter of the episodes; the checkpoints do not say whether the world model was trained on them"

@@ -17,7 +17,7 @@ from torchrl.objectives import LossModule
 
 from playslot_rl import keys
 from playslot_rl.config import DynamicsStageConfig
-from playslot_rl.frames import normalise
+from playslot_rl.frames import normalise, psnr
 from playslot_rl.losses.common import batch_psnr, draw_frames, of_frames
 from playslot_rl.modules.inverse_dynamics import InverseDynamics, LatentActions
 from playslot_rl.modules.predictors import Predictor
@@ -125,19 +125,26 @@ class DynamicsLoss(LossModule):
         else:
             predicted = self.predictor.rollout(slots[:, :seed], p, v)
         mse_slot = (predicted - slots[:, 1:]).square().mean()
-        mse_image = self._image(predicted, tensordict.get(self.tensor_keys.pixels)[:, 1:], generator)
-        return self._collect(mse_image, mse_slot, latent)
+        mse_image, decibels = self._image(predicted, tensordict.get(self.tensor_keys.pixels)[:, 1:], generator)
+        return self._collect(mse_image, decibels, mse_slot, latent)
 
-    def _image(self, predicted: Tensor, pixels: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Image error of predictions (B, T-1, N, D) against the frames (B, T-1, 3, H, W) that follow."""
-        batch, steps = predicted.shape[:2]
-        chosen = draw_frames(batch, steps, self.config.decoded_frames, generator)
+    def _image(self, predicted: Tensor, pixels: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        """Image error of predictions (B, T-1, N, D) against the frames (B, T-1, 3, H, W) that follow, and PSNR: in
+        training that of the error, else the mean over every frame past the seed, clamped to [0, 1].
+        """
+        training, (batch, steps) = self.predictor.training, predicted.shape[:2]
+        chosen = draw_frames(batch, steps, self.config.decoded_frames, generator) if training else None
         if chosen is not None:
             predicted, pixels = of_frames(predicted, chosen), of_frames(pixels, chosen)
         frames = normalise(pixels.to(predicted.device))
-        return (self.savi.decode(predicted).frames - frames).square().mean()
+        decoded = self.savi.decode(predicted).frames
+        mse = (decoded - frames).square().mean()
+        if training:
+            return mse, batch_psnr(mse)
+        errors = (decoded.detach().clamp(0, 1) - frames).square().mean(dim=(2, 3, 4))
+        return mse, psnr(errors[:, self.config.seed_frames - 1 :]).mean()
 
-    def _collect(self, mse_image: Tensor, mse_slot: Tensor, latent: LatentActions) -> TensorDict:
+    def _collect(self, mse_image: Tensor, decibels: Tensor, mse_slot: Tensor, latent: LatentActions) -> TensorDict:
         config, k = self.config, max(self.inverse_dynamics.n_prototypes, 1)
         used, perplexity = usage(latent.code.detach(), k)
         return TensorDict(
@@ -147,7 +154,7 @@ class DynamicsLoss(LossModule):
                 "loss_vq": config.vq_weight * latent.vq_loss,
                 "mse_image": mse_image.detach(),
                 "mse_slot": mse_slot.detach(),
-                "psnr": batch_psnr(mse_image),
+                "psnr": decibels,
                 "usage": used,
                 "perplexity": perplexity,
             },

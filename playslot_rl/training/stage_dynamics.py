@@ -97,7 +97,7 @@ class DynamicsStage:
         return {"loss": total_loss(out), "loss_vq": out["loss_vq"], **logged}
 
     def validate(self, step: int) -> Mapping[str, float]:
-        """Errors of autoregressive rollouts on held-out clips, with the latents' means, in fp32."""
+        """Errors of autoregressive rollouts on held-out clips, with the latents' means, in fp32, all frames decoded."""
         self.model.savi.precision = "fp32"
         names = ("mse_image", "mse_slot", "psnr", "usage", "perplexity")
 

@@ -176,14 +176,23 @@ def test_the_world_models_own_videos_are_measured_where_its_validation_was(model
     assert not np.intersect1d(found.tested, found.fitted).size
     none = hold_out(videos(), metas, DataConfig(validation=0.0), 100)
     assert not none.known
+    stored = {"dynamics": metas["dynamics"] | {"validation": 0.5}}
+    assert hold_out(videos(), stored, DataConfig(validation=0.25), 100).tested.tolist() == (
+        split_episodes(EPISODES, 0.5, 4)[1].tolist()
+    )
+    both = {stage: {"data": {"train": "print"}, "seed": seed} for stage, seed in (("slots", 0), ("dynamics", 4))}
+    shared = np.intersect1d(*(split_episodes(EPISODES, 0.5, seed)[1] for seed in (0, 4)))
+    assert hold_out(videos(), both, DataConfig(validation=0.5), 100).tested.tolist() == shared.tolist() != []
 
 
 def test_the_policys_demonstrations_are_measured_on_those_it_held_out() -> None:
     source = videos()
     trained = split_demonstrations(source, 8, 3, 3, 0).trained.fingerprint
     policy = {"data": {"demos": trained}, "demos": 8, "held_out_demos": 3, "seed": 0}
-    found = hold_out(source, {"policy": policy}, DataConfig(), 100)
-    assert (found.tested.tolist(), found.known) == ([9, 10, 11], True)
+    for held_out, known in ((3, True), (2, False)):
+        metas = {"policy": policy, "slots": {"held_out": held_out}, "dynamics": {"held_out": 3}}
+        found = hold_out(source, metas, DataConfig(), 100)
+        assert (found.tested.tolist(), found.known) == ([9, 10, 11], known)
     assert hold_out(source, {"policy": policy | {"demos": 7}}, DataConfig(), 100).known is False
     named = hold_out(source, {}, DataConfig(held_out=2), 100)
     assert (named.tested.tolist(), named.known) == ([10, 11], False)

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from playslot_rl.evaluation.effects import (
+    Drawn,
+    Replayed,
+    Windows,
     agreement,
     centroids,
     change_in,
@@ -14,6 +18,7 @@ from playslot_rl.evaluation.effects import (
     moving_slots,
     same_mover,
     squared_change,
+    transfer_lines,
 )
 
 
@@ -88,3 +93,15 @@ def test_change_inside_a_region_is_one_spread_evenly_zero() -> None:
 def test_squared_change_is_in_units_of_the_range() -> None:
     black, white = np.zeros((1, 2, 2, 3), np.uint8), np.full((1, 2, 2, 3), 255, np.uint8)
     assert squared_change(black, white).tolist() == [[[1.0, 1.0], [1.0, 1.0]]]
+
+
+def test_a_window_that_moves_alone_has_no_other_to_compare_with() -> None:
+    start = np.stack([square(2, 2)] * 3)
+    true = np.stack([square(20, 2), *start[1:]])
+    elsewhere = np.array([1, 0, 0])
+    windows = Windows(
+        torch.zeros(3, 6, 2, 4), torch.zeros(3, 5, 4), np.zeros((3, 6, 32, 32, 3), np.uint8), elsewhere, elsewhere + 1
+    )
+    drawn = [Drawn(np.zeros((3, 32, 32, 3), np.uint8), labels) for labels in (start, true, true, true)]
+    lines, _ = transfer_lines(Replayed(windows, *drawn, None), displacements(start, true, 2), 2)
+    assert lines[-1].note == "no other window to compare with moves"

@@ -69,9 +69,24 @@ def test_the_image_loss_on_a_random_subset_is_unbiased() -> None:
     model, batch = model_of(), clips(2)
     full = loss_of(model).eval()(batch)["mse_image"]
     some = loss_of(model, replace(CONFIG, decoded_frames=2)).eval()
+    model.predictor.train()  # without dropout: it says that some are drawn
     draws = torch.stack([some(batch, generator=seeded(seed))["mse_image"] for seed in range(60)])
     assert draws.std() > 0
     assert (draws.mean() - full).abs() < 4 * draws.std() / 60**0.5
+
+
+@torch.no_grad()
+def test_what_validates_is_the_mean_psnr_of_every_clamped_frame_past_the_seed() -> None:
+    model, batch = model_of(), clips(2)
+    judged = loss_of(model, replace(CONFIG, decoded_frames=1)).eval()(batch)["psnr"]
+    latent = model.inverse_dynamics(batch[keys.SLOTS])
+    predicted = model.predictor.rollout(
+        batch[keys.SLOTS][:, : CONFIG.seed_frames], latent.prototype, latent.variability
+    )
+    frames = model.savi.decode(predicted).frames.clamp(0, 1)[:, CONFIG.seed_frames - 1 :]
+    true = batch[keys.PIXELS][:, CONFIG.seed_frames :].float() / 255
+    each = -10 * ((frames - true).square().mean((2, 3, 4)) + 1e-8).log10()
+    assert judged == pytest.approx(float(each.mean()), abs=1e-4)
 
 
 @torch.no_grad()

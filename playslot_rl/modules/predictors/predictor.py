@@ -29,6 +29,7 @@ class Predictor(Protocol):
     """Predicts the slots of the next frame; `context` is how many frames it sees at most."""
 
     context: int
+    training: bool
 
     def __call__(self, slots: Tensor, *condition: Tensor, valid: Tensor | None = None) -> Tensor:
         """Slots (B, T, N, D) of the frame after each given one (B, T, N, D), T at most the context, in one parallel
