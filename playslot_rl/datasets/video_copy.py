@@ -125,7 +125,7 @@ class VideoCopier:
         self._finish()
         self._frames, self._bytes, self._last_dts = 0, 0, -(2**62)
         self._out = av.open(str(self._next_path()), "w", format="mp4")
-        self._stream = self._out.add_stream_from_template(template)
+        self._stream = self._out.add_stream_from_template(template, opaque=True)
         self._stream.time_base = template.time_base
 
     def _next_path(self) -> Path:

@@ -19,7 +19,7 @@ def foreign_frames(size: int = 32) -> list[np.ndarray[Any, Any]]:
 
 
 def write_foreign(
-    root: Path, dtype: str, size: int = 32, cameras: tuple[str, ...] = ("top",), die: bool = False
+    root: Path, dtype: str, size: int = 32, cameras: tuple[str, ...] = ("top",), die: bool = False, codec: str = "h264"
 ) -> Path:
     """A data set that is not ours: other names, no seed, no last-observation flag."""
     from lerobot.configs.video import RGBEncoderConfig
@@ -34,7 +34,8 @@ def write_foreign(
         for name in cameras
     }
     features["action"] = {"dtype": "float32", "shape": (2,), "names": ["x", "y"]}
-    encoder = RGBEncoderConfig(vcodec="h264", pix_fmt="yuv444p", crf=0) if dtype == "video" else None
+    lossless = {"vcodec": "h264", "pix_fmt": "yuv444p", "crf": 0}
+    encoder = RGBEncoderConfig(**lossless if codec == "h264" else {"vcodec": codec}) if dtype == "video" else None
     dataset = LeRobotDataset.create("me/foreign", fps=10, features=features, root=root, use_videos=dtype == "video",
                                     rgb_encoder=encoder)  # fmt: skip
     for episode in foreign_frames(size):

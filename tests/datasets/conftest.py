@@ -25,6 +25,15 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def av1(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same as LeRobot encodes by default; look, do not touch."""
+    from foreign import write_foreign
+
+    cameras = ("top", "side")
+    return write_foreign(tmp_path_factory.mktemp("set") / "av1", "video", size=64, cameras=cameras, codec="libsvtav1")
+
+
+@pytest.fixture(scope="session")
 def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two random episodes of our own collector, of three agent steps; look, do not touch."""
     from playslot_rl.collectors import collect

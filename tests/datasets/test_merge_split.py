@@ -65,7 +65,9 @@ def test_merged_images_are_the_sources_in_order(images: Path, other: Path, tmp_p
 
 
 @pytest.mark.integration
-def test_merged_videos_are_not_encoded_again(video: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["video", "av1"])
+def test_merged_videos_are_not_encoded_again(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    video: Path = request.getfixturevalue(kind)
     again = Path(shutil.copytree(video, tmp_path / "again"))
     merge([video, again], tmp_path / "all")
     for camera in (CAMERA, "observation.images.side"):
