@@ -32,7 +32,7 @@ STAGES: Final = {"savi_step": "slots", "dynamics_step": "dynamics", "policy_step
 CASES: Final = (*STAGES, "plan_step", "play_step")
 WAYS: Final = ("eager", "captured", "compiled")
 """Kernels launched one by one; in CUDA graphs; in graphs, SAVi's made by torch.compile, as the commands have it."""
-UNITS: Final = {"": "s", "_memory": "GiB", "_arithmetic": "TFLOP", "_batch": "rows"}
+UNITS: Final = {"": "s", "_memory": "GiB", "_share": "% of the peak arithmetic", "_arithmetic": "TFLOP", "_batch": "rows"}
 STEPS: Final = 10
 """Timed steps in a row; searches and games are timed `GAMES` times."""
 GAMES: Final = 3
@@ -63,7 +63,7 @@ def measure(device: torch.device, threads: int, quick: bool, say: Say) -> Figure
                 except (RuntimeError, ConfigError) as error:
                     say(f"{case}: {name} is left out: {explain(error)}")
                     continue
-                found[case][name] = took
+                found[case][name], found[f"{case}_share"][name] = took, 100 * arithmetic / took / peak
                 if memory is not None:
                     found[f"{case}_memory"][name] = memory / 2**30
     own: dict[str, Any] = {"gpu": torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)}

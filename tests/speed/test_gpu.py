@@ -54,13 +54,15 @@ def test_every_case_has_its_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu, "precisions", lambda _: ("fp32",))
     said: list[str] = []
     found = gpu.measure(CPU, 1, quick=True, say=said.append)
-    assert found.pop("machine")["peak_tflops"] > 0
+    peak = found.pop("machine")["peak_tflops"]
     assert {name: entry.pop("unit") for name, entry in found.items()} == {
         f"{case}{of}": unit for case in gpu.CASES for of, unit in gpu.UNITS.items()
     }
     for case in gpu.CASES:
         assert found[case].keys() == {"smoke_fp32_eager"}
         assert found[f"{case}_arithmetic"]["smoke"] > 0
+        share = found[f"{case}_arithmetic"]["smoke"] / found[case]["smoke_fp32_eager"] / peak
+        assert found[f"{case}_share"] == {"smoke_fp32_eager": pytest.approx(100 * share)}
     assert not any("left out" in line for line in said)
 
 
