@@ -32,7 +32,13 @@ STAGES: Final = {"savi_step": "slots", "dynamics_step": "dynamics", "policy_step
 CASES: Final = (*STAGES, "plan_step", "play_step")
 WAYS: Final = ("eager", "captured", "compiled")
 """Kernels launched one by one; in CUDA graphs; in graphs, SAVi's made by torch.compile, as the commands have it."""
-UNITS: Final = {"": "s", "_memory": "GiB", "_share": "% of the peak arithmetic", "_arithmetic": "TFLOP", "_batch": "rows"}
+UNITS: Final = {
+    "": "s",
+    "_memory": "GiB",
+    "_share": "% of the peak arithmetic",
+    "_arithmetic": "TFLOP",
+    "_batch": "rows",
+}
 STEPS: Final = 10
 """Timed steps in a row; searches and games are timed `GAMES` times."""
 GAMES: Final = 3
