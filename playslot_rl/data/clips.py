@@ -45,7 +45,7 @@ class Clips:
         self.source, self.frames, self.shown, self.seed = source, frames, shown, seed
         self.resident = resident and not streams_of(source.frames)
         self._pixels: DeviceRows | None = None
-        self.train_episodes, held_out = split_episodes(source.episodes, validation, seed)
+        self.train_episodes, held_out = split_episodes(source.episodes, validation, seed, source.lengths >= frames)
         self.held_out = self.spread(held_out)
 
     def pixels(self, rows: IntArray, device: torch.device) -> Tensor:

@@ -79,14 +79,16 @@ def valid_starts(
     return first, valid
 
 
-def split_episodes(episodes: int, validation: float, seed: int) -> tuple[IntArray, IntArray]:
+def split_episodes(
+    episodes: int, validation: float, seed: int, usable: npt.ArrayLike = True
+) -> tuple[IntArray, IntArray]:
     """Split episode indices into training and validation, sorted, at random but always the same for a seed.
 
-    At least one is held out, if the fraction is not 0 and there are two; with none, validation is the training set.
+    At least one of the `usable` (bool (E,): long enough) is held out and one is not, if the fraction is not 0 and there
+    are two: then as many of the drawn order as that takes. With none, validation is the training set.
     """
-    held_out = round(episodes * validation)
-    if validation > 0 and episodes >= 2:
-        held_out = min(max(1, held_out), episodes - 1)
     order = np.random.default_rng(seed).permutation(episodes).astype(np.int64)
+    fits = np.flatnonzero(np.broadcast_to(usable, episodes)[order])
+    held_out = int(np.clip(round(episodes * validation), fits[0] + 1, fits[-1])) if validation and len(fits) > 1 else 0
     training = np.sort(order[held_out:])
     return training, np.sort(order[:held_out]) if held_out else training

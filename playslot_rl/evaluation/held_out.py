@@ -75,10 +75,10 @@ def _candidates(
     trained = [meta for meta in world if str(meta.get("data", {}).get("train", "")) == source.fingerprint]
     if trained:
         chosen = usable
-        for meta in trained:  # each stage holds out by its own seed; checkpoints of before say no share
-            share = float(meta.get("validation", config.validation))
-            held = split_episodes(source.episodes, share, int(meta.get("seed", 0)))[1] if share > 0 else usable[:0]
-            chosen = np.intersect1d(chosen, held)
+        for meta in trained:  # each stage holds out by its own seed and clips; checkpoints of before say no share
+            share, fits = float(meta.get("validation", config.validation)), source.lengths >= meta.get("clip_frames", 1)
+            training, _ = split_episodes(source.episodes, share, int(meta.get("seed", 0)), fits)
+            chosen = np.setdiff1d(chosen, training)
         if len(chosen):
             return chosen, "the world model's own videos, the episodes that its validation held out", True
         return usable[-max(1, len(usable) // 4) :], "the world model's own videos, none of which were held out", False

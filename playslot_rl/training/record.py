@@ -141,13 +141,13 @@ class StageRecord:
             )
         return split_demonstrations(self.videos, config.demos, data.held_out, most, data.draw)
 
-    @property
-    def seen(self) -> dict[str, Any]:
-        """For the checkpoint: how many episodes there are, which share of them validates, and how many of the
-        demonstrations were left out (`playslot_rl.evaluation.held_out`).
+    def seen(self, frames: int) -> dict[str, Any]:
+        """For the checkpoint of a stage that sees clips of so many frames: how many episodes there are, which share of
+        them validates, and how many of the demonstrations were left out (`playslot_rl.evaluation.held_out`).
         """
         data = self.config.data
-        return {"episodes": self.data.episodes, "validation": data.validation, "held_out": data.held_out}
+        shares = {"validation": data.validation, "held_out": data.held_out}
+        return {"episodes": self.data.episodes, **shares, "clip_frames": frames}
 
     def clips(self, frames: int, shown: int = 32) -> Clips:
         """Clips of the videos, some of their episodes (`data.validation`) held out; `shown` of these at most validate.

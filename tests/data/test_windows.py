@@ -63,6 +63,18 @@ def test_a_split_is_disjoint_complete_and_repeats() -> None:
     assert not np.array_equal(split_episodes(40, 0.1, seed=6)[1], validation)
 
 
+def test_a_split_has_an_episode_that_is_long_enough_on_each_side() -> None:
+    for seed in range(30):
+        usable = np.random.default_rng(seed).random(14) < 0.3
+        for validation in (0.05, 0.5, 0.95):
+            training, held_out = split_episodes(14, validation, seed, usable)
+            assert (len(np.intersect1d(training, held_out)) == 0) == (usable.sum() >= 2)
+            assert (usable[training].any() and usable[held_out].any()) or not usable.any()
+            whole = split_episodes(14, validation, seed)
+            if usable[whole[0]].any() and usable[whole[1]].any():  # nothing has to change
+                assert np.array_equal(held_out, whole[1])
+
+
 def test_small_splits_keep_one_episode_on_each_side() -> None:
     assert [len(part) for part in split_episodes(2, 0.05, 0)] == [1, 1]
     assert [len(part) for part in split_episodes(1, 0.05, 0)] == [1, 1]

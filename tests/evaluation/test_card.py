@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from squares import EPISODES, videos
+from squares import EPISODES, LENGTH, videos
 
 from playslot_rl.config import DataConfig
+from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import split_demonstrations
 from playslot_rl.data.windows import split_episodes
 from playslot_rl.errors import DataError
@@ -180,6 +181,11 @@ def test_the_world_models_own_videos_are_measured_where_its_validation_was(model
     assert hold_out(videos(), stored, DataConfig(validation=0.25), 100).tested.tolist() == (
         split_episodes(EPISODES, 0.5, 4)[1].tolist()
     )
+    lengths = np.where(np.isin(np.arange(EPISODES), split_episodes(EPISODES, 0.1, 4)[1]), 2, videos().lengths)
+    short, clip = replace(videos(), lengths=lengths), metas["dynamics"] | {"clip_frames": 3}
+    tested, clips = hold_out(short, {"dynamics": clip}, DataConfig(validation=0.1), 100).tested, Clips(short, 3, 0.1, 4)
+    assert sorted([*tested, *clips.train_episodes]) == list(range(EPISODES))
+    assert np.isin(clips.held_out[:, 0] // LENGTH, tested).all()
     both = {stage: {"data": {"train": "print"}, "seed": seed} for stage, seed in (("slots", 0), ("dynamics", 4))}
     shared = np.intersect1d(*(split_episodes(EPISODES, 0.5, seed)[1] for seed in (0, 4)))
     assert hold_out(videos(), both, DataConfig(validation=0.5), 100).tested.tolist() == shared.tolist() != []

@@ -26,7 +26,7 @@ def training(record: StageRecord) -> Training:
         )
 
     part = Part("dynamics", stage, own, patience=patience_of(own.patience, "mse_slot"), pace=record.pace)
-    extra = {**record.seen, **read}
+    extra = {**record.seen(stage.clips.frames), **read}
     return Training([part], record.device, said, extra=extra, identity=read)
 
 

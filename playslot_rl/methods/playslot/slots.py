@@ -32,6 +32,6 @@ def training(record: StageRecord) -> Training:
         [Part("slots", stage, own, patience=patience_of(own.patience, "mse"), pace=record.pace)],
         device,
         lambda metrics: f"slots: {metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {record.folder}",
-        extra={**record.seen, "agent_steps": int((source.lengths - 1).sum()), **started},
+        extra={**record.seen(own.clip_frames), "agent_steps": int((source.lengths - 1).sum()), **started},
         identity=started,
     )
