@@ -258,7 +258,6 @@ class GymTask(PixelTask):
 
     @classmethod
     def actions_of(cls, config: EnvConfig) -> int:
-        """Width of its actions."""
         return facts(config.id).actions
 
     @classmethod

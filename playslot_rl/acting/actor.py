@@ -118,7 +118,6 @@ class SlotActor(Actor):
         return memory.update(told(seeds, self.tasks))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Parse, then act."""
         return self.heads(self.parser(tensordict))
 
 
@@ -130,7 +129,6 @@ class ReactiveActor(Actor):
         self.module = module
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The module's action."""
         return self.module(tensordict)
 
 
@@ -159,7 +157,6 @@ class ExpertActor(Actor):
         super().__init__(reads=(keys.EXPERT_ACTION,))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The expert's action."""
         return tensordict.set(keys.ACTION, tensordict.get(keys.EXPERT_ACTION))
 
 

@@ -61,12 +61,10 @@ class _CloningLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Keys that are read."""
         return [*self.observed, self.tensor_keys.action]
 
     @property
     def out_keys(self) -> list[NestedKey]:
-        """Keys that are written."""
         return [self.out_name]
 
     def forward(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDictBase:  # noqa: ARG002

@@ -91,7 +91,6 @@ class DynamicsLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Keys that are read."""
         names = self.tensor_keys
         return [names.slots, names.pixels, *([names.action] if self.needs_actions else [])]
 

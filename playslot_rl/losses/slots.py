@@ -67,7 +67,6 @@ class SlotsLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Keys that are read."""
         return [self.tensor_keys.pixels]
 
     def forward(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDictBase:

@@ -169,7 +169,6 @@ class Run:
     # Networks, restored in evaluation mode, without gradients
 
     def load_savi(self, device: torch.device | str = "cpu") -> SAVi:
-        """SAVi."""
         from playslot_rl.modules.savi import SAVi
 
         slots = self.stage("slots")

@@ -44,7 +44,6 @@ class Models:
     rows: list[dict[str, Any]]
 
     def lines(self) -> list[str]:
-        """A block of lines a model."""
         lines: list[str] = []
         for row in self.rows:
             width = max(map(len, row))
@@ -52,7 +51,6 @@ class Models:
         return [*lines, "playslot_rl.load('pretrained/NAME') and run=pretrained/NAME load one of them"]
 
     def to_json(self) -> str:
-        """A list of objects."""
         return json.dumps(self.rows, indent=2)
 
 

@@ -170,7 +170,6 @@ class _Run:
 
     @property
     def ended(self) -> bool:
-        """Whether there is nothing left to do."""
         patient = self.patience is None or not self.patience.ended(self.state)
         return self.state.step >= self.planned or not patient
 

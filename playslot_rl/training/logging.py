@@ -149,7 +149,6 @@ class Watch:
 
     @property
     def shows_pictures(self) -> bool:
-        """Whether there is a backend."""
         return self._logger is not None
 
     def warn(self, step: int, warnings: Mapping[str, str]) -> None:
@@ -202,7 +201,6 @@ class Watch:
                 raise self.not_finite(key, "not finite", when)
 
     def not_finite(self, what: str, got: str, when: str) -> TrainingError:
-        """The error of a number that is not finite."""
         last = self.checkpoints.last()
         kept = f"the last good checkpoint is {last}" if last else "there is no checkpoint yet"
         return TrainingError(

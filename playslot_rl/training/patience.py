@@ -33,7 +33,6 @@ class Patience:
     watched: str
 
     def ended(self, state: TrainingState) -> bool:
-        """Whether the error has not fallen for P validations."""
         return state.stale >= self.checks
 
     def judge(self, state: TrainingState, modules: Mapping[str, nn.Module], folder: Path) -> TrainingState:

@@ -40,7 +40,6 @@ class Training:
     adopt: Callable[[], None] | None = None
 
     def carry_out(self, record: StageRecord, begin: Callable[[], None]) -> StageCheckpoint:
-        """See `Prepared`."""
         return _train(record, self, begin)
 
 

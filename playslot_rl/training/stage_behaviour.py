@@ -85,7 +85,6 @@ class SeenSlots:
         return cls(slots, rows, None if demos.task is None else demos.task[rows])
 
     def inputs(self, noise: float = 0.0, stream: str = "noise") -> Inputs:
-        """What a policy reads of them."""
         return PairedInputs.told(TensorInputs(self.slots, noise, stream), self.task)
 
 
@@ -143,11 +142,9 @@ class CloneStage:
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """Policy, and oracle if there is one."""
         return {name: stage.criterion.network for name, stage in self.stages.items()}
 
     def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
-        """Those of the networks."""
         return together({name: stage.batch(step, generators) for name, stage in self.stages.items()})
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
@@ -295,7 +292,6 @@ class JointStage:
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """Policy and action decoder."""
         return {"policy": self.policy, "action_decoder": self.decoder}
 
     def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
@@ -305,14 +301,12 @@ class JointStage:
         )
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
-        """Errors of actions and of latents."""
         labelled = apart(batch, "acting")
         action = torch.stack([part.loss(labelled, step, generators)["loss"] for part in self.acting]).sum()
         latent = self.clone.loss(apart(batch, "cloning"), step, generators)["loss"]
         return {"loss": action + latent, "action": action, "latent": latent}
 
     def validate(self, step: int) -> Mapping[str, float]:
-        """Unexplained fraction of the actions' variance."""
         return self.acting[0].validate(step)
 
 

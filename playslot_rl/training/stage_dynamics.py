@@ -68,7 +68,6 @@ class DynamicsStage:
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """InvDyn and cOCVP."""
         return {"inverse_dynamics": self.model.inverse_dynamics, "predictor": self.model.predictor}
 
     @property
@@ -88,7 +87,6 @@ class DynamicsStage:
         return {keys.SLOTS: self._parsed(frames, generators), keys.PIXELS: frames}
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
-        """Image, slot and quantiser loss of one batch of clips."""
         self.model.savi.precision = self.config.precision
         teacher = step < self.config.teacher_steps
         with autocast(self.device.type, self.config.precision):

@@ -60,7 +60,6 @@ class TensorInputs:
         return sum(len(part) for part in self.parts)
 
     def draw(self, rows: Tensor, generators: StepGenerators) -> Tensor:
-        """Rows, with noise."""
         values = self.plain(rows)
         if self.noise == 0:
             return values
@@ -70,7 +69,6 @@ class TensorInputs:
         )
 
     def plain(self, rows: Tensor) -> Tensor:
-        """Rows, without noise."""
         rows = to_device(rows, self.parts[0].device)
         values, start = self.parts[0][rows.clamp(max=len(self.parts[0]) - 1)], len(self.parts[0])
         for part in self.parts[1:]:
@@ -96,11 +94,9 @@ class PairedInputs:
         return len(self.parts[0])
 
     def draw(self, rows: Tensor, generators: StepGenerators) -> tuple[Tensor, ...]:
-        """Rows of each, each with its own noise."""
         return tuple(part.draw(rows, generators) for part in self.parts)
 
     def plain(self, rows: Tensor) -> tuple[Tensor, ...]:
-        """Rows of each, without noise."""
         return tuple(part.plain(rows) for part in self.parts)
 
 
@@ -126,7 +122,6 @@ class FrameInputs:
         return len(self.rows)
 
     def draw(self, rows: Tensor, generators: StepGenerators) -> Tensor:
-        """Frames of rows, each shifted by its own random offset."""
         if self.shift == 0:
             return self.plain(rows)
         generator = generators.torch("shift", "cpu")
@@ -135,7 +130,6 @@ class FrameInputs:
         return shifted(frames.flatten(1, -3), to_device(offsets - self.shift, self.device)).view_as(frames)
 
     def plain(self, rows: Tensor) -> Tensor:
-        """Frames of rows, as they are."""
         return self.frames.take(rows)
 
 
@@ -149,11 +143,9 @@ class TakenInputs:
         return len(self.rows)
 
     def draw(self, rows: Tensor, generators: StepGenerators) -> Observed:
-        """As of the inputs."""
         return self.inputs.draw(self.rows[rows.cpu()], generators)
 
     def plain(self, rows: Tensor) -> Observed:
-        """As of the inputs."""
         return self.inputs.plain(self.rows[rows.cpu()])
 
 
@@ -215,18 +207,15 @@ class RegressionStage:
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """The network."""
         return {self.name: self.criterion.network}
 
     def batch(self, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """Inputs and targets of rows drawn uniformly."""
         drawn = torch.randint(len(self.targets), (self.batch_size,), generator=generators.torch(self.stream, "cpu"))
         rows = own_rows(drawn)
         observed = dict(zip(self.criterion.observed, _several(self.inputs.draw(rows, generators)), strict=True))
         return {**observed, self.criterion.tensor_keys.action: self.targets[to_device(rows, self.targets.device)]}
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """Error of one batch."""
         with autocast(self.targets.device.type, self.precision):
             losses = self.criterion(TensorDict(dict(batch)))
         return {"loss": losses[self.criterion.out_name]}

@@ -48,7 +48,6 @@ class SlotsStage:
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
-        """SAVi."""
         return {"savi": self.savi}
 
     def phase(self, step: int) -> str:
@@ -70,7 +69,6 @@ class SlotsStage:
         return {keys.PIXELS: magnified(frames, own.zoom, at)}
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
-        """Reconstruction error of one batch."""
         self.savi.precision = self.config.precision
         out = self.criterion(TensorDict(dict(batch)), generator=generators.torch("slots"))
         return {"loss": out["loss_reconstruction"], "psnr": out["psnr"]}

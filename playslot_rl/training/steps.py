@@ -64,7 +64,6 @@ class _Tape:
             event()
 
     def take(self, draw: Callable[[], Tensor]) -> Tensor:
-        """See `playslot_rl.runtime.shares.Tape`."""
         if self._served is not None:
             self._served += 1
             return self._buffers[self._served - 1]
