@@ -23,7 +23,8 @@ from playslot_rl.seeds.draws import StepGenerators
 
 
 class Clips:
-    """Clips of unlabelled videos: windows of the training episodes, and spread ones of the episodes held out.
+    """Clips of unlabelled videos: windows of the training episodes, and spread ones of the episodes held out, or of the
+    training ones where none are.
 
     Args:
         shown: at most so many windows validate.
@@ -45,7 +46,9 @@ class Clips:
         self.source, self.frames, self.shown, self.seed = source, frames, shown, seed
         self.resident = resident and not streams_of(source.frames)
         self._pixels: DeviceRows | None = None
-        self.train_episodes, held_out = split_episodes(source.episodes, validation, seed, source.lengths >= frames)
+        fits = source.lengths >= frames
+        self.train_episodes, held_out = split_episodes(source.episodes, validation, seed, fits, source.recorded)
+        self.validated = "training" if np.isin(held_out, self.train_episodes).any() else "held-out"
         self.held_out = self.spread(held_out)
 
     def pixels(self, rows: IntArray, device: torch.device) -> Tensor:

@@ -47,9 +47,10 @@ class Demonstrations:
             under the inferred latents; the first frame's are the parsed ones.
         latents: inferred latent actions (M, Z).
         actions: real actions (M, A) in [-1, 1], or None.
-        episode: number of the demonstration of each transition, int64 (M,); a shifted copy's is its original's.
+        episode: number of the demonstration of each transition, int64 (M,); a shifted copy's is its original's, and
+            all views of one have the same.
         step: number of the transition in its demonstration, int64 (M,).
-        lengths: transitions of each demonstration as it was recorded, int64 (E,).
+        lengths: transitions of each demonstration as it was recorded, int64 (R,).
         task: which of several tasks it is of, int64 (M, 1); None where there is one.
     """
 
@@ -129,20 +130,21 @@ def split_demonstrations(
     Raises:
         DataError: there are fewer episodes than `demos`, or none that is not kept.
     """
-    free = source.episodes - kept
+    count = source.recordings
+    free = count - kept
     if free < 1:
         raise DataError(
-            f"data.held_out: got {kept}, expected less than the {source.episodes} demonstrations there are: lower it "
+            f"data.held_out: got {kept}, expected less than the {count} demonstrations there are: lower it "
             "or collect more"
         )
     trained = first_demonstrations(source, free if demos is None else demos)
-    parsed = first_demonstrations(source, max(free, trained.episodes))
-    last = max(kept, measured) if draw is None else source.episodes - drawn_among(source.episodes, kept, measured)
-    rest = source.episodes - min(last, source.episodes - trained.episodes)
+    parsed = first_demonstrations(source, max(free, trained.recordings))
+    last = max(kept, measured) if draw is None else count - drawn_among(count, kept, measured)
+    rest = count - min(last, count - trained.recordings)
     if draw is not None:
-        trained = first_demonstrations(drawn_demonstrations(source, draw, source.episodes - last), trained.episodes)
-    usable = bool((source.lengths[rest:] >= 2).any())
-    return DemonstrationSplit(trained, parsed, episode_range(source, rest, source.episodes) if usable else None)
+        trained = first_demonstrations(drawn_demonstrations(source, draw, count - last), trained.recordings)
+    usable = bool((source.lengths[source.numbers >= rest] >= 2).any())
+    return DemonstrationSplit(trained, parsed, episode_range(source, rest, count) if usable else None)
 
 
 def drawn_among(episodes: int, kept: int, measured: int) -> int:
@@ -153,8 +155,8 @@ def drawn_among(episodes: int, kept: int, measured: int) -> int:
 @dataclass(frozen=True)
 class Transitions:
     """Transitions of some episodes, in order: the row they start from (row + 1 is the frame after it), the number of
-    their episode among those with one, and theirs in it, int64 (M,) each; and how many each episode had as it was
-    recorded, int64 (E,)."""
+    their recorded episode among those with one, and theirs in it, int64 (M,) each; and how many each recorded episode
+    had, int64 (R,)."""
 
     rows: npt.NDArray[np.int64]
     episode: npt.NDArray[np.int64]
@@ -226,10 +228,11 @@ def transitions(source: EpisodeFrames) -> Transitions:
     kept = np.nonzero(source.lengths >= 2)[0]
     if not len(kept):
         raise DataError("demonstrations: got no episode of two frames or more, expected videos: collect again")
+    _, first, number = np.unique(source.numbers[kept], return_index=True, return_inverse=True)
     steps = source.lengths[kept] - 1
     step = np.concatenate([np.arange(n) for n in steps])
     rows = np.repeat(source.starts[kept], steps) + step
-    return Transitions(rows, np.repeat(np.arange(len(kept)), steps), step, steps)
+    return Transitions(rows, np.repeat(number, steps), step, steps[first])
 
 
 def told_tasks(source: EpisodeFrames, moves: Transitions, env: EnvConfig) -> Tensor | None:
@@ -238,7 +241,9 @@ def told_tasks(source: EpisodeFrames, moves: Transitions, env: EnvConfig) -> Ten
     if not env.tasks:
         return None
     number = {sentence: i for i, sentence in enumerate(env.sentences)}
-    said = [] if source.tasks is None else source.tasks[source.lengths >= 2].tolist()
+    there = np.flatnonzero(source.lengths >= 2)
+    there = there[np.unique(source.numbers[there], return_index=True)[1]]
+    said = [] if source.tasks is None else source.tasks[there].tolist()
     unknown = sorted({*said} - {*number}) or ([] if said else ["nothing"])
     if unknown:
         raise DataError(
@@ -311,18 +316,16 @@ def label_demonstrations(
         DataError: no episode has two frames, nothing moves, mode `ground_truth` without actions, or actions of another
             width.
     """
-    moves = transitions(source)
-    moving = moving_slots(moves, slots, trim, margin)
-    first, episodes = np.cumsum(moves.lengths) - moves.lengths, np.nonzero(source.lengths >= 2)[0]
-    of_kept = np.full(len(moves.rows), -1)  # where each transition goes; -1: nowhere
-    of_kept[first[moving.episode] + moving.step] = np.arange(len(moving.rows))
+    moving = moving_slots(transitions(source), slots, trim, margin)
+    # Where the transition of each row goes; -1: nowhere.
+    of_kept = np.full(int((source.starts + source.lengths).max()), -1)
+    of_kept[moving.rows] = np.arange(len(moving.rows))
     actions = None if source.actions is None else real_actions(source, moving.rows, model.env.action_dim).to(device)
     task, labels = told_tasks(source, moving, model.env), tuple[Tensor, ...]()
-    for steps in np.unique(moves.lengths):
-        same = np.nonzero(moves.lengths == steps)[0]
-        for chosen in in_batches(same, EPISODES_AT_ONCE):
-            frames = source.starts[episodes[chosen]][:, None] + np.arange(steps + 1)
-            places = torch.from_numpy(of_kept[first[chosen][:, None] + np.arange(steps)])
+    for length in np.unique(source.lengths[source.lengths >= 2]):
+        for chosen in in_batches(np.nonzero(source.lengths == length)[0], EPISODES_AT_ONCE):
+            frames = source.starts[chosen][:, None] + np.arange(length)
+            places = torch.from_numpy(of_kept[frames[:, :-1]])
             found, kept = _label(model, source, slots, frames, device), places >= 0
             # Filled in: pieces that are joined in the end would need twice the memory.
             labels = labels or tuple(part.new_empty(len(moving.rows), *part.shape[2:]) for part in found)

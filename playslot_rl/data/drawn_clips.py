@@ -33,6 +33,7 @@ class DrawnClips(Clips):
     def __init__(self, env: EnvConfig, stride: int, *given: Any) -> None:
         check_actions(env)
         super().__init__(*given)
+        self.validated = "held-out"
         self.env, self.stride = env, stride
         self._sprites = padded_sprites(env.grid.size)
 

@@ -37,7 +37,7 @@ from playslot_rl.data.frame_build import FrameArray, build_frames
 from playslot_rl.data.metadata import stated_size
 from playslot_rl.data.remote import open_remote
 from playslot_rl.data.stream import FrameStream
-from playslot_rl.data.views import FrameRows, Frames, concatenate
+from playslot_rl.data.views import FrameRows, Frames, concatenate, views_of_one
 from playslot_rl.errors import DataError
 from playslot_rl.storage.atomic import write_json
 
@@ -67,6 +67,7 @@ class EpisodeFrames:
         name: the folder it was read from, for people.
         shares: of several sets that are drawn from with weights, which rows are whose; None draws all windows alike.
         tasks: what is to be done in each episode, str (E,); None where it was not read.
+        recorded: which recorded episode each is a view of, 0 to R - 1, int64 (E,); None where each is one of its own.
         limits: what actions in [-1, 1] stand for; None for those of our simulators, which are so, and without actions.
         states: proprioception, float32 (F, S), or None.
     """
@@ -87,11 +88,22 @@ class EpisodeFrames:
     limits: ActionLimits | None = None
     states: npt.NDArray[np.float32] | None = None
     tasks: npt.NDArray[np.str_] | None = None
+    recorded: npt.NDArray[np.int64] | None = None
 
     @property
     def episodes(self) -> int:
         """E."""
         return len(self.starts)
+
+    @property
+    def recordings(self) -> int:
+        """R, the episodes as they were recorded: several cameras see one each."""
+        return self.episodes if self.recorded is None else int(self.recorded.max()) + 1
+
+    @property
+    def numbers(self) -> npt.NDArray[np.int64]:
+        """Number of the recorded episode of each, int64 (E,)."""
+        return np.arange(self.episodes) if self.recorded is None else self.recorded
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -166,9 +178,10 @@ def open_sources(
         files = open_remote(str(root), cache_folder(cache)) if remote else open_files(root)
         labels = labels_of(files)
         limits = limits_of(files, labels["actions"])
+        views: list[EpisodeFrames] = []
         for one in camera.split(","):
             frames, fingerprint, feature = _frames_of(files, one.strip(), cache, image_size, resize, buffer)
-            sources.append(
+            views.append(
                 EpisodeFrames(
                     frames=frames,
                     fingerprint=fingerprint,
@@ -181,14 +194,8 @@ def open_sources(
                     **labels,
                 )
             )
-    first = sources[0]
-    for source in sources[1:]:
-        if source.image_size != first.image_size:
-            got, want = source.image_size, first.image_size
-            raise DataError(
-                f"{source.name}: got frames of {got[0]}x{got[1]}, expected {want[0]}x{want[1]} as in {first.name}"
-            )
-    return concatenate(sources) if len(sources) > 1 else first
+        sources.append(views_of_one(views))
+    return concatenate(sources)
 
 
 open_source = open_sources

@@ -143,15 +143,42 @@ def _viewed(source: EpisodeFrames, how: str, **changes: Any) -> EpisodeFrames:
     return replace(source, fingerprint=text_hash(f"{source.fingerprint}/{how}"), **changes)
 
 
-def _chosen(source: EpisodeFrames, episodes: slice | IntArray, how: str) -> EpisodeFrames:
-    """Some episodes, in an order. Row numbers stay, so that the slot cache of the whole serves any choice."""
+def _chosen(source: EpisodeFrames, numbers: IntArray, how: str) -> EpisodeFrames:
+    """Some recorded episodes, in an order: with all their views, which keep theirs. Row numbers stay, so that the slot
+    cache of the whole serves any choice."""
+    episodes, recorded = numbers, None
+    if source.recorded is not None:
+        place = np.full(source.recordings, -1)
+        place[numbers] = np.arange(len(numbers))
+        episodes = np.flatnonzero(place[source.recorded] >= 0)
+        recorded = place[source.recorded[episodes]]
     known = {name: getattr(source, name) for name in ("starts", "lengths", "seeds", "tasks")}
-    return _viewed(source, how, **{k: None if values is None else values[episodes] for k, values in known.items()})
+    chosen = {name: None if values is None else values[episodes] for name, values in known.items()}
+    return _viewed(source, how, **chosen, recorded=recorded)
+
+
+def views_of_one(views: Sequence[EpisodeFrames]) -> EpisodeFrames:
+    """One data set as several cameras saw it: each episode once for each of them."""
+    if len(views) == 1:
+        return views[0]
+    joined, recorded = concatenate(views), np.tile(np.arange(views[0].episodes), len(views))
+    return _viewed(joined, "views", recorded=recorded)
 
 
 def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
-    """Several data sets with frames of one size as one; labels that not all have, or of another width, are dropped."""
+    """Several data sets as one; labels that not all have, or of another width, are dropped. A DataError where their
+    frames are not of one size."""
+    if len(sources) == 1:
+        return sources[0]
+    for source in sources[1:]:
+        if source.image_size != sources[0].image_size:
+            got, want = ("x".join(map(str, each.image_size)) for each in (source, sources[0]))
+            raise DataError(
+                f"{source.name}: got frames of {got}, expected {want} as in {sources[0].name}: read sets of one kind"
+            )
     offsets = np.cumsum([0, *(len(source.frames) for source in sources)])[:-1]
+    before = np.cumsum([0, *(source.recordings for source in sources)])
+    recorded = [source.numbers + count for source, count in zip(sources, before, strict=False)]
 
     def joined(name: str) -> Any:
         labels = [getattr(source, name) for source in sources]
@@ -170,6 +197,7 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
         success=joined("success"),
         seeds=joined("seeds"),
         tasks=joined("tasks"),
+        recorded=None if all(s.recorded is None for s in sources) else np.concatenate(recorded),
         fingerprint=text_hash("+".join(source.fingerprint for source in sources)),
         name=",".join(dict.fromkeys(source.name for source in sources)),
         shares=None,
@@ -229,43 +257,43 @@ def _mean_actions(source: EpisodeFrames, stride: int) -> npt.NDArray[np.float32]
 
 
 def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames:
-    """Episodes `first` to `last` (exclusive) as a data set of their own, rows counted anew."""
-    begin, end = int(source.starts[first]), int(source.starts[last - 1] + source.lengths[last - 1])
+    """Recorded episodes `first` to `last` (exclusive) as a data set of their own, rows counted anew."""
+    chosen = _chosen(source, np.arange(first, last), f"episodes {first} {last}")
+    rows = np.arange(chosen.starts[0], chosen.starts[-1] + chosen.lengths[-1])
+    if source.recorded is not None:  # what lies between is of other episodes
+        rows = np.concatenate([chosen.episode_rows(episode) for episode in range(chosen.episodes)])
+    # A slice of a memory map is a view, but of others it would be copied to memory, all of it.
+    sliced = slice(rows[0], rows[-1] + 1) if len(rows) == rows[-1] + 1 - rows[0] else rows
     frames = source.frames
-    return _viewed(
-        source,
-        f"episodes {first} {last}",
-        # A slice of a memory map is a view, but of others it would be copied to memory, all of it.
-        frames=frames[begin:end] if isinstance(frames, np.ndarray) else RowView([frames], np.arange(begin, end)),
-        shares=None if source.shares is None else source.shares.between(begin, end),
-        starts=source.starts[first:last] - begin,
-        lengths=source.lengths[first:last],
-        actions=None if source.actions is None else source.actions[begin:end],
-        states=None if source.states is None else source.states[begin:end],
-        success=None if source.success is None else source.success[begin:end],
-        seeds=None if source.seeds is None else source.seeds[first:last],
-        tasks=None if source.tasks is None else source.tasks[first:last],
+    whole = {name: getattr(source, name) for name in ("actions", "states", "success")}
+    labels: dict[str, Any] = {name: None if values is None else values[sliced] for name, values in whole.items()}
+    return replace(
+        chosen,
+        frames=frames[sliced] if isinstance(frames, np.ndarray) and sliced is not rows else RowView([frames], rows),
+        shares=None if source.shares is None else source.shares.among(rows),
+        starts=np.searchsorted(rows, chosen.starts).astype(np.int64),
+        **labels,
     )
 
 
 def first_demonstrations(source: EpisodeFrames, demos: int | None) -> EpisodeFrames:
-    """The first `demos` episodes (a DataError where there are fewer); None, or all of them, gives the set itself."""
-    if demos is None or demos == source.episodes:
+    """The first `demos` recorded episodes (a DataError where there are fewer); None, or all, gives the set itself."""
+    if demos is None or demos == source.recordings:
         return source
-    if demos > source.episodes:
+    if demos > source.recordings:
         raise DataError(
-            f"demos: got {demos}, expected at most the {source.episodes} demonstrations there are: "
+            f"demos: got {demos}, expected at most the {source.recordings} demonstrations there are: "
             "lower it or collect more"
         )
-    return _chosen(source, slice(demos), f"first {demos}")
+    return _chosen(source, np.arange(demos), f"first {demos}")
 
 
 def drawn_demonstrations(source: EpisodeFrames, seed: int, among: int | None = None) -> EpisodeFrames:
     """The same episodes, the first `among` of them (None: all) in an order drawn by a seed."""
     first = first_demonstrations(source, among)
-    order = np.random.default_rng([seed, DRAW_STREAM]).permutation(first.episodes)
+    order = np.random.default_rng([seed, DRAW_STREAM]).permutation(first.recordings)
     how = f"drawn {seed}"
-    drawn = _chosen(source, np.concatenate((order, np.arange(first.episodes, source.episodes))), how)
+    drawn = _chosen(source, np.concatenate((order, np.arange(first.recordings, source.recordings))), how)
     return replace(drawn, fingerprint=text_hash(f"{first.fingerprint}/{how}"))
 
 
@@ -275,13 +303,13 @@ def split_tested(source: EpisodeFrames, fraction: float) -> tuple[EpisodeFrames,
     Raises:
         DataError: fewer than two would be left for either.
     """
-    kept = max(2, round(fraction * source.episodes))
-    if source.episodes - kept < 2:
+    kept = max(2, round(fraction * source.recordings))
+    if source.recordings - kept < 2:
         raise DataError(
-            f"data.tested={fraction}: got {source.episodes} episodes, expected at least 4, two of them to train on: "
+            f"data.tested={fraction}: got {source.recordings} episodes, expected at least 4, two of them to train on: "
             "collect more"
         )
-    order = np.random.default_rng(TEST_STREAM).permutation(source.episodes)
+    order = np.random.default_rng(TEST_STREAM).permutation(source.recordings)
     return (
         _chosen(source, np.sort(order[kept:]), f"trained {kept}"),
         _chosen(source, np.sort(order[:kept]), f"tested {kept}"),

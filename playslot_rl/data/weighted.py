@@ -46,9 +46,9 @@ class Shares:
         found: IntArray = np.searchsorted(self.ends, starts, side="right").astype(np.int64)
         return found
 
-    def between(self, begin: int, end: int) -> Shares:
-        """Of rows `begin` to `end` (exclusive), counted anew."""
-        return replace(self, ends=np.clip(self.ends, begin, end) - begin, sources=())
+    def among(self, rows: IntArray) -> Shares:
+        """Of some rows, sorted, counted anew."""
+        return replace(self, ends=np.searchsorted(rows, self.ends).astype(np.int64), sources=())
 
 
 def weighted(sources: Sequence[EpisodeFrames], weights: Sequence[float | None], names: Sequence[str]) -> EpisodeFrames:

@@ -80,13 +80,19 @@ def valid_starts(
 
 
 def split_episodes(
-    episodes: int, validation: float, seed: int, usable: npt.ArrayLike = True
+    episodes: int, validation: float, seed: int, usable: npt.ArrayLike = True, recorded: IntArray | None = None
 ) -> tuple[IntArray, IntArray]:
-    """Split episode indices into training and validation, sorted, at random but always the same for a seed.
+    """Split episode indices into training and validation, sorted, at random but always the same for a seed; all views
+    of a `recorded` episode (its number, (E,)) lie in one of them.
 
     At least one of the `usable` (bool (E,): long enough) is held out and one is not, if the fraction is not 0 and there
     are two: then as many of the drawn order as that takes. With none, validation is the training set.
     """
+    if recorded is not None:
+        numbers, first = np.unique(recorded, return_index=True)
+        parts = split_episodes(len(numbers), validation, seed, np.broadcast_to(usable, episodes)[first])
+        training, validated = (np.flatnonzero(np.isin(recorded, numbers[part])).astype(np.int64) for part in parts)
+        return training, validated
     order = np.random.default_rng(seed).permutation(episodes).astype(np.int64)
     fits = np.flatnonzero(np.broadcast_to(usable, episodes)[order])
     held_out = int(np.clip(round(episodes * validation), fits[0] + 1, fits[-1])) if validation and len(fits) > 1 else 0

@@ -45,12 +45,13 @@ class HeldOut:
         """
         chosen = np.concatenate([self.fitted, self.tested])
         tested = np.arange(len(chosen)) >= len(self.fitted)
-        return replace(source, starts=source.starts[chosen], lengths=source.lengths[chosen]), tested
+        some = replace(source, starts=source.starts[chosen], lengths=source.lengths[chosen], recorded=None)
+        return some, tested
 
 
 def hold_out(source: EpisodeFrames, metas: Mapping[str, Mapping[str, Any]], config: DataConfig, most: int) -> HeldOut:
     """Choose at most `most` episodes of two frames or more, a quarter of them at most to test on; a DataError where
-    there is none.
+    there is none. All views of a recorded episode lie on one side.
 
     Of the world model's own videos, as the fingerprints in the checkpoints' `metas` by stage tell, those are tested
     that its validation held out; of the policy's demonstrations the last ones, as many as were held out; of any other
@@ -71,34 +72,37 @@ def hold_out(source: EpisodeFrames, metas: Mapping[str, Mapping[str, Any]], conf
 def _candidates(
     source: EpisodeFrames, metas: Mapping[str, Mapping[str, Any]], config: DataConfig, usable: Ints
 ) -> tuple[Ints, str, bool]:
+    numbers = source.numbers[usable]
+    recorded = np.unique(numbers)
+    quarter = usable[numbers >= recorded[-max(1, len(recorded) // 4)]]
     world = [metas[stage] for stage in ("slots", "dynamics") if stage in metas]
     trained = [meta for meta in world if str(meta.get("data", {}).get("train", "")) == source.fingerprint]
     if trained:
         chosen = usable
         for meta in trained:  # each stage holds out by its own seed and clips; checkpoints of before say no share
             share, fits = float(meta.get("validation", config.validation)), source.lengths >= meta.get("clip_frames", 1)
-            training, _ = split_episodes(source.episodes, share, int(meta.get("seed", 0)), fits)
+            training, _ = split_episodes(source.episodes, share, int(meta.get("seed", 0)), fits, source.recorded)
             chosen = np.setdiff1d(chosen, training)
         if len(chosen):
             return chosen, "the world model's own videos, the episodes that its validation held out", True
-        return usable[-max(1, len(usable) // 4) :], "the world model's own videos, none of which were held out", False
+        return quarter, "the world model's own videos, none of which were held out", False
     last = _policy_held_out(source, metas.get("policy", {}), config)
-    if len(chosen := usable[usable >= source.episodes - last]):
+    if len(chosen := usable[numbers >= source.recordings - last]):
         unseen = bool(world) and all(int(meta.get("held_out", 0)) >= last for meta in world)
         why = (
             "training" if unseen else "the policy's training; the checkpoints do not say whether the world model's, too"
         )
         return chosen, f"the last {last} episodes, which are held out from {why}", unseen
-    if len(chosen := usable[usable >= source.episodes - config.held_out]):
+    if len(chosen := usable[numbers >= source.recordings - config.held_out]):
         return chosen, f"the last {config.held_out} episodes, as data.held_out says", False
     what = "the last quarter of the episodes; the checkpoints do not say whether the world model was trained on them"
-    return usable[-max(1, len(usable) // 4) :], what, False
+    return quarter, what, False
 
 
 def _policy_held_out(source: EpisodeFrames, policy: Mapping[str, Any], config: DataConfig) -> int:
     """How many of the last episodes the policy's training held out, if this is the set it was trained on; else 0."""
     held, demos = int(policy.get("held_out_demos", 0)), int(policy.get("demos", 0))
-    if not held or not 0 < demos <= source.episodes - held:
+    if not held or not 0 < demos <= source.recordings - held:
         return 0
     # Its checkpoint names the demonstrations it was trained on, which a draw may have chosen.
     draws = {None, config.draw, int(policy.get("seed", 0))}

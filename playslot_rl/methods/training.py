@@ -122,7 +122,7 @@ def _model(spec: StageSpec, record: StageRecord, run: Run) -> StageCheckpoint:
     count = config.behaviour.labelled_demos if labelled else None
     record.data.require_actions(config.env.action_dim)
     if count is not None:
-        require_labelled(count, record.demos.trained.episodes)
+        require_labelled(count, record.demos.trained.recordings)
     require_finite(record.demos, count)
     world = getattr(getattr(config.baselines, config.method), "world", "")
     if not world:

@@ -60,9 +60,11 @@ def cloned(
         labelled: how many of them showed their actions; None: all.
         views: shifted copies that were cloned with them, and they themselves.
     """
-    demos, kept = int((split.trained.lengths >= 2).sum()), rows / (views * int((split.trained.lengths - 1).sum()))
+    trained = split.trained
+    demos = len(np.unique(trained.numbers[trained.lengths >= 2]))
+    kept = rows / (views * int((trained.lengths - 1).sum()))
     shown = "all" if labelled is None else str(labelled)
-    held_out = "none" if split.held_out is None else str(split.held_out.episodes)
+    held_out = "none" if split.held_out is None else str(split.held_out.recordings)
     line = f"{name}: {demos} demos, {100 * kept:.0f} % of their rows kept, {shown} labelled, {held_out} held out"
     return line, {
         "demos": demos,

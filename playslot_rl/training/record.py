@@ -69,7 +69,7 @@ def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrame
         return open_configured(config, roots)
     parts = {name: open_configured(config, name) for name in names}
     demos = parts[config.data.demos]
-    free = split_demonstrations(demos, None, config.data.held_out, 0).trained.episodes
+    free = split_demonstrations(demos, None, config.data.held_out, 0).trained.recordings
     parts[config.data.demos] = episode_range(demos, 0, free)
     return weighted([parts[name] for name in names], [root.weight for root in named], names)
 
@@ -176,7 +176,7 @@ class StageRecord:
     def labels(self) -> str:
         """How many these are, and their fingerprint."""
         found = self.labelled
-        return "none" if found is None else f"{found.episodes} ({found.fingerprint})"
+        return "none" if found is None else f"{found.recordings} ({found.fingerprint})"
 
     @property
     def drawn(self) -> str:

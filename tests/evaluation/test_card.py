@@ -177,6 +177,8 @@ def test_the_world_models_own_videos_are_measured_where_its_validation_was(model
     assert not np.intersect1d(found.tested, found.fitted).size
     none = hold_out(videos(), metas, DataConfig(validation=0.0), 100)
     assert not none.known
+    one = hold_out(videos(episodes=1), metas, DataConfig(validation=0.25), 100)
+    assert (one.tested.tolist(), one.known) == ([0], False), "it was trained on"
     stored = {"dynamics": metas["dynamics"] | {"validation": 0.5}}
     assert hold_out(videos(), stored, DataConfig(validation=0.25), 100).tested.tolist() == (
         split_episodes(EPISODES, 0.5, 4)[1].tolist()

@@ -21,7 +21,7 @@ def training(record: StageRecord) -> Training:
 
     def said(metrics: Mapping[str, float]) -> str:
         return (
-            f"dynamics: {metrics.get('psnr', float('nan')):.2f} dB on held-out rollouts, "
+            f"dynamics: {metrics.get('psnr', float('nan')):.2f} dB on {stage.clips.validated} rollouts, "
             f"code perplexity {metrics.get('perplexity', float('nan')):.1f}, {record.folder}"
         )
 

@@ -31,7 +31,9 @@ def training(record: StageRecord) -> Training:
     return Training(
         [Part("slots", stage, own, patience=patience_of(own.patience, "mse"), pace=record.pace)],
         device,
-        lambda metrics: f"slots: {metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {record.folder}",
+        lambda metrics: (
+            f"slots: {metrics.get('psnr', float('nan')):.2f} dB on {stage.clips.validated} clips, {record.folder}"
+        ),
         extra={**record.seen(own.clip_frames), "agent_steps": int((source.lengths - 1).sum()), **started},
         identity=started,
     )

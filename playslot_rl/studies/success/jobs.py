@@ -316,7 +316,7 @@ class Shared:
         if len(set(prints)) < len(prints):
             raise ConfigError(f"compare.runs: got one world model twice among {', '.join(runs)}, expected others")
         self._demos = open_videos(config, config.data.demos, "compare") if uses_demos(config) else None
-        self._draw = unusual_draw(config, self._demos.episodes) if self._demos else {}
+        self._draw = unusual_draw(config, self._demos.recordings) if self._demos else {}
         self._supervised = {name for name in config.compare.methods if _supervised(config, name)}
         self._videos = open_videos(config, config.data.root, "compare").fingerprint if self._supervised else ""
 
