@@ -130,7 +130,7 @@ class EpisodeFrames:
         if width is not None and self.actions.shape[1] != width:
             raise DataError(
                 f"got actions of width {self.actions.shape[1]}, expected {width} as in env.action_dim: "
-                "use a data set of this robot, or set env.action_dim when the world model is trained"
+                "use a data set of this robot, or set env.action_dim"
             )
         return self.actions
 

@@ -218,7 +218,12 @@ def for_frames(config: ExperimentConfig, seen: Survey, decide: Decisions) -> Exp
     predicted = min(dynamics.predicted_frames, longest - dynamics.seed_frames)
     return replace(
         config,
-        env=replace(config.env, image_size=size, action_dim=max(1, seen.action_dim), max_steps=max(2, typical - 1)),
+        env=replace(
+            config.env,
+            image_size=size,
+            action_dim=seen.action_dim or config.env.action_dim,
+            max_steps=max(2, typical - 1),
+        ),
         model=replace(config.model, savi=savi_for(config.model.savi, size)),
         data=replace(config.data, camera=seen.camera, stride=stride, resize=True, validation=validation),
         slots=replace(

@@ -17,7 +17,7 @@ from playslot_rl.data.demonstrations import (
     require_finite,
     require_labelled,
 )
-from playslot_rl.envs import check_task
+from playslot_rl.envs import RECORDED, check_task
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.methods.online.config import OnlineConfig
 from playslot_rl.runs import Run
@@ -93,10 +93,15 @@ def train_stage(spec: StageSpec, config: ExperimentConfig, run: Run, pace: Pace 
     slots = world.own if spec.copies else world.stage
     parents = world.world_stages if "dynamics" in spec.parents else {"slots": slots("slots")}
     for checkpoint in parents.values():
-        require_parent(config, run, checkpoint, "image_size", *(["action_dim"] if "dynamics" in parents else []))
+        require_parent(config, run, checkpoint, "image_size")
     groups: dict[str, Any] = {}
     if "dynamics" in parents:
-        groups["model"], groups["env"] = world.world_config
+        groups["model"], env = world.world_config
+        if config.env.name not in RECORDED or groups["model"].inverse_dynamics.mode == "ground_truth":
+            require_parent(config, run, parents["dynamics"], "action_dim")
+        elif config.env.action_dim == env.action_dim:  # nothing was typed, and unlabelled videos do not say it
+            config = _with_width(StageRecord(spec, run.folder, config))
+        groups["env"] = replace(env, action_dim=config.env.action_dim)
     else:
         groups["model"] = replace(config.model, savi=parents["slots"].sizes[0].savi)
     if spec.sizes:
@@ -104,6 +109,12 @@ def train_stage(spec: StageSpec, config: ExperimentConfig, run: Run, pace: Pace 
     ready = partial(run.take, parents["slots"]) if spec.copies else partial(run.build_on, world)
     record = StageRecord(spec, run.folder, config, parents, groups, ready, pace)
     return run_stage(record, partial(plugins.call, spec.parts, record))
+
+
+def _with_width(record: StageRecord) -> ExperimentConfig:
+    """The config with the width of the demonstrations' actions, where some are named that have any."""
+    actions, config = record.videos.actions if record.roots else None, record.config
+    return config if actions is None else replace(config, env=replace(config.env, action_dim=actions.shape[1]))
 
 
 def train_model(config: ExperimentConfig, spec: StageSpec, folder: Path) -> StageCheckpoint:

@@ -189,7 +189,8 @@ class Run:
         from playslot_rl.world_model import Agent
 
         policy = self.stage("policy")
-        world, (own, _) = self.load_world_model(device), policy.sizes
+        world = self.load_world_model(device)
+        own, world.env = policy.sizes  # videos without actions do not say how wide these are
         world.config = replace(world.config, policy=own.policy, action_decoder=own.action_decoder)
         oracle = ("oracle",) if "oracle" in policy.meta.get("modules", []) else ()
         parts = ("policy", "action_decoder", *oracle)

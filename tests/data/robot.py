@@ -36,8 +36,9 @@ def write_robot(
     names: Any = None,
     robot: str | None = "arm",
     size: int = 64,
+    labelled: bool = True,
 ) -> Path:
-    """A data set of a square that moves with the first two joints, by LeRobot's writer."""
+    """A data set of a square that moves with the first two joints, by LeRobot's writer; its actions, if `labelled`."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     actions = robot_actions() if actions is None else actions
@@ -50,13 +51,15 @@ def write_robot(
         },
         "action": {"dtype": dtype, "shape": (width,), "names": NAMES if names is None else names},
     }
+    if not labelled:
+        del features["action"]
     dataset = LeRobotDataset.create("me/arm", fps=10, features=features, root=root, robot_type=robot, use_videos=False)
     for episode in actions:
         for a in episode:
             frame = np.full((size, size, 3), 40, np.uint8)
             x, y = (int(size / 2 + np.clip(v, -200, 200) / 200 * size / 3) for v in np.asarray(a[:2], float))
             frame[y - 5 : y + 5, x - 5 : x + 5] = (220, 60, 30)
-            dataset.add_frame({CAMERA: frame, "action": a, "task": "reach"})
+            dataset.add_frame({CAMERA: frame, "task": "reach"} | ({"action": a} if labelled else {}))
         dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
     return root

@@ -17,8 +17,11 @@ from robot import CAMERA, CONSTANT, NAMES, OUTLIER, VALUE, edit_stats, robot_act
 import playslot_rl
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config import plugins
+from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.data.source import open_source
+from playslot_rl.datasets.adoption import Decisions, for_frames
+from playslot_rl.datasets.survey import survey
 from playslot_rl.envs.pixel_task import PixelTask
 from playslot_rl.runs import Run
 from playslot_rl.sharing.folder import RANGE
@@ -50,6 +53,21 @@ def trained(arm: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
 
 
 @pytest.fixture(scope="module")
+def unlabelled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Videos of that robot without actions."""
+    return write_robot(tmp_path_factory.mktemp("unlabelled") / "bare", labelled=False)
+
+
+@pytest.fixture(scope="module")
+def watched(unlabelled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with a world model of them, in which nothing says how wide the actions are."""
+    run = tmp_path_factory.mktemp("watched") / "run"
+    smoke("train-slots", "env=video", f"data.root={unlabelled}", f"out={run}")
+    smoke("train-dynamics", f"run={run}")
+    return run
+
+
+@pytest.fixture(scope="module")
 def policy(trained: tuple[Path, Done], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its policy, exported."""
     folder = tmp_path_factory.mktemp("policies") / "arm"
@@ -71,6 +89,22 @@ def acted(model: playslot_rl.PlaySlot, frames: np.ndarray[Any, Any]) -> np.ndarr
 
 def ends(meta: dict[str, Any]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     return np.float32(meta["actions"]["low"]), np.float32(meta["actions"]["high"])
+
+
+def test_a_world_model_of_unlabelled_videos_gets_a_policy(
+    watched: Path, unlabelled: Path, arm: Path, frames: np.ndarray[Any, Any], tmp_path: Path
+) -> None:
+    other, few = tmp_path / "other", ("behaviour.labelled_demos=3", f"data.demos={arm}")
+    for run, own in ((other, ("env.action_dim=6",)), (tmp_path / "mine", ())):
+        smoke("train-policy", f"run={watched}", f"out={run}", *few, *own)
+        assert json.loads((run / "config.json").read_text())["env"]["action_dim"] == 6
+        assert acted(playslot_rl.load(run, device="cpu"), frames).shape == (12, 6)
+    assert playslot("export", f"run={other}", f"out={tmp_path / 'policy'}", *ONE_CORE).err == ""
+    message = "got actions of width 6, expected 5 as in env.action_dim"
+    refused("train-policy", f"run={watched}", f"out={tmp_path / 'no'}", *few, "env.action_dim=5", message=message)
+    config = compose([f"data.root={unlabelled}", "env.action_dim=6", f"out={tmp_path / 'adopted'}"], "adopt")
+    decide = Decisions(tmp_path / "adopted", {}, 0.0)
+    assert for_frames(config, survey(str(unlabelled)), decide).env.action_dim == 6
 
 
 def meta_of(run: Path, stage: str) -> dict[str, Any]:

@@ -42,7 +42,7 @@ def training(record: StageRecord) -> Training:
     world = record.world.load_world_model(device)
     if config.env.tasks or world.env.tasks:
         require_task(config, world.env, ("task",))  # the policy is told the tasks of its world model
-    world.config = sizes(config, world.config)
+    world.config, world.env = sizes(config, world.config), record.groups["env"]
     with global_seed(config.seed, 0, "policy"):
         agent = Agent.untrained(world, oracle=behaviour.oracle).to(device)
     views, others = demonstration_views(config, split, world.savi, record.prints["slots"])
