@@ -67,7 +67,7 @@ def load(run: str | Path | Run = "pretrained", device: str = "", seed: int = 0) 
 
     require_type(run, "run", str, PathLike, Run, expected="a run folder or `pretrained`")
     require_type(seed, "seed", SupportsIndex, expected="a number")
-    folder = run.folder if isinstance(run, Run) else Path(run)
+    folder = run.folder if isinstance(run, Run) else Path(run).expanduser()
     if is_model_folder(folder):
         return PlaySlot.from_pretrained(folder, device, seed=seed)
     target = probed(named_device(device))
@@ -131,7 +131,7 @@ class PlaySlot:
 
         require_type(name, "name", str, PathLike, expected="a folder, or user/name on the Hub")
         require_type(seed, "seed", SupportsIndex, expected="a number")
-        folder, target = Path(name), probed(named_device(device))
+        folder, target = Path(name).expanduser(), probed(named_device(device))
         if not folder.is_dir():
             from playslot_rl.hub.pull import pull_policy
 

@@ -47,6 +47,8 @@ def main(config: ExperimentConfig) -> None:
         raise ConfigError(
             f"data.root: got {config.data.root or 'nothing'}, expected one data set, such as data.root=SET"
         )
+    if "," in config.data.camera:
+        raise ConfigError(f"data.camera: got {config.data.camera}, expected one: adopt reads one camera")
     began = time.monotonic()
     run = run_to_write(config).folder
     seen = survey(config.data.root, config.data.camera)

@@ -38,6 +38,7 @@ def open_studio(config: ExperimentConfig) -> Studio:
     """The model of `config.run` and the places to start from."""
     from playslot_rl.api import load
     from playslot_rl.play.studio import Studio
+    from playslot_rl.sharing.folder import is_model_folder
 
     if not config.run:
         raise ConfigError("run: got nothing, expected a run or a pretrained model, such as run=pretrained")
@@ -48,7 +49,8 @@ def open_studio(config: ExperimentConfig) -> Studio:
     recorded, simulated = recorded_starts(config, run, world, agent), simulated_starts(config, world)
     if recorded is None and simulated is None:
         print("no data set and no simulator to start from: upload a picture, or give data.root=", flush=True)
-    out = Path(config.out or "runs") / "play"
+    kept = bool(config.out) and not is_model_folder(Path(config.out))  # nothing is written into an exported policy
+    out = Path(config.out if kept else "runs") / "play"
     return Studio(
         world, agent, recorded, simulated, out, config.run, config.play.fps,
         squeezes=config.data.resize, horizon=predicted_frames(run), camera=run_camera(config, recorded),
@@ -100,12 +102,13 @@ def recorded_starts(
     from playslot_rl.envs import ENVIRONMENTS
     from playslot_rl.evaluation.held_out import data_folders
     from playslot_rl.play.starts import RecordedStarts, task_maker
+    from playslot_rl.sharing.folder import is_model_folder
 
-    known = bool(run.pretrained)
+    known = bool(run.pretrained) or is_model_folder(run.folder)
     named = data_folders(config, None if known else run.folder)
     found = [root for root in named if (root / "meta" / "info.json").is_file()]
     missing = [root for root in named if root not in found]
-    # A pretrained model names no data set, so the user did; a run names those of its training.
+    # A pretrained model or an exported policy names no data set, so the user did; a run names those of its training.
     typed = known or config.data.root != run.config.data.root
     if missing and (typed or (not found and config.env.name not in ENVIRONMENTS)):
         raise DataError(f"data.root={missing[0]}: got no data set, expected a LeRobot v3.0 one: check data.root=")

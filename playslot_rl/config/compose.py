@@ -22,7 +22,7 @@ from playslot_rl.config.baselines import known_methods
 from playslot_rl.config.families import preset_values
 from playslot_rl.config.machine import require_machine
 from playslot_rl.config.methods import canonical_method
-from playslot_rl.config.plain import flatten, nearest, put, type_hints
+from playslot_rl.config.plain import flatten, merged, multiplied, nearest, put, type_hints
 from playslot_rl.config.planning import GOALS, PLANNERS, PROPOSALS
 from playslot_rl.config.roles import keys_of
 from playslot_rl.config.tasks import GROUP as TASKS_GROUP
@@ -48,6 +48,10 @@ NAMES: Final = {"plan": {"planner": PLANNERS, "proposal": PROPOSALS, "goals": GO
 """Commands with keys of their group that go without its name, and take one name, several with commas, or `all`."""
 PRETRAINED: Final = "pretrained"
 """`run=pretrained` names the task's pretrained world model, `run=pretrained/ENV` one of them: no run folders."""
+
+
+EXPORTED: Final = "playslot"
+"""`type` in the `config.json` of an exported policy, by which LeRobot finds its class."""
 
 
 def is_pretrained(run: str) -> bool:
@@ -91,7 +95,7 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
             pairs.setdefault("env", run.partition("/")[2])  # the task that the model is named after
             _check_choice("env", pairs["env"])
         if continues:
-            config = _from_run(Path(run), pairs)
+            config = _from_run(Path(run), pairs, command == "play")
         else:
             groups = tuple(f"{group}={pairs[group]}" for group in GROUPS if group in pairs)
             config = from_dict(ExperimentConfig, _with_task(_presets(groups), _typed(pairs)))
@@ -268,31 +272,16 @@ def _presets(groups: tuple[str, ...]) -> dict[str, Any]:
     values = cast("dict[str, Any]", composed)
     if "times" in values:
         base = _presets(tuple(f"{group}={name}" for group, name in {**chosen, "preset": values["of"]}.items()))
-        grown = _multiplied(_merge(to_dict(ExperimentConfig()), base), values["times"])
-        return _merge(grown, values.get("sets", {})) | {"preset": values["preset"]}
-    return values if task is None else _merge(values, {"env": to_dict(task.env), "model": dict(task.model)})
+        grown = multiplied(merged(to_dict(ExperimentConfig()), base), values["times"])
+        return merged(grown, values.get("sets", {})) | {"preset": values["preset"]}
+    return values if task is None else merged(values, {"env": to_dict(task.env), "model": dict(task.model)})
 
 
 def _with_task(values: dict[str, Any], typed: Mapping[str, Any]) -> dict[str, Any]:
     """What a preset says, changed by how long its task lasts, and then by what was typed."""
-    env = _merge(values["env"], typed.get("env", {}))
+    env = merged(values["env"], typed.get("env", {}))
     own = preset_values(env, values["preset"], values["dynamics"]["predicted_frames"], plugins.brought(TASKS_GROUP))
-    return _merge(_merge(values, own), typed)
-
-
-def _multiplied(values: Mapping[str, Any], factors: Mapping[str, Any]) -> dict[str, Any]:
-    """Values times factors of the same nesting, lists number by number; integers are rounded, and none that was above 0
-    falls to it.
-    """
-
-    def times(value: Any, factor: Any) -> Any:
-        if isinstance(value, Mapping):
-            return _multiplied(value, factor)
-        if isinstance(value, list | tuple):
-            return [times(one, factor) for one in value]
-        return max(min(value, 1), round(value * factor)) if isinstance(value, int) else value * factor
-
-    return {**values, **{key: times(values[key], factor) for key, factor in factors.items()}}
+    return merged(merged(values, own), typed)
 
 
 def _typed(pairs: Mapping[str, str]) -> dict[str, Any]:
@@ -309,7 +298,7 @@ def _typed(pairs: Mapping[str, str]) -> dict[str, Any]:
                 )
             change: dict[str, Any] = {}
             put(change, override.key_or_group, override.value())
-            typed = _merge(typed, change)
+            typed = merged(typed, change)
     return typed
 
 
@@ -325,9 +314,10 @@ def _explained() -> Iterator[None]:
         raise ConfigError(f"cannot read the arguments: {first_line(error)}; expected key=value pairs") from error
 
 
-def _from_run(run: Path, pairs: Mapping[str, str]) -> ExperimentConfig:
-    """The stored config of a run, changed by what the user typed; `out` is the run where it is not given."""
-    stored = stored_config(run)
+def _from_run(run: Path, pairs: Mapping[str, str], play: bool) -> ExperimentConfig:
+    """The stored config of a run, or, to play, that of an exported policy, changed by what the user typed; `out` is the
+    run where it is not given."""
+    stored = stored_config(run, play)
     for group in GROUPS:
         if group in pairs:
             have = stored.preset if group == "preset" else stored.env.name
@@ -339,35 +329,37 @@ def _from_run(run: Path, pairs: Mapping[str, str]) -> ExperimentConfig:
     values = to_dict(stored)
     defaults = to_dict(ExperimentConfig())
     values.update({key: defaults[key] for key in keys_of(ExperimentConfig, "call")})
-    config = from_dict(ExperimentConfig, _merge(values, _typed(pairs)))
+    config = from_dict(ExperimentConfig, merged(values, _typed(pairs)))
     return config if config.out else dataclasses.replace(config, out=str(run))
 
 
-def stored_config(run: Path) -> ExperimentConfig:
-    """`RUN/config.json`; a ConfigError where it is missing or not one of this version."""
+def stored_config(run: Path, exported: bool = False) -> ExperimentConfig:
+    """`RUN/config.json`; a ConfigError where it is missing or not one of this version. With `exported` that of an
+    exported policy is taken, too, as far as it says one.
+    """
     path = run / "config.json"
     if not path.is_file():
-        hint = near_run(str(run))
-        raise ConfigError(
-            f"run={run}: got no {path}, expected the folder of a run{hint}; make one with `playslot pipeline out={run}`"
-        )
+        cure = f"{near_run(str(run))}; make one with `playslot pipeline out={run}`"
+        if (run / "meta" / "info.json").is_file():
+            raise ConfigError(f"run={run}: got a data set, expected the folder of a run: data sets are data.root=")
+        raise ConfigError(f"run={run}: got no {path}, expected the folder of a run{cure}")
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(values, dict):
             raise ValueError(f"got a {type(values).__name__}, expected a group of keys")
-        return from_dict(ExperimentConfig, known_methods(values))
+        if values.get("type") != EXPORTED:
+            return from_dict(ExperimentConfig, known_methods(values))
+        if exported:
+            data = {key: values[key] for key in ("resize", "stride") if key in values}
+            data |= {"camera": next(iter(values.get("input_features", {})), "")}
+            said = {"env": values.get("env", {}), "model": values.get("model", {}), "data": data}
+            return from_dict(ExperimentConfig, said)
     except ValueError as error:
         raise ConfigError(f"{path} cannot be used: {error}; restore it or start a new run") from error
-
-
-def _merge(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in changes.items():
-        if isinstance(value, Mapping) and isinstance(merged.get(key), dict):
-            merged[key] = _merge(merged[key], value)
-        else:
-            merged[key] = value
-    return merged
+    raise ConfigError(
+        f"run={run}: got an exported policy, expected the run that it was exported from: `playslot play` and "
+        "playslot_rl.load take such a folder"
+    )
 
 
 def spelled(config: ExperimentConfig, command: str) -> list[str]:

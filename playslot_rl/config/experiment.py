@@ -19,6 +19,7 @@ from playslot_rl.config.roles import (
     EPISODE_COUNT,
     NOT_NEGATIVE,
     SEED,
+    UNSAID,
     YEAR_MINUTES,
     Checked,
     above_zero,
@@ -48,6 +49,8 @@ class DataConfig(Checked):
         draw: seed that draws which of the other demonstrations are the first ones; None takes them as recorded.
         camera: image feature(s) to read, separated by commas; empty means the only one.
         stride: of each episode every `stride`-th frame is read (`playslot_rl.data.views.every`).
+        stride_action: of the actions up to the next frame read, their `mean`, or the `last`: for absolute targets,
+            grippers and angles that wrap.
         resize: resize frames of another size than `env.image_size` (area averaging) instead of refusing them.
         cache: folder of the frame and slot caches; empty means `$PLAYSLOT_CACHE` or `~/.cache/playslot_rl`.
         cache_limit: of all caches there together, such as `20GB`; the least recently used make room, never what a
@@ -69,6 +72,7 @@ class DataConfig(Checked):
     draw: int | None = field(default=None, metadata=SEED)
     camera: str = ""
     stride: int = field(default=1, metadata=at_least(1, "1 (every frame) or more"))
+    stride_action: Literal["mean", "last"] = field(default="mean", metadata=was("mean") | UNSAID)
     resize: bool = False
     cache: str = field(default="", metadata=role("machine", "folder"))
     cache_limit: str = field(default="", metadata=role("machine") | text(is_amount, "an amount such as 20GB"))

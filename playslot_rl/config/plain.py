@@ -85,6 +85,32 @@ def put(values: dict[str, Any], key: str, value: Any) -> None:
     group[name] = value
 
 
+def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested dicts with the values of the second where both have one."""
+    both = dict(base)
+    for key, value in changes.items():
+        if isinstance(value, Mapping) and isinstance(both.get(key), dict):
+            both[key] = merged(both[key], value)
+        else:
+            both[key] = value
+    return both
+
+
+def multiplied(values: Mapping[str, Any], factors: Mapping[str, Any]) -> dict[str, Any]:
+    """Values times factors of the same nesting, lists number by number; integers are rounded, and none that was above 0
+    falls to it.
+    """
+
+    def times(value: Any, factor: Any) -> Any:
+        if isinstance(value, Mapping):
+            return multiplied(value, factor)
+        if isinstance(value, list | tuple):
+            return [times(one, factor) for one in value]
+        return max(min(value, 1), round(value * factor)) if isinstance(value, int) else value * factor
+
+    return {**values, **{key: times(values[key], factor) for key, factor in factors.items()}}
+
+
 def fingerprint(config: Any) -> str:
     """Short content hash of a config: equal configs, equal names."""
     text = json.dumps(to_dict(config), sort_keys=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import io
 import itertools
+import math
 import struct
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.data.contents import Contents, Span
-from playslot_rl.data.metadata import LARGEST_PICTURE, stated_size
+from playslot_rl.data.metadata import INFO_NAME, LARGEST_PICTURE, stated_size
 from playslot_rl.data.places import Problems, inside, is_plain_path
 from playslot_rl.data.tables import WRONG_COLUMN, Array
 from playslot_rl.errors import DataError, first_line
@@ -56,10 +57,9 @@ def rgb_frames(
             break
         yield row, to_rgb(frame)
     if problems.errors:
-        raise DataError(
-            f"a frame of {camera} cannot be decoded: {problems.errors[0]}; the data set is damaged, collect or pull "
-            "it again"
-        )
+        said = problems.errors[0]
+        cure = "" if "the data set" in said else "; the data set is damaged, collect or pull it again"
+        raise DataError(f"a frame of {camera} cannot be decoded: {said}{cure}")
 
 
 def to_rgb(frame: Decoded) -> npt.NDArray[np.uint8]:
@@ -225,10 +225,27 @@ def _frames_at(contents: Contents, path: Path, times: Sequence[float], tolerance
         if number:
             break
     if number < len(times):
+        rate = _own_rate(contents.opened(path))
+        if abs(rate / contents.fps - 1) > 0.1:  # frames that are missing change it by less
+            raise DataError(
+                f"{path}: got a video of {rate:g} frames a second, expected {contents.fps:g} as in {INFO_NAME}: make "
+                "the data set again with one rate for both"
+            )
         raise DataError(
             f"{path}: cannot decode the frame at {times[number]:.3f} s ({reason}), expected a whole video of "
             f"{len(times)} frames: the data set is damaged, collect or pull it again"
         )
+
+
+def _own_rate(source: Any) -> float:
+    """Frames a second of a video, as it says; NaN where it does not."""
+    import av
+
+    try:
+        with av.open(str(source) if isinstance(source, Path) else source) as container:
+            return float(container.streams.video[0].average_rate or math.nan)
+    except (av.FFmpegError, OSError, IndexError):
+        return math.nan
 
 
 def _decoded_from(source: Any, begin: float) -> Iterator[tuple[float, Any]]:

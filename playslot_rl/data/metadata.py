@@ -67,6 +67,12 @@ def damaged(error: BaseException) -> str:
     return text if isinstance(error, _BoundsError) else f"{type(error).__name__} ({text})"
 
 
+def clips_hint(root: Path) -> str:
+    """Where it is said how plain videos become a data set, as the end of a message; empty where the folder has none."""
+    clips = any(path.suffix.lower() == ".mp4" for path in root.iterdir())
+    return "; it holds .mp4 files: docs/tutorials/your-own-videos.md makes a data set of them" if clips else ""
+
+
 def read_info(root: Path) -> dict[str, Any]:
     """`meta/info.json`, after a check of the values that everything else needs.
 
@@ -79,6 +85,7 @@ def read_info(root: Path) -> dict[str, Any]:
     if not path.is_file():
         raise DataError(
             f"{root}: got no {INFO_NAME}, expected a LeRobot v3.0 data set; check the path or pull it again"
+            f"{clips_hint(root)}"
         )
     if not inside(root, path):
         raise DataError(f"{path}: got a link out of the data set, expected a file of its own: copy it there")

@@ -13,7 +13,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -218,13 +218,13 @@ def shifted_copies(source: EpisodeFrames, shift: int, copies: int) -> Sequence[E
     return [shifted(source, (shift * y, shift * x)) for y, x in DIRECTIONS[: copies if shift else 0]]
 
 
-def every(source: EpisodeFrames, stride: int) -> EpisodeFrames:
+def every(source: EpisodeFrames, stride: int, action: Literal["mean", "last"] = "mean") -> EpisodeFrames:
     """The same episodes with every `stride`-th of their frames; `stride` 1 gives the data set itself.
 
         row r of episode e  <-  row starts_e + k r,    r = 0 .. ceil(lengths_e / k) - 1
 
     The action of a kept row is the mean of the k actions that lead to the next kept one (those of a velocity or of a
-    displacement a step stay in their range).
+    displacement a step stay in their range), or the `last` of them (of targets: where the robot is to be then).
     """
     if stride < 1:
         raise ValueError(f"stride: got {stride}, expected 1 (every frame) or more")
@@ -235,25 +235,26 @@ def every(source: EpisodeFrames, stride: int) -> EpisodeFrames:
     rows = np.concatenate([np.arange(s, s + n, stride, dtype=np.int64) for s, n in pairs])
     return _viewed(
         source,
-        f"every {stride}",
+        f"every {stride}" + ("" if action == "mean" else f" {action}"),
         frames=RowView([source.frames], rows),
         starts=(np.cumsum(lengths) - lengths).astype(np.int64),
         lengths=lengths.astype(np.int64),
-        actions=None if source.actions is None else _mean_actions(source, stride),
+        actions=None if source.actions is None else _led_actions(source, stride, action == "last"),
         states=None if source.states is None else source.states[rows],
         success=None if source.success is None else source.success[rows],
         fps=source.fps / stride,
     )
 
 
-def _mean_actions(source: EpisodeFrames, stride: int) -> npt.NDArray[np.float32]:
+def _led_actions(source: EpisodeFrames, stride: int, only_last: bool) -> npt.NDArray[np.float32]:
     """(F, A) for the kept rows. An episode's last action is padding and counts only where nothing else is left."""
-    actions, means = source.require_actions(), []
+    actions, found = source.require_actions(), []
     for start, length in zip(source.starts, source.lengths, strict=True):
         for first in range(0, int(length), stride):
             last = max(first + 1, min(first + stride, int(length) - 1))
-            means.append(actions[start + first : start + last].mean(axis=0))
-    return np.stack(means).astype(np.float32)
+            led = actions[start + first : start + last]
+            found.append(led[-1] if only_last else led.mean(axis=0))
+    return np.stack(found).astype(np.float32)
 
 
 def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames:

@@ -122,4 +122,4 @@ def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path])
     paths = [root.path for root in named]
     buffer = data.shuffle_buffer if data.stream else None
     source = open_sources(paths, data.camera, Cache.of(data), image_size=size, resize=data.resize, buffer=buffer)
-    return every(source, data.stride)
+    return every(source, data.stride, data.stride_action)

@@ -212,6 +212,10 @@ def for_frames(config: ExperimentConfig, seen: Survey, decide: Decisions) -> Exp
     """The config with frame size, stride, and clips that the episodes have room for."""
     size = decide("frame size", lambda: choose_size(seen))
     stride = decide("stride", lambda: choose_stride(seen, size))
+    if stride > 1 and seen.action_dim:
+        how = config.data.stride_action
+        ask = "; for absolute targets, grippers or angles that wrap: data.stride_action=last"
+        print(f"actions: the {how} of the {stride} from one kept frame to the next{ask * (how == 'mean')}", flush=True)
     kept = -(-seen.lengths // stride)
     typical, dynamics = int(np.median(kept)), config.dynamics
     longest, validation = clip_room(kept, shortest(config), config.data.validation, config.seed)

@@ -42,7 +42,7 @@ class Verification:
         found = [f"error: {line}" for line in self.errors] + [f"warning: {line}" for line in self.warnings]
         counts = f"{self.episodes} episodes, {self.frames} frames"
         if not self.ok:
-            return [*found, f"{self.root}: damaged ({len(self.errors)} errors), {counts} can be read"]
+            return [*found, f"{self.root}: damaged ({len(self.errors)} errors), {counts} in its rows"]
         return [*found, f"{self.root}: sound, {counts}, fingerprint {self.fingerprint}"]
 
 

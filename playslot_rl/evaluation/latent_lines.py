@@ -102,7 +102,9 @@ def action_lines(model: WorldModel, parsed: ParsedEpisodes, seed: int) -> tuple[
         noisy = noise_latents(model, parsed, seed)
         lines["noise_size"] = _noise_size(noisy[parsed.tested], parsed.latents[parsed.tested])
         if parsed.actions is None:
-            missing = "no actions"
+            given = parsed.source.actions
+            bad = 0 if given is None else int((~np.isfinite(given[parsed.pixels])).any(axis=1).sum())
+            missing = f"NaN or infinite actions in {bad} of {len(parsed.rows)} transitions" if bad else "no actions"
         elif parsed.tested_episodes.all():
             missing = "no other episodes to fit a probe on"
         else:

@@ -54,6 +54,9 @@ class SlotMLP(nn.Module):
 class InverseDynamics(nn.Module):
     """InvDyn_S or InvDyn_M, by `config.variant`.
 
+    Note: the paper does not say where var starts. Here it is softplus(-4) = 0.018, with a tenth of the usual weights: a
+    softplus of 0 would drown the differences of neighbouring frames.
+
     Args:
         config: sizes and mode; in mode `none` latents have width 0, and say only how many frames there are.
         action_dim: A, the width of z in mode `ground_truth`.
@@ -82,7 +85,6 @@ class InverseDynamics(nn.Module):
             )
             self.to_mean = nn.Linear(c.dim, c.latent_dim)
             self.to_variance = nn.Linear(c.dim, c.latent_dim)
-            # Start with little noise: a softplus of 0 would drown the differences of neighbouring frames.
             nn.init.constant_(self.to_variance.bias, -4.0)
             with torch.no_grad():
                 self.to_variance.weight.mul_(0.1)

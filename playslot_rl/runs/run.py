@@ -74,7 +74,9 @@ class Run:
         first, _, env = str(name).partition("/")
         if first == PRETRAINED:
             return cls(pretrained_folder(env or "button_press"), env or "button_press")
-        folder = Path(name)
+        folder = Path(name).expanduser()
+        if (folder / "meta" / "info.json").is_file():
+            raise CheckpointError(f"run={name}: got a data set, expected the folder of a run: data sets are data.root=")
         if not str(name) or not folder.is_dir():
             raise CheckpointError(
                 f"run={name}: no such folder, expected a run folder or `{PRETRAINED}`: check run={near_run(str(name))}"
@@ -123,7 +125,14 @@ class Run:
         source = read_json(link).get("source")
         if not isinstance(source, str):
             raise CheckpointError(f'{link}: got no "source", expected "{PRETRAINED}/ENV" or a path: train again')
-        return Run.open(source if source.partition("/")[0] == PRETRAINED else self.folder / source)
+        if source.partition("/")[0] == PRETRAINED:
+            return Run.open(source)
+        if not (self.folder / source).is_dir():
+            raise CheckpointError(
+                f"run={self.folder}: got no world model, expected it at {Path(os.path.normpath(self.folder / source))} "
+                "(world_model.json): copy that run along, or export the policy where both are"
+            )
+        return Run.open(self.folder / source)
 
     def place(self, stage: str) -> Path:
         """`RUN/STAGE/checkpoint`, there or not."""

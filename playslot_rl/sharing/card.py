@@ -14,7 +14,7 @@ import yaml
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.action_limits import said
-from playslot_rl.envs import ENVIRONMENTS, task_metadata
+from playslot_rl.envs import ENVIRONMENTS, RECORDED, task_metadata
 from playslot_rl.sharing.commands import Result, places, rate_words, reproduce, use
 from playslot_rl.sharing.folder import LICENCE, TAGS, SharedPolicyConfig, shared_modules
 from playslot_rl.visualization.document import table
@@ -38,6 +38,7 @@ CLOCKED: Final = (
 )
 PROTOCOL_NAMES: Final = {"simulation": "in simulation (closed loop)", "imagination": "in imagination (open loop)"}
 UNKNOWN: Final = "not recorded"
+SHOWN: Final = 5  # tasks of a data set
 REFERENCES: Final = {
     "random": "random actions",
     "expert": "scripted expert",
@@ -110,12 +111,15 @@ def _task(policy: SharedPolicyConfig) -> dict[str, str]:
     numbers = f"{env.action_dim} numbers in [-1, 1]"
     if policy.actions:
         numbers = f"{env.action_dim} numbers, in the units of the data set: {said(policy.actions)}"
+    tasks = policy.source.get("tasks", [])
+    others = f" and {len(tasks) - SHOWN} others" if len(tasks) > SHOWN else ""
+    steps = {} if env.name in RECORDED else {"agent steps": f"at most {env.max_steps} an episode{rate}"}
     return {
-        "task": words or "not described",
+        "task": words or "; ".join(tasks[:SHOWN]) + others or "not described",
         "camera": f"`{policy.camera}`, {side} RGB; frames of another size are {other}",
         "frames": rate_words(policy),
         "action": f"`{keys.FEATURE_ACTION}`, {numbers}" + (f": {action}" if action else ""),
-        "agent steps": f"at most {env.max_steps} an episode{rate}",
+        **steps,
         "memory": "SAVi's slots are carried from frame to frame: call `reset()` before each episode",
     }
 

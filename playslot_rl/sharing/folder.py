@@ -24,6 +24,7 @@ from torch import nn
 
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig, ModelConfig, from_dict, to_dict
+from playslot_rl.config.compose import EXPORTED
 from playslot_rl.data.action_limits import said, scaled
 from playslot_rl.data.metadata import json_content
 from playslot_rl.envs import RECORDED
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from playslot_rl.world_model import Agent
 
 
-TYPE: Final = "playslot"
+TYPE: Final = EXPORTED
 """Name under which the second distribution, `lerobot_policy_playslot`, registers the policy at LeRobot."""
 CONFIG: Final = "config.json"
 WEIGHTS: Final = "model.safetensors"

@@ -46,6 +46,7 @@ def read_source(run: Run) -> dict[str, Any]:
             "world_model": parents["dynamics"].meta.get("data", {}).get("train", ""),
             "demonstrations": meta.get("data", {}).get("demos", ""),
         },
+        "tasks": meta.get("tasks", []),
         "demos": meta.get("demos"),
         "labelled_demos": meta.get("labelled_demos"),
         "seed": meta.get("seed"),

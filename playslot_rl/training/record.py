@@ -341,7 +341,10 @@ class StageRecord:
         Raises:
             OutputError: full disk, or a folder that cannot be written.
         """
-        known: dict[str, Any] = {"actions": self.actions} if self.role == "demos" else {}
+        known: dict[str, Any] = {}
+        if self.role == "demos":
+            tasks = [] if self.data.tasks is None else self.data.tasks.tolist()
+            known = {"actions": self.actions, "tasks": sorted({task for task in tasks if task})}
         if self.spec.labels:
             known["labelled"] = self.labels
         path = checkpoint_folder(self.run, self.name)

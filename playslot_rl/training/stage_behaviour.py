@@ -18,7 +18,6 @@ from playslot_rl import keys
 from playslot_rl.config import BehaviourStageConfig
 from playslot_rl.config.stages import AFTER_CLONING
 from playslot_rl.data.demonstrations import Demonstrations
-from playslot_rl.errors import DataError
 from playslot_rl.losses.behaviour import ActionDecoderLoss, BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import Decides, LatentPolicy
@@ -131,14 +130,10 @@ class CloneStage:
             )
         }
         if oracle is not None:
-            if demos.actions is None:
-                raise DataError(
-                    "behaviour.oracle: got demonstrations without actions, expected some for the slot oracle: "
-                    "set behaviour.oracle=false"
-                )
             acted = _acted(held_out)
             measured = None if acted is None else (acted.slots, acted.require_actions(), acted.task)
-            self.stages["oracle"] = oracle_stage(oracle, demos.slots, demos.actions, config, measured, demos.task)
+            actions = demos.require_actions()
+            self.stages["oracle"] = oracle_stage(oracle, demos.slots, actions, config, measured, demos.task)
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:

@@ -11,11 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 from damage import CAMERA, ROWS, edit_column, edit_json, truncate
 from PIL import Image
 
+from playslot_rl.data.metadata import read_info
 from playslot_rl.data.source import open_source
 from playslot_rl.datasets.info import info
 from playslot_rl.datasets.merge import merge
@@ -119,6 +121,35 @@ def test_half_a_video_is_refused_by_training_and_named_by_verify(broken_video: P
     assert any(str(path) in line for line in verify(broken_video).errors)
     other = open_source(broken_video, "observation.images.side", cache=tmp_path / "cache")
     assert len(other.frames) == 15
+
+
+def test_a_video_of_another_rate_than_stated_is_named_with_both(broken_video: Path, tmp_path: Path) -> None:
+    path = next(broken_video.glob("videos/*top/*/*.mp4"))
+    quick = tmp_path / "quick.mp4"
+    with av.open(str(path)) as old, av.open(str(quick), "w") as new:
+        stream = new.add_stream_from_template(old.streams.video[0])
+        for packet in old.demux(video=0):
+            if packet.pts is not None and packet.dts is not None:
+                packet.pts, packet.dts, packet.duration = packet.pts // 2, packet.dts // 2, packet.duration // 2
+                packet.stream = stream
+                new.mux(packet)
+    quick.replace(path)
+    message = "got a video of 20 frames a second, expected 10 as in meta/info.json"
+    with pytest.raises(DataError, match=message):
+        open_source(broken_video, CAMERA, cache=tmp_path / "cache")
+    result = verify(broken_video)
+    assert any(message in line for line in result.errors)
+    assert result.lines()[-1].endswith("errors), 3 episodes, 15 frames in its rows")
+
+
+def test_clips_without_a_set_are_shown_the_page_that_makes_one(tmp_path: Path) -> None:
+    for clips in (False, True):
+        if clips:
+            (tmp_path / "one.mp4").touch()
+        for reads in (open_source, read_info):
+            with pytest.raises(DataError, match=r"got no meta/info\.json") as caught:
+                reads(tmp_path)
+            assert ("docs/tutorials/your-own-videos.md" in str(caught.value)) == clips
 
 
 def test_a_video_with_more_pixels_than_any_is_refused_by_its_header(

@@ -91,6 +91,19 @@ def test_latents_of_noise_recover_nothing(model: WorldModel, card: Card) -> None
     assert lines["above_frame"].verdict != "good"
 
 
+def test_actions_that_are_no_numbers_are_counted(model: WorldModel, card: Card) -> None:
+    parsed, source = card.parsed, card.parsed.source
+    assert source.actions is not None
+    broken = source.actions.copy()
+    broken[parsed.pixels[[2, 5]], 0] = np.nan
+    for actions, why in (
+        (broken, f"NaN or infinite actions in 2 of {len(parsed.rows)} transitions"),
+        (None, "no actions"),
+    ):
+        given = replace(parsed, source=replace(source, actions=actions), actions=None)
+        assert by_key(action_lines(model, given, 0)[0])["linear_probe"].note == why
+
+
 def test_probes_refuse_an_episode_on_both_sides() -> None:
     z, episodes = np.zeros((6, 2), np.float32), np.repeat(np.arange(2), 3)
     for tested in (np.array([1, 0, 0, 0, 0, 0], bool), np.ones(6, bool), np.zeros(6, bool)):

@@ -16,6 +16,7 @@ from playslot_rl.config.compose import compose
 from playslot_rl.data.windows import split_episodes
 from playslot_rl.datasets import adoption
 from playslot_rl.datasets.adoption import SHORTEST, clip_room, savi_for, scheduled, start_for, steps_within, too_short
+from playslot_rl.datasets.survey import Survey
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.recipes.play import open_studio
 from playslot_rl.runs import Run
@@ -84,6 +85,26 @@ def test_a_set_that_nobody_prepared_becomes_a_world_model(
     refused("adopt", f"data.root={any_set}", f"out={run}", *longer, message="minutes: got 3.0, expected 0.02")
 
 
+def test_the_settings_say_what_is_done_with_the_actions_between_two_kept_frames(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = Survey(tmp_path, "top", 30.0, (64, 64), np.full(8, 100), 2, [], 0.0)
+    decide = adoption.Decisions(tmp_path, {}, 0.0)
+    for stride, width, how, said in (
+        (8, 2, "mean", "actions: the mean of the 8 from one kept frame to the next; for absolute targets, grippers"),
+        (8, 2, "last", "actions: the last of the 8 from one kept frame to the next\n"),
+        (1, 2, "mean", ""),
+        (8, 0, "mean", ""),
+    ):
+        decide.made |= {name: {"value": n, "reason": ""} for name, n in (("frame size", 64), ("stride", stride))}
+        config = compose(["env=video", f"data.stride_action={how}"], "adopt")
+        made = adoption.for_frames(config, replace(seen, action_dim=width), decide)
+        assert (made.data.stride, made.data.stride_action) == (stride, how)
+        printed = capsys.readouterr().out
+        assert said in printed
+        assert ("actions:" in printed) == bool(said)
+
+
 @pytest.mark.slow
 def test_videos_of_two_cameras_become_a_model_that_can_be_played(tmp_path: Path) -> None:
     root = write_set(tmp_path / "set", (24, 22, 26, 24, 23), 2, ("top", "side"), (480, 640), video=True)
@@ -109,6 +130,7 @@ def test_what_cannot_be_adopted_is_refused_before_anything_is_written(tmp_path: 
         "frames of observation.images.top that never change": (f"data.root={still}", out),
         "episodes of one frame": (f"data.root={frames}", out),
         r"got episodes of 2 frames \(median\), expected at least 3": (f"data.root={short}", out),
+        "got top,side, expected one: adopt reads one camera": (f"data.root={still}", "data.camera=top,side", out),
     }.items():
         refused("adopt", *given, message=message)
     assert not run.exists()

@@ -186,4 +186,7 @@ def test_videos_without_actions_train_the_unlabelled_stages_only(videos: Path, t
     run = tmp_path / "run"
     smoke("train-slots", f"out={run}", f"data.root={mute}")
     smoke("train-dynamics", f"run={run}")
-    refused("train-policy", f"run={run}", message="demonstrations without actions")
+    for oracle in ("true", "false"):  # the decoder needs them, too
+        asked = f"behaviour.oracle={oracle}"
+        refused("train-policy", f"run={run}", asked, message="got a data set without actions, expected the feature")
+    assert not (run / "policy").exists()

@@ -15,6 +15,7 @@ from commands import ONE_CORE, contents, playslot, refused
 
 from playslot_rl.config import to_dict
 from playslot_rl.config.compose import compose
+from playslot_rl.recipes.play import open_studio
 from playslot_rl.runs import Run
 from playslot_rl.sharing.commands import reproduce
 from playslot_rl.sharing.folder import read_config
@@ -181,6 +182,25 @@ def test_a_run_without_a_policy_or_with_damaged_weights_is_refused(run: Path, tm
     shutil.rmtree(run / "policy")
     refused("export", f"run={run}", f"out={tmp_path / 'new'}", message="expected a trained policy")
     assert not (tmp_path / "new").exists()
+
+
+def test_an_exported_policy_is_played_and_other_commands_say_what_it_is(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exported(run, tmp_path / "press")
+    monkeypatch.chdir(tmp_path)
+    for command in ("export", "inspect", "train-policy"):
+        refused(command, "run=press", "out=new", message="run=press: got an exported policy, expected the run", code=2)
+    config = compose(["run=press", *ONE_CORE], "play")
+    before = contents(tmp_path / "press")
+    studio = open_studio(config)
+    try:
+        assert studio.agent is not None
+        assert studio.recorded is None
+        assert str(studio.out) == "runs/play"
+    finally:
+        studio.close()
+    assert contents(tmp_path / "press") == before
 
 
 def test_the_same_command_again_says_that_the_policy_is_there(run: Path, tmp_path: Path) -> None:

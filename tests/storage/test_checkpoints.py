@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from playslot_rl.config import to_dict
-from playslot_rl.errors import CheckpointError
+from playslot_rl.config.compose import stored_config
+from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.runs import Run
 from playslot_rl.storage.checkpoints import checkpoint_folder, read_stage, require_config, save_stage
 from playslot_rl.storage.resume import first_difference
@@ -222,6 +223,16 @@ def test_a_missing_stage_names_the_command(run: Path, tmp_path: Path) -> None:
         Run.open("")
 
 
+def test_a_data_set_is_no_run_and_a_home_is_found(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "set" / "meta").mkdir(parents=True)
+    (tmp_path / "set" / "meta" / "info.json").write_text("{}")
+    for refuses, error in ((Run.open, CheckpointError), (stored_config, ConfigError)):
+        with pytest.raises(error, match="got a data set, expected the folder of a run"):
+            refuses(tmp_path / "set")
+    monkeypatch.setenv("HOME", str(run.parent))
+    assert Run.open(f"~/{run.name}").folder == run
+
+
 def test_a_changed_config_names_the_key(run: Path) -> None:
     slots = read_stage(checkpoint_folder(run, "slots"), "slots")
     model = to_dict(tiny_config())["model"]
@@ -292,6 +303,12 @@ def test_a_run_may_use_the_world_model_of_another(run: Path, tmp_path: Path) -> 
     assert json.loads((child / "world_model.json").read_text()) == {"source": "../run"}
     assert Run.open(child).world_run.folder.resolve() == run.resolve()
     Run.open(child).load_agent()
+    alone = shutil.copytree(child, tmp_path / "elsewhere" / "child")
+    there = tmp_path / "elsewhere" / "run"
+    with pytest.raises(
+        CheckpointError, match=rf"got no world model, expected it at {there} \(world_model.json\): copy"
+    ):
+        Run.open(alone).load_agent()
     (child / "world_model.json").write_text("{}")
     with pytest.raises(CheckpointError, match='no "source"'):
         Run.open(child).load_agent()

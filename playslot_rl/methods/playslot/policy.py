@@ -38,6 +38,7 @@ def training(record: StageRecord) -> Training:
     config, split, device = record.config, record.demos, record.device
     behaviour = config.behaviour
     require_labelled(behaviour.labelled_demos, split.trained.recordings)  # before anything is computed
+    split.trained.require_actions()
     require_finite(split, None if behaviour.oracle else behaviour.labelled_demos)
     world = record.world.load_world_model(device)
     if config.env.tasks or world.env.tasks:
