@@ -72,7 +72,7 @@ def run_camera(config: ExperimentConfig, recorded: RecordedStarts | None) -> str
     from playslot_rl import keys
 
     if recorded is not None:
-        return recorded.source.camera
+        return recorded.source.camera.split(",")[0]
     named = config.data.camera.split(",")[0].strip()
     if not named:
         return keys.FEATURE_IMAGE

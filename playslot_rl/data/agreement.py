@@ -265,16 +265,16 @@ def _require_order(contents: Contents, problems: Problems) -> None:
         )
     if problems.errors:
         more = f" (and {len(problems.errors) - 1} more)" if len(problems.errors) > 1 else ""
-        _say(
+        say_once(
             f"note: {contents.root}: {problems.errors[0].replace(f'{contents.root}/', '')}{more}; stage 1 does not "
             "need that and trains, LeRobot's reader may fail: run `playslot dataset verify`, then `repair`"
         )
     for line in problems.warnings_of(CLUTTER)[:SHOWN]:
-        _say(f"note: {line}")
+        say_once(f"note: {line}")
 
 
 @functools.cache
-def _say(line: str) -> None:
+def say_once(line: str) -> None:
     """Once, by one of several processes."""
     if here().first:
         print(line, file=sys.stderr, flush=True)

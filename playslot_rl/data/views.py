@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.data.action_limits import joined_limits
+from playslot_rl.data.agreement import say_once
 from playslot_rl.errors import DataError
 
 if TYPE_CHECKING:
@@ -165,17 +166,37 @@ def views_of_one(views: Sequence[EpisodeFrames]) -> EpisodeFrames:
     return _viewed(joined, "views", recorded=recorded)
 
 
+def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
+    """Refuse, by a DataError, sets of other frame sizes or rates, with `weights` of other robots or widths of actions,
+    too; what else is not as in the first is said."""
+    first = sources[0]
+    for source in sources[1:]:
+        size, expected = ("x".join(map(str, each.image_size)) for each in (source, first))
+        facts: list[tuple[str, object, object, str]] = [
+            ("frames of", size, expected, ""),
+            ("frames a second", f"{source.fps:g}", f"{first.fps:g}", ""),
+        ]
+        if source.robot and first.robot:
+            facts.append(("recordings of", source.robot, first.robot, "leave one out, unless they act alike"))
+        if source.actions is not None and first.actions is not None:
+            widths = source.actions.shape[1], first.actions.shape[1]
+            facts.append(("actions of width", *widths, "none are read; leave one out where they count"))
+        for what, got, want, cure in facts:
+            said = f"{source.name}: got {what} {got}, expected {want} as in {first.name}"
+            if got != want and (weights or not cure):
+                raise DataError(f"{said}: read sets of one kind")
+            if got != want:
+                say_once(f"note: {said}: {cure}")
+        if source.name != first.name and source.camera != first.camera:
+            seen = f"{source.name}: got frames of {source.camera}, expected {first.camera} as in {first.name}"
+            say_once(f"note: {seen}: choose by data.camera=, unless they show the same view")
+
+
 def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
-    """Several data sets as one; labels that not all have, or of another width, are dropped. A DataError where their
-    frames are not of one size."""
+    """Several data sets as one; labels that not all have, or of another width, are dropped. Raises as `agree`."""
     if len(sources) == 1:
         return sources[0]
-    for source in sources[1:]:
-        if source.image_size != sources[0].image_size:
-            got, want = ("x".join(map(str, each.image_size)) for each in (source, sources[0]))
-            raise DataError(
-                f"{source.name}: got frames of {got}, expected {want} as in {sources[0].name}: read sets of one kind"
-            )
+    agree(sources)
     offsets = np.cumsum([0, *(len(source.frames) for source in sources)])[:-1]
     before = np.cumsum([0, *(source.recordings for source in sources)])
     recorded = [source.numbers + count for source, count in zip(sources, before, strict=False)]
@@ -189,6 +210,7 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
     actions = joined("actions")
     return replace(
         sources[0],
+        camera=",".join(dict.fromkeys(source.camera for source in sources)),
         frames=RowView([source.frames for source in sources]),
         starts=np.concatenate([s.starts + offset for s, offset in zip(sources, offsets, strict=True)]),
         lengths=joined("lengths"),

@@ -21,7 +21,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import DataRoot, data_roots
 from playslot_rl.data.cache import Cache
 from playslot_rl.data.source import EpisodeFrames, open_sources
-from playslot_rl.data.views import IntArray, concatenate, every, text_hash
+from playslot_rl.data.views import IntArray, agree, concatenate, every, text_hash
 from playslot_rl.errors import DataError
 
 
@@ -51,30 +51,18 @@ class Shares:
         return replace(self, ends=np.searchsorted(rows, self.ends).astype(np.int64), sources=())
 
 
-def weighted(sources: Sequence[EpisodeFrames], weights: Sequence[float | None], names: Sequence[str]) -> EpisodeFrames:
+def weighted(sources: Sequence[EpisodeFrames], weights: Sequence[float | None]) -> EpisodeFrames:
     """Several data sets as one, each with its own frame cache; without any weight as `concatenate`.
 
     Raises:
-        DataError: sets with weights differ in frame size, rate or width of their actions.
+        DataError: as `agree`.
     """
     given = [weight for weight in weights if weight is not None]
     if len(sources) == 1:
         return sources[0]
     if not given:
         return concatenate(sources)
-    for source, name in zip(sources[1:], names[1:], strict=True):
-        size, expected = ("x".join(map(str, each.image_size)) for each in (source, sources[0]))
-        facts: list[tuple[str, object, object]] = [
-            ("frames of", size, expected),
-            ("frames a second", f"{source.fps:g}", f"{sources[0].fps:g}"),
-        ]
-        if source.robot and sources[0].robot:
-            facts.append(("recordings of", source.robot, sources[0].robot))
-        if source.actions is not None and sources[0].actions is not None:
-            facts.append(("actions of width", source.actions.shape[1], sources[0].actions.shape[1]))
-        for what, got, want in facts:
-            if got != want:
-                raise DataError(f"{name}: got {what} {got}, expected {want} as in {names[0]}: read sets of one kind")
+    agree(sources, weights=True)
     joined = concatenate(sources)
     fingerprint = text_hash(f"{joined.fingerprint}/weights {','.join(f'{weight:g}' for weight in given)}")
     ends = np.cumsum([len(source.frames) for source in sources]).astype(np.int64)
@@ -111,13 +99,13 @@ def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path])
     `roots` are folders, or a text with commas and weights (`playslot_rl.config.weights`).
 
     Raises:
-        DataError: as `open_sources`; or sets with weights do not agree.
+        DataError: as `open_sources`; or the sets do not agree.
         ConfigError: a weight that is not above 0.
     """
     named = data_roots(roots) if isinstance(roots, str) else [DataRoot(str(root), None) for root in roots]
     if any(root.weight is not None for root in named):
         parts = [open_configured(config, [root.path]) for root in named]
-        return weighted(parts, [root.weight for root in named], [root.path for root in named])
+        return weighted(parts, [root.weight for root in named])
     data, size = config.data, config.env.image_size
     paths = [root.path for root in named]
     buffer = data.shuffle_buffer if data.stream else None

@@ -181,9 +181,9 @@ def _policy(run: Run, agent: Agent, config: ExperimentConfig, source: dict[str, 
 def described(run: Run) -> SharedPolicyConfig:
     """What a run says of the frames that its policy looks at, and of its actions; its networks are not made."""
     view, meta = run.view, run.own("policy").meta
-    one = "" if "," in view.camera else view.camera
+    named = str(meta.get("camera") or ""), view.camera
     return SharedPolicyConfig(
-        camera=str(meta.get("camera") or one or keys.FEATURE_IMAGE),
+        camera=next((one for one in named if one and "," not in one), keys.FEATURE_IMAGE),
         resize=view.resize,
         stride=view.stride,
         fps=float(meta.get("fps", 0.0)),

@@ -19,6 +19,7 @@ from playslot_rl.config.roles import by_default, without
 from playslot_rl.config.stage_spec import StageSpec, group_of
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.action_limits import ActionLimits, said, scaled
+from playslot_rl.data.agreement import say_once
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import DemonstrationSplit, split_demonstrations
 from playslot_rl.data.drawn_clips import DrawnClips
@@ -71,7 +72,7 @@ def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrame
     demos = parts[config.data.demos]
     free = split_demonstrations(demos, None, config.data.held_out, 0).trained.recordings
     parts[config.data.demos] = episode_range(demos, 0, free)
-    return weighted([parts[name] for name in names], [root.weight for root in named], names)
+    return weighted([parts[name] for name in names], [root.weight for root in named])
 
 
 @dataclass(frozen=True)
@@ -367,7 +368,21 @@ class StageRecord:
         return done
 
     def _shown(self) -> dict[str, Any]:
-        """What the frames are that the stage was shown: how many a second, and of which camera if it is one."""
-        several = "," in self.config.data.camera
-        drawn = {"drawn": self.drawn} if self.drawn else {}
-        return {"fps": self.data.fps, **drawn} | ({} if several else {"camera": self.data.camera})
+        """What the frames are that the stage was shown: how many a second, and of which cameras."""
+        return {"fps": self.data.fps, **({"drawn": self.drawn} if self.drawn else {}), "camera": self.data.camera}
+
+    def say_unlike(self) -> None:
+        """Say where its frames are of another rate or camera than those its parents were shown: a line each, once."""
+        own, cameras = self.data, self.data.camera.split(",")
+        rates = [float(parent.meta["fps"]) for parent in self.parents.values() if parent.meta.get("fps")]
+        seen = [str(parent.meta["camera"]) for parent in self.parents.values() if parent.meta.get("camera")]
+        other = next((fps for fps in rates if f"{fps:g}" != f"{own.fps:g}"), None)
+        if other is not None:
+            said = (
+                f"note: {own.name}: got {own.fps:g} frames a second, expected {other:g} as the run's model was shown: "
+            )
+            say_once(f"{said}record at that rate, or choose data.stride=")
+        unlike = next((known for known in seen if not {*cameras} <= {*known.split(",")}), None)
+        if unlike is not None:
+            said = f"note: {own.name}: got frames of {own.camera}, expected {unlike} as the run's model was shown: "
+            say_once(f"{said}choose by data.camera=, unless they show the same view")

@@ -71,6 +71,8 @@ def run_stage(record: StageRecord, prepare: Callable[[], Prepared]) -> StageChec
     wait()  # until all have looked
     if done is not None:
         return done
+    if record.role:
+        record.say_unlike()
     with record.training() as begin:
         return prepare().carry_out(record, begin)
 

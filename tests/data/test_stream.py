@@ -166,7 +166,7 @@ def test_a_buffer_that_has_room_for_all_blocks_holds_all_of_them_at_every_step(
     assert "note: data.shuffle_buffer=5 holds 1 of 3 blocks of episodes" in capsys.readouterr().out
     monkeypatch.setattr(processes, "_here", processes.Processes(1, 2))
     ShuffleBuffer(small.frames, small.starts, small.lengths - 1, np.zeros(3, int), np.ones(1), 0)
-    agreement._say("note: something")
+    agreement.say_once("note: something")
     said = capsys.readouterr()
     assert (said.out, said.err) == ("", ""), "one of several processes says it"
 

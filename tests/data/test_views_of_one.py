@@ -110,7 +110,7 @@ def test_a_test_keeps_whole_episodes_and_sets_side_by_side_stay_apart(both: Epis
     trained, tested = split_tested(both, 0.25)
     assert (trained.recordings, tested.recordings) == (6, 2)
     assert not recorded(trained) & recorded(tested)
-    two = concatenate([every(both, 2), seen_by(3, first=8)])
+    two = concatenate([every(both, 2), replace(seen_by(3, first=8), fps=5.0)])
     assert two.recordings == 16
     assert two.numbers.tolist() == [*range(8), *range(8), *range(8, 16)]
     held = split_demonstrations(trained, None, 2, 0).held_out
@@ -120,7 +120,7 @@ def test_a_test_keeps_whole_episodes_and_sets_side_by_side_stay_apart(both: Epis
 
 def test_the_rest_of_sets_with_weights_knows_whose_its_rows_are(both: EpisodeFrames) -> None:
     other = replace(views_of_one([seen_by(1, 8), seen_by(2, 8)]), name="other")
-    joined = weighted([both, other], [1.0, 2.0], ["set", "other"])
+    joined = weighted([both, other], [1.0, 2.0])
     rest = split_demonstrations(joined, None, 9, 0).held_out
     assert rest is not None
     assert rest.shares is not None

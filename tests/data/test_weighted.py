@@ -43,7 +43,7 @@ SMALL, LARGE = [4, 3], [6] * 20
 
 @pytest.fixture
 def two() -> EpisodeFrames:
-    return weighted([a_set(0, SMALL), a_set(1, LARGE)], [2.0, 1.0], ["a", "b"])
+    return weighted([a_set(0, SMALL), a_set(1, LARGE)], [2.0, 1.0])
 
 
 def test_sets_are_drawn_by_weight_and_their_windows_alike(two: EpisodeFrames) -> None:
@@ -84,11 +84,11 @@ def test_the_draw_repeats_and_frames_are_not_copied(two: EpisodeFrames) -> None:
 
 def test_weights_are_part_of_the_fingerprint_and_no_weights_are_as_before() -> None:
     sets = [a_set(0, SMALL), a_set(1, LARGE)]
-    prints = {weighted(sets, weights, ["a", "b"]).fingerprint for weights in ([2, 1], [1, 1], [1, 2], [None, None])}
+    prints = {weighted(sets, weights).fingerprint for weights in ([2, 1], [1, 1], [1, 2], [None, None])}
     assert len(prints) == 4
-    assert weighted(sets, [None, None], ["a", "b"]).fingerprint == concatenate(sets).fingerprint
-    assert weighted(sets, [None, None], ["a", "b"]).shares is None
-    assert weighted(sets[:1], [3.0], ["a"]).fingerprint == sets[0].fingerprint
+    assert weighted(sets, [None, None]).fingerprint == concatenate(sets).fingerprint
+    assert weighted(sets, [None, None]).shares is None
+    assert weighted(sets[:1], [3.0]).fingerprint == sets[0].fingerprint
 
 
 @pytest.mark.parametrize(
@@ -101,9 +101,23 @@ def test_weights_are_part_of_the_fingerprint_and_no_weights_are_as_before() -> N
     ],
 )
 def test_sets_that_do_not_agree_are_refused(change: dict[str, object], message: str) -> None:
-    sets = [a_set(0, SMALL, robot="button_press"), a_set(1, SMALL, **change)]
+    sets = [a_set(0, SMALL, robot="button_press", name="a"), a_set(1, SMALL, **({"name": "b"} | change))]
     with pytest.raises(DataError, match=message):
-        weighted(sets, [1.0, 1.0], ["a", "b"])
+        weighted(sets, [1.0, 1.0])
+
+
+def test_sets_without_weights_agree_in_frames_and_rate_and_the_rest_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    first = a_set(0, SMALL, robot="arm", name="a")
+    with pytest.raises(DataError, match="b: got frames a second 20, expected 10 as in a: read sets of one kind"):
+        concatenate([first, a_set(1, SMALL, fps=20.0, name="b")])
+    wide = {"actions": np.zeros((7, 4), np.float32)}
+    joined = concatenate([first, a_set(1, SMALL, name="b", robot="hand", camera="side", **wide)])
+    said = capsys.readouterr().err.splitlines()
+    for line, what in zip(said, ("recordings of hand", "actions of width 4", "frames of side"), strict=True):
+        assert line.startswith(f"note: b: got {what}, expected ")
+    assert (joined.camera, joined.actions) == ("top,side", None)
+    concatenate([first, a_set(1, SMALL, name="b", robot="arm")])
+    assert capsys.readouterr().err == ""
 
 
 def test_a_set_without_a_window_is_refused(two: EpisodeFrames) -> None:
@@ -149,7 +163,7 @@ def test_slots_are_parsed_once_for_each_set_whatever_the_weights(
     savi = SAVi(replace(tiny_config().model.savi, decoder_channels=(16, 16)), 32)
     parts = [slot_cache(source, savi, "f" * 16, tmp_path) for source in two.shares.sources]  # type: ignore[union-attr]
     monkeypatch.setattr(SAVi, "forward", None)
-    other = weighted([a_set(0, SMALL), a_set(1, LARGE)], [1.0, 5.0], ["a", "b"])
+    other = weighted([a_set(0, SMALL), a_set(1, LARGE)], [1.0, 5.0])
     for source in (two, other):
         slots = slot_cache(source, savi, "f" * 16, tmp_path)
         assert len(slots) == sum(SMALL) + sum(LARGE)

@@ -1,0 +1,41 @@
+"""A stage says where its frames are not like those that its parents were shown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from clips import moving_square
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.methods import METHODS
+from playslot_rl.training.record import StageRecord
+
+STRIDE = "got 5 frames a second, expected 10 as the run's model was shown: record at that rate, or choose data.stride="
+
+
+@pytest.mark.parametrize(
+    ("fps", "camera", "parent", "expected"),
+    [
+        (10.0, "front", {"fps": 10.0, "camera": "front"}, []),
+        (10.0, "front", {"fps": 10.0, "camera": "front,side"}, []),
+        (10.0, "front", {}, []),
+        (5.0, "front", {"fps": 10.0, "camera": "front"}, [STRIDE]),
+        (10.0, "front,side", {"fps": 10.0, "camera": "front"}, ["got frames of front,side, expected front as"]),
+        (5.0, "side", {"fps": 10.0, "camera": "front"}, [STRIDE, "got frames of side, expected front as"]),
+    ],
+)
+def test_another_rate_or_camera_is_one_line(
+    fps: float, camera: str, parent: dict[str, Any], expected: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    parents = cast("Any", {name: SimpleNamespace(meta=parent) for name in ("slots", "dynamics")})
+    record = StageRecord(METHODS["playslot"].last, Path("run"), ExperimentConfig(demos=4), parents)
+    name = f"{fps:g} {camera} {parent}"  # a line is said once
+    vars(record)["videos"] = replace(moving_square(), fps=fps, camera=camera, name=name)
+    record.say_unlike()
+    said = capsys.readouterr().err.splitlines()
+    for line, start in zip(said, expected, strict=True):
+        assert line.startswith(f"note: {name}: {start}")
