@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import ClassVar, Final, Literal
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.machine import WEIGHT, Need, chain
@@ -28,6 +28,7 @@ class CLAMConfig(PretrainedConfig):
     """
 
     group = "baselines.clam."
+    encoder: ClassVar[Literal["strided"]] = "strided"
     channels: tuple[int, ...] = field(default=(64, 128, 128), metadata=COUNT)
     hidden: int = field(default=256, metadata=COUNT)
     latent_dim: int = field(default=8, metadata=COUNT)

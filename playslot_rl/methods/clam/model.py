@@ -12,15 +12,13 @@ Shapes: B batch, H W image height and width, Z latent-action width, A action wid
 
 from __future__ import annotations
 
-from functools import partial
-
 import torch
 from torch import Tensor, nn
 
 from playslot_rl.acting.actor import Actor
 from playslot_rl.frames import normalise
 from playslot_rl.methods.clam.method import MODEL, NAME, CLAMConfig
-from playslot_rl.methods.lapo.model import ChangeUNet, EncoderMLP, PixelPolicy, pixel_actor
+from playslot_rl.methods.lapo.model import ChangeUNet, EncoderMLP, pixel_actor
 from playslot_rl.runs import Run
 
 
@@ -29,7 +27,7 @@ class Inverse(nn.Module):
 
     def __init__(self, config: CLAMConfig, image_size: int) -> None:
         super().__init__()
-        self.network = EncoderMLP(9, config.channels, image_size, config.hidden, config.latent_dim)
+        self.network = EncoderMLP.of(config, 3, image_size)
 
     def forward(self, frames: Tensor) -> Tensor:
         z: Tensor = self.network(normalise(frames).flatten(1, 2))
@@ -49,15 +47,7 @@ class Forward(ChangeUNet):
         return frames[:, 1] + self.change(torch.cat((frames.flatten(1, 2), everywhere), dim=1), z)
 
 
-class CLAMPolicy(PixelPolicy):
-    """CLAM's latent policy"""
-
-    def __init__(self, config: CLAMConfig, image_size: int) -> None:
-        super().__init__(EncoderMLP(3, config.channels, image_size, config.hidden, config.latent_dim))
-
-
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a finished run; a CheckpointError where it is missing, damaged, or of another model."""
     done = run.stage(NAME, MODEL.name)
-    own = done.group(CLAMConfig, NAME)
-    return pixel_actor(done, partial(CLAMPolicy, own), own.latent_dim, own.hidden, device)
+    return pixel_actor(done, done.group(CLAMConfig, NAME), device)

@@ -21,17 +21,15 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.clips import Clips
-from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
+from playslot_rl.data.demonstrations import Transitions
 from playslot_rl.data.neighbours import Ends, in_batches
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray
 from playslot_rl.frames import normalise
 from playslot_rl.methods.clam.method import NAME, CLAMConfig
-from playslot_rl.methods.clam.model import CLAMPolicy, Forward, Inverse
-from playslot_rl.methods.cloning import LatentCloning
-from playslot_rl.methods.lapo.training import on_pairs
+from playslot_rl.methods.clam.model import Forward, Inverse
+from playslot_rl.methods.lapo.training import PixelCloning, on_pairs
 from playslot_rl.methods.supervised import LabelledMoves
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.runtime.precision import autocast
@@ -115,19 +113,15 @@ class PolicyStage(RegressionStage):
         return {**super().modules, "action_decoder": self.decoder}
 
 
-class CLAMBehaviour(LatentCloning):
-    """See `LatentCloning`; the decoder is the model's. A CheckpointError where the model is damaged."""
+class CLAMBehaviour(PixelCloning):
+    """The decoder is the model's. A CheckpointError where the model is damaged."""
 
     kind = PolicyStage
 
-    def __init__(
-        self, config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
-    ) -> None:
-        self.own: CLAMConfig = config.baselines.clam
-        self.inverse, self.decoder = load_model(model, device)
-        super().__init__(config, demos, device, self.own.shift, self.own.policy, self.own.loss)
-        with global_seed(config.seed, 0, NAME):
-            self.policy = CLAMPolicy(self.own, config.env.image_size).to(device)
+    def __init__(self, record: StageRecord) -> None:
+        self.inverse, decoder = load_model(record.parents["clam_model"], record.device)
+        super().__init__(record)
+        self.decoder = decoder
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
         return infer_latents(self.inverse, source, moves, self.device)
@@ -159,7 +153,7 @@ def model(record: StageRecord) -> Training:
 
 def policy(record: StageRecord) -> Training:
     config, own = record.config, record.config.baselines.clam
-    behaviour = CLAMBehaviour(config, record.parents["clam_model"], record.demos, record.device)
+    behaviour = CLAMBehaviour(record)
     stage = behaviour.policy_stage()
     assert isinstance(stage, PolicyStage)
     stage.decoder = behaviour.decoder

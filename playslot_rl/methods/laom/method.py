@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import ClassVar, Final, Literal
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.machine import WEIGHT, Need, chain
@@ -33,6 +33,7 @@ class LAOMConfig(PretrainedConfig):
     """
 
     group = "baselines.laom."
+    encoder: ClassVar[Literal["strided"]] = "strided"
     channels: tuple[int, ...] = field(default=(96, 192, 192), metadata=COUNT)
     hidden: int = field(default=1024, metadata=COUNT)
     latent_dim: int = field(default=8192, metadata=COUNT)

@@ -16,15 +16,13 @@ Shapes: B batch, C input channels, H W image height and width, E features, Z lat
 
 from __future__ import annotations
 
-from functools import partial
-
 import torch
 from torch import Tensor, nn
 
 from playslot_rl.acting.actor import Actor
 from playslot_rl.frames import normalise
 from playslot_rl.methods.laom.method import MODEL, NAME, LAOMConfig
-from playslot_rl.methods.lapo.model import ConvEncoder, EncoderMLP, PixelPolicy, pixel_actor
+from playslot_rl.methods.lapo.model import ConvEncoder, pixel_actor
 from playslot_rl.runs import Run
 
 LAYERS = 3
@@ -128,15 +126,7 @@ class Target(nn.Module):
         return change
 
 
-class LAOMPolicy(PixelPolicy):
-    """LAOM's latent policy"""
-
-    def __init__(self, config: LAOMConfig, image_size: int) -> None:
-        super().__init__(EncoderMLP(3, config.channels, image_size, config.hidden, config.latent_dim))
-
-
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a finished run; a CheckpointError where it is missing, damaged, or of another model."""
     done = run.stage(NAME, MODEL.name)
-    own = done.group(LAOMConfig, NAME)
-    return pixel_actor(done, partial(LAOMPolicy, own), own.latent_dim, own.hidden, device)
+    return pixel_actor(done, done.group(LAOMConfig, NAME), device)

@@ -24,17 +24,16 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.clips import Clips
-from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
+from playslot_rl.data.demonstrations import Transitions
 from playslot_rl.data.neighbours import Ends, in_batches, pairs_at
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray
 from playslot_rl.frames import normalise
-from playslot_rl.methods.cloning import LatentCloning, cloning
+from playslot_rl.methods.cloning import cloning
 from playslot_rl.methods.laom.method import NAME, LAOMConfig
-from playslot_rl.methods.laom.model import LAOMPolicy, LatentActions, Target
-from playslot_rl.methods.lapo.training import on_pairs
+from playslot_rl.methods.laom.model import LatentActions, Target
+from playslot_rl.methods.lapo.training import PixelCloning, on_pairs
 from playslot_rl.methods.supervised import LabelledMoves, jittered
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
@@ -141,18 +140,12 @@ def infer_latents(
     return torch.cat([model(*pixels.unbind(1)) for pixels in frames])
 
 
-class LAOMBehaviour(LatentCloning):
-    """See `LatentCloning`; a CheckpointError where the model is damaged."""
+class LAOMBehaviour(PixelCloning):
+    """A CheckpointError where the model is damaged."""
 
-    def __init__(
-        self, config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
-    ) -> None:
-        self.own: LAOMConfig = config.baselines.laom
-        self.model = load_model(model, device)
-        super().__init__(config, demos, device, self.own.shift, self.own.policy, self.own.loss)
-        with global_seed(config.seed, 0, NAME):
-            self.policy = LAOMPolicy(self.own, config.env.image_size).to(device)
-            self.decoder = self.new_decoder(self.own.latent_dim, self.own.hidden)
+    def __init__(self, record: StageRecord) -> None:
+        self.model = load_model(record.parents["laom_model"], record.device)
+        super().__init__(record)
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
         return infer_latents(self.model, source, moves, self.device)
@@ -184,5 +177,4 @@ def model(record: StageRecord) -> Training:
 
 def policy(record: StageRecord) -> Training:
     own: LAOMConfig = record.config.baselines.laom
-    behaviour = LAOMBehaviour(record.config, record.parents["laom_model"], record.demos, record.device)
-    return cloning(record, behaviour, own.policy, own.decoder_steps, own.decoder_lr)
+    return cloning(record, LAOMBehaviour(record), own.policy, own.decoder_steps, own.decoder_lr)

@@ -18,10 +18,10 @@ code.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -101,8 +101,8 @@ class EncoderMLP(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, out_dim))
 
     @classmethod
-    def of(cls, config: LAPOConfig, frames: int, image_size: int) -> EncoderMLP:
-        """Frames to LAPO's latent."""
+    def of(cls, config: Any, frames: int, image_size: int) -> EncoderMLP:
+        """Frames to the latent of a method, by its settings (LAPO's, LAOM's, CLAM's)."""
         return cls(3 * frames, config.channels, image_size, config.hidden, config.latent_dim, config.encoder)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -228,9 +228,9 @@ class ForwardModel(ChangeUNet):
 class PixelPolicy(nn.Module):
     """A latent policy: frames (B, 3, H, W), uint8 or float [0, 1], to latent actions (B, Z)."""
 
-    def __init__(self, network: EncoderMLP) -> None:
+    def __init__(self, config: Any, image_size: int) -> None:
         super().__init__()
-        self.network = network
+        self.network = EncoderMLP.of(config, 1, image_size)
 
     def forward(self, pixels: Tensor) -> Tensor:
         return self.decide(self.features(pixels))
@@ -243,23 +243,10 @@ class PixelPolicy(nn.Module):
         return self.network.out(features[:, 0])
 
 
-class LAPOPolicy(PixelPolicy):
-    """LAPO's."""
-
-    def __init__(self, config: LAPOConfig, image_size: int) -> None:
-        super().__init__(EncoderMLP.of(config, 1, image_size))
-
-
-def pixel_actor(
-    done: StageCheckpoint,
-    policy: Callable[[int], PixelPolicy],
-    latent_dim: int,
-    hidden: int,
-    device: torch.device | str,
-) -> Actor:
-    """The actor of a finished policy, which `policy` builds for frames of a size, and of the decoder beside it."""
-    build = partial(policy, done.sizes[1].image_size)
-    parts = DecodedPolicy.load(done, build, latent_dim, hidden, device)
+def pixel_actor(done: StageCheckpoint, own: Any, device: torch.device | str) -> Actor:
+    """The actor of a finished policy, and of the decoder beside it."""
+    build = partial(PixelPolicy, own, done.sizes[1].image_size)
+    parts = DecodedPolicy.load(done, build, own.latent_dim, own.hidden, device)
     return latent_actor(parts.policy, parts.action_decoder)
 
 
@@ -272,5 +259,4 @@ def sizes(done: StageCheckpoint) -> LAPOConfig:
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a finished run; a CheckpointError where it is missing, damaged, or of another inverse model."""
     done = run.stage(NAME, MODEL.name)
-    own = sizes(done)
-    return pixel_actor(done, partial(LAPOPolicy, own), own.latent_dim, own.hidden, device)
+    return pixel_actor(done, sizes(done), device)

@@ -24,9 +24,9 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.config import ExperimentConfig, StageConfig
+from playslot_rl.config import StageConfig
 from playslot_rl.data.clips import Clips
-from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
+from playslot_rl.data.demonstrations import Transitions
 from playslot_rl.data.device_rows import DeviceRows
 from playslot_rl.data.neighbours import Ends, in_batches
 from playslot_rl.data.source import EpisodeFrames
@@ -35,7 +35,7 @@ from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import normalise
 from playslot_rl.methods.cloning import LatentCloning, cloning
 from playslot_rl.methods.lapo.method import NAME, LAPOConfig
-from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolicy, QuantisedInverse
+from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, PixelPolicy, QuantisedInverse
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
@@ -143,18 +143,24 @@ def infer_latents(
     return torch.cat(parts)
 
 
-class LAPOBehaviour(LatentCloning):
-    """See `LatentCloning`; a CheckpointError where the model is damaged."""
+class PixelCloning(LatentCloning):
+    """See `LatentCloning`: a policy on frames clones what the model infers from them."""
 
-    def __init__(
-        self, config: ExperimentConfig, model: StageCheckpoint, demos: DemonstrationSplit, device: torch.device
-    ) -> None:
-        self.own: LAPOConfig = config.baselines.lapo
-        self.inverse = load_inverse(model, device)
-        super().__init__(config, demos, device, self.own.shift, self.own.policy, self.own.loss)
-        with global_seed(config.seed, 0, NAME):
-            self.policy = LAPOPolicy(self.own, config.env.image_size).to(device)
-            self.decoder = self.new_decoder(self.own.latent_dim, self.own.hidden)
+    def __init__(self, record: StageRecord) -> None:
+        config, device = record.config, record.device
+        self.own = own = getattr(config.baselines, record.name)
+        super().__init__(config, record.demos, device, own.shift, own.policy, own.loss)
+        with global_seed(config.seed, 0, record.name):
+            self.policy = PixelPolicy(own, config.env.image_size).to(device)
+            self.decoder = self.new_decoder(own.latent_dim, own.hidden)
+
+
+class LAPOBehaviour(PixelCloning):
+    """A CheckpointError where the model is damaged."""
+
+    def __init__(self, record: StageRecord) -> None:
+        self.inverse = load_inverse(record.parents["lapo_model"], record.device)
+        super().__init__(record)
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
         return infer_latents(self.inverse, source, moves, self.device, self.own.targets == "quantised")
@@ -196,5 +202,4 @@ def on_pairs(
 
 def policy(record: StageRecord) -> Training:
     own: LAPOConfig = record.config.baselines.lapo
-    behaviour = LAPOBehaviour(record.config, record.parents["lapo_model"], record.demos, record.device)
-    return cloning(record, behaviour, own.policy, own.decoder_steps, own.decoder_lr)
+    return cloning(record, LAPOBehaviour(record), own.policy, own.decoder_steps, own.decoder_lr)
