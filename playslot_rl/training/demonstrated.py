@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -17,7 +17,9 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import shifted_copies
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runs import Run
+from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
+from playslot_rl.training.run_stage import Training
 from playslot_rl.world_model import module_device
 
 ParsedVideos = tuple[EpisodeFrames, npt.NDArray[np.float32]]
@@ -71,3 +73,22 @@ def cloned(
         "labelled_demos": demos if labelled is None else labelled,
         "kept_rows": round(kept, 4),
     }
+
+
+def cloning_alone(
+    record: StageRecord,
+    part: Part,
+    rows: int,
+    said: str = "",
+    facts: Mapping[str, Any] | None = None,
+    labelled: int | None = None,
+    views: int = 1,
+) -> Training:
+    """The training of a stage that clones demonstrations in one part: `rows`, `labelled` and `views` as in `cloned`;
+    `said` ends its closing line, and `facts` are for `meta.json` and of its identity.
+    """
+    line, known = cloned(record.name, record.demos, rows, labelled, views)
+    facts = facts or {}
+    return Training(
+        [part], record.device, lambda _: f"{line}{said}, {record.folder}", extra={**known, **facts}, identity=facts
+    )

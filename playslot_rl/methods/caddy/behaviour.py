@@ -38,7 +38,7 @@ from playslot_rl.methods.cloning import LatentCloning, action_stage, cloning
 from playslot_rl.methods.video.training import on_clips, pixel_model
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint
-from playslot_rl.training.demonstrated import cloned
+from playslot_rl.training.demonstrated import cloning_alone
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
@@ -172,6 +172,5 @@ def policy(record: StageRecord) -> Training:
 def oracle(record: StageRecord) -> Training:
     own: CADDYOracleConfig = record.config.baselines.caddy_oracle
     stage = oracle_stage(record.config, record.parents["caddy"], record.demos, record.device)
-    said, extra = cloned(record.name, record.demos, len(stage.targets))
     part = Part(f"{record.name}.policy", stage, own.policy, group=f"baselines.{record.name}.policy")
-    return Training([part], record.device, lambda _: f"{said}, {record.folder}", extra=extra)
+    return cloning_alone(record, part, len(stage.targets))

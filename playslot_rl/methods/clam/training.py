@@ -37,7 +37,7 @@ from playslot_rl.runtime.processes import spread
 from playslot_rl.runtime.shares import own_rows
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint
-from playslot_rl.training.demonstrated import cloned
+from playslot_rl.training.demonstrated import cloning_alone
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
@@ -157,6 +157,5 @@ def policy(record: StageRecord) -> Training:
     stage = behaviour.policy_stage()
     assert isinstance(stage, PolicyStage)
     stage.decoder = behaviour.decoder
-    said, extra = cloned(record.name, record.demos, len(stage.targets), config.behaviour.labelled_demos)
     part = Part("clam.policy", stage, own.policy, group="baselines.clam.policy")
-    return Training([part], record.device, lambda _: f"{said}, {record.folder}", extra=extra)
+    return cloning_alone(record, part, len(stage.targets), labelled=config.behaviour.labelled_demos)

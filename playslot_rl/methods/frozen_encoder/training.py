@@ -31,7 +31,7 @@ from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.checkpoints import load_weights
-from playslot_rl.training.demonstrated import cloned
+from playslot_rl.training.demonstrated import cloning_alone
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
@@ -112,10 +112,4 @@ def policy(record: StageRecord) -> Training:
     seen = stage.inputs.plain(rows)
     assert isinstance(seen, Tensor)
     network.eval().standardise(seen)
-    said, extra = cloned(record.name, split, len(stage.targets))
-    return Training(
-        [Part(f"{own.group}policy", stage, own.policy)],
-        device,
-        lambda _: f"{said}, {record.folder}",
-        extra=extra,
-    )
+    return cloning_alone(record, Part(f"{own.group}policy", stage, own.policy), len(stage.targets))

@@ -31,7 +31,7 @@ from playslot_rl.runtime.devices import to_device
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.shares import own_rows
 from playslot_rl.seeds.draws import StepGenerators, global_seed
-from playslot_rl.training.demonstrated import cloned
+from playslot_rl.training.demonstrated import cloning_alone
 from playslot_rl.training.fit import Part
 from playslot_rl.training.optimizer import build_adam
 from playslot_rl.training.record import StageRecord
@@ -154,15 +154,10 @@ def training(record: StageRecord, state: bool = False) -> Training:
     trained = chunked(config, split.trained, own, chunk, device, own.shift, state)
     held_out = None if split.held_out is None else chunked(config, split.held_out, own, chunk, device, 0, state)
     stage = ChunkStage(policy, own, trained, held_out)
-    said, extra = cloned(record.name, split, len(trained))
     facts = {"pretraining": pretraining, "chunk": chunk, **({"state": policy.state_dim} if state else {})}
-    return Training(
-        [Part(f"baselines.{record.name}", stage, own, group=group, optimizer=partial(_optimizer, policy, own))],
-        device,
-        lambda _: f"{said}, chunks of {chunk}, ResNet-18 from {pretraining}, {record.folder}",
-        extra={**extra, **facts},
-        identity=facts,
-    )
+    part = Part(f"baselines.{record.name}", stage, own, group=group, optimizer=partial(_optimizer, policy, own))
+    said = f", chunks of {chunk}, ResNet-18 from {pretraining}"
+    return cloning_alone(record, part, len(trained), said, facts)
 
 
 def _optimizer(

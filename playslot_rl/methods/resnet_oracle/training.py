@@ -8,7 +8,7 @@ from playslot_rl.methods.cloning import action_stage
 from playslot_rl.methods.resnet_oracle.method import NAME, ResNetOracleConfig
 from playslot_rl.methods.resnet_oracle.network import ResNetPolicy, load_trunk
 from playslot_rl.seeds.draws import global_seed
-from playslot_rl.training.demonstrated import cloned
+from playslot_rl.training.demonstrated import cloning_alone
 from playslot_rl.training.fit import Part
 from playslot_rl.training.patience import Patience
 from playslot_rl.training.record import StageRecord
@@ -32,11 +32,6 @@ def training(record: StageRecord, frames: int = 1) -> Training:
     policy.to(device)
     stage = action_stage("policy", policy, keys.PIXELS, lambda x: x, config, split, device, own.shift, own, 512, frames)
     patience = Patience(own.patience, f"unexplained{HELD_OUT}") if own.patience and split.held_out is not None else None
-    said, extra = cloned(record.name, split, len(stage.targets))
-    return Training(
-        [Part(f"baselines.{record.name}", stage, own, group=f"baselines.{NAME}", patience=patience)],
-        device,
-        lambda _: f"{said}, ResNet-18 from {pretraining}, {record.folder}",
-        extra={**extra, "pretraining": pretraining},
-        identity={"pretraining": pretraining},
-    )
+    part = Part(f"baselines.{record.name}", stage, own, group=f"baselines.{NAME}", patience=patience)
+    said = f", ResNet-18 from {pretraining}"
+    return cloning_alone(record, part, len(stage.targets), said, {"pretraining": pretraining})

@@ -8,7 +8,7 @@ from torch import Tensor
 from playslot_rl.data.demonstrations import moving_slots, real_actions, require_finite, told_tasks, transitions
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import global_seed
-from playslot_rl.training.demonstrated import ParsedVideos, cloned, demonstration_views
+from playslot_rl.training.demonstrated import ParsedVideos, cloning_alone, demonstration_views
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
@@ -40,10 +40,5 @@ def training(record: StageRecord) -> Training:
     views, others = demonstration_views(config, split, savi, record.prints["slots"])
     slots, actions, task = examples(views)
     stage = oracle_stage(oracle, slots, actions, behaviour, examples(others) if others else None, task)
-    said, extra = cloned(record.name, split, len(slots), views=len(views))
-    return Training(
-        [Part(record.name, stage, config.behaviour, group="behaviour")],
-        device,
-        lambda _: f"{said}, {record.folder}",
-        extra=extra,
-    )
+    part = Part(record.name, stage, config.behaviour, group="behaviour")
+    return cloning_alone(record, part, len(slots), views=len(views))
