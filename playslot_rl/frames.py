@@ -10,6 +10,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Of ImageNet's frames, with which torchvision's weights were trained."""
+
 
 def normalise(pixels: Tensor) -> Tensor:
     """uint8 [0, 255] to float32 [0, 1], of any shape; floats pass through."""

@@ -93,19 +93,29 @@ class StageProgress:
 
 
 @contextlib.contextmanager
+def quiet(name: str, level: int) -> Iterator[None]:
+    """Without a logger's lines below a level."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(level)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+@contextlib.contextmanager
 def quiet_datasets() -> Iterator[None]:
     """Without the progress bar that `datasets` draws for every episode, and without LeRobot's line about a picture that
     cannot be written: the episode that lacks it cannot be saved.
     """
     import datasets
 
-    shown, pictures = datasets.utils.logging.is_progress_bar_enabled(), logging.getLogger(PICTURE_WRITER)
+    shown = datasets.utils.logging.is_progress_bar_enabled()
     datasets.disable_progress_bars()
-    level = pictures.level
-    pictures.setLevel(logging.CRITICAL)
     try:
-        yield
+        with quiet(PICTURE_WRITER, logging.CRITICAL):
+            yield
     finally:
-        pictures.setLevel(level)
         if shown:
             datasets.enable_progress_bars()

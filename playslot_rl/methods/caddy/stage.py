@@ -37,12 +37,11 @@ from torch.nn import functional as F
 from playslot_rl import keys
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.windows import IntArray
-from playslot_rl.frames import normalise, psnr
+from playslot_rl.frames import IMAGENET_MEAN, IMAGENET_STD, normalise, psnr
 from playslot_rl.losses.common import total_loss
 from playslot_rl.methods.caddy.action import ActionInformation, divergence, joint_distribution, mutual_information
 from playslot_rl.methods.caddy.method import CADDYConfig
 from playslot_rl.methods.caddy.model import CADDY, Rollout, at_times
-from playslot_rl.methods.resnet_oracle.network import IMAGENET_MEAN, IMAGENET_STD
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread

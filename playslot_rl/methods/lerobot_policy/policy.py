@@ -19,9 +19,8 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.frames import normalise
+from playslot_rl.frames import IMAGENET_MEAN, IMAGENET_STD, normalise
 from playslot_rl.methods.lerobot_policy.method import ACTConfig, ChunkConfig, DiffusionConfig, require_diffusers
-from playslot_rl.methods.resnet_oracle.network import IMAGENET_MEAN, IMAGENET_STD
 from playslot_rl.modules.action_range import ActionRange
 
 STATISTICS = ("mean", "std", "min", "max")

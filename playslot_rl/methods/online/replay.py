@@ -11,10 +11,9 @@ Shapes: n episodes of L frames (`env.max_steps` + 1), B sequences of T frames, A
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
@@ -26,6 +25,7 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.methods.online.config import OnlineConfig
+from playslot_rl.runtime.progress import quiet
 from playslot_rl.storage.resume import KEPT, TrainingCheckpoints, optimizer_tensors, restore_optimizer
 from playslot_rl.storage.tensors import load_modules, load_tensors, module_tensors, save_tensors
 
@@ -82,7 +82,7 @@ class Replay:
             raise ValueError(f"replay: got episodes of {frames} frames, expected {self.episode_frames}")
         number = torch.arange(self.episodes, self.episodes + n).unsqueeze(-1).expand(n, frames)
         rows = episodes.clone(recurse=False).set(keys.EPISODE, number.contiguous())
-        with _quiet():
+        with quiet("torchrl", logging.WARNING):
             self._buffer.extend(rows.set(STREAM, torch.zeros_like(number)).reshape(-1))
         self.episodes += n
 
@@ -107,17 +107,6 @@ class Replay:
         flat = self._buffer.sample().exclude("index", STREAM)
         batch: TensorDict = flat.reshape(self.batch_size, self.sequence)
         return batch.set(keys.REWARD, batch.get(keys.REWARD) * self.reward_scale)
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    logger = logging.getLogger("torchrl")
-    level = logger.level
-    logger.setLevel(logging.WARNING)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
 
 
 @dataclass(frozen=True)

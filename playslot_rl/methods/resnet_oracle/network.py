@@ -26,7 +26,7 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import Actor, ReactiveActor, with_present
 from playslot_rl.config import PolicyConfig
 from playslot_rl.errors import CheckpointError
-from playslot_rl.frames import normalise
+from playslot_rl.frames import IMAGENET_MEAN, IMAGENET_STD, normalise
 from playslot_rl.methods.resnet_oracle.method import HISTORY, NAME, ResNetOracleConfig
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.runs import Run
@@ -35,9 +35,6 @@ from playslot_rl.world_model import oracle_module
 
 WIDTH = 512
 Pretraining = Literal["imagenet", "scratch"]
-
-# Statistics of ImageNet, with which torchvision's weights were trained.
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class ResNetPolicy(nn.Module):
