@@ -35,12 +35,12 @@ def resnet() -> Actor:
 
 
 def lapo() -> Actor:
-    from playslot_rl.methods.lapo.model import PixelPolicy
+    from playslot_rl.methods.lapo.model import LAPOPolicy
     from playslot_rl.modules.action_decoder import ActionDecoder
 
     config = compose(["preset=smoke"])
     own = config.baselines.lapo
-    return latent_actor(PixelPolicy(own, 64), ActionDecoder(config.model.action_decoder, own.latent_dim, 4))
+    return latent_actor(LAPOPolicy(own, 64), ActionDecoder(config.model.action_decoder, own.latent_dim, 4))
 
 
 def chunks(name: str) -> Actor:

@@ -225,8 +225,10 @@ class ForwardModel(ChangeUNet):
         return past[:, -1] + self.change(past.flatten(1, 2), z)
 
 
-class PixelPolicy(nn.Module):
-    """A latent policy: frames (B, 3, H, W), uint8 or float [0, 1], to latent actions (B, Z)."""
+class LAPOPolicy(nn.Module):
+    """LAPO's latent policy, and that of the methods after it: frames (B, 3, H, W), uint8 or float [0, 1], to latent
+    actions (B, Z); `config` are the settings of one of them.
+    """
 
     def __init__(self, config: Any, image_size: int) -> None:
         super().__init__()
@@ -245,7 +247,7 @@ class PixelPolicy(nn.Module):
 
 def pixel_actor(done: StageCheckpoint, own: Any, device: torch.device | str) -> Actor:
     """The actor of a finished policy, and of the decoder beside it."""
-    build = partial(PixelPolicy, own, done.sizes[1].image_size)
+    build = partial(LAPOPolicy, own, done.sizes[1].image_size)
     parts = DecodedPolicy.load(done, build, own.latent_dim, own.hidden, device)
     return latent_actor(parts.policy, parts.action_decoder)
 

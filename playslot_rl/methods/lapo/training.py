@@ -35,7 +35,7 @@ from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import normalise
 from playslot_rl.methods.cloning import LatentCloning, cloning
 from playslot_rl.methods.lapo.method import NAME, LAPOConfig
-from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, PixelPolicy, QuantisedInverse
+from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolicy, QuantisedInverse
 from playslot_rl.modules.quantizer import usage
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
@@ -151,7 +151,7 @@ class PixelCloning(LatentCloning):
         self.own = own = getattr(config.baselines, record.name)
         super().__init__(config, record.demos, device, own.shift, own.policy, own.loss)
         with global_seed(config.seed, 0, record.name):
-            self.policy = PixelPolicy(own, config.env.image_size).to(device)
+            self.policy = LAPOPolicy(own, config.env.image_size).to(device)
             self.decoder = self.new_decoder(own.latent_dim, own.hidden)
 
 

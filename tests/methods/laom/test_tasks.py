@@ -15,7 +15,7 @@ from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS
 from playslot_rl.methods.clam.model import Forward, Inverse
 from playslot_rl.methods.laom.model import LatentActions
-from playslot_rl.methods.lapo.model import PixelPolicy
+from playslot_rl.methods.lapo.model import LAPOPolicy
 from playslot_rl.recipes import train_baseline
 from playslot_rl.runs import Run
 
@@ -54,8 +54,8 @@ def test_the_sizes_of_every_preset_fit_together(task: str, preset: str) -> None:
         frames = torch.empty(2, 3, 3, size, size)
         model = LatentActions(laom, size, config.env.action_dim)
         z = model(frames[:, 0], frames[:, 2])
-        assert z.shape == PixelPolicy(laom, size)(frames[:, 0]).shape == (2, laom.latent_dim)
+        assert z.shape == LAPOPolicy(laom, size)(frames[:, 0]).shape == (2, laom.latent_dim)
         assert model.change(model.features(frames[:, 0]), z).shape == (2, model.features.width)
         z = Inverse(clam, size)(frames)
-        assert z.shape == PixelPolicy(clam, size)(frames[:, 0]).shape == (2, clam.latent_dim)
+        assert z.shape == LAPOPolicy(clam, size)(frames[:, 0]).shape == (2, clam.latent_dim)
         assert Forward(clam)(frames[:, :2], z).shape == frames[:, 0].shape

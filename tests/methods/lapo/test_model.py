@@ -20,7 +20,7 @@ from playslot_rl.data.neighbours import Ends
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.lapo.method import Encoder, LAPOConfig
-from playslot_rl.methods.lapo.model import ConvEncoder, ForwardModel, InverseModel, PixelPolicy, sizes
+from playslot_rl.methods.lapo.model import ConvEncoder, ForwardModel, InverseModel, LAPOPolicy, sizes
 from playslot_rl.methods.lapo.training import LAPOModelStage, infer_latents, load_inverse
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators, global_seed
@@ -137,11 +137,11 @@ def test_a_policy_of_an_earlier_form_has_the_same_weights_and_models_of_one_are_
     config = compose(["preset=smoke"])
     old = {"channels": [8, 16], "hidden": 32, "groups": 2, "code_dim": 4, "codes": 4}
     plain = {"env": to_dict(config.env), "model": to_dict(config.model), "lapo": old}
-    made = {"modules": {"x": PixelPolicy(CONFIG, 32)}, "data": {}, "parents": {}, "metrics": {}, "steps": 1}
+    made = {"modules": {"x": LAPOPolicy(CONFIG, 32)}, "data": {}, "parents": {}, "metrics": {}, "steps": 1}
     done = save_stage(tmp_path / "old", stage="lapo_model", config=plain, seconds=0.0, **made)  # type: ignore[arg-type]
     own = sizes(done)
     names = {"network.encoder.levels.0.0.weight", "network.encoder.levels.1.1.second.bias", "network.mlp.2.weight"}
-    assert names <= set(PixelPolicy(own, 32).state_dict())
+    assert names <= set(LAPOPolicy(own, 32).state_dict())
     with pytest.raises(CheckpointError, match=r"LAPO's models of an earlier form .*train them again") as caught:
         load_inverse(done, "cpu")
     assert "\n" not in str(caught.value)
@@ -212,7 +212,7 @@ def test_the_actor_decodes_the_policys_latent_and_what_it_saw() -> None:
     sizes = ActionDecoderConfig(8, state_dim=8, state_layers=1, state_heads=2)
     pixels = torch.randint(256, (3, 3, 32, 32), dtype=torch.uint8)
     for reads in (False, True):
-        policy = PixelPolicy(config, 32)
+        policy = LAPOPolicy(config, 32)
         decoder = ActionDecoder(replace(sizes, reads_slots=reads), config.latent_dim, 4, config.hidden).eval()
         actor = latent_actor(policy, decoder)
         out = actor(actor.reset([1, 2, 3]).set(keys.PIXELS, pixels))
@@ -229,7 +229,7 @@ def test_fine_tuning_shows_labelled_rows_their_actions_and_goes_on_cloning_all()
     moves = transitions(source)
     frames, labelled = FrameInputs(source, moves.rows, "cpu"), torch.tensor([3, 8, 9])
     policy, decoder = (
-        PixelPolicy(CONFIG, 32),
+        LAPOPolicy(CONFIG, 32),
         ActionDecoder(ActionDecoderConfig(8), CONFIG.latent_dim, 2, CONFIG.hidden),
     )
     criterion = BehaviourLoss(policy)
