@@ -27,7 +27,7 @@ class Inverse(nn.Module):
 
     def __init__(self, config: CLAMConfig, image_size: int) -> None:
         super().__init__()
-        self.network = EncoderMLP.of(config, 3, image_size)
+        self.network = EncoderMLP(config, 3, image_size)
 
     def forward(self, frames: Tensor) -> Tensor:
         z: Tensor = self.network(normalise(frames).flatten(1, 2))

@@ -84,37 +84,27 @@ class ConvEncoder(nn.Module):
 
 
 class EncoderMLP(nn.Module):
-    """A ConvEncoder's last level, flattened, through one hidden layer: (B, C, H, W) to (B, out_dim)."""
+    """A ConvEncoder's last level, flattened, through one hidden layer: F frames (B, 3 F, H, W) to latents (B, Z), of
+    the settings of a method (LAPO's, LAOM's, CLAM's).
+    """
 
-    def __init__(
-        self,
-        in_channels: int,
-        channels: tuple[int, ...],
-        image_size: int,
-        hidden: int,
-        out_dim: int,
-        kind: Encoder = "strided",
-    ) -> None:
+    def __init__(self, config: Any, frames: int, image_size: int) -> None:
         super().__init__()
-        self.encoder = ConvEncoder(in_channels, channels, kind)
+        channels, hidden = config.channels, config.hidden
+        self.encoder = ConvEncoder(3 * frames, channels, config.encoder)
         width = channels[-1] * (image_size // 2 ** len(channels)) ** 2
-        self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, out_dim))
-
-    @classmethod
-    def of(cls, config: Any, frames: int, image_size: int) -> EncoderMLP:
-        """Frames to the latent of a method, by its settings (LAPO's, LAOM's, CLAM's)."""
-        return cls(3 * frames, config.channels, image_size, config.hidden, config.latent_dim, config.encoder)
+        self.mlp = nn.Sequential(nn.Linear(width, hidden), nn.ReLU(), nn.Linear(hidden, config.latent_dim))
 
     def forward(self, x: Tensor) -> Tensor:
         return self.out(self.hidden(x))
 
     def hidden(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) to the hidden layer, (B, hidden), after its ReLU."""
+        """(B, 3 F, H, W) to the hidden layer, (B, hidden), after its ReLU."""
         h: Tensor = self.mlp[:2](self.encoder(x)[-1].flatten(1))
         return h
 
     def out(self, hidden: Tensor) -> Tensor:
-        """(B, hidden) to (B, out_dim)."""
+        """(B, hidden) to (B, Z)."""
         out: Tensor = self.mlp[2](hidden)
         return out
 
@@ -169,7 +159,7 @@ class InverseModel(QuantisedInverse):
     """IDM on frames (B, F, 3, H, W), uint8 or float [0, 1]."""
 
     def __init__(self, config: LAPOConfig, image_size: int) -> None:
-        super().__init__(config, EncoderMLP.of(config, config.frames, image_size))
+        super().__init__(config, EncoderMLP(config, config.frames, image_size))
 
     def read(self, frames: Tensor) -> Tensor:
         return super().read(normalise(frames).flatten(1, 2))
@@ -232,7 +222,7 @@ class LAPOPolicy(nn.Module):
 
     def __init__(self, config: Any, image_size: int) -> None:
         super().__init__()
-        self.network = EncoderMLP.of(config, 1, image_size)
+        self.network = EncoderMLP(config, 1, image_size)
 
     def forward(self, pixels: Tensor) -> Tensor:
         return self.decide(self.features(pixels))
