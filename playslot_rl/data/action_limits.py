@@ -69,7 +69,8 @@ class ActionLimits:
         """What was taken, in one line, with the share of these actions (M, A) that lie outside and are clipped."""
         cut = []
         for i in np.flatnonzero(self.quantiles):
-            outside = 100 * float(np.mean((actions[:, i] < self.low[i]) | (actions[:, i] > self.high[i])))
+            known = actions[~np.isnan(actions[:, i]), i]
+            outside = 100 * float(np.mean((known < self.low[i]) | (known > self.high[i])))
             seen = f"{self.smallest[i]:.6g}..{self.largest[i]:.6g}"
             cut.append(f"{self.names[i]} by quantiles (all: {seen}), {outside:.2g} % of its values clipped")
         return "; ".join([f"actions: {said(self.plain())}", *cut])

@@ -260,9 +260,9 @@ def real_actions(source: EpisodeFrames, rows: npt.NDArray[np.int64], width: int)
 
 
 def probed_actions(source: EpisodeFrames, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.float32] | None:
-    """Real actions (M, A) of transitions for a measure, scaled as they are learned; None where there are none, or some
-    that are no numbers."""
-    if source.actions is None or not np.isfinite(source.actions[rows]).all():
+    """Real actions (M, A) of transitions for a measure, scaled as they are learned; NaN where they are not known. None
+    where none is."""
+    if source.actions is None or not np.isfinite(source.actions[rows]).all(axis=1).any():
         return None
     scaled: npt.NDArray[np.float32] = _unit_actions(source, source.actions[rows]).numpy()
     return scaled
@@ -278,19 +278,28 @@ def _unit_actions(source: EpisodeFrames, actions: npt.NDArray[np.float32]) -> Te
 
 
 def require_finite(demos: DemonstrationSplit, labelled: int | None = None) -> None:
-    """Refuse demonstrations whose actions are learned (of the first `labelled`; None: all) or measured, and are no
-    numbers."""
+    """Refuse demonstrations whose actions are learned (of the first `labelled`; None: all), and that have none, or are
+    learned or measured, and are no numbers."""
     for source, shown in ((demos.trained, labelled), (demos.held_out, None)):
         if source is None or source.actions is None:
             continue
         moves = transitions(source)
-        rows = moves.rows if shown is None else moves.rows[moves.episode < shown]
-        bad = int((~np.isfinite(source.actions[rows])).any(axis=1).sum())
+        actions, read = source.actions[moves.rows], moves.episode < (source.recordings if shown is None else shown)
+        acted = np.logical_or(~np.isnan(actions).all(axis=1), not source.unlabelled)
+        if source is demos.trained and not acted[read].all():
+            some = len(np.unique(moves.episode[acted]))
+            raise DataError(
+                f"{source.unlabelled}: got no actions, expected some in all {len(np.unique(moves.episode[read]))} "
+                f"demonstrations whose actions are learned: {some} have any; name theirs first in data.demos, and set "
+                f"demos={some}, or behaviour.labelled_demos={some} or less and behaviour.oracle=false"
+            )
+        read &= acted
+        bad = int((~np.isfinite(actions[read])).any(axis=1).sum())
         if bad:
             raise DataError(
-                f"{source.name}: got NaN or infinite actions in {bad} of {len(rows)} transitions that are learned from "
-                "or measured on, expected finite numbers: leave those episodes out, or lower behaviour.labelled_demos "
-                "and set behaviour.oracle=false"
+                f"{source.name}: got NaN or infinite actions in {bad} of {read.sum()} transitions that are learned "
+                "from or measured on, expected finite numbers: leave those episodes out, or lower "
+                "behaviour.labelled_demos and set behaviour.oracle=false"
             )
 
 

@@ -59,7 +59,8 @@ class EpisodeFrames:
     Attributes:
         frames: uint8 (F, H, W, 3), [0, 255], memory-mapped; index it by integers, slices or integer arrays.
         starts, lengths: int64 (E,).
-        actions: float32 (F, A), as they were recorded, or None if the data set (or one of several) has none.
+        actions: float32 (F, A), as they were recorded, NaN in those of several sets that have none; None if none has.
+        unlabelled: names of those sets, with commas.
         success: bool (F,), or None.
         seeds: int64 (E,), or None.
         fingerprint: content hash, 16 hex digits.
@@ -89,6 +90,7 @@ class EpisodeFrames:
     states: npt.NDArray[np.float32] | None = None
     tasks: npt.NDArray[np.str_] | None = None
     recorded: npt.NDArray[np.int64] | None = None
+    unlabelled: str = ""
 
     @property
     def episodes(self) -> int:

@@ -193,7 +193,8 @@ def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
 
 
 def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
-    """Several data sets as one; labels that not all have, or of another width, are dropped. Raises as `agree`."""
+    """Several data sets as one; labels that not all have, or of another width, are dropped, but actions that only some
+    have are NaN in the others. Raises as `agree`."""
     if len(sources) == 1:
         return sources[0]
     agree(sources)
@@ -207,7 +208,12 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
             return None
         return np.concatenate(labels)
 
-    actions = joined("actions")
+    acting, actions = [source for source in sources if source.actions is not None], None
+    silent = {s.name if s.actions is None else s.unlabelled: None for s in sources if acting}
+    if len(widths := {source.require_actions().shape[1] for source in acting}) == 1:
+        none = np.full((1, *widths), np.nan, np.float32)
+        rows = [none.repeat(len(s.frames), axis=0) if s.actions is None else s.actions for s in sources]
+        actions = np.concatenate(rows)
     return replace(
         sources[0],
         camera=",".join(dict.fromkeys(source.camera for source in sources)),
@@ -223,7 +229,8 @@ def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
         fingerprint=text_hash("+".join(source.fingerprint for source in sources)),
         name=",".join(dict.fromkeys(source.name for source in sources)),
         shares=None,
-        limits=None if actions is None else joined_limits([s.limits for s in sources], actions.shape[1]),
+        unlabelled=",".join(filter(None, silent)),
+        limits=None if actions is None else joined_limits([s.limits for s in acting], actions.shape[1]),
     )
 
 

@@ -5,7 +5,7 @@ Shapes: M transitions, Z latent-action width (N * Z with one latent per slot), A
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,7 @@ class ParsedEpisodes:
         rows: row of `slots` that a transition starts from (M,).
         pixels: row of the source's frames, likewise.
         episodes: episode of each transition (M,).
-        actions: (M, A), scaled as they are learned, or None.
+        actions: (M, A), scaled as they are learned, NaN where they are not known, or None.
     """
 
     source: EpisodeFrames
@@ -61,6 +61,11 @@ class ParsedEpisodes:
         rows = spread_windows(self.starts, self.source.lengths, frames, most, np.flatnonzero(self.tested_episodes))
         of = np.searchsorted(self.starts, rows[:, 0], side="right") - 1
         return rows, rows + (self.source.starts - self.starts)[of][:, None], of
+
+    def take(self, kept: npt.NDArray[np.bool_]) -> ParsedEpisodes:
+        """Some of the transitions (M,)."""
+        parts = ("latents", "codes", "rows", "pixels", "episodes", "actions")
+        return replace(self, **{name: getattr(self, name)[kept] for name in parts})
 
     @property
     def tested(self) -> npt.NDArray[np.bool_]:
@@ -108,17 +113,19 @@ def action_lines(model: WorldModel, parsed: ParsedEpisodes, seed: int) -> tuple[
         elif parsed.tested_episodes.all():
             missing = "no other episodes to fit a probe on"
         else:
-            scores = _scores(parsed, parsed.actions, noisy, seed)
-            if scores["latent"]["linear"]["mean_r2"] is None:
-                missing, scores = "the actions do not vary", {}
-            else:
-                lines |= _probe_lines(scores)
+            known = np.asarray(np.isfinite(parsed.actions).all(axis=1))
+            of = "" if known.all() else f"; {known.sum()} of {len(known)} transitions have actions"
+            missing, scores = _scores(parsed.take(known), noisy[known], seed)
+            lines |= _probe_lines(scores, of) if scores else {}
     keys = [key for key, measure in MEASURES.items() if measure.group == ACTIONS]
     return [lines.get(key) or line(key, None, missing) for key in keys], {"probes": scores}
 
 
-def _scores(parsed: ParsedEpisodes, actions: Floats, noisy: Floats, seed: int) -> dict[str, Any]:
-    """What is seen -> result of `probe_actions`."""
+def _scores(parsed: ParsedEpisodes, noisy: Floats, seed: int) -> tuple[str, dict[str, Any]]:
+    """Why there are none, or else what is seen -> result of `probe_actions`."""
+    actions = parsed.actions
+    if actions is None or not parsed.tested.any() or parsed.tested.all():
+        return "no actions in the tested episodes, or in no others", {}
     wrong = repaired(np.arange(len(parsed.rows)), parsed.tested, derived_seed(seed, 0, "wrong pairs"))
     seen = {
         "latent": parsed.latents,
@@ -127,15 +134,17 @@ def _scores(parsed: ParsedEpisodes, actions: Floats, noisy: Floats, seed: int) -
         "noise": noisy,
     }
     scores = {name: probe_actions(x, actions, parsed.episodes, tested=parsed.tested) for name, x in seen.items()}
-    before = np.nonzero(parsed.episodes[1:] == parsed.episodes[:-1])[0]  # an episode's last one has none after it
+    if scores["latent"]["linear"]["mean_r2"] is None:
+        return "the actions do not vary", {}
+    before = np.nonzero(np.diff(parsed.rows) == 1)[0]  # an episode's last one has none after it
     episodes, tested = parsed.episodes[before], parsed.tested[before]
     if tested.any() and not tested.all():
         late = probe_actions(parsed.latents[before + 1], actions[before], episodes, tested=tested)
         scores |= {"late": late} if late["linear"]["mean_r2"] is not None else {}
-    return scores
+    return "", scores
 
 
-def _probe_lines(scores: dict[str, Any]) -> dict[str, Line]:
+def _probe_lines(scores: dict[str, Any], of: str) -> dict[str, Line]:
     best = {name: max(score["linear"]["mean_r2"], score["mlp"]["mean_r2"]) for name, score in scores.items()}
     own, lag = scores["latent"], line("lag", None, "no transitions that others follow, or their actions do not vary")
     # A probe that fails on other episodes is no better the further it fails: differences end at about nothing.
@@ -147,7 +156,7 @@ def _probe_lines(scores: dict[str, Any]) -> dict[str, Line]:
         lag = line("lag", counted["late"] - counted["latent"], f"one later: {best['late']:.2f}")
         if max(best["late"], best["latent"]) <= 0:
             lag = lag.without_value(f"{UNTOLD}: {best['latent']:.2f}")
-    held = f"{own['test']} transitions of {own['test_episodes']} held-out episodes, fitted on {own['train']} others"
+    held = f"{own['test']} transitions of {own['test_episodes']} held-out episodes, fitted on {own['train']} others{of}"
     return {
         "linear_probe": line("linear_probe", own["linear"]["mean_r2"], held),
         "mlp_probe": line("mlp_probe", own["mlp"]["mean_r2"], held),

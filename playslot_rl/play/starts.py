@@ -202,6 +202,8 @@ class RecordedStarts:
         seeds, actions = self.source.seeds, self.source.actions
         if self.make_task is None or seeds is None or actions is None or actions.shape[1] != self.model.env.action_dim:
             return None
+        if not np.isfinite(actions[rows[:-1]]).all():
+            return None
         task = self.make_task()
         try:
             twin = Twin(task, int(seeds[episode]), list(actions[rows[:-1]]))

@@ -51,6 +51,14 @@ def policy_taken_over(config: ExperimentConfig, record: StageRecord, steps: int)
     return partial(Run(record.run).take_training, source, record.name, steps) if source else None
 
 
+def _without_actions(source: EpisodeFrames) -> str:
+    """How many of some demonstrations have none, where others do, for a line."""
+    if source.actions is None or not source.unlabelled:
+        return ""
+    silent = np.isnan(source.actions[source.starts]).all(axis=1)
+    return f" ({len(np.unique(source.numbers[silent]))} without actions)" if silent.any() else ""
+
+
 def cloned(
     name: str, split: DemonstrationSplit, rows: int, labelled: int | None = None, views: int = 1
 ) -> tuple[str, dict[str, Any]]:
@@ -67,7 +75,10 @@ def cloned(
     kept = rows / (views * int((trained.lengths - 1).sum()))
     shown = "all" if labelled is None else str(labelled)
     held_out = "none" if split.held_out is None else str(split.held_out.recordings)
-    line = f"{name}: {demos} demos, {100 * kept:.0f} % of their rows kept, {shown} labelled, {held_out} held out"
+    silent = "" if split.held_out is None else _without_actions(split.held_out)
+    line = (
+        f"{name}: {demos} demos, {100 * kept:.0f} % of their rows kept, {shown} labelled, {held_out} held out{silent}"
+    )
     return line, {
         "demos": demos,
         "labelled_demos": demos if labelled is None else labelled,

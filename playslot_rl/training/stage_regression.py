@@ -173,7 +173,7 @@ class RegressionStage:
         name: of the network in checkpoints, and of the generator that draws the rows.
         criterion: compares `criterion.network`'s outputs, trained in place, with the targets.
         checks: what a validation looks at, by the name of the error; the training data as `unexplained` if empty.
-        held_out: demonstrations that are not trained on, checked as `unexplained_held_out`.
+        held_out: demonstrations that are not trained on, checked as `unexplained_held_out` where their target is known.
         validated: at most so many rows of each, evenly spread, are looked at in a validation; 0 takes all.
         stream: name of the generator that draws the rows; `name` if empty.
         precision: `bf16` trains the network under autocast (`auto`: where that pays); it is validated in fp32.
@@ -202,8 +202,8 @@ class RegressionStage:
         self.inputs, self.targets, self.batch_size, self.validated = inputs, targets, batch_size, validated
         self.precision = precision
         self.checks = dict(checks or {"unexplained": (inputs, targets)})
-        if held_out is not None:
-            self.checks[f"unexplained{HELD_OUT}"] = held_out
+        if held_out is not None and len((known := _with_targets(*held_out))[1]):
+            self.checks[f"unexplained{HELD_OUT}"] = known
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -229,6 +229,12 @@ class RegressionStage:
         count = min(self.validated or len(targets), len(targets))
         rows = torch.linspace(0, len(targets) - 1, count, device=targets.device).long()
         return apply_rows(self.criterion.network, inputs, rows), targets[rows]
+
+
+def _with_targets(inputs: Inputs, targets: Tensor) -> Examples:
+    """Those whose target is known: demonstrations without actions, beside others that have some, have NaN."""
+    known = ~targets.flatten(1).isnan().any(dim=1)
+    return (inputs, targets) if known.all() else (TakenInputs(inputs, known.nonzero()[:, 0]), targets[known])
 
 
 def together(batches: Mapping[str, Mapping[str, Tensor]]) -> dict[str, Tensor]:

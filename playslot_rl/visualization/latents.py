@@ -49,9 +49,11 @@ def read_latents(model: WorldModel, root: Path, given: ReportInput) -> LatentDat
         return LatentData(root.name, codes, None, None)
     rows = np.concatenate([np.arange(s, s + n - 1) for s, n in zip(starts, lengths, strict=True) if n > 1])
     actions, probed = np.asarray(source.actions[rows]), probed_actions(source, rows)
-    if probed is None or len(np.unique(episodes)) < 2:
+    known = np.isfinite(actions).all(axis=1)
+    if probed is None or len(np.unique(episodes[known])) < 2:
         return LatentData(root.name, codes, actions, None)
-    return LatentData(root.name, codes, actions, probe_actions(z, probed, episodes, codes=codes))
+    probe = probe_actions(z[known], probed[known], episodes[known], codes=codes[known])
+    return LatentData(root.name, codes, actions, probe)
 
 
 def latent_section(given: ReportInput) -> Section:

@@ -7,14 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from playslot_rl.data.action_limits import ActionLimits
 from playslot_rl.data.demonstrations import (
+    probed_actions,
     real_actions,
+    require_finite,
     require_labelled,
     split_demonstrations,
     transitions,
 )
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.views import drawn_demonstrations, first_demonstrations
+from playslot_rl.data.views import concatenate, drawn_demonstrations, first_demonstrations
 from playslot_rl.errors import DataError
 
 
@@ -64,6 +67,32 @@ def test_actions_are_clamped_and_of_the_right_width(source: EpisodeFrames) -> No
     assert real_actions(source, np.array([0, 1]), 2).tolist() == [[-1.0, 0.0], [1.0, 1.0]]
     with pytest.raises(DataError, match="got actions of width 2, expected 4"):
         real_actions(source, np.array([0]), 4)
+
+
+def test_sets_with_and_without_actions_are_one_whose_first_demonstrations_are_labelled(source: EpisodeFrames) -> None:
+    low, high = np.float32([-1, 0]), np.float32([9, 10])
+    acted = replace(source, name="acted", limits=ActionLimits(("x", "y"), low, high, low, high))
+    silent = replace(source, name="silent", actions=None)
+    both = concatenate([acted, silent])
+    assert both.actions is not None
+    assert both.limits is not None
+    assert source.actions is not None
+    assert np.array_equal(both.actions[:6], source.actions)
+    assert np.isnan(both.actions[6:]).all()
+    assert (both.unlabelled, both.limits.low.tolist(), both.limits.high.tolist()) == ("silent", [-1, 0], [9, 10])
+    assert "silent" not in both.limits.line(both.actions)
+    split = split_demonstrations(both, 5, 0, 1)
+    for labelled in (1, 2):
+        require_finite(split, labelled)
+    probed = probed_actions(both, np.array([0, 6]))
+    assert probed is not None
+    assert np.isnan(probed).any(axis=1).tolist() == [False, True]
+    other = split_demonstrations(concatenate([silent, acted]), 6, 0, 1)
+    for wanted, given in ((3, split), (None, split), (1, other)):
+        with pytest.raises(DataError, match=r"^silent: got no actions, expected some .*: 2 have any"):
+            require_finite(given, wanted)
+    assert concatenate([silent, silent]).actions is None
+    assert concatenate([acted, replace(acted, actions=np.zeros((6, 3), np.float32))]).actions is None
 
 
 @pytest.mark.parametrize(

@@ -137,6 +137,20 @@ def test_without_actions_their_lines_are_not_measured(model: WorldModel) -> None
     assert found["noise_size"].value is not None
 
 
+def test_probes_are_of_the_transitions_with_actions(model: WorldModel) -> None:
+    real = videos().actions
+    assert real is not None
+    some = np.where(np.arange(len(real))[:, None] // LENGTH % 2, real, np.nan).astype(np.float32)
+    lines = [make_card(model, replace(videos(), actions=part), {}, DataConfig()).lines for part in (real, some)]
+    whole, half = map(by_key, lines)
+    assert half["linear_probe"].note.endswith("; 36 of 72 transitions have actions")
+    assert half["linear_probe"].value not in (None, whole["linear_probe"].value)
+    assert half["codes_in_use"] == whole["codes_in_use"]
+    late = np.where(np.arange(len(real))[:, None] < 9 * LENGTH, real, np.nan).astype(np.float32)
+    found = by_key(make_card(model, replace(videos(), actions=late), {}, DataConfig()).lines)
+    assert found["linear_probe"].note == "no actions in the tested episodes, or in no others"
+
+
 def test_one_episode_says_what_it_cannot_tell(model: WorldModel) -> None:
     found = by_key(make_card(model, videos(1), {}, DataConfig()).lines)
     assert found["linear_probe"].note == "no other episodes to fit a probe on"

@@ -94,7 +94,8 @@ def ends(meta: dict[str, Any]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, An
 def test_a_world_model_of_unlabelled_videos_gets_a_policy(
     watched: Path, unlabelled: Path, arm: Path, frames: np.ndarray[Any, Any], tmp_path: Path
 ) -> None:
-    other, few = tmp_path / "other", ("behaviour.labelled_demos=3", f"data.demos={arm}")
+    few: tuple[str, ...] = ("behaviour.labelled_demos=3", f"data.demos={arm}")
+    other = tmp_path / "other"
     for run, own in ((other, ("env.action_dim=6",)), (tmp_path / "mine", ())):
         smoke("train-policy", f"run={watched}", f"out={run}", *few, *own)
         assert json.loads((run / "config.json").read_text())["env"]["action_dim"] == 6
@@ -102,6 +103,13 @@ def test_a_world_model_of_unlabelled_videos_gets_a_policy(
     assert playslot("export", f"run={other}", f"out={tmp_path / 'policy'}", *ONE_CORE).err == ""
     message = "got actions of width 6, expected 5 as in env.action_dim"
     refused("train-policy", f"run={watched}", f"out={tmp_path / 'no'}", *few, "env.action_dim=5", message=message)
+    both = (f"run={watched}", f"data.demos={arm},{unlabelled}")
+    done = smoke("train-policy", *both, *few[:1], "behaviour.oracle=false", f"out={tmp_path / 'both'}", "demos=9")
+    assert "9 demos, " in done.out
+    assert "2 held out (2 without actions)" in done.out
+    message = r"bare: got no actions, expected some in all 7 .*: 6 have any"
+    few = ("behaviour.labelled_demos=7", "behaviour.oracle=false", f"out={tmp_path / 'no'}")
+    refused("train-policy", *both, *few, message=message)
     config = compose([f"data.root={unlabelled}", "env.action_dim=6", f"out={tmp_path / 'adopted'}"], "adopt")
     decide = Decisions(tmp_path / "adopted", {}, 0.0)
     assert for_frames(config, survey(str(unlabelled)), decide).env.action_dim == 6

@@ -66,6 +66,17 @@ def _demos(seed: int, count: int = 30) -> Demonstrations:
     )  # fmt: skip
 
 
+def test_what_has_no_target_is_not_measured() -> None:
+    x, y, network = torch.randn(9, 3), torch.randn(9, 2), nn.Linear(3, 2)
+    given = [torch.where(torch.arange(9)[:, None] < count, y, torch.nan) for count in (5, 0)]
+    some, none = (
+        RegressionStage("n", _stage(network, x, y).criterion, TensorInputs(x), y, 4, held_out=(TensorInputs(x), part))
+        for part in given
+    )
+    assert some.validate(0)["unexplained_held_out"] == pytest.approx(unexplained(network(x[:5]).detach(), y[:5]))
+    assert none.validate(0).keys() == {"unexplained"}
+
+
 def _policies() -> tuple[LatentPolicy, LatentPolicy]:
     torch.manual_seed(1)
     sizes = tiny_config().model.policy

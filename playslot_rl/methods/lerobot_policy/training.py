@@ -152,7 +152,9 @@ def training(record: StageRecord, state: bool = False) -> Training:
     policy.give(real_actions(split.trained, moves.rows, width), states)
     policy.to(device)
     trained = chunked(config, split.trained, own, chunk, device, own.shift, state)
-    held_out = None if split.held_out is None else chunked(config, split.held_out, own, chunk, device, 0, state)
+    other = split.held_out
+    measured = other is not None and bool(np.isfinite(other.require_actions()).all() or not other.unlabelled)
+    held_out = chunked(config, other, own, chunk, device, 0, state) if other is not None and measured else None
     stage = ChunkStage(policy, own, trained, held_out)
     facts = {"pretraining": pretraining, "chunk": chunk, **({"state": policy.state_dim} if state else {})}
     part = Part(f"baselines.{record.name}", stage, own, group=group, optimizer=partial(_optimizer, policy, own))
