@@ -158,7 +158,7 @@ def open_sources(
     """Open LeRobot v3.0 data sets as one; with several cameras each episode comes once for each of them.
 
     Frames are decoded once, into the frame cache; with a `buffer` they are decoded while they are read
-    (`playslot_rl.data.stream`). Labels that not every data set has are dropped.
+    (`playslot_rl.data.stream`). Labels that not every data set has are dropped, but actions.
 
     Args:
         roots: folders, or a text with commas; with a `buffer` also addresses of data sets on the Hub.

@@ -73,8 +73,7 @@ def _candidates(
     source: EpisodeFrames, metas: Mapping[str, Mapping[str, Any]], config: DataConfig, usable: Ints
 ) -> tuple[Ints, str, bool]:
     numbers = source.numbers[usable]
-    recorded = np.unique(numbers)
-    quarter = usable[numbers >= recorded[-max(1, len(recorded) // 4)]]
+    quarter = usable[np.isin(numbers, _last_quarter(source, numbers))]
     world = [metas[stage] for stage in ("slots", "dynamics") if stage in metas]
     trained = [meta for meta in world if str(meta.get("data", {}).get("train", "")) == source.fingerprint]
     if trained:
@@ -97,6 +96,17 @@ def _candidates(
         return chosen, f"the last {config.held_out} episodes, as data.held_out says", False
     what = "the last quarter of the episodes; the checkpoints do not say whether the world model was trained on them"
     return quarter, what, False
+
+
+def _last_quarter(source: EpisodeFrames, numbers: Ints) -> Ints:
+    """The last quarter of some recorded episodes; where only some have actions, of those and of the others."""
+    recorded, first = np.unique(numbers, return_index=True)
+    parts = [recorded]
+    if source.unlabelled and source.actions is not None:
+        begins = source.starts[np.flatnonzero(source.lengths >= 2)[first]]
+        silent = np.asarray(np.isnan(source.actions[begins]).all(axis=1))
+        parts = [part for part in (recorded[~silent], recorded[silent]) if len(part)]
+    return np.concatenate([part[-max(1, len(part) // 4) :] for part in parts])
 
 
 def _policy_held_out(source: EpisodeFrames, policy: Mapping[str, Any], config: DataConfig) -> int:

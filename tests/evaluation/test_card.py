@@ -146,6 +146,11 @@ def test_probes_are_of_the_transitions_with_actions(model: WorldModel) -> None:
     assert half["linear_probe"].note.endswith("; 36 of 72 transitions have actions")
     assert half["linear_probe"].value not in (None, whole["linear_probe"].value)
     assert half["codes_in_use"] == whole["codes_in_use"]
+    few = replace(
+        videos(), actions=np.where(np.arange(len(real))[:, None] < 4 * LENGTH, real, np.nan).astype(np.float32)
+    )
+    assert hold_out(few, {}, DataConfig(), 100).tested.tolist() == [9, 10, 11]
+    assert hold_out(replace(few, unlabelled="b"), {}, DataConfig(), 100).tested.tolist() == [3, 10, 11]
     late = np.where(np.arange(len(real))[:, None] < 9 * LENGTH, real, np.nan).astype(np.float32)
     found = by_key(make_card(model, replace(videos(), actions=late), {}, DataConfig()).lines)
     assert found["linear_probe"].note == "no actions in the tested episodes, or in no others"
