@@ -128,7 +128,7 @@ def probed(latent: float, frame: float, late: float) -> dict[str, Line]:
         name: {"linear": {"mean_r2": r2}, "mlp": {"mean_r2": r2 - 0.4}, "test": 9, "train": 9, "test_episodes": 3}
         for name, r2 in {"latent": latent, "frame": frame, "late": late, "shuffled": -0.1, "noise": -0.1}.items()
     }
-    return {one.key: one for one in settle(list(_probe_lines(scores).values()))}
+    return {one.key: one for one in settle(list(_probe_lines(scores, "").values()))}
 
 
 def test_the_difference_of_two_probes_that_find_nothing_is_no_measure() -> None:

@@ -119,8 +119,9 @@ class CLAMBehaviour(PixelCloning):
     kind = PolicyStage
 
     def __init__(self, record: StageRecord) -> None:
+        own: CLAMConfig = record.config.baselines.clam
         self.inverse, decoder = load_model(record.parents["clam_model"], record.device)
-        super().__init__(record)
+        super().__init__(record, own.shift, own.loss)
         self.decoder = decoder
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:

@@ -144,8 +144,9 @@ class LAOMBehaviour(PixelCloning):
     """A CheckpointError where the model is damaged."""
 
     def __init__(self, record: StageRecord) -> None:
+        own: LAOMConfig = record.config.baselines.laom
         self.model = load_model(record.parents["laom_model"], record.device)
-        super().__init__(record)
+        super().__init__(record, own.shift, own.loss)
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
         return infer_latents(self.model, source, moves, self.device)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -146,10 +146,10 @@ def infer_latents(
 class PixelCloning(LatentCloning):
     """See `LatentCloning`: a policy on frames clones what the model infers from them."""
 
-    def __init__(self, record: StageRecord) -> None:
+    def __init__(self, record: StageRecord, shift: int, loss: Literal["l2", "l1"]) -> None:
         config, device = record.config, record.device
-        self.own = own = getattr(config.baselines, record.name)
-        super().__init__(config, record.demos, device, own.shift, own.policy, own.loss)
+        own = getattr(config.baselines, record.name)
+        super().__init__(config, record.demos, device, shift, own.policy, loss)
         with global_seed(config.seed, 0, record.name):
             self.policy = LAPOPolicy(own, config.env.image_size).to(device)
             self.decoder = self.new_decoder(own.latent_dim, own.hidden)
@@ -159,11 +159,12 @@ class LAPOBehaviour(PixelCloning):
     """A CheckpointError where the model is damaged."""
 
     def __init__(self, record: StageRecord) -> None:
-        self.inverse = load_inverse(record.parents["lapo_model"], record.device)
-        super().__init__(record)
+        own: LAPOConfig = record.config.baselines.lapo
+        self.inverse, self.targets = load_inverse(record.parents["lapo_model"], record.device), own.targets
+        super().__init__(record, own.shift, own.loss)
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
-        return infer_latents(self.inverse, source, moves, self.device, self.own.targets == "quantised")
+        return infer_latents(self.inverse, source, moves, self.device, self.targets == "quantised")
 
 
 def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseModel:
