@@ -15,7 +15,7 @@ import pytest
 from jobs import job_identities
 from stages import stage_identities
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("thin_resnets")]
 
 
 def _compare(name: str, values: dict[str, Any]) -> None:

@@ -306,7 +306,7 @@ def test_actions_that_are_no_numbers_are_refused_where_they_are_learned(
     actions = robot_actions()
     actions[4][7, 2] = np.nan
     broken = write_robot(tmp_path / "set", actions)
-    world = (*TASK, f"run={trained[0]}", f"data.demos={broken}")
+    world = (*TASK, f"run={trained[0]}", f"data.demos={broken}", "behaviour.decoder_steps=6")
     message = r"got NaN or infinite actions in 1 of 174 transitions"
     command = ("train-policy", *world, f"out={tmp_path / 'run'}", *ONE_CORE)
     note, error = playslot(*map(str, command)).err.splitlines()
