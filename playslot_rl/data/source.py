@@ -108,6 +108,13 @@ class EpisodeFrames:
         return np.arange(self.episodes) if self.recorded is None else self.recorded
 
     @property
+    def silent(self) -> npt.NDArray[np.bool_]:
+        """Which episodes have no actions though others have some, bool (E,)."""
+        if self.actions is None or not self.unlabelled:
+            return np.zeros(self.episodes, dtype=np.bool_)
+        return np.asarray(np.isnan(self.actions[self.starts]).all(axis=1))
+
+    @property
     def image_size(self) -> tuple[int, int]:
         """(H, W)."""
         return int(self.frames.shape[1]), int(self.frames.shape[2])

@@ -100,12 +100,8 @@ def _candidates(
 
 def _last_quarter(source: EpisodeFrames, numbers: Ints) -> Ints:
     """The last quarter of some recorded episodes; where only some have actions, of those and of the others."""
-    recorded, first = np.unique(numbers, return_index=True)
-    parts = [recorded]
-    if source.unlabelled and source.actions is not None:
-        begins = source.starts[np.flatnonzero(source.lengths >= 2)[first]]
-        silent = np.asarray(np.isnan(source.actions[begins]).all(axis=1))
-        parts = [part for part in (recorded[~silent], recorded[silent]) if len(part)]
+    silent = np.isin(numbers, source.numbers[source.silent])
+    parts = [part for part in (np.unique(numbers[~silent]), np.unique(numbers[silent])) if len(part)]
     return np.concatenate([part[-max(1, len(part) // 4) :] for part in parts])
 
 

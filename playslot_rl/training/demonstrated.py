@@ -53,10 +53,8 @@ def policy_taken_over(config: ExperimentConfig, record: StageRecord, steps: int)
 
 def _without_actions(source: EpisodeFrames) -> str:
     """How many of some demonstrations have none, where others do, for a line."""
-    if source.actions is None or not source.unlabelled:
-        return ""
-    silent = np.isnan(source.actions[source.starts]).all(axis=1)
-    return f" ({len(np.unique(source.numbers[silent]))} without actions)" if silent.any() else ""
+    silent = len(np.unique(source.numbers[source.silent]))
+    return f" ({silent} without actions)" if silent else ""
 
 
 def cloned(
