@@ -73,7 +73,8 @@ class StageConfig(Checked):
         validate_every: steps between validations.
         log_every: steps between log lines.
         execution: `graph` records what a step computes once, as a CUDA graph, and replays it; `eager` launches its
-            kernels one by one; `auto` is `graph` on a GPU, wherever the step can be recorded.
+            kernels one by one; `auto` is `graph` on a GPU, wherever the step can be recorded, and `eager` for several
+            processes, whose `graph` no two GPUs have tried.
         compile: make kernels of the networks' parts by torch.compile; needs a C++ compiler, and up to a minute
             at the start; `null` compiles SAVi with the full encoder on a GPU, where 2,000 steps are left.
     """

@@ -185,6 +185,15 @@ def copied(tensors: Sequence[Tensor]) -> None:
         tensor.detach().copy_(whole)
 
 
+def recordable() -> bool:
+    """Whether a CUDA graph can hold what is exchanged: NCCL's exchanges are kernels, gloo's are the host's work."""
+    if _here.world == 1:
+        return True
+    import torch.distributed as dist
+
+    return "nccl" in dist.get_backend()
+
+
 def claim(what: str) -> bool:
     """Whether this process is the first one to ask for `what`: always, where it is the only one or has met no others.
 

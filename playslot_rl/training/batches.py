@@ -8,7 +8,8 @@ averaged by one flat sum, between the backward pass and the clipping. With one s
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -56,46 +57,56 @@ class GlobalBatches:
             global_norms(module)
             copied([*module.parameters(), *module.buffers()])
 
+    @property
+    def shares(self) -> list[Share]:
+        """Those that this process computes, one after the other."""
+        first = here().rank * self.micros
+        return [Share(first + micro, self.count, micro, self.micros) for micro in range(self.micros)]
+
+    @property
+    def begins(self) -> bool:
+        """Whether codebooks start from the whole of the next batch, before its first micro-batch is quantised."""
+        return self.micros > 1 and any(quantizer.starts_from_a_batch for quantizer in self._quantizers)
+
     def backward(self, step: int, generators: StepGenerators) -> dict[str, Tensor]:
         """Gradients of the global batch into the parameters; its loss and the other numbers of it.
 
         Raises:
             PeerError: another process ended.
         """
-        if self.count == 1:
+        if self.begins:
             with global_seed(generators.seed, step):
-                losses = dict(step_loss(self.stage, step, generators))
-                losses["loss"].backward()
-            return losses
-        numbers = []
-        with global_seed(generators.seed, step):
-            begins = self.micros > 1 and any(quantizer.starts_from_a_batch for quantizer in self._quantizers)
-            if begins:
                 self._rehearse(step, generators)
-                numbers = [self._share(step, generators, own) for own in self._shares()]
-        # Every micro-batch draws the global batch's noise anew, so that all slice the same.
-        for own in () if begins else self._shares():
+                return self.combined([self._share(step, generators, own) for own in self.shares])
+        numbers = []
+        for own in self.shares:  # each draws the global batch's noise anew, so that all slice the same
             with global_seed(generators.seed, step):
                 numbers.append(self._share(step, generators, own))
-        means = {key: torch.stack([part[key].float() for part in numbers]).mean() for key in numbers[0]}
-        return self._averaged(means) if here().world > 1 else means
+        return self.combined(numbers)
 
-    def _shares(self) -> Iterator[Share]:
-        first = here().rank * self.micros
-        for micro in range(self.micros):
-            yield Share(first + micro, self.count, micro, self.micros)
+    def gradients(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> dict[str, Tensor]:
+        """Of a share's batch, within `sharing`, into the parameters' or added to them; its numbers."""
+        losses = self.stage.loss(batch, step, generators)
+        (losses["loss"] if self.micros == 1 else losses["loss"] / self.micros).backward()
+        return {key: value.detach() for key, value in losses.items()}
+
+    def combined(self, shares: Iterable[dict[str, Tensor]]) -> dict[str, Tensor]:
+        """The numbers of the global batch, of those of the own shares, and its gradients in place of the own ones."""
+        first, *others = shares
+        means = first
+        if others:
+            means = {key: torch.stack([part[key].float() for part in (first, *others)]).mean() for key in first}
+        return self._averaged(means) if here().world > 1 else means
 
     def _share(self, step: int, generators: StepGenerators, own: Share) -> dict[str, Tensor]:
         with sharing(own):
-            losses = step_loss(self.stage, step, generators)
-            (losses["loss"] / self.micros).backward()
-        return {key: value.detach() for key, value in losses.items()}
+            return self.gradients(self.stage.batch(step, generators), step, generators)
 
     @torch.no_grad()
     def _rehearse(self, step: int, generators: StepGenerators) -> None:
         """Show the first global batch to codebooks that start from it, before its first micro-batch is quantised."""
-        for micro in range(self.micros):
-            with sharing(Share(here().rank * self.micros + micro, self.count, micro, self.micros, rehearsal=True)):
+        for own in self.shares:
+            with sharing(replace(own, rehearsal=True)):
                 step_loss(self.stage, step, generators)
 
     def _averaged(self, numbers: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -123,6 +123,7 @@ def fit(
     if run.average is not None:
         run.average.settle()
     if run.steps.on_gpu:
+        run.steps.release()
         run.optimizer.zero_grad(set_to_none=True)  # gradients of a captured step hold all of its memory
     return run.state, start
 

@@ -116,9 +116,10 @@ class _Trial:
             if self.batch:
                 break
         self.rows = max(map(len, self.batch.values()))
+        self.held = sum(value.nbytes for value in self.batch.values()) * parts * batches.micros
 
     def peak(self, rows: int) -> float:
-        """Bytes, with those of the batch itself, which a captured step holds twice."""
+        """Bytes, with those of the process's whole batch, whose micro-batches a captured step holds together."""
         parts = {key: value[: max(1, len(value) * rows // self.rows)] for key, value in self.batch.items()}
 
         def compute() -> None:
@@ -127,7 +128,7 @@ class _Trial:
                 self.batches.stage.loss(batch, self.step, self.generators)["loss"].backward()
 
         try:
-            return peak_memory(compute, self.device) + sum(value.nbytes for value in parts.values())
+            return peak_memory(compute, self.device) + self.held
         finally:
             for parameter in self.batches.parameters.values():
                 parameter.grad = None

@@ -2,9 +2,10 @@
 
     batch, random numbers -> buffers;   [ loss, gradients, clipping, Adam ] -> numbers
 
-What is in brackets is one graph for each phase of a stage (`playslot_rl.training.stage.PhasedStage`); a replay costs
-the host one launch instead of thousands. Random numbers are drawn before it, by the same generators in the same order
-as without a graph, so that they stay a function of seed, step and stream.
+What is in brackets is one graph for each phase of a stage (`playslot_rl.training.stage.PhasedStage`), of all shares of
+the batch that a process computes and with what it exchanges with others; a replay costs the host one launch instead of
+thousands. Random numbers are drawn before it, by the same generators in the same order as without a graph, so that they
+stay a function of seed, step and stream.
 
 Nothing in a step on a GPU waits for it: a step whose loss or gradient is not finite is skipped by Adam and found at the
 next look (`Steps.not_finite`).
@@ -26,8 +27,8 @@ from torch import Tensor
 from playslot_rl.config import StageConfig
 from playslot_rl.errors import ConfigError, TrainingError
 from playslot_rl.runtime.captured import recorded, stopped_at
-from playslot_rl.runtime.processes import here
-from playslot_rl.runtime.shares import taped
+from playslot_rl.runtime.processes import agreed, here, recordable
+from playslot_rl.runtime.shares import Share, sharing, taped
 from playslot_rl.seeds.draws import StepGenerators, derived_seed, global_seed
 from playslot_rl.training.batches import GlobalBatches
 from playslot_rl.training.memory import does_not_fit, out_of_memory
@@ -39,27 +40,31 @@ WARM: Final = 3
 
 
 class _Tape:
-    """The random numbers of a step, in buffers: recorded in one step, handed out while the next is captured, drawn anew
-    before each replay.
+    """The rows of a share of the batch, and the random numbers of its step, in buffers: recorded in one step, handed
+    out while the next is captured, drawn anew before each replay.
     """
 
-    def __init__(self, seed: int, device: torch.device) -> None:
-        self.seed, self.device, self.step = seed, device, 0
+    def __init__(self, share: Share, seed: int) -> None:
+        self.share, self.seed, self.step = share, seed, 0
+        self.inputs: dict[str, Tensor] = {}
         self._generators: dict[tuple[str, str], torch.Generator] = {}
         self._buffers: list[Tensor] = []
         self._events: list[Callable[[], object]] = []
         self._served: int | None = None
 
-    def record(self) -> None:
-        """Begin anew: what is drawn from now on is remembered."""
-        self._buffers, self._events, self._served = [], [], None
+    def begin(self, anew: bool) -> None:
+        """From now on what is drawn is remembered, in place of all before; or the buffers are handed out in order."""
+        if anew:
+            self.inputs, self._buffers, self._events = {}, [], []
+        self._served = None if anew else 0
 
-    def serve(self) -> None:
-        """From now on hand out the buffers, in their order."""
-        self._served = 0
-
-    def redraw(self) -> None:
-        """Fill the buffers with the numbers of `step`."""
+    def fill(self, batch: Mapping[str, Tensor]) -> None:
+        """Put these rows and the numbers of `step` into the buffers."""
+        for name, value in batch.items():
+            if name in self.inputs:
+                self.inputs[name].copy_(value)
+            else:
+                self.inputs[name] = value.clone()
         for event in self._events:
             event()
 
@@ -120,12 +125,11 @@ class Steps:
         self.optimizer, self.config, self.seed, self.device = optimizer, config, seed, torch.device(device)
         self.on_gpu = self.device.type == "cuda"
         self.captures = self._captures()
-        self._tape = _Tape(seed, self.device)
+        self._tapes = [_Tape(share, seed) for share in batches.shares]
         self._replay: Callable[[], None] | None = None
         self._phase: Hashable = None
         self._taken = 0
         self._said = False
-        self._inputs: dict[str, Tensor] = {}
         self._values: dict[str, Tensor] = {}
         self._trouble = torch.full((3,), -1.0, device=self.device)
         self._number = torch.zeros((), device=self.device)
@@ -150,8 +154,7 @@ class Steps:
             if not out_of_memory(error):
                 raise
         # The error is gone, and with it its frames and what they held.
-        self._replay, self._inputs, self._values = None, {}, {}
-        self._tape.record()
+        self.release()
         self.optimizer.zero_grad(set_to_none=True)
         raise does_not_fit(self.batches, self.config, self.key, step, self.seed, self.device)
 
@@ -162,6 +165,12 @@ class Steps:
             return None
         what, value = ("gradient norm", norm) if math.isfinite(loss) else ("loss", loss)
         return what, value, int(step) + 1
+
+    def release(self) -> None:
+        """Let go of what was recorded, and its memory: NCCL's processes cannot part while a graph exchanges by them."""
+        self._replay, self._values, self._taken = None, {}, 0
+        for tape in self._tapes:
+            tape.begin(anew=True)
 
     def _written(self, step: int) -> dict[str, Tensor]:
         self.optimizer.zero_grad(set_to_none=True)
@@ -187,36 +196,52 @@ class Steps:
             self._refused("these steps compute something else each time, or wait for values")
             return self._written(step)
         if phase != self._phase:
-            self._replay, self._phase, self._taken = None, phase, 0
-        tape, self._tape.step = self._tape, step
-        with global_seed(self.seed, step):
-            batch = self.stage.batch(step, StepGenerators(self.seed, step, self.device))
-            if self._taken < WARM:
-                self._taken += 1
-                tape.record()
-                return self._computed(step, batch)
+            self.release()
+            self._phase = phase
+        if self.batches.begins:
+            return self._written(step)
+        if self._taken < WARM:
+            self._taken += 1
+            return self._computed(step, warm=True)
+        *others, last = self._tapes
+        for tape in others:
+            with self._seeded(tape, step):
+                tape.fill(self._batch(step))
+        with self._seeded(last, step):
+            last.fill(self._batch(step))
             if self._replay is None:
-                self._inputs = {name: value.clone() for name, value in batch.items()}
-                tape.serve()
-                self._replay = self._recorded(partial(self._computed, step, self._inputs))
-                if self._replay is None:
-                    return self._written(step)
-            for name, value in batch.items():
-                self._inputs[name].copy_(value)
-            tape.redraw()
-            self._replay()
-        return self._values
+                self._replay = self._recorded(partial(self._computed, step))
+            if self._replay is not None:
+                self._replay()
+                return self._values
+        return self._written(step)
 
-    def _computed(self, step: int, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def _computed(self, step: int, warm: bool = False) -> dict[str, Tensor]:
+        """The step from the buffers, or the one by which they are made (`warm`)."""
         self.optimizer.zero_grad(set_to_none=True)
-        with taped(self._tape):
-            generators = _TapedGenerators(self.seed, step, self.device, tape=self._tape)
-            losses = self.stage.loss(batch, step, generators)
-            losses["loss"].backward()
-        return self._stepped(losses)
+        numbers = []
+        for tape in self._tapes:
+            generators = _TapedGenerators(self.seed, step, self.device, tape=tape)
+            tape.begin(anew=warm)
+            with self._seeded(tape, step) if warm else sharing(tape.share):
+                batch = self._batch(step) if warm else tape.inputs
+                with taped(tape):
+                    numbers.append(self.batches.gradients(batch, step, generators))
+        return self._stepped(self.batches.combined(numbers))
+
+    def _batch(self, step: int) -> Mapping[str, Tensor]:
+        return self.stage.batch(step, StepGenerators(self.seed, step, self.device))
+
+    @contextlib.contextmanager
+    def _seeded(self, tape: _Tape, step: int) -> Iterator[None]:
+        """As a share is computed in `GlobalBatches.backward`: each draws the numbers of the whole batch."""
+        tape.step = step
+        with global_seed(self.seed, step), sharing(tape.share):
+            yield
 
     def _recorded(self, compute: Callable[[], dict[str, Tensor]]) -> Callable[[], None] | None:
         """What computes the same once more, into the same `_values`; None where it cannot be captured, which is said.
+        Either all processes get one, or none: a replay waits for those of the others.
 
         Raises:
             TrainingError: it cannot, and `execution` is `graph`.
@@ -225,12 +250,17 @@ class Steps:
         try:
             replay, self._values = recorded(compute, self._stream)
         except RuntimeError as error:
+            agreed(False)
             if out_of_memory(error):
                 raise
             self._refused(f"a step could not be captured at {stopped_at(error)}", error)
-            self.captures = False
-            return None
-        return replay
+        else:
+            if all(agreed(True)):
+                return replay
+            self._refused("another process could not capture a step, and says why")
+        self.captures = False
+        self.release()
+        return None
 
     def _refused(self, why: str, error: RuntimeError | None = None) -> None:
         """Say once why steps are not captured; an error where `execution` is `graph`."""
@@ -242,11 +272,13 @@ class Steps:
 
     def _captures(self) -> bool:
         """Whether steps are to be captured, by the setting and by what there is."""
-        wanted, why = self.config.execution, ""
+        wanted, why, several = self.config.execution, "", here().world > 1
         if not self.on_gpu:
             why = f"got device {self.device.type}, expected cuda"
-        elif self.batches.count > 1:
-            why = "got several processes or optim.accumulate above 1, expected one share of the batch"
+        elif several and not recordable():
+            why = "got processes that do not meet by NCCL, whose exchanges alone can be captured"
+        elif several and wanted == "auto":
+            why = f"got {here().world} processes, for which a step is captured by {self.key}.execution=graph alone"
         if wanted == "graph" and why:
             raise ConfigError(f"{self.key}.execution=graph: {why}: use {self.key}.execution=auto")
         if wanted == "auto" and why and self.on_gpu and here().first:

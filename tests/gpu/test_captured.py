@@ -12,12 +12,13 @@ from typing import Any
 import pytest
 import tiny_stages
 import torch
-from tiny_stages import CADDY_STEPS, STAGES, in_double
+from ranks import alone_in_a_group
+from tiny_stages import BY_BATCH, CADDY_STEPS, OPTIM, STAGES, in_double
 from torch import Tensor
 
 from playslot_rl.acting.imagination import ImaginationSession
 from playslot_rl.config import StageConfig
-from playslot_rl.errors import TrainingError
+from playslot_rl.errors import ConfigError, TrainingError
 from playslot_rl.runtime.captured import Captured
 from playslot_rl.seeds.draws import step_generator
 from playslot_rl.storage.tensors import module_tensors
@@ -79,6 +80,31 @@ def test_captured_steps_end_with_the_weights_of_the_written_ones(name: str, tmp_
         warnings.filterwarnings("error", message=".* could not be captured", category=RuntimeWarning)
         captured = trained(name, tmp_path / "graph", "auto")
     assert difference(trained(name, tmp_path / "eager", "eager"), captured) <= SAME
+
+
+@pytest.mark.parametrize("name", [name for name in STAGES if name not in BY_BATCH])
+def test_micro_batches_are_captured(name: str, tmp_path: Path) -> None:
+    optim = replace(OPTIM, accumulate=2)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".* launched one by one", category=RuntimeWarning)
+        captured = trained(name, tmp_path / "graph", "auto", optim=optim)
+    assert difference(trained(name, tmp_path / "eager", "eager", optim=optim), captured) <= SAME
+
+
+@pytest.mark.parametrize("name", ["slots", "dynamics", "lapo"])
+def test_exchanges_of_nccl_are_captured(name: str, tmp_path: Path) -> None:
+    """Those of one process; the second training has a communicator from the first, as after a validation."""
+    with alone_in_a_group("nccl"):
+        eager = trained(name, tmp_path / "eager", "eager")
+        captured = trained(name, tmp_path / "graph", "graph")
+        with pytest.warns(RuntimeWarning, match=r"got 1 processes, .* by .*\.execution=graph alone"):
+            trained(name, tmp_path / "auto", "auto")
+    assert difference(eager, captured) <= SAME
+
+
+def test_exchanges_of_gloo_are_refused(tmp_path: Path) -> None:
+    with alone_in_a_group("gloo"), pytest.raises(ConfigError, match=r"got processes that do not meet by NCCL"):
+        trained("decoder", tmp_path, "graph")
 
 
 @pytest.mark.parametrize("name", STAGES)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,32 @@ def _rank(rank: int, world: int, port: int, work: Callable[..., None], arguments
         traceback.print_exc(file=sys.__stderr__)
         os._exit(1)
     os._exit(0)
+
+
+class _Several(int):
+    """One that is taken for more, where it is asked for by `== 1` and `> 1`."""
+
+    __hash__ = int.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return False
+
+    def __gt__(self, other: int) -> bool:
+        return True
+
+
+@contextlib.contextmanager
+def alone_in_a_group(backend: str) -> Iterator[None]:
+    """Inside the block this process makes all exchanges of one of several, in a group of its own."""
+    import torch.distributed as dist
+
+    dist.init_process_group(backend, store=dist.HashStore(), rank=0, world_size=1)
+    processes._here = processes.Processes(0, _Several(1))
+    try:
+        yield
+    finally:
+        processes._here = processes.Processes()
+        dist.destroy_process_group()
 
 
 def log_of(folder: Path) -> list[dict[str, Any]]:

@@ -5,17 +5,23 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from unittest.mock import Mock, patch
 
 import pytest
 import torch
 from ranks import launcher_variables, log_of, run_ranks
+from replayed import Replayed, different
 from tiny_stages import DOUBLE, STAGES, in_double
 
-from playslot_rl.errors import CheckpointError, ConfigError, PeerError
+from playslot_rl.errors import CheckpointError, ConfigError, PeerError, TrainingError
 from playslot_rl.runtime import processes
 from playslot_rl.runtime.processes import agreed, claim, here, wait
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
+from playslot_rl.training import fit as fit_module
+from playslot_rl.training import steps as steps_module
 from playslot_rl.training.fit import fit
+from playslot_rl.training.steps import Steps
 
 pytestmark = pytest.mark.integration
 
@@ -130,6 +136,65 @@ def test_micro_batches_and_an_average_on_two_ranks_are_those_of_one(tmp_path: Pa
         assert other["loss" if "loss" in one else "psnr"] == pytest.approx(
             one["loss" if "loss" in one else "psnr"], rel=10 * CURVE
         )
+
+
+def replayed(folder: Path) -> None:
+    """Steps as they are written, and as a graph takes them: micro-batches, and a codebook beside BatchNorm."""
+    for name, micros in (("dynamics", 3), ("lapo", 1)):
+        ended = []
+        for steps in (Steps, Replayed):
+            part = STAGES[name]()
+            config = replace(part.config, steps=8, optim=replace(part.config.optim, accumulate=micros))
+            with patch.object(fit_module, "Steps", steps):
+                fit(replace(part, config=config), folder / steps.__name__ / name, seed=SEED)
+            ended.append(module_tensors(part.stage.modules))
+        assert different(*ended) == set()
+    assert Replayed.replays > 0
+
+
+def test_replayed_steps_of_two_ranks_are_the_written_ones(tmp_path: Path) -> None:
+    assert run_ranks(2, replayed, tmp_path) == [0, 0]
+
+
+class _Recorded(Steps):
+    """Steps that are recorded as on a GPU."""
+
+    def _captures(self) -> bool:
+        return True
+
+    def _recorded(self, compute: Any) -> Any:
+        self._stream = Mock()
+        try:
+            return super()._recorded(compute)
+        finally:
+            self._stream = None
+
+
+def one_fails(folder: Path) -> None:
+    """Only rank 0 can record a step, and none is replayed."""
+
+    def recorded(*_: Any) -> tuple[Mock, dict[str, torch.Tensor]]:
+        if here().rank == 1:
+            raise RuntimeError("operation not permitted")
+        return Mock(side_effect=AssertionError("replayed without the other")), {}
+
+    def ended(execution: str, steps: type[Steps]) -> dict[str, torch.Tensor]:
+        part = STAGES["decoder"]()
+        with patch.object(fit_module, "Steps", steps), patch.object(steps_module, "recorded", recorded):
+            config = replace(part.config, execution=execution)  # type: ignore[arg-type]
+            fit(replace(part, config=config), folder / f"{execution} {steps.__name__}", seed=SEED)
+        return module_tensors(part.stage.modules)
+
+    why = "could not be captured at .*: operation" if here().rank else "another process could not capture"
+    with pytest.raises(TrainingError, match=why):
+        ended("graph", _Recorded)
+    with pytest.warns(RuntimeWarning, match=why):
+        refused = ended("auto", _Recorded)
+    assert different(refused, ended("auto", Steps)) == set()
+
+
+def test_ranks_of_which_one_cannot_record_a_step_end_or_go_on_together(tmp_path: Path) -> None:
+    assert run_ranks(2, one_fails, tmp_path) == [0, 0]
 
 
 def difference(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> float:

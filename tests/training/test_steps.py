@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import pytest
 import torch
-from tiny_stages import CADDY_STEPS, STAGES, STEPS
+from ranks import alone_in_a_group, log_of
+from replayed import Replayed, different
+from tiny_stages import BY_BATCH, CADDY_STEPS, STAGES, STEPS
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -19,34 +21,16 @@ from playslot_rl.storage.tensors import module_tensors
 from playslot_rl.training import fit as fit_module
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.stage import PhasedStage, step_loss
-from playslot_rl.training.steps import WARM, Steps
+from playslot_rl.training.steps import WARM
 
 WAITS = ("_local_scalar_dense", "lift_fresh", "nonzero", "bincount", "masked_select", "unique")
 """Operators that need a value on the host, a shape that depends on values, or a tensor made of a list (an index)."""
 
 
-class Replayed(Steps):
-    """Steps as a graph takes them: what is recorded is one step's own call, and nothing of a later step reaches it but
-    the buffers. So a number that a stage reads elsewhere is that of the recorded step for ever."""
-
-    replays = 0
-
-    def _captures(self) -> bool:
-        return True
-
-    def _recorded(self, compute: Callable[[], dict[str, Tensor]]) -> Callable[[], None]:
-        def replay() -> None:
-            type(self).replays += 1
-            self._tape.serve()
-            with patch.object(torch, "Generator", side_effect=AssertionError("a generator was made in a replay")):
-                self._values = compute()
-
-        return replay
-
-
-def trained(name: str, folder: Path) -> dict[str, Tensor]:
+def trained(name: str, folder: Path, **optim: Any) -> dict[str, Tensor]:
     part = STAGES[name]()
-    fit(part, folder, seed=3)
+    config = replace(part.config, optim=replace(part.config.optim, **optim))
+    fit(replace(part, config=config), folder, seed=3)
     return module_tensors(part.stage.modules)
 
 
@@ -56,13 +40,35 @@ def test_a_replayed_step_is_the_step(name: str, tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(fit_module, "Steps", Replayed)
     monkeypatch.setattr(Replayed, "replays", 0)
     replayed = trained(name, tmp_path / "replayed")
-    assert {key for key in written if not torch.equal(written[key], replayed[key])} == set()
+    assert different(written, replayed) == set()
     steps = {"caddy": CADDY_STEPS, "resnet": 2}.get(name, STEPS)
     stage = STAGES[name]().stage
     phases = [stage.phase(step) if isinstance(stage, PhasedStage) else "all" for step in range(steps)]
     expected = sum(max(0, phases.count(phase) - WARM) for phase in set(phases) if phase is not None)
     assert Replayed.replays == expected
     assert expected > 0 or name in ("caddy", "resnet")
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", [name for name in STAGES if name not in BY_BATCH])
+def test_a_replayed_step_in_micro_batches_is_the_step(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = trained(name, tmp_path / "written", accumulate=2)
+    monkeypatch.setattr(fit_module, "Steps", Replayed)
+    monkeypatch.setattr(Replayed, "replays", 0)
+    assert different(written, trained(name, tmp_path / "replayed", accumulate=2)) == set()
+    assert log_of(tmp_path / "written") == log_of(tmp_path / "replayed")
+    assert Replayed.replays > 0
+
+
+def test_a_replayed_step_exchanges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = trained("decoder", tmp_path / "alone")
+    with alone_in_a_group("gloo"):
+        written = trained("decoder", tmp_path / "written")
+        monkeypatch.setattr(fit_module, "Steps", Replayed)
+        replayed = trained("decoder", tmp_path / "replayed")
+    assert different(written, replayed) == different(written, alone) == set()
 
 
 class Refused(Replayed):
@@ -76,7 +82,7 @@ def test_what_cannot_be_recorded_is_taken_as_it_is_written(tmp_path: Path, monke
     written = trained("dynamics", tmp_path / "written")
     monkeypatch.setattr(fit_module, "Steps", Refused)
     refused = trained("dynamics", tmp_path / "refused")
-    assert {key for key in written if not torch.equal(written[key], refused[key])} == set()
+    assert different(written, refused) == set()
 
 
 class _Seen(TorchDispatchMode):

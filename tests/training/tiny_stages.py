@@ -283,6 +283,8 @@ DOUBLE = ("slots", "resnet", "svg", "caddy", "lapo")
 of a batch's mean into another curve within a few steps, as another number of threads does. Slots that still share all
 pixels do likewise.
 """
+BY_BATCH = ("resnet", "svg", "caddy", "lapo")
+"""They normalise by their whole batch and do not accumulate."""
 STAGES: dict[str, Callable[[], Part]] = {
     "slots": slots,
     "dynamics": dynamics,
