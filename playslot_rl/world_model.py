@@ -166,16 +166,7 @@ class _Step(nn.Module):
         slots = slot_history.reshape(-1, *slot_history.shape[len(batch) :])
         actions = action_history.reshape(-1, *action_history.shape[len(batch) :])
         actions = torch.cat([actions[:, :-1], z.reshape(-1, 1, *z.shape[len(batch) :])], 1)
-        lengths = length.reshape(-1)
-        if slots.device.type == "cuda":
-            predicted = self.world_model.next_slots(slots, actions, lengths)
-        else:
-            # Frames before the longest episode's first carry nothing: leaving them out makes short imaginations cheap.
-            window = int(lengths.max())
-            whole = int(lengths.min()) == window
-            predicted = self.world_model._next_slots(
-                slots[:, -window:], actions[:, -window:], None if whole else lengths
-            )
+        predicted = self._predicted(slots, actions, length.reshape(-1))
         slots = torch.cat([slots[:, 1:], predicted[:, None]], 1)
         actions = torch.cat([actions[:, 1:], torch.zeros_like(actions[:, :1])], 1)
         return (
@@ -184,6 +175,14 @@ class _Step(nn.Module):
             actions.reshape(*batch, *actions.shape[1:]),
             (length + 1).clamp(max=context),
         )
+
+    def _predicted(self, slots: Tensor, actions: Tensor, lengths: Tensor) -> Tensor:
+        if slots.device.type == "cuda":
+            return self.world_model.next_slots(slots, actions, lengths)
+        # Frames before the longest episode's first carry nothing: leaving them out makes short imaginations cheap.
+        window = int(lengths.max())
+        whole = int(lengths.min()) == window
+        return self.world_model._next_slots(slots[:, -window:], actions[:, -window:], None if whole else lengths)
 
 
 def dynamics_module(world_model: WorldModel) -> TensorDictSequential:

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from playslot_rl import keys
@@ -54,14 +53,15 @@ def imagine(agent: Agent, first: TensorDictBase, steps: int, generator: torch.Ge
     ones mislead it (docs/notebook/labels.md).
     """
     env = ImaginationEnv(agent.world_model, first.batch_size, generator=generator)
-    start = env.reset(first)
-    policy, task = latent_policy_module(agent.policy), first.get(keys.TASK, None)
-    if task is not None:
-        policy = TensorDictModule(lambda slots: agent.policy(slots, task), [keys.SLOTS], [keys.LATENT_ACTION])
-    rollout = env.rollout(steps, policy, tensordict=start, auto_reset=False, break_when_any_done=False)
-    slots = torch.cat([start[keys.SLOTS].unsqueeze(1), rollout["next", keys.SLOTS]], 1)
-    latents = rollout[keys.LATENT_ACTION]
-    return Imagination(slots, latents, agent.action_decoder(latents))
+    state, task = env.reset(first), first.get(keys.TASK, None)
+    slots, latents = [state[keys.SLOTS]], list[Tensor]()
+    # Not by `env.rollout`, which asks the device after each step whether an episode is over.
+    for _ in range(steps):
+        latents.append(agent.policy(slots[-1]) if task is None else agent.policy(slots[-1], task))
+        state = env.step_mdp(env.step(state.set(keys.LATENT_ACTION, latents[-1])))
+        slots.append(state[keys.SLOTS])
+    z = torch.stack(latents, 1)
+    return Imagination(torch.stack(slots, 1), z, agent.action_decoder(z))
 
 
 class ImaginationActor(PlannedActor):

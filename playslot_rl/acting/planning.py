@@ -82,23 +82,23 @@ class PlanningActor(Actor):
         slots, step = tensordict.get(keys.SLOTS), tensordict.get(keys.STEP_COUNT)
         history = torch.cat([tensordict.get(keys.SLOT_HISTORY)[:, 1:], slots[:, None]], 1)
         tensordict.set(keys.SLOT_HISTORY, history)
-        fresh = step.squeeze(-1) == 0
-        if bool(fresh.any()):
+        steps = step.flatten().tolist()
+        if 0 in steps:
+            fresh = step.squeeze(-1) == 0
             state, goal = tensordict.get(keys.SLOT_STATE), tensordict.get(keys.GOAL_PIXELS)
             parsed = parse_goal(self.agent.world_model.savi, state[fresh], goal[fresh], self.config.looks)
             put_rows(tensordict, fresh, {keys.GOAL_SLOTS: parsed})
-        for row in range(len(step)):
-            if int(step[row]) % self.size.every == 0:
-                self._plan(tensordict, row)
+        for row, at in enumerate(steps):
+            if at % self.size.every == 0:
+                self._plan(tensordict, row, at)
         now = (step.squeeze(-1) % self.size.every).clamp(max=self.size.horizon - 1)
         rows = torch.arange(len(step), device=step.device)
         tensordict.set(keys.LATENT_ACTION, tensordict.get(keys.PLANNED_LATENTS)[rows, now])
         return self.decoder(tensordict).set(keys.STEP_COUNT, step + 1)
 
-    def _plan(self, tensordict: TensorDictBase, row: int) -> None:
+    def _plan(self, tensordict: TensorDictBase, row: int, step: int) -> None:
         """Renew the plan of one episode in the tensordict."""
-        begin = time.perf_counter()
-        step, seed = int(tensordict.get(keys.STEP_COUNT)[row]), int(tensordict.get(keys.EPISODE_SEED)[row])
+        begin, seed = time.perf_counter(), int(tensordict.get(keys.EPISODE_SEED)[row])
         cost = self._cost(tensordict, row, step)
         proposal = self._proposal(cost.slots[-1])
         starts = proposal

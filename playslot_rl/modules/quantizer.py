@@ -210,5 +210,5 @@ def usage(code: Tensor, n_prototypes: int) -> tuple[Tensor, Tensor]:
 
 
 def one_hot(code: Tensor, count: int) -> Tensor:
-    """(M,) int64 to booleans (M, K), without the look at the values that torch's takes."""
-    return code[:, None] == torch.arange(count, device=code.device)
+    """(...) int64 to booleans (..., K), without the look at the values that torch's takes."""
+    return code[..., None] == torch.arange(count, device=code.device)

@@ -246,10 +246,10 @@ class PlaySession:
     def _draw(self, state: Any, present: Sequence[int], number: int = 0) -> Frame:
         """The frame of a state, which becomes the present moment's look."""
         decoded = self._decode(state[keys.SLOTS][0])
-        frame: Frame = to_uint8(decoded.frames)
-        owner = np.asarray(present)[owners(decoded.masks).cpu().numpy()]
+        owner = owners(decoded.masks)
         objects = decoded.rgb.clamp(0, 1) * decoded.masks + (1 - decoded.masks)
-        self._look = (number, Look(frame, owner, to_uint8(objects)))
+        frame: Frame = to_uint8(decoded.frames)  # all is computed before the first is read
+        self._look = (number, Look(frame, np.asarray(present)[owner.cpu().numpy()], to_uint8(objects)))
         return frame
 
     def look(self) -> Look:
@@ -274,7 +274,5 @@ class PlaySession:
         ahead.restore(now.state)
         ahead.branch(k)
         latents = torch.stack([self.latent(number, variability, slot) for number in numbers])
-        frames = [np.broadcast_to(now.frame, (k, *now.frame.shape))]
-        for _ in range(steps):
-            frames.append(to_uint8(self._decode(self._advance(ahead, latents)).frames))
-        return np.stack(frames, 1)
+        seen = [self._decode(self._advance(ahead, latents)).frames for _ in range(steps)]
+        return np.concatenate([np.broadcast_to(now.frame, (k, 1, *now.frame.shape)), to_uint8(torch.stack(seen, 1))], 1)

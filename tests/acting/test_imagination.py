@@ -9,13 +9,15 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
+from waits import no_waits
 
 from playslot_rl import keys
+from playslot_rl.acting.agent import imagine as unfold
 from playslot_rl.acting.imagination import ImaginationEnv, ImaginationSession
 from playslot_rl.config import LatentMode
 from playslot_rl.frames import normalise
 from playslot_rl.testing import tiny_agent, tiny_config
-from playslot_rl.world_model import Agent, WorldModel, dynamics_module, latent_policy_module
+from playslot_rl.world_model import Agent, WorldModel, _Step, dynamics_module, latent_policy_module
 
 CONTEXT = 4
 
@@ -295,3 +297,18 @@ def test_a_reward_of_another_shape_is_refused(agent: Agent) -> None:
     env = ImaginationEnv(agent.world_model, [2], reward=lambda slots: slots.mean((-2, -1)))
     with pytest.raises(ValueError, match=r"reward: got shape \(2,\) of slots \(2, 4, 32\), expected \(2, 1\)"):
         imagine(env, agent, slots_of((2,)), 1)
+
+
+def test_imagined_steps_read_no_value(agent: Agent, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a GPU, which leaves no frames out."""
+    monkeypatch.setattr(_Step, "_predicted", lambda step, *histories: step.world_model.next_slots(*histories))
+    first = TensorDict({keys.SLOTS: slots_of((2,))}, [2])
+    start, session = ImaginationEnv(agent.world_model, [2]).reset(first), ImaginationSession(agent.world_model)
+    session.reset(slots=first[keys.SLOTS])
+    expected = unfold(agent, first, 6)
+    monkeypatch.setattr(ImaginationEnv, "reset", lambda env, given: start.clone())  # TorchRL's own reads
+    with no_waits(), torch.no_grad():
+        found = unfold(agent, first, 6)
+        played = [session.step(found.latents[:, step]) for step in range(6)]
+    assert torch.equal(found.slots, expected.slots)
+    torch.testing.assert_close(torch.stack(played, 1), expected.slots[:, 1:], atol=1e-5, rtol=1e-4)

@@ -37,8 +37,8 @@ class Search:
         shape: (H, [N,] Z) of a plan.
         starts: plans (S, H, [N,] Z) to begin with, such as the shifted last plan or a policy's; S may be 0.
         bound: the search stays where every whitened coordinate is in [-bound, bound]; beyond, the model is guessing.
-        seconds: of wall clock that the search may take, at least one iteration; 0: the planner's iterations decide,
-            and the plan is a function of its inputs.
+        seconds: of wall clock that the search may take, at least one iteration, after each of which it then waits for
+            the device; 0: the planner's iterations decide, and the plan is a function of its inputs.
     """
 
     cost: Cost
@@ -54,6 +54,8 @@ class Search:
         while done == 0 or (time.perf_counter() - begin < self.seconds if self.seconds else done < iterations):
             yield done
             done += 1
+            if self.seconds and self.starts.is_cuda:
+                torch.cuda.synchronize(self.starts.device)
 
     def latents(self, coordinates: Tensor) -> Tensor:
         """Whitened coordinates (..., Z) to latent actions."""
@@ -91,11 +93,14 @@ class Planner(Protocol):
 
 
 class Best:
-    """The best plan so far. Plans to begin with are tried first, so that nothing worse than they are is returned."""
+    """The best plan so far and its cost, on the device: nothing waits for them before `plan` reads them. Plans to begin
+    with are tried first, so that nothing worse than they are is returned.
+    """
 
     def __init__(self, search: Search) -> None:
-        self.search, self.costs = search, list[float]()
-        self.latents, self.cost = search.whitening.mean.expand(search.shape), float("inf")
+        mean = search.whitening.mean
+        self.search, self._noted = search, list[Tensor]()
+        self.latents, self.cost = mean.expand(search.shape), mean.new_full((), torch.inf)
 
     @torch.no_grad()
     def begin(self) -> Tensor:
@@ -107,19 +112,21 @@ class Best:
     def offer(self, latents: Tensor, costs: Tensor) -> Tensor:
         """Take the best of some candidates if it is better; returns their costs (M,), infinite where not finite."""
         costs = torch.where(costs.isfinite(), costs, torch.inf).detach()
-        index = int(costs.argmin())
-        if float(costs[index]) < self.cost:
-            self.latents, self.cost = latents[index].detach().clone(), float(costs[index])
+        index = costs.argmin(0, keepdim=True)  # a number would be read
+        better = costs[index][0] < self.cost
+        self.latents = torch.where(better, latents[index][0].detach(), self.latents)
+        self.cost = torch.where(better, costs[index][0], self.cost)
         return costs
 
     def note(self) -> None:
-        self.costs.append(self.cost)
+        self._noted.append(self.cost)
 
     def plan(self) -> Plan:
         """The result; a ValueError where no candidate had a finite cost."""
-        if self.cost == float("inf"):
+        *costs, cost = torch.stack([*self._noted, self.cost]).tolist()
+        if cost == float("inf"):
             raise ValueError("plan: got no finite cost, expected one: look at the goal and at the model's predictions")
-        return Plan(self.latents, self.cost, self.costs)
+        return Plan(self.latents, cost, costs)
 
 
 def correlated(noise: Tensor, correlation: float) -> Tensor:

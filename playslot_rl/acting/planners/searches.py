@@ -4,6 +4,9 @@ Deviations (`spread`; `start_spread` where there are plans to begin with; `floor
 coordinates, as of the training latents; `correlation`, 0 to under 1, is that of the noise of neighbouring steps, which
 resemble each other in a motion. `iterations` do not count where the search is given seconds.
 
+Nothing reads a value before the plan, so on a GPU the host runs ahead. There the rollout is replayed as one launch: of
+1,857 a step of cross-entropy at `compact`, 83 are left. They are not captured, since every plan has another cost.
+
 Shapes: M candidates, K elites or prototypes, H horizon, Z latent-action width.
 """
 
@@ -13,9 +16,9 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from playslot_rl.acting.planners.planner import Best, Plan, Search
+from playslot_rl.modules.quantizer import one_hot
 
 
 @dataclass(frozen=True)
@@ -113,11 +116,13 @@ def path_weights(costs: Tensor, temperature: float) -> Tensor:
     """
     costs = costs.double()  # squares of 1e30 overflow in single precision
     finite = costs.isfinite()
-    if not bool(finite.any()):
-        return torch.full_like(costs, 1 / len(costs)).float()
-    known = costs[finite]
-    scale = known.std(unbiased=False).clamp(min=1e-12 * known.abs().max().clamp(min=1e-12))
-    return torch.softmax(-(costs - known.min()) / (temperature * scale), 0).float()
+    share = finite.double().mean()
+    # Infinite ones become the others' mean: nothing is chosen by a mask, of which the device would be asked.
+    known = torch.where(finite, costs, torch.where(finite, costs, 0.0).mean() / share)
+    scale = known.std(unbiased=False) / share.sqrt()
+    scale = scale.clamp(min=1e-12 * known.abs().max().clamp(min=1e-12))
+    weights = torch.softmax(-(costs - known.min()) / (temperature * scale), 0)
+    return torch.where(share > 0, weights, 1 / len(costs)).float()
 
 
 @dataclass(frozen=True)
@@ -150,8 +155,7 @@ class GradientPlanner:
                 best.note()
                 optimiser.zero_grad()
                 # The gradient of the logarithm: Adam's steps then depend on no unit, and huge costs do not overflow.
-                relative = costs[finite] / costs[finite].detach().abs().clamp(min=1e-30)
-                relative.sum().backward()
+                costs.backward(torch.where(finite, 1 / costs.detach().abs().clamp(min=1e-30), 0.0))
                 optimiser.step()
                 with torch.no_grad():
                     point.clamp_(-search.bound, search.bound)
@@ -194,7 +198,7 @@ class PrototypePlanner:
         probabilities = torch.full((*steps, k), 1 / k, device=self.prototypes.device)
         if len(search.starts):
             near = torch.cdist(first.reshape(-1, first.shape[-1]), self.prototypes).argmin(-1).reshape(steps)
-            probabilities = (1 - self.lean) * probabilities + self.lean * F.one_hot(near, k)
+            probabilities = (1 - self.lean) * probabilities + self.lean * one_hot(near, k)
         kept = torch.empty(0, *steps, dtype=torch.long, device=self.prototypes.device)
         for _ in search.rounds(self.iterations):
             drawn = torch.multinomial(
@@ -204,6 +208,6 @@ class PrototypePlanner:
             latents = self.prototypes[tried]
             costs = best.offer(latents, search.cost(latents))
             kept = tried[costs.topk(min(self.elites, len(tried)), largest=False).indices]
-            probabilities = (1 - self.floor) * F.one_hot(kept, k).float().mean(0) + self.floor / k
+            probabilities = (1 - self.floor) * one_hot(kept, k).float().mean(0) + self.floor / k
             best.note()
         return best.plan()

@@ -5,10 +5,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
+from typing import get_args
+from unittest.mock import Mock
 
 import pytest
 import torch
+from tiny_searches import tiny_search
 from torch import Tensor
+from waits import no_waits
 
 from playslot_rl.acting.planners import (
     CEMPlanner,
@@ -19,9 +23,10 @@ from playslot_rl.acting.planners import (
     Search,
     shifted,
 )
-from playslot_rl.acting.planners.planner import correlated, latent_statistics, unfaded
+from playslot_rl.acting.planners.planner import Best, correlated, latent_statistics, unfaded
 from playslot_rl.acting.planners.searches import path_weights
 from playslot_rl.config import ActionDecoderConfig, PolicyConfig
+from playslot_rl.config.planning import PlannerName
 from playslot_rl.modules.whitening import Whitening
 from playslot_rl.testing import tiny_agent, tiny_config
 
@@ -217,3 +222,18 @@ def test_faded_directions_are_taken_back() -> None:
     assert float(whitening(z).std(0)[2]) < 0.2, "faded out"
     torch.testing.assert_close(unfaded(whitening)(z).std(0), torch.ones(3), atol=0.02, rtol=0)
     assert torch.equal(unfaded(whitening).basis, whitening.basis)
+
+
+@pytest.mark.parametrize("name", get_args(PlannerName))
+def test_a_search_reads_no_value_before_its_plan(name: PlannerName, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So on a GPU the host is always ahead of the device."""
+    planner, problem = tiny_search(name)
+    expected, read = planner(problem, generator()), Best.plan
+    monkeypatch.setattr(Best, "plan", lambda best: best)
+    monkeypatch.setattr(torch.optim.Adam, "step", adam := Mock())  # it counts its steps on the host
+    with no_waits():
+        best = planner(problem, generator())
+    plan = read(best)  # type: ignore[arg-type]
+    assert len(plan.costs) == len(expected.costs) > 2
+    if not adam.called:
+        assert torch.equal(plan.latents, expected.latents)
