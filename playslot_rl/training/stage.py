@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor, nn
 
+from playslot_rl.data.clips import Clips
 from playslot_rl.seeds.draws import StepGenerators
 
 
@@ -37,6 +38,12 @@ class Stage(Protocol):
         """Numbers on held-out data after `step` steps; called without gradients, modules in eval mode. What takes long
         is shared out by `playslot_rl.runtime.processes.spread`.
         """
+
+
+class ClipStage(Stage, Protocol):
+    """A `Stage` on clips, which say what it is validated on."""
+
+    clips: Clips
 
 
 def step_loss(stage: Stage, step: int, generators: StepGenerators) -> Mapping[str, Tensor]:

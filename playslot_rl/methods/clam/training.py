@@ -149,7 +149,7 @@ def model(record: StageRecord) -> Training:
     labelled = LabelledMoves(record.labelled, config, device)
     stage = CLAMStage(inverse, forward, decoder, record.clips(2, shown=256), labelled, own)
     known = config.behaviour.labelled_demos
-    return on_pairs(record, stage, own.model, f"change left on held-out frames, {known} labelled")
+    return on_pairs(record, stage, own.model, labels=f", {known} labelled")
 
 
 def policy(record: StageRecord) -> Training:

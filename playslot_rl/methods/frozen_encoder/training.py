@@ -88,7 +88,8 @@ def model(record: StageRecord) -> Training:
         [Part(f"{own.group}model", stage, own.model)],
         record.device,
         lambda metrics: (
-            f"{record.name}: {metrics.get('psnr', float('nan')):.1f} dB on held-out frames, {record.folder}"
+            f"{record.name}: {metrics.get('psnr', float('nan')):.1f} dB on {stage.clips.validated} frames, "
+            f"{record.folder}"
         ),
         extra={"episodes": record.data.episodes},
     )

@@ -173,7 +173,7 @@ def model(record: StageRecord) -> Training:
     labelled = None if record.labelled is None else LabelledMoves(record.labelled, config, device)
     stage = LAOMStage(latents.to(device), target.to(device), record.clips(2, shown=256), labelled, own)
     known = 0 if labelled is None else config.behaviour.labelled_demos
-    return on_pairs(record, stage, own.model, f"features' change left on held-out pairs, {known} labelled")
+    return on_pairs(record, stage, own.model, "features' change", f", {known} labelled")
 
 
 def policy(record: StageRecord) -> Training:

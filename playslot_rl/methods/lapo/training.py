@@ -45,7 +45,7 @@ from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
-from playslot_rl.training.stage import Stage
+from playslot_rl.training.stage import ClipStage
 from playslot_rl.world_model import module_device
 
 TWO: Final = ("inverse", "forward")
@@ -188,14 +188,15 @@ def model(record: StageRecord) -> Training:
 
 
 def on_pairs(
-    record: StageRecord, stage: Stage, schedule: StageConfig, what: str = "change left on held-out pairs"
+    record: StageRecord, stage: ClipStage, schedule: StageConfig, what: str = "change", labels: str = ""
 ) -> Training:
     """The training of a model of latent actions by `schedule`, `baselines.METHOD.model`; `what` is `unexplained`."""
     return Training(
         [Part(f"baselines.{record.name.removesuffix('_model')}.model", stage, schedule)],
         record.device,
         lambda metrics: (
-            f"{record.name}: {100 * metrics.get('unexplained', float('nan')):.0f} % of the {what}, {record.folder}"
+            f"{record.name}: {100 * metrics.get('unexplained', float('nan')):.0f} % of the {what} left on "
+            f"{stage.clips.validated} pairs{labels}, {record.folder}"
         ),
         extra={"episodes": record.data.episodes},
     )

@@ -19,7 +19,7 @@ from playslot_rl.training.fit import Part
 from playslot_rl.training.patience import Patience, patience_of
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
-from playslot_rl.training.stage import Stage
+from playslot_rl.training.stage import ClipStage
 from playslot_rl.training.stage_dynamics import dynamics_on_slots
 from playslot_rl.world_model import WorldModel
 
@@ -38,7 +38,7 @@ def check_pixel_model(build: Callable[[Any, int], nn.Module], config: Experiment
 
 def on_clips(
     record: StageRecord,
-    stage: Stage,
+    stage: ClipStage,
     own: StageConfig,
     patience: Patience | None = None,
     extra: Mapping[str, Any] | None = None,
@@ -47,7 +47,10 @@ def on_clips(
     return Training(
         [Part(f"baselines.{record.name}", stage, own, patience=patience)],
         record.device,
-        lambda metrics: f"{record.name}: {metrics.get('psnr', float('nan')):.2f} dB on held-out clips, {record.folder}",
+        lambda metrics: (
+            f"{record.name}: {metrics.get('psnr', float('nan')):.2f} dB on {stage.clips.validated} clips, "
+            f"{record.folder}"
+        ),
         extra={"episodes": record.data.episodes, **(extra or {})},
     )
 
