@@ -120,12 +120,14 @@ class CLAMBehaviour(PixelCloning):
 
     def __init__(self, record: StageRecord) -> None:
         own: CLAMConfig = record.config.baselines.clam
-        self.inverse, decoder = load_model(record.parents["clam_model"], record.device)
+        self.inverse, self._decoder = load_model(record.parents["clam_model"], record.device)
         super().__init__(record, own.shift, own.loss)
-        self.decoder = decoder
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
         return infer_latents(self.inverse, source, moves, self.device)
+
+    def new_decoder(self, latent_dim: int, state_dim: int) -> ActionDecoder:  # noqa: ARG002
+        return self._decoder
 
 
 def load_model(model: StageCheckpoint, device: torch.device | str) -> tuple[Inverse, ActionDecoder]:
