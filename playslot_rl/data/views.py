@@ -192,12 +192,12 @@ def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
             say_once(f"note: {seen}: choose by data.camera=, unless they show the same view")
 
 
-def concatenate(sources: Sequence[EpisodeFrames]) -> EpisodeFrames:
+def concatenate(sources: Sequence[EpisodeFrames], weights: bool = False) -> EpisodeFrames:
     """Several data sets as one; labels that not all have, or of another width, are dropped, but actions that only some
     have are NaN in the others. Raises as `agree`."""
     if len(sources) == 1:
         return sources[0]
-    agree(sources)
+    agree(sources, weights)
     offsets = np.cumsum([0, *(len(source.frames) for source in sources)])[:-1]
     before = np.cumsum([0, *(source.recordings for source in sources)])
     recorded = [source.numbers + count for source, count in zip(sources, before, strict=False)]

@@ -21,7 +21,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import DataRoot, data_roots
 from playslot_rl.data.cache import Cache
 from playslot_rl.data.source import EpisodeFrames, open_sources
-from playslot_rl.data.views import IntArray, agree, concatenate, every, text_hash
+from playslot_rl.data.views import IntArray, concatenate, every, text_hash
 from playslot_rl.errors import DataError
 
 
@@ -62,8 +62,7 @@ def weighted(sources: Sequence[EpisodeFrames], weights: Sequence[float | None]) 
         return sources[0]
     if not given:
         return concatenate(sources)
-    agree(sources, weights=True)
-    joined = concatenate(sources)
+    joined = concatenate(sources, weights=True)
     fingerprint = text_hash(f"{joined.fingerprint}/weights {','.join(f'{weight:g}' for weight in given)}")
     ends = np.cumsum([len(source.frames) for source in sources]).astype(np.int64)
     shares = Shares(ends, np.asarray(given, np.float64), tuple(sources), fingerprint)
