@@ -12,10 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from playslot_rl.config import OptimConfig, StageConfig
+from playslot_rl.config.compose import compose
 from playslot_rl.errors import TrainingError
-from playslot_rl.runtime.precision import resolve_precision, speedup
+from playslot_rl.runtime.precision import PAYS, resolve_precision
 from playslot_rl.runtime.shares import own_rows
 from playslot_rl.seeds.draws import StepGenerators
+from playslot_rl.speed.steps import precisions, time_step
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.steps import WARM
 
@@ -69,8 +71,11 @@ def test_what_is_named_fits(tmp_path: Path, execution: str) -> None:
     found = re.search(r"expected at most (\d+): use it, or rows\.optim\.accumulate=(\d+)$", message)
     assert found is not None, message
     rows, micros = map(int, found.groups())
-    assert 64 <= rows <= 256
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated()
     trained(Convolutions(rows), tmp_path / "fits", execution)
+    peak = torch.cuda.max_memory_allocated() - before
+    assert GIB <= peak <= 2 * GIB, "neither too many rows nor needlessly few"
     trained(Convolutions(512), tmp_path / "shares", execution, micros)
     assert len(full) > 0
 
@@ -80,7 +85,7 @@ def test_a_capture_that_runs_out_of_memory_names_the_batch_that_fits(tmp_path: P
         trained(Convolutions(64, full_at=WARM), tmp_path, "auto")
 
 
-def test_bf16_pays_on_this_gpu_where_it_is_quicker() -> None:
-    times = speedup("cuda")
-    print(f"bf16 is {times:.2f} times quicker on {torch.cuda.get_device_name()}")
-    assert resolve_precision("auto", "cuda") == ("bf16" if times >= 1.1 else "fp32")
+def test_auto_is_the_precision_of_the_quicker_step() -> None:
+    config, device = compose(["preset=paper", "env=button_press"]), torch.device("cuda")
+    took = {kind: time_step(config, "slots", device, kind, batch=8)[0] for kind in precisions("cuda")}
+    assert took[resolve_precision("auto", "cuda")] <= PAYS * min(took.values()), took
