@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -51,7 +52,9 @@ class _Run:
         self.learner, self.online, self.prior = training.learner, training.own, training.prior
         self.config, self.folder, self.device = config, folder, record.device
         learner, online = self.learner, self.online
-        self.replay = Replay(online, config.env.max_steps + 1)
+        self.ring = folder / "ring"
+        self.remove_ring()  # which a kill has left
+        self.replay = Replay(online, config.env.max_steps + 1, self.ring if online.replay_on_disk else None)
         own = {name: without(online, "free"), "seed": config.seed}
         self.checkpoints = OnlineCheckpoints(folder, {**own, **record.resumes()}, record.spec.typed)
         cure = f"lower its learning rate (baselines.{name}.*)"
@@ -79,6 +82,9 @@ class _Run:
         finally:
             if self.players is not None:
                 self.players.close()
+
+    def remove_ring(self) -> None:
+        shutil.rmtree(self.ring, ignore_errors=True)
 
     @property
     def finished(self) -> bool:
@@ -242,8 +248,9 @@ class OnlineTraining:
     def train(self, record: StageRecord, begin: Callable[[], None]) -> tuple[OnlineState, int]:
         """Train until `steps` agent steps (or `minutes`), carrying on from the newest checkpoint.
 
-        Writes `checkpoints`, `replay`, `logs`, `metrics.jsonl` and `curve.json` in `RUN/METHOD`, nothing else. `begin`
-        is called before the first step. Returns where it ended, and the agent steps that this process started at.
+        Writes `checkpoints`, `replay`, `logs`, `metrics.jsonl` and `curve.json` in `RUN/METHOD`, and while it trains
+        `ring`, where the replay is on the disk. `begin` is called before the first step. Returns where it ended, and
+        the agent steps that this process started at.
 
         Raises:
             TrainingError: a loss or weight is not finite; the last good checkpoint stays.
@@ -255,11 +262,14 @@ class OnlineTraining:
         begin()
         online, start, logging = self.own, run.state.step, record.config.logging
         run.watch.history.rewind(start)
-        if not run.finished:
-            progress = StageProgress(record.name, start, online.steps, logging.progress, online.evaluate_every)
-            with run.watch.running(logging, start), progress, run.pool, run.playing():
-                while not run.finished:
-                    run.advance(progress)
+        try:
+            if not run.finished:
+                progress = StageProgress(record.name, start, online.steps, logging.progress, online.evaluate_every)
+                with run.watch.running(logging, start), progress, run.pool, run.playing():
+                    while not run.finished:
+                        run.advance(progress)
+        finally:
+            run.remove_ring()
         run.write_curve()
         return run.state, start
 

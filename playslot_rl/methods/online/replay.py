@@ -38,10 +38,11 @@ class Replay:
 
     Every frame comes with `keys.ACTION` and `keys.REWARD`, of the step that led to it (the reward as the task gave it;
     `sample` multiplies it by `reward_scale`), and `keys.IS_FIRST` and `keys.IS_LAST`. A sequence no longer than an
-    episode lies within one; a longer one runs on into the next episode, with its `IS_FIRST`.
+    episode lies within one; a longer one runs on into the next episode, with its `IS_FIRST`. Its files are in the
+    folder `ring`, which is not there yet; None keeps it in memory.
     """
 
-    def __init__(self, config: OnlineConfig, episode_frames: int) -> None:
+    def __init__(self, config: OnlineConfig, episode_frames: int, ring: Path | None = None) -> None:
         from torchrl.data import LazyMemmapStorage, LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
         self.batch_size, self.sequence = config.batch_size, config.sequence or episode_frames
@@ -53,7 +54,8 @@ class Replay:
         rows = self.capacity * episode_frames
         within = self.sequence <= episode_frames
         self._buffer = TensorDictReplayBuffer(
-            storage=LazyMemmapStorage(rows) if config.replay_on_disk else LazyTensorStorage(rows),
+            # Without a folder its files would lie in /dev/shm, which is memory.
+            storage=LazyTensorStorage(rows) if ring is None else LazyMemmapStorage(rows, scratch_dir=ring),
             # The flags of the replay stay as they are: a sequence that starts within an episode is no first frame.
             sampler=SliceSampler(
                 slice_len=self.sequence,

@@ -69,6 +69,27 @@ def test_updates_keep_their_ratio_to_steps_and_wait_for_the_random_start(tmp_pat
     assert min(row["step"] for row in rows if row["split"] == "train") == 16
 
 
+def test_a_replay_on_the_disk_lies_in_the_stage_s_folder_while_it_trains_and_draws_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes: list[int] = []
+    ring, original = tmp_path / "disk" / "toy" / "ring", ToyLearner.update
+
+    def watched(self: ToyLearner, batch: TensorDict, generators: StepGenerators) -> Mapping[str, Tensor]:
+        sizes.append(sum(path.stat().st_size for path in ring.rglob("*")))
+        return original(self, batch, generators)
+
+    here, _ = train(tmp_path / "here")
+    ring.mkdir(parents=True)
+    (ring / "pixels.memmap").write_bytes(b"of a kill")
+    with monkeypatch.context() as patch:
+        patch.setattr(ToyLearner, "update", watched)
+        there, _ = train(tmp_path / "disk", replay_on_disk=True)
+    assert min(sizes) > 40 * 3 * 8 * 8  # of all the frames that it may hold
+    assert same(weights(here), weights(there))
+    assert not ring.exists()
+
+
 def test_the_curve_has_a_row_for_each_interval_and_the_random_policy(tmp_path: Path) -> None:
     _, result = train(tmp_path)
     curve = json.loads((tmp_path / "toy" / "curve.json").read_text())
