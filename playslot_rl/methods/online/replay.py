@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
@@ -88,20 +88,14 @@ class Replay:
             self._buffer.extend(rows.set(STREAM, torch.zeros_like(number)).reshape(-1))
         self.episodes += n
 
-    def restore(self, episodes: TensorDictBase, total: int) -> None:
+    def restore(self, parts: Iterable[tuple[int, TensorDictBase]], total: int) -> None:
         """Fill an empty replay as it was after `total` episodes, bit for bit, from at least the last
-        min(`total`, `capacity`) of them, in order, batch size [m, L].
+        min(`total`, `capacity`) of them, in order: parts, the number of their first and batch size [m, L].
         """
-        kept = episodes[-min(total, self.capacity) :]
-        first = total - len(kept)
-        if first == 0:
-            self.add(kept)
-            return
-        # The ring was full: slot by slot from its start, then once more up to where its next episode goes.
-        split = -first % self.capacity
-        for start, part in ((first + split, kept[split:]), (first, kept[:split]), (first + split, kept[split:])):
-            self.episodes = start
-            self.add(part)
+        self.episodes = max(total - self.capacity, 0)  # the ring's next slot is that of its oldest episode
+        self._buffer.writer.load_state_dict({"_cursor": self.episodes % self.capacity * self.episode_frames})
+        for first, part in parts:
+            self.add(part[max(self.episodes - first, 0) :])
 
     def sample(self, generator: torch.Generator) -> TensorDict:
         """Draw sequences, batch size [B, T]: an episode (or the whole ring) at random, a start in it at random."""
@@ -173,18 +167,22 @@ class ReplayJournal:
             if following <= before:
                 path.unlink()
 
-    def read(self, total: int) -> TensorDict:
-        """The episodes up to `total`, batch size [m, L]; a CheckpointError where a file is missing or damaged."""
-        parts = [load_tensors(path) for _, path in self.files()]
-        first = self.files()[0][0] if parts else 0
-        whole = {key: torch.cat([part[key] for part in parts]) for key in (parts[0] if parts else {})}
-        found = first + (len(next(iter(whole.values()))) if whole else 0)
+    def read(self, total: int, capacity: int) -> Iterator[tuple[int, TensorDict]]:
+        """At least the last `capacity` episodes up to `total`, a file at a time: the number of its first, and batch
+        size [m, L]. A CheckpointError where a file is missing or damaged.
+        """
+        files = self.files()
+        found = min(files[0][0], max(total - capacity, 0)) if files else 0
+        for first, path in files:
+            if first == found:
+                part = whole_episodes(load_tensors(path))
+                found += len(part)
+                yield first, part
         if found != total:
             raise CheckpointError(
                 f"{self.folder}: got episodes up to {found}, expected {total}: "
                 f"delete {self.folder.parent} to start anew"
             )
-        return whole_episodes(whole)
 
 
 class OnlineCheckpoints(TrainingCheckpoints):
@@ -247,6 +245,6 @@ class OnlineCheckpoints(TrainingCheckpoints):
             restore_optimizer(optimizer, own, str(last))
         state = OnlineState(**{item.name: stored[item.name] for item in fields(OnlineState) if item.name in stored})
         self.journal.rewind(state.episodes)
-        replay.restore(self.journal.read(state.episodes), state.episodes)
+        replay.restore(self.journal.read(state.episodes, replay.capacity), state.episodes)
         self._counted = [state.episodes]
         return state

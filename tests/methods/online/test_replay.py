@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import weakref
+from pathlib import Path
+
 import pytest
 import torch
 from tensordict import TensorDict
 
 from playslot_rl import keys
-from playslot_rl.errors import ConfigError
+from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.methods.online.config import OnlineConfig
-from playslot_rl.methods.online.replay import Replay
+from playslot_rl.methods.online.replay import Replay, ReplayJournal
+from playslot_rl.storage.tensors import load_tensors
 
 FRAMES = 4
 
@@ -110,7 +114,7 @@ def test_a_restored_replay_draws_what_the_first_one_would(total: int, sequence: 
     grown, restored = (replay(sequence, capacity=5 * FRAMES) for _ in range(2))
     for number in range(total):
         grown.add(episodes(number, 1))
-    restored.restore(episodes(0, total), total)
+    restored.restore([(0, episodes(0, 2)), (2, episodes(2, total - 2))], total)
     for extra in range(4):
         assert restored.episodes == grown.episodes
         one, other = draw(grown, extra), draw(restored, extra)
@@ -123,3 +127,33 @@ def test_a_restored_replay_draws_what_the_first_one_would(total: int, sequence: 
 def test_a_capacity_below_one_sequence_is_refused() -> None:
     with pytest.raises(ConfigError, match="capacity: got 4 frames, expected at least"):
         replay(6, capacity=4)
+
+
+def test_a_journal_is_read_one_file_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    journal, grown, restored = ReplayJournal(tmp_path), replay(3), replay(3)
+    held: list[weakref.ref[torch.Tensor]] = []
+    alive: list[int] = []
+
+    def watched(path: Path) -> dict[str, torch.Tensor]:
+        alive.append(sum(ref() is not None for ref in held))
+        tensors = load_tensors(path)
+        held.append(weakref.ref(tensors["place"]))
+        return tensors
+
+    monkeypatch.setattr("playslot_rl.methods.online.replay.load_tensors", watched)
+    for first in range(0, 10, 2):
+        journal.append(first, episodes(first, 2))
+        grown.add(episodes(first, 2))
+    restored.restore(journal.read(10, restored.capacity), 10)
+    assert len(alive) == 5
+    assert max(alive) <= 1  # the one before is let go when the next is there
+    assert torch.equal(draw(grown)["place"], draw(restored)["place"])
+
+
+@pytest.mark.parametrize("files, found", [((0, 4), 2), ((2, 4), 0)])
+def test_a_journal_with_a_gap_is_refused(tmp_path: Path, files: tuple[int, int], found: int) -> None:
+    journal = ReplayJournal(tmp_path)
+    for first in files:
+        journal.append(first, episodes(first, 2))
+    with pytest.raises(CheckpointError, match=f"got episodes up to {found}, expected 6"):
+        replay(3).restore(journal.read(6, 25), 6)
