@@ -155,7 +155,7 @@ class _Run:
                     raise self.watch.not_finite(key, str(value), self._when())
             self.state = replace(self.state, updates=update + 1)
             if update == 0 or (update + 1) % self.online.log_every == 0:
-                self._log("train", numbers, at=update + 1)
+                self._log("train", numbers, at=self.state.step)
 
     def _development_seeds(self) -> list[int]:
         return [episode_seed("development", 0, i) for i in range(self.online.evaluation_episodes)]
