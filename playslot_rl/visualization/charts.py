@@ -162,31 +162,36 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
 
 
 def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Mapping[str, Any], theme: Theme) -> bytes:
-    """PNG of two panels, mean return with its standard error and success rate with its 95 % interval: points by method,
-    and the random policy's. A ValueError where there is no point.
+    """PNG of two panels, mean return with its standard error and success rate with its 95 % interval (where the task
+    measures any): points by method, and the random policy's. A ValueError where there is no point.
     """
     if not any(curves.values()):
         raise ValueError("learning_chart: got no points, expected at least one")
-    figure = new_figure(6.8, 2.8)
-    left, right = figure.subplots(1, 2)
+    solves = all(row["success_rate"] is not None for rows in (*curves.values(), [random]) for row in rows)
+    figure = new_figure(6.8 if solves else 3.6, 2.8)
+    left, *right = figure.subplots(1, 1 + solves, squeeze=False)[0]
     for method, rows in curves.items():
         style = style_of(method)
         colour = theme.series[6] if style is None else theme.series[style.colour]
-        name = METHODS[method].title if method in METHODS else method
-        keys = ("env_steps", "return_mean", "return_error", "success_rate")
-        steps, mean, error, rate = (np.array([row[key] for row in rows]) for key in keys)
-        low, high = 100 * np.array([row["ci95"] for row in rows]).reshape(-1, 2).T
-        for axes, values, lower, upper in ((left, mean, mean - error, mean + error), (right, 100 * rate, low, high)):
-            label = name if axes is left else None
+        steps, mean, error = (
+            np.array([row[key] for row in rows]) for key in ("env_steps", "return_mean", "return_error")
+        )
+        bands = [(left, mean, mean - error, mean + error)]
+        for axes in right:
+            low, high = 100 * np.array([row["ci95"] for row in rows]).reshape(-1, 2).T
+            bands.append((axes, 100 * np.array([row["success_rate"] for row in rows]), low, high))
+        for axes, values, lower, upper in bands:
+            label = (METHODS[method].title if method in METHODS else method) if axes is left else None
             axes.plot(steps, values, color=colour, marker="o", markersize=3.5, linewidth=1.5, label=label)
             axes.fill_between(steps, lower, upper, color=colour, alpha=0.2, linewidth=0)
     grey = theme.series[-1]
     left.axhline(random["return_mean"], color=grey, linestyle="--", linewidth=1.3, label="random policy")
-    right.axhline(100 * random["success_rate"], color=grey, linestyle="--", linewidth=1.3)
     left.set_ylabel("return of an episode", fontsize=9)
-    right.set_ylabel("success rate, %", fontsize=9)
-    right.set_ylim(-3, 103)
-    for axes in (left, right):
+    for axes in right:
+        axes.axhline(100 * random["success_rate"], color=grey, linestyle="--", linewidth=1.3)
+        axes.set_ylabel("success rate, %", fontsize=9)
+        axes.set_ylim(-3, 103)
+    for axes in (left, *right):
         axes.set_xlabel("agent steps", fontsize=9)
         step_axis(axes)
         style_axes(axes, theme)

@@ -86,12 +86,17 @@ class Learner(Protocol):
 @dataclass(frozen=True)
 class PlayedEpisodes:
     """Whole episodes: `frames` of batch size [n, L], on the CPU (the learner's stored keys, ACTION, REWARD, IS_FIRST,
-    IS_LAST), undiscounted sums of rewards (n,), and whether a step solved the task.
+    IS_LAST), undiscounted sums of rewards (n,), and whether a step solved the task (None where it measures no success).
     """
 
     frames: TensorDict
     returns: tuple[float, ...]
-    successes: tuple[bool, ...]
+    successes: tuple[bool | None, ...]
+
+
+def solved_of(successes: Sequence[bool | None]) -> int | None:
+    """How many episodes were solved; None of a task that measures no success."""
+    return None if None in successes else sum(map(bool, successes))
 
 
 class LearnerActor(Actor):
@@ -170,4 +175,4 @@ def play(
     arrived = torch.from_numpy(received).T.unsqueeze(-1).contiguous()
     values = {**frames.to_dict(), keys.REWARD: arrived, keys.IS_FIRST: first, keys.IS_LAST: last}
     returns = tuple(received.sum(axis=0, dtype=np.float64).tolist())
-    return PlayedEpisodes(TensorDict(values, frames.batch_size), returns, tuple(bool(o.success) for o in outcomes))
+    return PlayedEpisodes(TensorDict(values, frames.batch_size), returns, tuple(o.success for o in outcomes))

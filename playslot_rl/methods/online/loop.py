@@ -25,7 +25,7 @@ from playslot_rl.acting.episodes import LOCKSTEP, TaskPool
 from playslot_rl.config.methods import METHODS
 from playslot_rl.config.roles import without
 from playslot_rl.evaluation.intervals import wilson
-from playslot_rl.methods.online.acting import Learner, PlayedEpisodes, play
+from playslot_rl.methods.online.acting import Learner, PlayedEpisodes, play, solved_of
 from playslot_rl.methods.online.config import OnlineConfig
 from playslot_rl.methods.online.players import Players, Round, play_round
 from playslot_rl.methods.online.replay import OnlineCheckpoints, OnlineState, Replay
@@ -123,7 +123,8 @@ class _Run:
         self.new.append(played.frames)
         step = state.step + n * self.config.env.max_steps
         self.state = replace(state, step=step, rounds=state.rounds + 1, episodes=state.episodes + n)
-        values = {"return": sum(played.returns) / n, "success": sum(played.successes) / n}
+        solved = solved_of(played.successes)
+        values = {"return": sum(played.returns) / n} | ({} if solved is None else {"success": solved / n})
         self._log("acting", values)
         if self.players is not None and step < self.online.steps:
             self.players.begin(self._round())  # with the weights from before the updates that come now
@@ -163,7 +164,8 @@ class _Run:
     def _measure(self, random: bool = False) -> dict[str, Any]:
         """Play the development episodes without exploring.
 
-        Gives `return_mean` and its standard error, `success_rate` (0 to 1) and its Wilson interval `ci95`.
+        Gives `return_mean` and its standard error, `success_rate` (0 to 1) and its Wilson interval `ci95`, both None
+        of a task that measures no success.
         """
         seeds, played = self._development_seeds(), []
         self._mode(False)
@@ -174,12 +176,12 @@ class _Run:
                 chunk = seeds[first : first + LOCKSTEP]
                 played.append(play(self.pool, chunk, learner, self.device, generator, random=random))
         returns = np.array([value for part in played for value in part.returns])
-        solved = sum(sum(part.successes) for part in played)
+        solved = solved_of([value for part in played for value in part.successes])
         return {
             "return_mean": float(returns.mean()),
             "return_error": float(returns.std(ddof=1) / np.sqrt(len(returns))) if len(returns) > 1 else 0.0,
-            "success_rate": solved / len(returns),
-            "ci95": list(wilson(solved, len(returns))),
+            "success_rate": None if solved is None else solved / len(returns),
+            "ci95": None if solved is None else list(wilson(solved, len(returns))),
         }
 
     def _evaluate(self) -> None:
@@ -285,10 +287,12 @@ class OnlineTraining:
         }
         done = record.save(self.modules, state.metrics, state.updates, state.seconds, extra)
         last, random, before = state.curve[-1], state.random, f" and {self.prior} of SAVi's data" if self.prior else ""
+        success = ""
+        if last["success_rate"] is not None:
+            success = f", success {100 * last['success_rate']:.0f} % (random {100 * random['success_rate']:.0f} %)"
         print(
             f"{record.name}: {state.step} agent steps{before}, {state.updates} updates; development episodes: return "
-            f"{last['return_mean']:.2f} (random {random['return_mean']:.2f}), success "
-            f"{100 * last['success_rate']:.0f} % (random {100 * random['success_rate']:.0f} %); {record.folder}",
+            f"{last['return_mean']:.2f} (random {random['return_mean']:.2f}){success}; {record.folder}",
             flush=True,
         )
         return done

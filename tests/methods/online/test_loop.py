@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from online_toy import STEPS, ToyLearner, ToyPool, interrupt, same, toy_online, train, weights
+from online_toy import STEPS, ToyLearner, ToyPool, ToyTask, interrupt, same, toy_online, train, weights
+from PIL import Image
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -21,6 +22,7 @@ from playslot_rl.errors import CheckpointError, TrainingError
 from playslot_rl.methods.online import loop
 from playslot_rl.methods.online.acting import play
 from playslot_rl.seeds.draws import StepGenerators
+from playslot_rl.visualization.charts import draw_curve
 
 
 @pytest.fixture(autouse=True)
@@ -98,6 +100,36 @@ def test_the_curve_has_a_row_for_each_interval_and_the_random_policy(tmp_path: P
     assert curve["random"] == result.state.random
     for row in curve["rows"]:
         assert {"updates", "seconds", "return_mean", "return_error", "success_rate", "ci95"} <= row.keys()
+
+
+def test_a_task_without_success_has_none_on_its_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ToyTask, "solves", False, raising=False)
+    train(tmp_path, steps=16)
+    curve = json.loads((tmp_path / "toy" / "curve.json").read_text())
+    for row in (curve["random"], *curve["rows"]):
+        assert (row["success_rate"], row["ci95"]) == (None, None)
+        assert row["return_mean"] != 0
+    assert "success" not in (tmp_path / "toy" / "metrics.jsonl").read_text()
+    draw_curve(tmp_path / "toy", "dreamer")
+    height, width = np.asarray(Image.open(tmp_path / "toy" / "curve_light.png")).shape[:2]
+    assert width < 1.5 * height  # one panel
+
+
+def test_a_backend_sees_steps_that_never_go_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[int, str]] = []
+
+    class Backend:
+        def log(self, values: Mapping[str, float], step: int) -> None:
+            seen.extend((step, name) for name in values)
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr("playslot_rl.training.logging.open_logger", lambda *_: Backend())
+    train(tmp_path, steps=32)
+    steps = [step for step, _ in seen]
+    assert steps == sorted(steps)
+    assert {name for _, name in seen} >= {"toy/train/loss", "toy/validation/return_mean"}
 
 
 @pytest.mark.integration
