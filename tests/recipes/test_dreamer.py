@@ -42,7 +42,7 @@ def test_a_run_leaves_weights_a_curve_and_its_config(run: Path) -> None:
     meta = json.loads((run / "dreamer" / "checkpoint" / "meta.json").read_text())
     assert meta["stage"] == "dreamer"
     assert meta["env_steps"] == 36
-    assert meta["steps"] == 1 + 12 // 4
+    assert meta["steps"] == 1 + 24 // 4
     assert meta["parameters"] > 0
     curve = json.loads((run / "dreamer" / "curve.json").read_text())
     assert [row["env_steps"] for row in curve["rows"]] == [12, 24, 36]

@@ -96,7 +96,7 @@ class _Run:
         if not before.random:
             self.state = replace(before, random=self._measure(random=True))
         self._play()
-        if self.state.step > self.online.prefill and self.replay.ready:
+        if self.state.step >= self.online.prefill and self.replay.ready:
             self._learn()
         self.state = replace(self.state, ratio_from=self.ratio.state_dict()["previous"], seconds=self._seconds())
         progress.update(min(self.state.step, self.online.steps), {})

@@ -20,7 +20,8 @@ from playslot_rl import keys
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.errors import CheckpointError, TrainingError
 from playslot_rl.methods.online import loop
-from playslot_rl.methods.online.acting import play
+from playslot_rl.methods.online.acting import PlayedEpisodes, play
+from playslot_rl.methods.online.players import Round, play_round
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.visualization.charts import draw_curve
 
@@ -65,10 +66,33 @@ def test_updates_keep_their_ratio_to_steps_and_wait_for_the_random_start(tmp_pat
     assert result.state.step == 64
     assert result.state.episodes == 64 // STEPS
     # The first call gives one update, then one for two steps after it.
-    assert result.state.updates == 1 + (64 - 16) // 2
+    assert result.state.updates == 1 + (64 - 8) // 2
     assert len(learner.batches) == result.state.updates
     rows = [json.loads(line) for line in (tmp_path / "toy" / "metrics.jsonl").read_text().splitlines()]
-    assert min(row["step"] for row in rows if row["split"] == "train") == 16
+    assert min(row["step"] for row in rows if row["split"] == "train") == 8
+
+
+@pytest.mark.parametrize("prefill", [8, 12, 16])
+def test_rounds_are_random_until_the_first_update_and_no_longer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prefill: int
+) -> None:
+    order: list[str] = []
+    update = ToyLearner.update
+
+    def played(pool: Any, learner: Any, device: Any, wanted: Round) -> PlayedEpisodes:
+        order.append("random" if wanted.random else "own")
+        return play_round(pool, learner, device, wanted)
+
+    def learned(self: ToyLearner, batch: TensorDict, generators: StepGenerators) -> Mapping[str, Tensor]:
+        order.append("update")
+        return update(self, batch, generators)
+
+    monkeypatch.setattr(loop, "play_round", played)
+    monkeypatch.setattr(ToyLearner, "update", learned)
+    train(tmp_path, steps=24, prefill=prefill)
+    first = order.index("update")
+    assert set(order[:first]) == {"random"}
+    assert "random" not in order[first:]
 
 
 def test_a_replay_on_the_disk_lies_in_the_stage_s_folder_while_it_trains_and_draws_the_same(
@@ -133,7 +157,7 @@ def test_a_backend_sees_steps_that_never_go_back(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("at, resumed", [(0, 0), (9, 32), (22, 48)])
+@pytest.mark.parametrize("at, resumed", [(0, 0), (13, 32), (22, 48)])
 def test_a_run_that_was_interrupted_ends_with_the_weights_of_one_that_was_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, resumed: int
 ) -> None:
@@ -191,9 +215,9 @@ def test_a_budget_of_minutes_ends_the_run_with_a_checkpoint_and_a_point(tmp_path
 
 def test_a_loss_that_is_not_finite_stops_with_the_last_good_checkpoint(tmp_path: Path) -> None:
     with pytest.raises(
-        TrainingError, match=r"toy: loss is nan at update 11, .* last good checkpoint is .*step_00000032"
+        TrainingError, match=r"toy: loss is nan at update 15, .* last good checkpoint is .*step_00000032"
     ):
-        train(tmp_path, ToyLearner(nan_at=10))
+        train(tmp_path, ToyLearner(nan_at=14))
     assert sorted(path.name for path in (tmp_path / "toy" / "checkpoints").iterdir()) == [
         "step_00000016",
         "step_00000032",

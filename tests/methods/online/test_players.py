@@ -102,8 +102,8 @@ def test_the_weights_are_one_round_old(monkeypatch: pytest.MonkeyPatch, tmp_path
     monkeypatch.setattr(ToyLearner, "update", noted)
     train(tmp_path, workers=1, steps=32, prefill=16, update_ratio=0.125, checkpoint_every=1000)
     assert order == [
-        ("begin", 0), ("finish", 0), ("begin", 1), ("finish", 1), ("begin", 2), ("finish", 2),
-        ("begin", 3), ("update", 0), ("finish", 3), ("update", 1),
+        ("begin", 0), ("finish", 0), ("begin", 1), ("finish", 1), ("begin", 2), ("update", 0),
+        ("finish", 2), ("begin", 3), ("update", 1), ("finish", 3), ("update", 2),
     ]  # fmt: skip
 
 
