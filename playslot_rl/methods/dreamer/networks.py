@@ -36,6 +36,7 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
 from playslot_rl.config import EnvConfig
 from playslot_rl.errors import ConfigError
+from playslot_rl.frames import quantise
 from playslot_rl.methods.dreamer.method import NAME, DreamerConfig
 from playslot_rl.runs import Run
 
@@ -113,9 +114,9 @@ class DreamerNetworks(nn.Module):
         self.value = TwoHotHead(features, config.layers, config.units)
 
     def reduce(self, pixels: Tensor) -> Tensor:
-        """Frames uint8 (n, 3, H, W) averaged to uint8 (n, 3, F, F)."""
-        factor = pixels.shape[-1] // self.frame_size
-        return pixels if factor == 1 else F.avg_pool2d(pixels.float(), factor).round().to(torch.uint8)
+        """Frames (n, 3, H, W), uint8 or floats in [0, 1], averaged to uint8 (n, 3, F, F)."""
+        frames, factor = quantise(pixels), pixels.shape[-1] // self.frame_size
+        return frames if factor == 1 else F.avg_pool2d(frames.float(), factor).round().to(torch.uint8)
 
     def blank(self, n: int) -> TensorDict:
         """State and last action of n new episodes: zero, which is how every sequence of the replay starts too."""

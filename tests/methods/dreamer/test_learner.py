@@ -95,6 +95,12 @@ def test_frames_are_reduced_by_their_mean() -> None:
     frames = torch.zeros(1, 3, 64, 64, dtype=torch.uint8)
     frames[..., :4, :2] = 200
     assert networks.reduce(frames)[0, 0, 0, 0] == 100
+    assert torch.equal(networks.reduce(frames / 255), networks.reduce(frames))
+
+
+def test_floats_of_the_size_that_it_sees_are_bytes_too() -> None:
+    frames = torch.randint(0, 256, (1, 3, 16, 16), dtype=torch.uint8)
+    assert torch.equal(learner().networks.reduce(frames / 255), frames)
 
 
 def test_filtering_frame_by_frame_is_the_rollout_of_the_sequence(parts: Parts) -> None:
