@@ -172,3 +172,10 @@ def test_savis_data_are_counted_from_the_config_the_checkpoint_or_its_episodes(w
 def test_settings_that_cannot_be_are_refused(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         compose(["preset=smoke", f"baselines.sold.{override}"])
+
+
+def test_a_context_that_a_sequence_across_episodes_may_not_hold_is_refused(world: Path, tmp_path: Path) -> None:
+    longer = ("env.max_steps=3", "baselines.sold.sequence=6", "baselines.sold.context=4")
+    with pytest.raises(ConfigError, match=r"baselines\.sold\.context: got 4, expected at most 3"):
+        train(_config(world, tmp_path / "run", *longer))
+    assert not (tmp_path / "run").exists()

@@ -12,6 +12,7 @@ from playslot_rl.config.methods import Load, Method, Style
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import COUNT, LAYERS, NOT_NEGATIVE, above_zero, at_least, was, within
 from playslot_rl.config.stage_spec import StageSpec
+from playslot_rl.errors import ConfigError
 from playslot_rl.methods.online.config import SEQUENCE, SHARE, OnlineConfig
 
 
@@ -98,6 +99,16 @@ class SOLDConfig(OnlineConfig):
         check(fits, f"{group}least_context", self.least_context, f"at most {group}context={self.context}")
         learns = self.slot_weight + self.image_weight > 0 and min(self.slot_weight, self.image_weight) >= 0
         check(learns, f"{group}slot_weight", self.slot_weight, "slot_weight or image_weight above 0, none below")
+
+    def check(self, name: str, config: ExperimentConfig) -> None:
+        """Refuse, by a ConfigError, a context that a sequence across episodes may not hold of any one episode."""
+        frames = config.env.max_steps + 1
+        most = min(frames, (self.sequence + 1) // 2)
+        if self.sequence > frames and self.context > most:
+            raise ConfigError(
+                f"{name}.context: got {self.context}, expected at most {most}, which every sequence of {self.sequence} "
+                f"frames has of one episode of {frames}: lower it, or set {name}.sequence=0"
+            )
 
     def needs(self, name: str, config: ExperimentConfig) -> Iterator[Need]:
         slots = config.model.savi.n_slots * config.model.savi.slot_dim

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -12,11 +14,14 @@ from torch.distributions import Normal
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from playslot_rl import keys
+from playslot_rl.errors import ConfigError
 from playslot_rl.methods.sold import losses
 from playslot_rl.methods.sold.learner import SOLDLearner
 from playslot_rl.methods.sold.losses import imagine
+from playslot_rl.methods.sold.method import SOLDConfig
 from playslot_rl.methods.sold.networks import sample_action
 from playslot_rl.seeds.draws import StepGenerators
+from playslot_rl.testing import tiny_config
 
 Make = Callable[..., SOLDLearner]
 NETWORKS = ("dynamics", "reward", "actor", "critic")
@@ -59,6 +64,17 @@ def test_the_image_loss_reaches_the_dynamics_through_the_frozen_decoder(make_lea
     learner = make_learner(image_weight=1.0, slot_weight=0.0, decoded_frames=1)
     assert learner.stored == (keys.SLOTS, keys.PIXELS)
     assert learner.update(batch, StepGenerators(0, 0))["dynamics_grad_norm"] > 0
+
+
+@pytest.mark.parametrize("sequence", [5, 6, 7, 8, 11])
+def test_a_context_is_refused_that_some_sequence_across_episodes_holds_of_none(sequence: int) -> None:
+    config, frames = tiny_config(max_steps=3), 4
+    places = [Counter((first + i) // frames for i in range(sequence)) for first in range(frames)]
+    longest = min(max(place.values()) for place in places)
+    for context in range(1, sequence):
+        own = SOLDConfig(sequence=sequence, context=context, least_context=1)
+        with pytest.raises(ConfigError) if context > longest else nullcontext():
+            own.check("baselines.sold", config)
 
 
 @pytest.mark.slow
