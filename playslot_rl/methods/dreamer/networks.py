@@ -128,12 +128,12 @@ class DreamerNetworks(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """The posterior state z_t, h_t after a frame o_t, uint8 (n, 3, F, F), from z_{t-1}, h_{t-1} and a_{t-1}.
 
-        Note: TorchRL's `RSSMStateEstimatorV3` draws z from the global generator; here it is drawn from `generator`, or
-        is the
-        most likely one where that is None.
+        Note: TorchRL's modules draw z^ and z from the global generator; here z alone is drawn, from `generator`, or is
+        the most likely one where that is None.
         """
-        _, _, belief = self.prior(state, belief, action)
-        logits, _ = self.posterior(belief, self.encoder(frames))
+        belief, posterior = self.prior.rnn(state, belief, action), self.posterior
+        flat = posterior.obs_rnn_to_post_projector(torch.cat([belief, self.encoder(frames)], -1))
+        logits = flat.unflatten(-1, (posterior.num_categoricals, posterior.num_classes))
         if generator is None:
             chosen = logits.argmax(-1)
         else:
@@ -186,11 +186,8 @@ class DreamerActor(Actor):
         return self.networks.blank(len(seeds)).to(self.device)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """PIXELS uint8 (n, 3, H, W) and the memory -> ACTION (n, A) and the memory."""
-        # The prior draws a sample that is not used here.
-        with torch.random.fork_rng(devices=[]):
-            out = act(self.networks, tensordict, None)
-        return tensordict.update(out.select(*self.out_keys))
+        """PIXELS (n, 3, H, W) and the memory -> ACTION (n, A) and the memory."""
+        return tensordict.update(act(self.networks, tensordict, None).select(*self.out_keys))
 
 
 def load_actor(run: Run, device: torch.device | str = "cpu") -> DreamerActor:

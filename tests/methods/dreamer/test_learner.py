@@ -79,9 +79,11 @@ def test_the_slow_critic_follows_the_critic() -> None:
 def test_acting_without_exploring_is_a_function_of_memory_and_frame(parts: Parts) -> None:
     agent = DreamerLearner(parts.networks, parts.config)
     memory = agent.initial(3).set(keys.PIXELS, torch.randint(0, 256, (3, 3, 64, 64), dtype=torch.uint8))
+    before = torch.get_rng_state()
     with torch.no_grad():
         seen = [agent.act(memory.clone(), torch.Generator().manual_seed(i), explore=False) for i in range(2)]
         drawn = [agent.act(memory.clone(), torch.Generator().manual_seed(i), explore=True) for i in (0, 0, 1)]
+    assert torch.equal(torch.get_rng_state(), before)  # the global generator is none of its business
     assert torch.equal(seen[0][keys.ACTION], seen[1][keys.ACTION])
     assert torch.equal(drawn[0][keys.ACTION], drawn[1][keys.ACTION])
     assert not torch.equal(drawn[0][keys.ACTION], drawn[2][keys.ACTION])
@@ -113,8 +115,10 @@ def test_filtering_frame_by_frame_is_the_rollout_of_the_sequence(parts: Parts) -
         for frame in range(3):
             state, belief = memory["state"], memory["belief"]
             action = torch.where(batch[keys.IS_FIRST][:, frame], 0, batch[keys.ACTION][:, frame])
-            _, belief = parts.networks.filter(state, belief, action, batch[keys.PIXELS][:, frame], None)
+            likely, belief = parts.networks.filter(state, belief, action, batch[keys.PIXELS][:, frame], None)
             assert torch.allclose(belief, out["next", "belief"][:, frame], atol=1e-5)
+            posterior = out["next", "posterior_logits"][:, frame]
+            assert torch.equal(likely.view_as(posterior).argmax(-1), posterior.argmax(-1))
             memory = memory.update({"state": out["next", "state"][:, frame], "belief": belief})
 
 
