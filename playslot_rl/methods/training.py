@@ -53,7 +53,7 @@ def train(config: ExperimentConfig) -> StageCheckpoint:
     """Train `config.method` into `OUT/STAGE`; killed, the same command carries on; finished, it says so.
 
     Raises:
-        ConfigError: a method that acts, and a task without simulator or dense reward.
+        ConfigError: a method that acts, and a task without simulator, or blocks without dense reward.
         CheckpointError: no finished parent, or `out` was begun otherwise.
         DataError: no videos, too few demonstrations, or none with actions.
         OutputError, TrainingError: see `playslot_rl.errors`.
@@ -173,7 +173,7 @@ def _require_moving(record: StageRecord, labelled: int | None) -> None:
 
 def require_online(config: ExperimentConfig, online: OnlineConfig, method: str) -> None:
     """Refuse what cannot be learned by acting, before anything is started: a ConfigError for several processes, an
-    environment without simulator or dense reward, or more episodes than a seed has.
+    environment without simulator, blocks without dense reward, or more episodes than a seed has.
     """
     if here().world > 1:
         raise ConfigError(
