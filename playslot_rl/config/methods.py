@@ -75,7 +75,7 @@ class Method:
 
     @property
     def online(self) -> bool:
-        """Whether it learns by acting: environment steps on the axis, a reward needed."""
+        """Whether it learns by acting: it needs a reward, and is compared over environment steps."""
         return not self.last.data
 
     @property
