@@ -58,6 +58,7 @@ class DreamerConfig(OnlineConfig):
 
     update_ratio: float = field(default=0.25, metadata=above_zero())
     group = "baselines.dreamer."
+    within_episode = False  # as the source's stream of frames; `IS_FIRST` resets the state
     frame_size: int = field(default=0, metadata=at_least(0, "0 (the environment's) or pixels"))
     depth: int = field(default=16, metadata=COUNT)
     mults: tuple[int, ...] = field(default=(2, 3, 4, 4), metadata=COUNT)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from playslot_rl.config.machine import Need
 from playslot_rl.config.plain import check
@@ -29,8 +30,8 @@ class OnlineConfig(Checked):
             are one round old; 0 plays them in this process, between its updates, with the newest ones.
         update_ratio: updates for each agent step.
         batch_size: sequences in an update (B).
-        sequence: frames in a sequence (T); 0 means whole episodes. Sequences longer than an episode run across
-            episodes, shorter ones stay within one.
+        sequence: frames in a sequence (T); 0 means whole episodes. Others run across episodes; SOLD's stay within one
+            where they are no longer.
         reward_scale: rewards are multiplied by it before the method learns from them; the curve's returns are not.
             Grids of values and the least range of returns that is divided by (1) suit rewards of the order of 1 to 10.
         capacity: frames that the replay keeps; the oldest episodes go first.
@@ -41,6 +42,7 @@ class OnlineConfig(Checked):
         log_every: updates between lines of `metrics.jsonl`.
     """
 
+    within_episode: ClassVar[bool] = True
     steps: int = field(default=1_000_000, metadata=at_least(1))
     minutes: float = field(default=0.0, metadata=role("free") | at_least(0, largest=YEAR_MINUTES))
     prefill: int = field(default=1000, metadata=at_least(1))

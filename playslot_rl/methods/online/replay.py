@@ -37,9 +37,9 @@ class Replay:
     """A ring of the latest `capacity` episodes; a ConfigError where that is less than one sequence or one episode.
 
     Every frame comes with `keys.ACTION` and `keys.REWARD`, of the step that led to it (the reward as the task gave it;
-    `sample` multiplies it by `reward_scale`), and `keys.IS_FIRST` and `keys.IS_LAST`. A sequence no longer than an
-    episode lies within one; a longer one runs on into the next episode, with its `IS_FIRST`. Its files are in the
-    folder `ring`, which is not there yet; None keeps it in memory.
+    `sample` multiplies it by `reward_scale`), and `keys.IS_FIRST` and `keys.IS_LAST`. Sequences run on into the next
+    episode, with its `IS_FIRST`, but for whole episodes, and those no longer than one where `config.within_episode`.
+    Its files are in the folder `ring`, which is not there yet; None keeps it in memory.
     """
 
     def __init__(self, config: OnlineConfig, episode_frames: int, ring: Path | None = None) -> None:
@@ -52,7 +52,7 @@ class Replay:
             need = max(self.sequence, episode_frames) + episode_frames
             raise ConfigError(f"capacity: got {config.capacity} frames, expected at least {need}: raise it")
         rows = self.capacity * episode_frames
-        within = self.sequence <= episode_frames
+        within = config.sequence == 0 or (config.within_episode and self.sequence <= episode_frames)
         self._buffer = TensorDictReplayBuffer(
             # Without a folder its files would lie in /dev/shm, which is memory.
             storage=LazyTensorStorage(rows) if ring is None else LazyMemmapStorage(rows, scratch_dir=ring),

@@ -126,6 +126,21 @@ def test_the_critics_loss_on_replayed_rewards_also_trains_the_representation(par
     assert parts.touched() == {"encoder", "prior", "posterior", "value"}
 
 
+def test_rewards_of_the_next_episode_do_not_reach_the_values_of_the_last(parts: Parts) -> None:
+    batch = random_batch()
+    batch[keys.IS_FIRST][:, 1:], batch[keys.IS_LAST][:] = False, False
+    batch[keys.IS_LAST][:, 3], batch[keys.IS_FIRST][:, 4] = True, True
+    found = []
+    for raised in (None, 3, 4):
+        changed = batch.clone()
+        if raised is not None:
+            changed[keys.REWARD][:, raised] += 5
+        with global_seed(0, 0), torch.no_grad():
+            found.append(parts.loss(records(changed, parts.networks))["loss_replay_value"].item())
+    assert found[1] != found[0]
+    assert found[2] == found[0]
+
+
 def test_actions_are_bounded_gaussians_that_start_wide_and_centred(parts: Parts) -> None:
     mean, std = parts.networks.actor(torch.randn(100, 12), torch.randn(100, 8))
     assert mean.shape == std.shape == (100, A)

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 
 from playslot_rl import keys
 from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.methods.dreamer.method import DreamerConfig
 from playslot_rl.methods.online.config import OnlineConfig
 from playslot_rl.methods.online.replay import Replay, ReplayJournal
 from playslot_rl.storage.tensors import load_tensors
@@ -51,6 +52,18 @@ def test_a_sequence_no_longer_than_an_episode_lies_within_one(sequence: int) -> 
     assert len((places[:, 0] // 10).unique()) == 5
     starts = (places[:, 0] % 10).unique().tolist()
     assert starts == list(range(FRAMES - sequence + 1))
+
+
+def test_dreamers_sequences_run_across_episodes_so_that_every_frame_is_drawn_alike() -> None:
+    source = Replay(DreamerConfig(batch_size=400, sequence=2, capacity=100), FRAMES)
+    source.add(episodes(0, 10))
+    batch = draw(source)
+    assert (batch["place"][:, 0] % 10).unique().tolist() == [0, 1, 2, 3]
+    assert torch.equal(batch[keys.IS_FIRST].squeeze(-1), batch["place"] % 10 == 0)
+    assert batch[keys.IS_FIRST].float().mean().item() == pytest.approx(1 / FRAMES, abs=0.05)  # within one: a sixth
+    whole = Replay(DreamerConfig(batch_size=8, sequence=0, capacity=100), FRAMES)
+    whole.add(episodes(0, 10))
+    assert draw(whole)[keys.IS_FIRST][:, 0].all()
 
 
 def test_rewards_are_scaled_when_they_are_drawn_and_stored_as_they_came() -> None:
