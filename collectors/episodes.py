@@ -66,14 +66,14 @@ class SeededView(TensorView):
     A reset before the running episode's end starts it again. TorchRL resets more often than there are episodes (when it
     looks at the environment, and after an episode's last step): a reset without a job touches neither the simulator nor
     the renderer, and its observation is all zeros. `jobs` are places in the collection and seeds of episodes that have
-    not been started.
+    not been started, `turns` those of `EnvConfig`.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]] = ()) -> None:
+    def __init__(self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]] = (), turns: int = 1) -> None:
         counter = gym.spaces.Box(0, 2**62, (1,), np.int64)
         counters = dict.fromkeys((EPISODE_INDEX, EPISODE_SEED, EPISODE_STEP, REDRAWN), counter)
         super().__init__(env, {keys.EXPERT_ACTION: env.action_space, **counters})
-        self.jobs = deque(jobs)
+        self.jobs, self.turns = deque(jobs), turns
         self._running: tuple[int, int] | None = None
         self._episode_seed = self._redrawn = self._step = 0
 
@@ -101,7 +101,7 @@ class SeededView(TensorView):
             self._running = self.jobs.popleft()
         first, self._step = self._running[1], 0
         for attempt in range(MAX_REDRAWS):
-            self._episode_seed, self._redrawn = first + attempt * redraw_stride(first), attempt
+            self._episode_seed, self._redrawn = first + attempt * redraw_stride(first, self.turns), attempt
             observation, info = self.env.reset(seed=self._episode_seed)
             if not info["success"]:
                 return self.view(observation, info), info
@@ -123,7 +123,7 @@ class EpisodeCollector(Collector):
     """TorchRL's collector, whose batches (T,) are the one whole episode that it is asked for."""
 
     def __init__(self, spec: CollectionSpec) -> None:
-        self._spec, self._view = spec, SeededView(make_env(spec.env, spec.render))
+        self._spec, self._view = spec, SeededView(make_env(spec.env, spec.render), turns=spec.env.turns)
         super().__init__(
             wrap(self._view),
             make_policy(spec),

@@ -21,6 +21,7 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config import EnvConfig, RenderConfig
+from playslot_rl.seeds.episodes import whole_turns
 
 Frames = npt.NDArray[np.uint8]
 Actions = npt.NDArray[np.float32]
@@ -153,12 +154,14 @@ def run_episodes(
         see_last: show the actor the last frame too, though it cannot act any more.
         draw: draw also the frames that the actor does not look at, where there is a `look_on`.
         stride: distance between the seeds of an episode that is drawn anew because it starts solved. None is the number
-            of episodes: redrawn seeds meet no other episode's, and every actor redraws the same ones.
+            of episodes: redrawn seeds meet no other episode's, and every actor redraws the same ones. It is rounded up
+            so that the episode keeps its task or goal (`EnvConfig.turns`).
     """
     outcomes: list[Outcome] = []
+    stride = whole_turns(stride or len(seeds), pool.env.turns)
     for first in range(0, len(seeds), lockstep):
         chunk = seeds[first : first + lockstep]
-        episodes = _LockStep(pool, actor, chunk, first, stride or len(seeds), look_on, draw)
+        episodes = _LockStep(pool, actor, chunk, first, stride, look_on, draw)
         outcomes += episodes.run(stop, see_last)
     return outcomes
 

@@ -194,6 +194,11 @@ class EnvConfig(Checked):
         return replace(self, task=self.tasks[in_turn(seed, len(self.tasks))]) if self.tasks else self
 
     @property
+    def turns(self) -> int:
+        """Tasks, or goals, that episodes take in turn by the seed; 1 where all have the same."""
+        return 5 if self.name == "ogbench" and self.goals == "evaluation" else max(1, len(self.tasks))
+
+    @property
     def full_name(self) -> str:
         """The name, the task where that has several, and what varies, as folders and reports call it."""
         own = self.task or self.id.replace("/", "_").replace(":", "_")

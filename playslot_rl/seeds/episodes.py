@@ -68,6 +68,13 @@ def episode_seed(stream: Stream, seed: int, index: int, first: int | None = None
     return (bits << _STREAM_BIT) + (seed << _SEED_BIT) + index
 
 
-def redraw_stride(number: int) -> int:
-    """Distance between an episode's number and those drawn next where it starts solved, 31 at most."""
-    return 1 << _DRAW_BIT if number >> _STREAM_BIT else _SMALL_STRIDE
+def redraw_stride(number: int, turns: int = 1) -> int:
+    """Distance between an episode's number and those drawn next where it starts solved, 31 at most; the task or goal
+    stays that of the number where these are taken in turn, so many of them.
+    """
+    return whole_turns(1 << _DRAW_BIT if number >> _STREAM_BIT else _SMALL_STRIDE, turns)
+
+
+def whole_turns(stride: int, turns: int) -> int:
+    """The least multiple of the turns from a stride on."""
+    return stride + -stride % turns

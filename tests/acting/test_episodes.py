@@ -53,6 +53,13 @@ class CounterPool(TaskPool):
         return list(self.made[:count])
 
 
+def test_an_episode_that_is_drawn_anew_keeps_its_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Counter, "reset", lambda self, seed: (self._observe(), {"success": seed < 30}))
+    pool = CounterPool()
+    pool.env = replace(pool.env, name="ogbench", task="cube-single")
+    assert [e.seed for e in run_episodes(pool, ExpertActor(), [19, 21, 40])] == [34, 31, 40]
+
+
 def test_each_seed_is_run_once_in_order_and_counts_its_own_steps() -> None:
     seeds = [3, 0, 1, 8, 6, 12, 5]  # more than one chunk
     episodes = run_episodes(CounterPool(), ExpertActor(), seeds)

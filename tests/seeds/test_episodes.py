@@ -18,20 +18,22 @@ EDGES = (0, 1, 999, 1000, 1001, 1899, 1900, 1901, 2000, 4242, 2**31, LARGEST_SEE
 DRAWS = 20
 
 
-def numbers(stream: Stream, seed: int, index: int) -> list[int]:
+def numbers(stream: Stream, seed: int, index: int, turns: int = 1) -> list[int]:
     """An episode's number and those it is redrawn with."""
     first = episode_seed(stream, seed, index)
-    return [first + attempt * redraw_stride(first) for attempt in range(DRAWS)]
+    return [first + attempt * redraw_stride(first, turns) for attempt in range(DRAWS)]
 
 
-def test_no_number_has_two_episodes() -> None:
+@pytest.mark.parametrize("turns", [1, 5, 10])
+def test_no_number_has_two_episodes_and_redrawn_ones_keep_their_turn(turns: int) -> None:
     rng = random.Random(0)
     drawn = {rng.randint(0, rng.choice([1200, 10**6, LARGEST_SEED])) for _ in range(100)}
     seen: dict[int, tuple[Stream, int, int, int]] = {}
     for stream, seed in itertools.product(STREAMS, sorted({*EDGES, *drawn})):
         for index in {0, 1, 499_999, 500_000, EPISODES - 1, *(rng.randrange(EPISODES) for _ in range(5))}:
-            for attempt, number in enumerate(numbers(stream, seed, index)):
+            for attempt, number in enumerate(numbers(stream, seed, index, turns)):
                 assert 0 <= number < 2**62
+                assert number % turns == episode_seed(stream, seed, index) % turns
                 assert seen.setdefault(number, (stream, seed, index, attempt)) == (stream, seed, index, attempt)
 
 
