@@ -307,7 +307,8 @@ class PlaySlot:
         drawn as `render` says: use what the training data were drawn with. A CheckpointError where the model has no
         policy, a ConfigError where the task has no simulator.
         """
-        decoder, env = self._require_agent("simulation").action_decoder, self.world_model.env
+        decoder, stride = self._require_agent("simulation").action_decoder, self._policy.stride if self._policy else 1
+        env = self.world_model.env.every(stride)
         from playslot_rl.acting.simulation import make_simulation_env
 
         require_type(render, "render", RenderConfig, type(None), expected="a RenderConfig, or None")

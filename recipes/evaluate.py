@@ -12,7 +12,7 @@ from typing import Any
 from playslot_rl.config import EnvConfig, ExperimentConfig, plugins
 from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.envs import PROCEDURAL
-from playslot_rl.errors import CheckpointError
+from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes import objects
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import require_task, run_of_pretrained, run_to_read
@@ -45,7 +45,7 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
     run_facts(run.folder)  # a run without a policy is refused before anything is loaded
     require_task(config, run.own("policy").group(EnvConfig, "env"))
     agent = run.load_agent(open_device(config.device, config.threads))
-    with TaskPool(config.env, config.render) as pool:
+    with TaskPool(config.acting, config.render) as pool:
         result = evaluate_run(run.folder, agent, config, config.protocol, pool)
         print(describe(result, run.folder))
         if report:
@@ -65,7 +65,7 @@ def evaluate_baseline(config: ExperimentConfig, run: Run) -> None:
     device = open_device(config.device, config.threads)
     actor = plugins.call(METHODS[config.method].load.actor, run, device)
     actor.eval()
-    with TaskPool(config.env, config.render) as pool:
+    with TaskPool(config.acting, config.render) as pool:
         print(describe(evaluate_actor(run.folder, actor, config, pool), run.folder), flush=True)
 
 
@@ -120,6 +120,8 @@ def run_with_policy(config: ExperimentConfig, command: str = "evaluate") -> Run:
     run = run_to_read(config, command, "the folder of a run with a trained policy, such as run=runs/demo")
     if run.pretrained and config.protocol != "slots" and not run.has("policy"):
         raise CheckpointError(f"run={config.run} is a world model without a policy; run `playslot train-policy`")
+    if (got := config.data.stride) != (expected := run.view.stride):
+        raise ConfigError(f"data.stride: got {got}, expected {expected}, as run={config.run} was trained: leave it out")
     return run
 
 

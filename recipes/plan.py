@@ -34,7 +34,7 @@ def main(config: ExperimentConfig) -> None:
     run = run_with_policy(config, "plan")
     require_one_task(config, "plan")
     check_task(config.env, expert=True, success=True)  # refuses what has no simulator
-    frame_skip = config.env.frame_skip
+    frame_skip = config.acting.frame_skip
     try:
         sizes = {goals: search_size(config.plan, goals, frame_skip) for goals in config.plan.goals}
     except ValueError as error:
@@ -60,7 +60,7 @@ def main(config: ExperimentConfig) -> None:
         )
     folder, parts = run.folder / "planning", {}
     for goals, size in sizes.items():
-        with GoalPool(config.env, config.render) as pool:
+        with GoalPool(config.acting, config.render) as pool:
             common = {"demos": facts.demos, "labelled_demos": facts.labelled_demos, **_facts(config, run.folder)}
             common |= {"fingerprints": facts.fingerprints, "commit": facts.commit, "size": asdict(size)}
             parts[goals] = _measure(config, agent, pool, goals, folder / goals, common)
@@ -90,13 +90,13 @@ def _measure(
     from playslot_rl.visualization.charts import LIGHT
     from playslot_rl.visualization.planning_page import solution_chart
 
-    plan, first, whole = config.plan, first_seed(config, config.seed), config.env.max_steps
+    plan, first, whole = config.plan, first_seed(config, config.seed), config.acting.max_steps
     episodes = make_goals(pool, range(first, first + (config.episodes or EPISODES)), goals, plan, config.seed)
     check_disjoint([episode.seed for episode in episodes], training_seeds(config, Path(common["folder"])))
     solution = cost_along_solution(agent, episodes, plan.looks, plan.match)
     folder.mkdir(parents=True, exist_ok=True)
     write_bytes(folder / "cost.png", solution_chart(solution, LIGHT))
-    steps = whole if goals == "solved" else max(2, round(plan.budget / config.env.frame_skip))
+    steps = whole if goals == "solved" else max(2, round(plan.budget / config.acting.frame_skip))
     every, found = common["size"]["every"], {}
     for name, actor in ways_of_acting(config, agent, goals, episodes).items():
         played = play(pool, actor, episodes, goals, steps, every, draw=False)

@@ -89,8 +89,8 @@ def simulated_starts(config: ExperimentConfig, world: WorldModel) -> SimulatedSt
         return None
     require_task(config, world.env, SAME_TASK[2:])
     metadata = task_metadata(config.env)
-    fps = metadata["control_hz"] / config.env.frame_skip
-    maker = task_maker(config.env, config.render)
+    fps = metadata["control_hz"] / config.acting.frame_skip
+    maker = task_maker(config.acting, config.render)
     return SimulatedStarts(world, maker, fps, metadata["task"], first_seed(config, config.seed))
 
 
@@ -119,5 +119,5 @@ def recorded_starts(
     env = replace(config.env, image_size=world.env.image_size)
     source = open_configured(replace(config, env=env), found)
     simulator = agent is not None and config.env.name in ENVIRONMENTS
-    maker = task_maker(config.env, config.render) if simulator else None
+    maker = task_maker(config.acting, config.render) if simulator else None
     return RecordedStarts(world, source, maker, config.seed)

@@ -193,6 +193,11 @@ class EnvConfig(Checked):
         """The task of several whose an episode is: each in turn by the seed; else itself."""
         return replace(self, task=self.tasks[in_turn(seed, len(self.tasks))]) if self.tasks else self
 
+    def every(self, stride: int) -> EnvConfig:
+        """The task as a policy of every `stride`-th frame acts in it: its steps are so many times longer, and fewer."""
+        steps = max(2, -(-self.max_steps // stride))
+        return replace(self, frame_skip=stride * self.frame_skip, max_steps=steps)
+
     @property
     def turns(self) -> int:
         """Tasks, or goals, that episodes take in turn by the seed; 1 where all have the same."""

@@ -288,6 +288,11 @@ class ExperimentConfig(Checked):
     export: ExportConfig = field(default_factory=ExportConfig, metadata=role("call"))
     play: PlayConfig = field(default_factory=PlayConfig, metadata=role("call", "machine"))
 
+    @property
+    def acting(self) -> EnvConfig:
+        """The task as policies act in it, `data.stride` frames of the data a step."""
+        return self.env.every(self.data.stride)
+
     def __post_init__(self) -> None:
         super().__post_init__()
         require_method("method", self.method)

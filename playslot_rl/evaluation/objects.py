@@ -248,10 +248,10 @@ def segmented_episodes(config: ExperimentConfig, seeds: Sequence[int]) -> Iterat
             clips = generate([seed], config.env.max_steps, config.env)
             yield clips.frames[0], clips.masks[0].astype(np.int64)
         return
-    env = make_env(config.env, config.render).unwrapped
+    env = make_env(config.acting, config.render).unwrapped
     try:
         for seed in seeds:
-            yield segmented_episode(env, seed, config.env.max_steps)
+            yield segmented_episode(env, seed, config.acting.max_steps)
     finally:
         env.close()
 

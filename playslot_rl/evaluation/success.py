@@ -123,12 +123,12 @@ def evaluate(
     agent.eval()
     oracle = None if agent.oracle is None else oracle_actor(agent)
     # The expert plays an episode while the pool's own environments wait at its first frame.
-    with TaskPool(config.env, config.render) as stage:
+    with TaskPool(config.acting, config.render) as stage:
         actor: Actor
         if protocol == "simulation":
             actor = playslot_actor(agent)
         elif protocol == "imagination":
-            actor = ImaginationActor(agent, config.env.max_steps)
+            actor = ImaginationActor(agent, config.acting.max_steps)
         else:
             actor = ReplayActor(agent, partial(perform, stage))
         return measure(
@@ -151,7 +151,7 @@ def measure(
     """Measure any actor in evaluation mode, as `evaluate` does; null values of the slot oracle without an `oracle`."""
     seeds = held_out_seeds(config, seed, episodes, run)
     begin = time.perf_counter()
-    with TaskPool(config.env, config.render) if pool is None else contextlib.nullcontext(pool) as used:
+    with TaskPool(config.acting, config.render) if pool is None else contextlib.nullcontext(pool) as used:
         outcome = run_episodes(used, actor, seeds)
         wall = time.perf_counter() - begin
         references: dict[str, dict[str, Any]] = {n: {"success_rate": None, "ci95": None} for n in REFERENCES}
@@ -167,13 +167,13 @@ def measure(
         "protocol": protocol,
         "episodes": episodes,
         "seeds": played,
-        **summary(outcome, config.env),
+        **summary(outcome, config.acting),
         "labelled_demos": facts.labelled_demos,
         "demos": facts.demos,
         **facts.extra,
         "references": references,
         "references_protocol": "simulation (closed loop), on the same seeds",
-        "max_steps": config.env.max_steps,
+        "max_steps": config.acting.max_steps,
         "redrawn": sum(e.redrawn for e in outcome),
         "per_episode": [e.plain() for e in outcome],
         "seed": seed,
@@ -188,7 +188,7 @@ def measure(
 
 def task_facts(config: ExperimentConfig, seed: int) -> dict[str, Any]:
     """What besides weights decides a result, as JSON stores it: task, renderer, first evaluation seed."""
-    values = {"env": to_dict(config.env), "render": to_dict(config.render), "first_seed": first_seed(config, seed)}
+    values = {"env": to_dict(config.acting), "render": to_dict(config.render), "first_seed": first_seed(config, seed)}
     return json.loads(json.dumps(values))  # type: ignore[no-any-return]
 
 
@@ -275,7 +275,7 @@ def run_references(
     `cache` is a JSON file that both protocols of a run share. The oracle's result is in it by the weights of oracle and
     SAVi that `oracle_fingerprint` names; empty, it is not cached.
     """
-    actors: dict[str, Actor] = {"random": RandomActor(config.env.max_steps, config.env.action_dim)}
+    actors: dict[str, Actor] = {"random": RandomActor(config.acting.max_steps, config.acting.action_dim)}
     results: dict[str, dict[str, Any]] = {}
     if getattr(pool.take(1)[0], "has_expert", True):
         actors["expert"] = ExpertActor()
@@ -289,10 +289,10 @@ def run_references(
             stored = json.loads(cache.read_text())
     for name, actor in actors.items():
         weights = oracle_fingerprint if name == "slot_oracle" else name
-        what = [weights, to_dict(config.env), to_dict(config.render), list(seeds)]
+        what = [weights, to_dict(config.acting), to_dict(config.render), list(seeds)]
         key = f"{name}-{hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:16]}"
         if not weights or key not in stored:
-            stored[key] = summary(run_episodes(pool, actor, seeds), config.env)
+            stored[key] = summary(run_episodes(pool, actor, seeds), config.acting)
         results[name] = stored[key]
     if oracle is None:
         results["slot_oracle"] = dict(NOTHING)

@@ -181,6 +181,10 @@ def require_online(config: ExperimentConfig, online: OnlineConfig, method: str) 
             "torchrun or accelerate launch"
         )
     check_task(config.env, success=True)
+    if config.data.stride > 1:
+        raise ConfigError(
+            f"data.stride: got {config.data.stride}, expected 1: {method} learns by acting, not from data"
+        )
     if config.env.name.startswith("block_") and config.env.blocks.reward != "dense":
         raise ConfigError(
             f"env.blocks.reward: got {config.env.blocks.reward} with method={method}, expected dense: "

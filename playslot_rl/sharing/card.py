@@ -99,7 +99,7 @@ def facts_table(rows: dict[str, str]) -> str:
 
 
 def _task(policy: SharedPolicyConfig) -> dict[str, str]:
-    env, words, action, rate = policy.env, "", "", ""
+    env, words, action, rate = policy.env.every(policy.stride), "", "", ""
     if env.name in ENVIRONMENTS:
         from playslot_rl.envs.lerobot import frames_a_second
 

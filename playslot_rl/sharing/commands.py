@@ -193,11 +193,12 @@ def use(policy: SharedPolicyConfig, experiment: ExperimentConfig | None = None) 
     alike = replace(own, image_size=task.image_size, frame_skip=task.frame_skip, max_steps=task.max_steps)
     if alike != task:
         return REAL.format(why=CHANGED, camera=policy.camera, rate=rate_words(policy))
+    acting = own.every(policy.stride)
     options = {
         "image_size": (own.image_size, 64),
         "quality": (known.render.quality, "fast"),
-        "frame_skip": (own.frame_skip * policy.stride, task.frame_skip),
-        "episode_length": (-(-own.max_steps // policy.stride), task.max_steps),
+        "frame_skip": (acting.frame_skip, task.frame_skip),
+        "episode_length": (acting.max_steps, task.max_steps),
     }
     command = ["lerobot-eval", "--policy.path=THIS_FOLDER", "--env.type=playslot", f"--env.task={task_name}"]
     command += [f"--env.{name}={value}" for name, (value, default) in options.items() if value != default]

@@ -52,7 +52,7 @@ def write_report(
     for module in (model, agent):
         if module is not None:
             module.eval()
-    with TaskPool(config.env, config.render) if pool is None else nullcontext(pool) as used:
+    with TaskPool(config.acting, config.render) if pool is None else nullcontext(pool) as used:
         relative = os.path.relpath(run)
         shown = relative if not relative.startswith("..") else run.name
         given = ReportInput(run, config, model, agent, used, shown, read_metas(run))
@@ -97,7 +97,7 @@ def build(given: ReportInput) -> Document:
 
 
 def settings_section(given: ReportInput) -> Section:
-    env, model = given.config.env, given.world_model
+    env, model = given.config.acting, given.world_model
     task = [
         ["frames", f"{env.image_size} x {env.image_size} pixels, rendering `{given.config.render.quality}`"],
         ["agent step", f"{env.frame_skip} environment steps; at most {env.max_steps} agent steps an episode"],

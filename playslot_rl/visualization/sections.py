@@ -141,7 +141,7 @@ def success_section(given: ReportInput) -> Section:
         alt = "; ".join(f"{n}: {percent(rate)}, {interval(list(ci))}" for n, rate, ci, _ in drawn)
         ways = (
             "Simulation: the agent sees every frame. Imagination: it sees the first frame only, unfolds "
-            f"{given.config.env.max_steps} steps in latent space, and the decoded actions are then executed."
+            f"{given.config.acting.max_steps} steps in latent space, and the decoded actions are then executed."
         )
         if "replay" in results:
             ways += (

@@ -6,11 +6,17 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from commands import Done, contents, playslot, refused, smoke, weights
 
+from playslot_rl.config import EnvConfig, RenderConfig
+from playslot_rl.config.compose import compose
+from playslot_rl.envs import make_env, task_metadata
 from playslot_rl.evaluation.intervals import wilson
+from playslot_rl.recipes.play import simulated_starts
+from playslot_rl.runs import Run
 
 pytestmark = pytest.mark.integration
 
@@ -66,6 +72,42 @@ def test_eval_info_has_the_promised_keys(shared_run: Path, protocol: str) -> Non
     for reference in info["references"].values():
         assert 0.0 <= reference["success_rate"] <= 1.0
         assert reference["ci95"] == list(wilson(round(2 * reference["success_rate"]), 2))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "evaluate protocol=simulation episodes=1 env.max_steps=5",
+        "evaluate protocol=slots episodes=1 env.max_steps=5",
+        "plan planner=prototypes proposal=none goals=ahead episodes=1 env.max_steps=19 plan.horizon=2 plan.near=0.01",
+        "play",
+    ],
+)
+def test_a_policy_of_every_second_frame_acts_at_half_the_rate(
+    run: Path, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, *arguments = command.split()
+    stored = json.loads((run / "config.json").read_text())
+    stored["data"]["stride"] = 2
+    (run / "config.json").write_text(json.dumps(stored))
+    made: list[EnvConfig] = []
+
+    def make(env: EnvConfig, render: RenderConfig) -> Any:
+        made.append(env)
+        return make_env(env, render)
+
+    monkeypatch.setattr("playslot_rl.envs.make_env", make)
+    monkeypatch.setattr("playslot_rl.evaluation.objects.make_env", make)
+    if name == "play":
+        starts = simulated_starts(compose([f"run={run}", *arguments], name), Run(run).load_world_model())
+        assert starts is not None
+        starts.make_task().close()
+        assert starts.fps == task_metadata(made[0])["control_hz"] / 10
+    else:
+        refused(name, f"run={run}", *arguments, "data.stride=1", message="data.stride: got 1, expected 2")
+        smoke(name, f"run={run}", *arguments)
+    steps = {"plan": 10}.get(name, 3)  # half of them, rounded up
+    assert {(env.frame_skip, env.max_steps) for env in made} == {(10, steps)}
 
 
 def test_evaluation_seeds_are_none_of_the_collected_ones(shared_run: Path) -> None:

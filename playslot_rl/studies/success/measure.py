@@ -155,7 +155,7 @@ class SuccessMeasure:
             evaluate(replace(own, protocol=protocol))
 
     def rows(self, job: SuccessJob, status: Status) -> list[dict[str, Any]]:
-        return job_rows(job, self.config.env.frame_skip, status)
+        return job_rows(job, self.config.acting.frame_skip, status)
 
     def said(self, rows: Sequence[Mapping[str, Any]]) -> str:
         known = [row for row in rows if row["success_rate"] is not None]
@@ -176,7 +176,7 @@ class SuccessMeasure:
             "block": block_of(config),
             "videos": list(own.videos),
             "worlds": own.worlds,
-            "max_steps": config.env.max_steps,
+            "max_steps": config.acting.max_steps,
             "jobs": len({row["name"] for row in rows}),
             "summary": summary,
             "reference": reference,
@@ -186,7 +186,7 @@ class SuccessMeasure:
             "rows": rows,
             **self._shared,
             "learn_from_demos": config.collect.learn_from_demos,
-            "frame_skip": config.env.frame_skip,
+            "frame_skip": config.acting.frame_skip,
             "threads": config.threads,
         }
 
@@ -242,6 +242,6 @@ def _references(config: ExperimentConfig) -> dict[str, dict[str, Any]]:
     evaluation seed that a training data set holds.
     """
     seeds = held_out_seeds(config, config.compare.evaluation_seed, config.episodes or 0)
-    with TaskPool(config.env, config.render) as pool:
+    with TaskPool(config.acting, config.render) as pool:
         found = run_references(None, config, seeds, pool, cache=Path(config.out) / "references.json")
     return {name: found[name] for name in ("random", "expert")}
