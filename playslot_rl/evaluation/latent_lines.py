@@ -135,7 +135,7 @@ def _scores(parsed: ParsedEpisodes, noisy: Floats, seed: int) -> tuple[str, dict
     }
     scores = {name: probe_actions(x, actions, parsed.episodes, tested=parsed.tested) for name, x in seen.items()}
     if scores["latent"]["linear"]["mean_r2"] is None:
-        return "the actions do not vary", {}
+        return "the tested actions hardly vary", {}
     before = np.nonzero(np.diff(parsed.rows) == 1)[0]  # an episode's last one has none after it
     episodes, tested = parsed.episodes[before], parsed.tested[before]
     if tested.any() and not tested.all():

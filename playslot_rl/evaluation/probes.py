@@ -19,6 +19,8 @@ from playslot_rl.modules.inverse_dynamics import InverseDynamics
 
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
+SPREAD = 0.1
+"""Least variance of a tested action, share of that it was fitted with: below it R² tells how still the robot stood."""
 
 
 @torch.no_grad()
@@ -78,7 +80,7 @@ def probe_actions(
 
     Returns:
         `linear` (ridge), `mlp` (two layers of 64) and, with codes, `code`: each `r2` (A values; None where the held-out
-        action does not vary) and `mean_r2`; `train` and `test` count transitions, `test_episodes` episodes.
+        action does not vary, or hardly (`SPREAD`)) and `mean_r2`; `train` and `test` count transitions, `test_episodes` episodes.
 
     Raises:
         ValueError: sizes differ, there are fewer than two episodes, or an episode is on both sides.
@@ -122,8 +124,8 @@ def _score(kind: str, x: Floats, y: Floats, x_test: Floats, y_test: Floats) -> d
         model.fit(x, y)
     predicted = np.asarray(model.predict(x_test)).reshape(y_test.shape)
     residual = np.square(y_test - predicted).mean(0)
-    spread = y_test.var(0)
-    r2 = [None if s < 1e-8 else float(1 - e / s) for e, s in zip(residual, spread, strict=True)]
+    spread, least = y_test.var(0), np.maximum(1e-8, SPREAD * y.var(0))
+    r2 = [None if s < m else float(1 - e / s) for e, s, m in zip(residual, spread, least, strict=True)]
     known = [v for v in r2 if v is not None]
     return {"r2": r2, "mean_r2": float(np.mean(known)) if known else None}
 

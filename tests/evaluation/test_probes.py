@@ -56,6 +56,16 @@ def test_an_action_that_never_varies_has_no_score() -> None:
     assert score["mean_r2"] == score["r2"][0]
 
 
+def test_a_gripper_that_only_trembles_in_the_tested_episodes_has_no_score() -> None:
+    z, rng, episodes = _data()
+    tested = episodes >= 18
+    closes = (rng.random(len(z)) < 0.1).astype(np.float32)
+    gripper = np.where(tested, 0.002 * rng.normal(size=len(z)), closes)
+    score = probe_actions(z, np.stack([z[:, 0], gripper], 1).astype(np.float32), episodes, tested=tested)["linear"]
+    assert score["r2"][1] is None
+    assert score["mean_r2"] == score["r2"][0] > 0.99
+
+
 def test_code_probe_sees_the_code_only() -> None:
     z, rng, episodes = _data(120)
     codes = rng.integers(0, 3, (len(z), 1))
