@@ -82,8 +82,12 @@ def _candidates(
             share, fits = float(meta.get("validation", config.validation)), source.lengths >= meta.get("clip_frames", 1)
             training, _ = split_episodes(source.episodes, share, int(meta.get("seed", 0)), fits, source.recorded)
             chosen = np.setdiff1d(chosen, training)
-        if len(chosen):
+        if len(chosen) and len(trained) == len(world):
             return chosen, "the world model's own videos, the episodes that its validation held out", True
+        if len(chosen):
+            stage = "dynamics" if trained[0] is metas.get("slots") else "slots"
+            why = f"one stage's videos, the episodes that it held out; {stage} had another set, which may hold them"
+            return chosen, why, False
         return quarter, "the world model's own videos, none of which were held out", False
     last = _policy_held_out(source, metas.get("policy", {}), config)
     if len(chosen := usable[numbers >= source.recordings - last]):

@@ -215,6 +215,10 @@ def test_the_world_models_own_videos_are_measured_where_its_validation_was(model
     assert hold_out(videos(), stored, DataConfig(validation=0.25), 100).tested.tolist() == (
         split_episodes(EPISODES, 0.5, 4)[1].tolist()
     )
+    elsewhere = metas | {"slots": {"data": {"train": "print+more"}, "seed": 4}}
+    mixed = hold_out(videos(), elsewhere, DataConfig(validation=0.25), 100)
+    assert (mixed.tested.tolist(), mixed.known) == (found.tested.tolist(), False), "SAVi may have seen them"
+    assert "slots had another set" in mixed.told_by
     lengths = np.where(np.isin(np.arange(EPISODES), split_episodes(EPISODES, 0.1, 4)[1]), 2, videos().lengths)
     short, clip = replace(videos(), lengths=lengths), metas["dynamics"] | {"clip_frames": 3}
     tested, clips = hold_out(short, {"dynamics": clip}, DataConfig(validation=0.1), 100).tested, Clips(short, 3, 0.1, 4)
