@@ -19,7 +19,7 @@ from playslot_rl.data.contents import camera_list, cameras_of, full_name
 from playslot_rl.data.metadata import INFO_NAME, RECORD_NAME, read_info
 from playslot_rl.envs import ENVIRONMENTS, RECORDED
 from playslot_rl.errors import CheckpointError, ConfigError, DataError, OutputError
-from playslot_rl.evaluation.success import POLICY_PROTOCOLS, run_facts
+from playslot_rl.evaluation.success import POLICY_PROTOCOLS, run_facts, task_facts
 from playslot_rl.runs import Run
 from playslot_rl.sharing.card import make_card
 from playslot_rl.sharing.commands import Result
@@ -89,8 +89,10 @@ def _elsewhere(root: Path) -> bool:
     return (root / INFO_NAME).is_file() and not (root / RECORD_NAME).is_file()
 
 
-def read_results(run: Run, source: dict[str, Any]) -> list[Result]:
-    """Evaluations of exactly this policy, not of an older one, from `RUN/evaluation/*/eval_info.json`."""
+def read_results(run: Run, config: ExperimentConfig, source: dict[str, Any]) -> list[Result]:
+    """Evaluations of exactly this policy, not of an older one, in the task and on the block of episodes that the run's
+    config says, from `RUN/evaluation/*/eval_info.json`.
+    """
     results = []
     for protocol in POLICY_PROTOCOLS:
         path = run.folder / "evaluation" / protocol / "eval_info.json"
@@ -98,7 +100,8 @@ def read_results(run: Run, source: dict[str, Any]) -> list[Result]:
             continue
         try:
             info = json.loads(path.read_text())
-            if info["fingerprints"] == source["fingerprints"] and info["success_rate"] is not None:
+            facts = {"fingerprints": source["fingerprints"], **task_facts(config, int(info["seed"]))}
+            if info["success_rate"] is not None and facts == {key: info.get(key) for key in facts}:
                 results.append(_result(info))
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(
@@ -137,7 +140,7 @@ def export_run(
     source = source or read_source(run)
     roots = data_roots(",".join(text for text in (config.data.root, config.data.demos) if text))
     source = {**source, "recorded_elsewhere": any(_elsewhere(Path(root.path)) for root in roots)}
-    results = read_results(run, source)
+    results = read_results(run, config, source)
     agent = run.load_agent()
     policy = _policy(run, agent, config, source)
     made = replace(config, data=replace(config.data, camera=run.view.camera))  # one of several may be exported

@@ -15,11 +15,12 @@ from commands import ONE_CORE, contents, playslot, refused
 
 from playslot_rl.config import to_dict
 from playslot_rl.config.compose import compose
+from playslot_rl.evaluation.success import task_facts
 from playslot_rl.recipes.play import open_studio
 from playslot_rl.runs import Run
 from playslot_rl.sharing.commands import reproduce
 from playslot_rl.sharing.folder import read_config
-from playslot_rl.sharing.run import read_results, read_source
+from playslot_rl.sharing.run import read_source
 from playslot_rl.storage.atomic import write_json
 
 pytestmark = pytest.mark.integration
@@ -32,7 +33,7 @@ def evaluated(run: Path, protocol: str, **changes: Any) -> dict[str, Any]:
         "mean_steps_to_success": 14.5, "fingerprints": read_source(Run.open(run))["fingerprints"],
         "references": {"random": {"success_rate": 0.0, "ci95": [0.0, 0.07]},
                        "slot_oracle": {"success_rate": None, "ci95": None}},
-    } | changes  # fmt: skip
+    } | task_facts(Run.open(run).config, 0) | changes  # fmt: skip
     write_json(run / "evaluation" / protocol / "eval_info.json", info)
     return info
 
@@ -92,10 +93,14 @@ def test_the_card_names_no_folder_of_this_machine(run: Path, tmp_path: Path) -> 
     assert str(tmp_path) not in written
 
 
-def test_results_of_an_older_policy_are_left_out(run: Path, tmp_path: Path) -> None:
-    evaluated(run, "simulation", fingerprints={"policy": "0" * 16})
+@pytest.mark.parametrize(
+    "other", [{"fingerprints": {"policy": "0" * 16}}, {"env": {"max_steps": 5}}, {"render": {}}, {"first_seed": 7}]
+)
+def test_results_of_an_older_policy_or_another_task_are_left_out(
+    run: Path, tmp_path: Path, other: dict[str, Any]
+) -> None:
+    evaluated(run, "simulation", **other)
     evaluated(run, "imagination", success_rate=0.46, ci95=[0.33, 0.6])
-    assert [result.protocol for result in read_results(Run.open(run), read_source(Run.open(run)))] == ["imagination"]
     card = exported(run, tmp_path / "press")
     assert "in imagination (open loop) | 46 % | 33 to 60 %" in card
     assert "98 %" not in card
