@@ -15,8 +15,9 @@ from playslot_rl.runs.opening import require_one_task
 def main(config: ExperimentConfig) -> None:
     """Write the policy of `config.run` to the new folder `config.out`, and push it where `config.export.repo` is given.
 
-    A folder that holds this very policy already is left as it is, and pushed where a push is asked for: that is how the
-    same command is typed again after a kill or a push that failed, a HubError.
+    A folder that holds this very policy already keeps it; its card has the newest results, unless it was edited, and it
+    is pushed where a push is asked for: so the same command is typed again after a kill or a push that failed, a
+    HubError.
     """
     run, folder = evaluate.run_with_policy(replace(config, out="")), Path(config.out)
     if not config.out or folder.resolve() == Path(config.run).resolve():
@@ -25,12 +26,12 @@ def main(config: ExperimentConfig) -> None:
     if not METHODS[config.method].imagines:
         raise ConfigError(f"run={config.run}: got a run of method={config.method}, expected one of PlaySlot")
     from playslot_rl.sharing.folder import is_model_folder
-    from playslot_rl.sharing.run import export_run, read_source, require_exported
+    from playslot_rl.sharing.run import export_run, read_source, renew_exported
 
     source = read_source(run)
     if is_model_folder(folder):
-        require_exported(run, folder, config, source)
-        print(f"policy: {folder} is there already, exported before", flush=True)
+        renewed = renew_exported(run, folder, config, source)
+        print(f"policy: {folder} is there already, exported before{'; its card is new' * renewed}", flush=True)
     elif folder.exists() or folder.is_symlink():
         raise OutputError(f"out={folder}: got something that is there already, expected a new folder: choose another")
     else:

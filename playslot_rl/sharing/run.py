@@ -7,7 +7,7 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -21,9 +21,10 @@ from playslot_rl.envs import ENVIRONMENTS, RECORDED
 from playslot_rl.errors import CheckpointError, ConfigError, DataError, OutputError
 from playslot_rl.evaluation.success import POLICY_PROTOCOLS, run_facts, task_facts
 from playslot_rl.runs import Run
-from playslot_rl.sharing.card import make_card
+from playslot_rl.sharing.card import MARK, make_card
 from playslot_rl.sharing.commands import Result
-from playslot_rl.sharing.folder import SharedPolicyConfig, require_whole, save_pretrained
+from playslot_rl.sharing.folder import CARD, SharedPolicyConfig, require_whole, save_pretrained
+from playslot_rl.storage.atomic import write_text
 
 if TYPE_CHECKING:
     from playslot_rl.world_model import Agent
@@ -140,23 +141,35 @@ def export_run(
     source = source or read_source(run)
     roots = data_roots(",".join(text for text in (config.data.root, config.data.demos) if text))
     source = {**source, "recorded_elsewhere": any(_elsewhere(Path(root.path)) for root in roots)}
-    results = read_results(run, config, source)
     agent = run.load_agent()
-    policy = _policy(run, agent, config, source)
+    card = _card(run, folder.name, agent, config, source)
+    return save_pretrained(agent, folder, _policy(run, agent, config, source), card)
+
+
+def _card(
+    run: Run, name: str, agent: Agent, config: ExperimentConfig, source: dict[str, Any]
+) -> Callable[[SharedPolicyConfig], str]:
+    results = read_results(run, config, source)
     made = replace(config, data=replace(config.data, camera=run.view.camera))  # one of several may be exported
-    return save_pretrained(agent, folder, policy, lambda written: make_card(folder.name, written, agent, made, results))
+    return lambda written: make_card(name, written, agent, made, results)
 
 
-def require_exported(run: Run, folder: Path, config: ExperimentConfig, source: dict[str, Any]) -> None:
-    """Check that a model folder is whole and holds what `export_run` would write into it, but for versions of libraries
-    and results on its card; an OutputError where it holds another policy, other errors as of `export_run`.
+def renew_exported(run: Run, folder: Path, config: ExperimentConfig, source: dict[str, Any]) -> bool:
+    """Check that a model folder is whole and holds what `export_run` would write into it, but for versions of
+    libraries, and renew its card unless it was edited by hand: whether that was another one. An OutputError where it
+    holds another policy, other errors as of `export_run`.
     """
-    made = require_whole(folder)
-    wanted = replace(_policy(run, run.load_agent(), config, source), fingerprint=made.fingerprint)
+    made, agent = require_whole(folder), run.load_agent()
+    wanted = replace(_policy(run, agent, config, source), fingerprint=made.fingerprint)
     if made.source.get("fingerprints") != source["fingerprints"] or replace(made, source=source) != wanted:
         raise OutputError(
             f"out={folder}: got another policy, expected a new folder or that of run={run.name}: choose another"
         )
+    old, card = (folder / CARD).read_text("utf-8", "replace"), _card(run, folder.name, agent, config, source)(made)
+    if old == card or MARK not in old:
+        return False
+    write_text(folder / CARD, card)
+    return True
 
 
 def _policy(run: Run, agent: Agent, config: ExperimentConfig, source: dict[str, Any]) -> SharedPolicyConfig:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
-from commands import ONE_CORE, contents, playslot, refused
+from commands import ONE_CORE, Done, contents, playslot, refused
 
 from playslot_rl.config import to_dict
 from playslot_rl.config.compose import compose
@@ -213,11 +213,18 @@ def test_the_same_command_again_says_that_the_policy_is_there(run: Path, tmp_pat
     out = tmp_path / "press"
     exported(run, out)
     before = contents(out)
-    evaluated(run, "simulation")  # for the next card, not for this one
-    done = playslot("export", f"run={run}", f"out={out}", *ONE_CORE)
-    assert (done.code, done.err) == (0, ""), done.err
-    assert done.out == f"policy: {out} is there already, exported before\n"
+    again = ("export", f"run={run}", f"out={out}", *ONE_CORE)
+    said = f"policy: {out} is there already, exported before"
+    assert playslot(*again) == Done(0, f"{said}\n", "")
     assert contents(out) == before
+    evaluated(run, "simulation")
+    assert playslot(*again) == Done(0, f"{said}; its card is new\n", "")
+    assert contents(out).keys() == before.keys()
+    assert {name for name in before if contents(out)[name] != before[name]} == {"README.md"}
+    assert (out / "README.md").read_text() == exported(run, tmp_path / "anew" / "press")
+    (out / "README.md").write_text("of my own")
+    assert playslot(*again) == Done(0, f"{said}\n", "")
+    assert (out / "README.md").read_text() == "of my own"
 
 
 def test_a_folder_that_another_export_or_a_damage_left_is_refused(run: Path, tmp_path: Path) -> None:
