@@ -197,6 +197,8 @@ def pull_policy(repo_id: str, revision: str = "", cache: str | Path = "", token:
     from playslot_rl.sharing.folder import CONFIG, FILES, RANGE, WEIGHTS
 
     home = cache_folder(cache) / "policies" / repo_id.replace("/", "--")
+    if re.fullmatch("[0-9a-f]{40}", revision) and (home / revision).is_dir():
+        return home / revision  # a commit never changes: no network is needed
     with open_repository(repo_id, home, token=token, writing=False, revision=revision, kind="model") as hub:
         commit = hub.commit_of(revision or MAIN)
 

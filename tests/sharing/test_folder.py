@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
@@ -14,7 +15,9 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from playslot_rl.data.cache import cache_folder
 from playslot_rl.errors import CheckpointError, OutputError
+from playslot_rl.hub import pull
 from playslot_rl.sharing.folder import (
     FILES,
     SharedPolicyConfig,
@@ -53,6 +56,20 @@ def test_a_folder_holds_what_lerobot_looks_for_and_no_oracle(folder: Path) -> No
     assert values["type"] == "playslot"
     assert values["input_features"] == {"observation.images.front": {"type": "VISUAL", "shape": [3, 64, 64]}}
     assert values["output_features"] == {"action": {"type": "ACTION", "shape": [4]}}
+
+
+def test_a_commit_that_is_in_the_cache_needs_no_network(folder: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    def no_network(*_: Any, **__: Any) -> None:
+        raise ConnectionError
+
+    monkeypatch.setattr(pull, "open_repository", no_network)
+    commit = "a" * 40
+    there = cache_folder(tmp_path / "cache") / "policies" / "me--press" / commit
+    shutil.copytree(folder, there)
+    assert pull.pull_policy("me/press", commit, tmp_path / "cache") == there
+    for moving in ("", "main", "b" * 40):
+        with pytest.raises(ConnectionError):
+            pull.pull_policy("me/press", moving, tmp_path / "cache")
 
 
 def test_saving_twice_gives_equal_files(agent: Agent, config: SharedPolicyConfig, folder: Path, tmp_path: Path) -> None:
