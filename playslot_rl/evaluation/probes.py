@@ -80,7 +80,8 @@ def probe_actions(
 
     Returns:
         `linear` (ridge), `mlp` (two layers of 64) and, with codes, `code`: each `r2` (A values; None where the held-out
-        action does not vary, or hardly (`SPREAD`)) and `mean_r2`; `train` and `test` count transitions, `test_episodes` episodes.
+        action does not vary, or hardly (`SPREAD`)) and `mean_r2`; `train` and `test` count transitions, `test_episodes`
+        episodes.
 
     Raises:
         ValueError: sizes differ, there are fewer than two episodes, or an episode is on both sides.
