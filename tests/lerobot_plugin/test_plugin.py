@@ -133,7 +133,9 @@ def test_reset_forgets_the_episode(loaded: tuple[Any, Any, Any]) -> None:
     first, later = policy.select_action(batch), policy.select_action(batch)
     assert not torch.equal(first, later)
     policy.reset()
+    policy.train()  # as while it is trained; it acts in evaluation mode nevertheless
     assert torch.equal(policy.predict_action_chunk(batch), first[:, None])
+    assert not any(module.training for module in policy.modules())
     policy.reset()
     assert torch.equal(policy.select_action({"front": next(iter(batch.values()))}), first), "renamed to the short name"
     policy.reset()
@@ -147,6 +149,9 @@ def test_what_does_not_fit_is_refused(folder: Path, loaded: tuple[Any, Any, Any]
     policy = loaded[0]
     with pytest.raises(ValueError, match=r"got observation.images.top, expected observation.images.front"):
         policy.select_action({"observation.images.top": torch.zeros(1, 3, 64, 64)})
+    for frames in (torch.full((1, 3, 64, 64), 255.0), torch.full((1, 3, 64, 64), float("nan"))):
+        with pytest.raises(ValueError, match=r"observation.images.front: got floats in .* expected \[0, 1\]"):
+            policy.select_action({"observation.images.front": frames})
     for refuse in (lambda: policy.forward({}), policy.get_optim_params, policy.config.get_optimizer_preset):
         with pytest.raises(NotImplementedError, match="playslot train-policy"):
             refuse()

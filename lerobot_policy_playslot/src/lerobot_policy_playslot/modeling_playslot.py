@@ -40,9 +40,10 @@ class PlaySlotPolicy(PreTrainedPolicy):
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Actions (B, A) in [-1, 1] for the frames of the policy's camera, float (B, 3, H, W) in [0, 1]; LeRobot's
         postprocessor gives them in the robot's units. A ValueError where there is no such camera, for frames of another
-        shape, and for another number of environments without a `reset`.
+        shape or range, and for another number of environments without a `reset`.
         """
         del kwargs
+        self.eval()  # as LeRobot's own policies do
         camera = self.policy_config.camera
         camera = camera if camera in batch else camera.rpartition(".")[2]  # renamed to the short name
         if camera not in batch:
@@ -51,7 +52,11 @@ class PlaySlotPolicy(PreTrainedPolicy):
             raise ValueError(
                 f'observation: got {had}, expected {camera}: rename yours by --rename_map=\'{{"yours": "{camera}"}}\''
             )
-        return self._loop.act(batch[camera], camera)
+        frames = batch[camera]
+        if frames.is_floating_point() and not bool(((frames >= 0) & (frames <= 1)).all()):
+            low, high = frames.min().item(), frames.max().item()
+            raise ValueError(f"{camera}: got floats in [{low:g}, {high:g}], expected [0, 1]: divide bytes by 255")
+        return self._loop.act(frames, camera)
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """The next action as a chunk of one, (B, 1, A). It is an agent step: the frames are remembered."""
