@@ -146,6 +146,8 @@ def read_config(folder: Path) -> SharedPolicyConfig:
     except ValueError as error:
         raise CheckpointError(f"{path} is damaged ({error}), expected JSON: export the policy again") from error
     kind = values.get("type") if isinstance(values, dict) else None
+    if isinstance(values, dict) and "preset" in values:
+        raise CheckpointError(f"{folder}: got a run, expected a policy: use playslot_rl.load, or `playslot export` it")
     if kind != TYPE:
         raise CheckpointError(f"{path}: got a policy of type {kind!r}, expected {TYPE!r}: check the folder")
     try:

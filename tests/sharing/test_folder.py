@@ -156,6 +156,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
     "half a weights file": (truncate, "is damaged"),
     "no config": (lambda f: (f / "config.json").unlink(), "config.json is missing"),
     "half a config": (lambda f: (f / "config.json").write_text("{"), "is damaged"),
+    "a run": (lambda f: (f / "config.json").write_text('{"preset": "paper"}'), "got a run, .*: use playslot_rl.load"),
     "another policy": (edit_config(lambda v: v.update(type="act")), "got a policy of type 'act'"),
     "an unknown size": (edit_config(lambda v: v["model"].update(wings=2)), "unknown key model.wings"),
     "no sizes": (edit_config(lambda v: v.pop("model")), "no 'model'"),
