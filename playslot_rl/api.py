@@ -156,7 +156,7 @@ class PlaySlot:
 
         agent = self._require_agent("save_pretrained")
         require_type(folder, "folder", str, PathLike, expected="the folder to write")
-        path = Path(folder)
+        path = Path(folder).expanduser()
         known = self._policy or SharedPolicyConfig(resize=self._resize)
         source = {**known.source, "versions": versions()}
         config = replace(known, env=agent.world_model.env, model=agent.world_model.config, source=source)

@@ -15,6 +15,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from playslot_rl.api import PlaySlot
 from playslot_rl.data.cache import cache_folder
 from playslot_rl.errors import CheckpointError, OutputError
 from playslot_rl.hub import pull
@@ -56,6 +57,16 @@ def test_a_folder_holds_what_lerobot_looks_for_and_no_oracle(folder: Path) -> No
     assert values["type"] == "playslot"
     assert values["input_features"] == {"observation.images.front": {"type": "VISUAL", "shape": [3, 64, 64]}}
     assert values["output_features"] == {"action": {"type": "ACTION", "shape": [4]}}
+
+
+def test_a_policy_is_saved_in_the_users_home_and_not_in_a_folder_called_tilde(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    PlaySlot.untrained().save_pretrained("~/press")
+    assert is_model_folder(tmp_path / "home" / "press")
+    assert not Path("~").exists()
 
 
 def test_a_commit_that_is_in_the_cache_needs_no_network(folder: Path, tmp_path: Path, monkeypatch: Any) -> None:
