@@ -235,6 +235,9 @@ def test_other_tasks_have_their_own_settings(task: str) -> None:
     assert config.task_config() == compose([f"env={task}"]).env
     assert config.features["agent_pos"].shape == (4,)
     assert PlaySlotEnv(task=task, episode_length=7).task_config() == replace(config.task_config(), max_steps=7)
+    for key in ("episode_length", "frame_skip"):
+        with pytest.raises(ValueError, match="got 0, expected"):
+            PlaySlotEnv(task=task, **{key: 0})
 
 
 def test_the_state_is_as_wide_as_the_tasks() -> None:

@@ -56,8 +56,8 @@ class PlaySlotEnv(EnvConfig):
     def task_config(self) -> ours.EnvConfig:
         """The task's settings in playslot_rl, with the changes made here."""
         env = replace(task_config(str(self.task)), image_size=self.image_size)
-        longest, skip = self.episode_length or env.max_steps, self.frame_skip or env.frame_skip
-        return replace(env, max_steps=longest, frame_skip=skip)
+        longest = env.max_steps if self.episode_length is None else self.episode_length
+        return replace(env, max_steps=longest, frame_skip=env.frame_skip if self.frame_skip is None else self.frame_skip)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
