@@ -139,8 +139,6 @@ def test_reset_forgets_the_episode(loaded: tuple[Any, Any, Any]) -> None:
     policy.reset()
     assert torch.equal(policy.select_action({"front": next(iter(batch.values()))}), first), "renamed to the short name"
     policy.reset()
-    assert torch.equal(policy.select_action({"front": next(iter(batch.values()))}), first), "renamed to the short name"
-    policy.reset()
 
 
 def test_what_does_not_fit_is_refused(folder: Path, loaded: tuple[Any, Any, Any]) -> None:
