@@ -57,7 +57,8 @@ class PlaySlotEnv(EnvConfig):
         """The task's settings in playslot_rl, with the changes made here."""
         env = replace(task_config(str(self.task)), image_size=self.image_size)
         longest = env.max_steps if self.episode_length is None else self.episode_length
-        return replace(env, max_steps=longest, frame_skip=env.frame_skip if self.frame_skip is None else self.frame_skip)
+        skip = env.frame_skip if self.frame_skip is None else self.frame_skip
+        return replace(env, max_steps=longest, frame_skip=skip)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
