@@ -146,7 +146,7 @@ def card_json(card: Card, source: EpisodeFrames, facts: Mapping[str, Any], began
         "held_out": held.told_by,
         "held_out_known": held.known,
         "lines": (lines := [one.plain() for one in card.lines]),
-        "verdict": asdict(conclude(lines, card.details.get("code_counts", []))),
+        "verdict": asdict(conclude(lines, card.details.get("code_counts", []), len(held.tested))),
         "details": card.details,
         "wall_seconds": round(time.perf_counter() - began, 2),
         "hardware": hardware(),

@@ -205,6 +205,8 @@ WORDS: Final = {
     "transfer": "latents do not move the slots of another episode as these moved",
     "sensitivity": "the future hardly depends on the latents",
 }
+ENOUGH: Final = 4
+"""Tested episodes: of fewer a probe's R² is chance, and nothing that was measured is worth much."""
 COLLAPSED: Final = 0.98
 """Share of the transitions of one prototype, from which on the others are not in use."""
 
@@ -257,11 +259,14 @@ def _words(missing: Sequence[str], known: Mapping[str, Line]) -> str:
 
 def concluded(result: Mapping[str, Any]) -> Conclusion:
     """The verdict of a stored card, also of one from before there were any."""
-    return conclude(result["lines"], result["details"].get("code_counts", []))
+    tested = len(result.get("episodes_tested", range(ENOUGH)))
+    return conclude(result["lines"], result["details"].get("code_counts", []), tested)
 
 
-def conclude(lines: Sequence[Mapping[str, Any]], code_counts: Sequence[int] = ()) -> Conclusion:
-    """The verdict, from settled lines as plain values (`Line.plain`), and how many transitions each prototype has."""
+def conclude(lines: Sequence[Mapping[str, Any]], code_counts: Sequence[int] = (), tested: int = ENOUGH) -> Conclusion:
+    """The verdict, from settled lines as plain values (`Line.plain`), how many transitions each prototype has, and how
+    many episodes were tested: below `ENOUGH` no probe decides.
+    """
     values = {str(one["key"]): one["value"] for one in lines}
     notes = {str(one["key"]): str(one["note"]) for one in lines}
     if NO_NUMBERS in notes.values():
@@ -283,7 +288,8 @@ def conclude(lines: Sequence[Mapping[str, Any]], code_counts: Sequence[int] = ()
         if value is None and key == "replay":
             return Conclusion(False, f"replay could not be measured: {notes.get(key, 'no such line')}")
     told = [values[key] for key in PROBES if values.get(key) is not None]
-    if told and max(told) <= 0:
+    if told and max(told) <= 0 and tested >= ENOUGH:
         return Conclusion(False, f"{UNTOLD} (R² {max(told):.2f})")
     weak = [str(one["key"]) for one in lines if one["verdict"] == "bad"]
-    return Conclusion(True, f"replay {values['replay']:.2f}" + (f"; weak: {', '.join(weak)}" if weak else ""))
+    few = f"; too few episodes to tell: {tested} tested, expected {ENOUGH} or more" if tested < ENOUGH else ""
+    return Conclusion(True, f"replay {values['replay']:.2f}{few}" + (f"; weak: {', '.join(weak)}" if weak else ""))

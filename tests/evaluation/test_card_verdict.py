@@ -149,9 +149,18 @@ def test_the_difference_of_two_probes_that_find_nothing_is_no_measure() -> None:
 GOOD = {key: measure.borders[0] for key, measure in MEASURES.items()}
 
 
-def judged(changes: dict[str, float | None], counts: tuple[int, ...] = ()) -> str:
+def judged(changes: dict[str, float | None], counts: tuple[int, ...] = (), tested: int = 9) -> str:
     lines = [line(key, value, "why") for key, value in (GOOD | changes).items()]
-    return str(conclude([one.plain() for one in settle(lines)], counts))
+    return str(conclude([one.plain() for one in settle(lines)], counts, tested))
+
+
+def test_a_few_episodes_do_not_tell_and_no_probe_of_them_decides() -> None:
+    dead = {"linear_probe": -0.15, "mlp_probe": -0.3}
+    few = "verdict: usable: replay 0.70; too few episodes to tell: 3 tested, expected 4 or more"
+    assert judged({}, tested=3) == few
+    assert judged(dict(dead), tested=3).startswith(few)
+    assert judged(dict(dead), tested=4).startswith("verdict: not usable: no probe")
+    assert judged({"replay": 0.1}, tested=3).startswith("verdict: not usable: replayed latents")
 
 
 def test_the_verdict_names_what_decides_it() -> None:
