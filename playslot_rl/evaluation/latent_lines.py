@@ -139,8 +139,9 @@ def _scores(parsed: ParsedEpisodes, noisy: Floats, seed: int) -> tuple[str, dict
     before = np.nonzero(np.diff(parsed.rows) == 1)[0]  # an episode's last one has none after it
     episodes, tested = parsed.episodes[before], parsed.tested[before]
     if tested.any() and not tested.all():
-        late = probe_actions(parsed.latents[before + 1], actions[before], episodes, tested=tested)
-        scores |= {"late": late} if late["linear"]["mean_r2"] is not None else {}
+        seen = {"prompt": parsed.latents[before], "late": parsed.latents[before + 1]}  # of the same transitions
+        pair = {name: probe_actions(x, actions[before], episodes, tested=tested) for name, x in seen.items()}
+        scores |= pair if pair["late"]["linear"]["mean_r2"] is not None else {}
     return "", scores
 
 
@@ -153,9 +154,9 @@ def _probe_lines(scores: dict[str, Any], of: str) -> dict[str, Line]:
     if best["latent"] <= 0:
         above = above.without_value(f"{UNTOLD}: {best['latent']:.2f}")
     if "late" in best:
-        lag = line("lag", counted["late"] - counted["latent"], f"one later: {best['late']:.2f}")
-        if max(best["late"], best["latent"]) <= 0:
-            lag = lag.without_value(f"{UNTOLD}: {best['latent']:.2f}")
+        lag = line("lag", counted["late"] - counted["prompt"], f"one later: {best['late']:.2f}")
+        if max(best["late"], best["prompt"]) <= 0:
+            lag = lag.without_value(f"{UNTOLD}: {best['prompt']:.2f}")
     held = f"{own['test']} transitions of {own['test_episodes']} held-out episodes, fitted on {own['train']} others{of}"
     return {
         "linear_probe": line("linear_probe", own["linear"]["mean_r2"], held),

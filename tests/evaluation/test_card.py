@@ -84,6 +84,20 @@ def test_a_robot_that_follows_late_shows_its_action_in_the_next_latent(model: Wo
     assert lag["late"].value > 0.9
 
 
+def test_the_lag_compares_latents_on_the_same_transitions(model: WorldModel, card: Card) -> None:
+    """Actions held for a whole episode but its last transition, which no later latent could show."""
+    parsed = card.parsed
+    assert parsed.actions is not None
+    first = np.searchsorted(parsed.episodes, parsed.episodes)
+    held, last = parsed.actions[first], np.diff(parsed.rows, append=-9) != 1
+    latents = held @ np.random.default_rng(0).normal(size=(4, 8)).astype(np.float32)
+    some = replace(parsed, latents=latents, actions=np.where(last[:, None], -held, held))
+    found = by_key(action_lines(model, some, 0)[0])
+    assert found["lag"].value == pytest.approx(0, abs=0.02)
+    assert found["linear_probe"].value is not None
+    assert found["linear_probe"].value < 0.9
+
+
 def test_latents_of_noise_recover_nothing(model: WorldModel, card: Card) -> None:
     noise = np.random.default_rng(1).normal(size=card.parsed.latents.shape).astype(np.float32)
     lines = by_key(action_lines(model, replace(card.parsed, latents=noise), 0)[0])

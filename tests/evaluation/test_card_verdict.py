@@ -124,9 +124,10 @@ def test_the_shipped_models_keep_their_verdicts() -> None:
 
 def probed(latent: float, frame: float, late: float) -> dict[str, Line]:
     """Lines of probes with these R²."""
+    controls = {"shuffled": -0.1, "noise": -0.1}
     scores = {
         name: {"linear": {"mean_r2": r2}, "mlp": {"mean_r2": r2 - 0.4}, "test": 9, "train": 9, "test_episodes": 3}
-        for name, r2 in {"latent": latent, "frame": frame, "late": late, "shuffled": -0.1, "noise": -0.1}.items()
+        for name, r2 in {"latent": latent, "frame": frame, "prompt": latent, "late": late, **controls}.items()
     }
     return {one.key: one for one in settle(list(_probe_lines(scores, "").values()))}
 
